@@ -131,8 +131,8 @@ class _Network(ABC):
         wanted = _count(self._space)
         if values.shape[:1] != (1,) or (wanted and values[0].size != wanted):
             raise ValueError(
-                f"{path!r} returns values of the shape {values.shape} for one observation, but needs (1, {wanted}) for "
-                f"actions in {self._space}"
+                f"{path!r} returns values of the shape {values.shape} for one observation, but must return (1, "
+                f"{wanted}) for actions in {self._space}"
             )
         self._forget(path)
 

@@ -181,8 +181,9 @@ def git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str
     if done.returncode and not skipped:
         if what:
             raise UsageError(
-                f"{what!r} is not a commit of the repository {folder}", fix="give a branch, a tag or a commit of it"
+                f"{what!r} is not a commit of the repository {folder}",
+                fix="give a branch, a tag or a commit of this repository",
             )
         said = " ".join(done.stderr.split()) or f"git {words[0]} failed"
-        raise CrashhuntError(said, fix="run it in the repository of the agent", where=str(folder))
+        raise CrashhuntError(said, fix="run the command in the repository of the agent", where=str(folder))
     return done.stdout.strip()

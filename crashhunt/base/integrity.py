@@ -146,7 +146,7 @@ def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the ty
     except RecursionError:
         raise ValueError("the JSON data are nested too deeply") from None
     if not isinstance(found, dict):
-        raise ValueError(f"the file holds {type(found).__name__}, not an object")
+        raise ValueError(f"the file contains a JSON value of the type {type(found).__name__}, not a JSON object")
     return cast(T, found)
 
 

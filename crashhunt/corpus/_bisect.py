@@ -136,7 +136,7 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
         if found.returncode == 0 and not Path(origin).resolve().is_relative_to(tree):
             raise UsageError(
                 f"{module!r} is imported from {origin}, independent of the revision",
-                fix="run it from the folder of the repository in which the module is (--from)",
+                fix="give --from FOLDER, the folder of the repository that contains the module",
             )
         if found.returncode != 0:
             return "cannot_run"
@@ -146,6 +146,7 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
         got: Got = json.loads(done.stdout)["cases"][0]["got"]
     except (ValueError, KeyError, IndexError):
         raise CrashhuntError(
-            f"the corpus case could not be run: {done.stderr.strip()[-300:]}", fix="see the error: crashhunt corpus run"
+            f"the corpus case could not be run: {done.stderr.strip()[-300:]}",
+            fix="run crashhunt corpus run to see the whole error",
         ) from None
     return got

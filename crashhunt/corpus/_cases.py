@@ -86,7 +86,7 @@ class Case:
         """
         found = list_bundles(self.path)
         if len(found) != 1:
-            message = f"the case has {len(found)} crashes; it must have 1"
+            message = f"the corpus case contains {len(found)} crashes, not exactly one"
             raise BundleError(
                 message, fix="restore it from the repository, or add the crash again", where=str(self.path)
             )

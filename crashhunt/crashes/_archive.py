@@ -122,7 +122,7 @@ def open_archive(path: Path) -> Iterator[Archive]:
             raise _refusal(path, f"cannot be unpacked: {error.strerror or error}") from None
         except Exception as error:  # zipfile and what it unpacks with have an error of their own for every damage
             name = "" if isinstance(error, zipfile.BadZipFile) else f"{type(error).__name__}: "
-            raise _refusal(path, f"not an undamaged zip file: {name}{' '.join(str(error).split())}") from None
+            raise _refusal(path, f"it is damaged, or not a zip file: {name}{' '.join(str(error).split())}") from None
         yield Archive(
             directory=directory,
             made_by=str(index.get("made_by", "?")),
@@ -157,16 +157,16 @@ def _checked(archive: zipfile.ZipFile, index: ArchiveIndex, path: Path) -> list[
     entries = [entry for entry in archive.infolist() if entry.filename != layout.ARCHIVE_INDEX]
     names = [entry.filename for entry in entries]
     if len(entries) > _MAX_FILES or sum(entry.file_size for entry in entries) > _MAX_BYTES:
-        raise _refusal(path, "it is too large")
+        raise _refusal(path, "its files are too many or too large")
     if len(set(names)) != len(names):
-        raise _refusal(path, "a file comes twice")
+        raise _refusal(path, "it contains two files with the same name")
     for entry in entries:
         name = entry.filename
         parts = PurePosixPath(name).parts
         if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name or ":" in parts[0]:
-            raise _refusal(path, f"the name {name!r} leads out of it")
+            raise _refusal(path, f"the path {name!r} leads out of the folder to which it is unpacked")
         if parts[0] not in (layout.HUNT, layout.CRASHES, *layout.BESIDE, layout.SNAPSHOTS):
-            raise _refusal(path, f"it has {name!r}, which is no part of a crash")
+            raise _refusal(path, f"it contains {name!r}, which does not belong to a crash")
         kind = stat.S_IFMT(entry.external_attr >> 16)
         if kind not in (0, stat.S_IFREG) or name.endswith("/"):
             raise _refusal(path, f"{name!r} is not a file")
@@ -186,11 +186,11 @@ def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, directory: Path, 
         while chunk := source.read(_CHUNK_BYTES):
             size += len(chunk)
             if size > listed["size"]:  # whatever the zip says of itself
-                raise _refusal(path, f"{entry.filename!r} is larger than it says")
+                raise _refusal(path, f"{entry.filename!r} is larger than its index states")
             digest.update(chunk)
             copy.write(chunk)
     if size != listed["size"] or digest.hexdigest() != listed["blake2b"]:
-        raise _refusal(path, f"{entry.filename!r} has changed")
+        raise _refusal(path, f"{entry.filename!r} has changed since it was exported")
 
 
 def _user() -> str:

@@ -246,7 +246,7 @@ _KEYS = CrashData.__required_keys__ | CrashData.__optional_keys__
 _PARTS: Mapping[str, type] = {
     "collision": Collision, "failure": Failure, "escape": Escape, "event": Event, "closest_approach": ClosestApproach,
 }  # fmt: skip
-_DAMAGE_FIX = "get an undamaged copy, or see with crashhunt check what can be saved"
+_DAMAGE_FIX = "get an undamaged copy, or run crashhunt check to see what can be recovered"
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,7 +52,9 @@ def stop_hunt(view: HuntView) -> None:
             f"the hunt is not running: its state is {state.state}", fix="only a running hunt can be stopped"
         )
     if owner["host"] != socket.gethostname():
-        raise UsageError(f"the hunt runs on {owner['host']}", fix=f"stop it there: kill -INT {owner['pid']}")
+        raise UsageError(
+            f"the hunt runs on the machine {owner['host']}", fix=f"stop it there: kill -INT {owner['pid']}"
+        )
     # The state is "running" only if the process is the one that the ledger names, and not a later one of its number.
     with suppress(ProcessLookupError):
         os.kill(owner["pid"], signal.SIGINT)

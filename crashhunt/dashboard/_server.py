@@ -162,7 +162,9 @@ def _listen(host: str, port: int) -> socket.socket:
             fix = f"give --port {free}, which is free" if free else "give another --port"
             raise UsageError(f"port {port} of {host} is taken", fix=fix) from None
         if error.errno == errno.EACCES:
-            raise UsageError(f"port {port} needs privileges", fix="give a --port from 1024 to 65535") from None
+            raise UsageError(
+                f"port {port} needs the rights of an administrator", fix="give a --port from 1024 to 65535"
+            ) from None
         raise UsageError(f"cannot listen on {host} port {port}: {error.strerror}", fix="give another --host") from None
 
 

@@ -27,8 +27,8 @@ def described_model(name: str) -> str:
     """
     kind: object = locate_model(name).what
     if not isinstance(kind, str):
-        message = f"{name!r} is not a disturbance model: its what is a {type(kind).__name__}"
-        raise PluginError(message, fix="see crashhunt.testing")
+        message = f"{name!r} is not a disturbance model: its attribute what is a {type(kind).__name__}, not a string"
+        raise PluginError(message, fix="set what to the kind of the disturbance, such as 'brake'")
     return str(kind)
 
 

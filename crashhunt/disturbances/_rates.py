@@ -68,7 +68,9 @@ def parse_fixed(words: Iterable[str], agents: Sequence[str], *, shown: str = "--
         one = _parsed(word, agents, shown)
         key = one.step, one.agent, one.what
         if key in found:
-            raise UsageError(f"{shown} {word}: {one.what} begins twice at step {one.step}", fix="give it once")
+            raise UsageError(
+                f"{shown} {word}: another {one.what} already begins at step {one.step}", fix="give one of the two"
+            )
         found[key] = one
     return tuple(one for _, one in sorted(found.items()))
 
@@ -163,7 +165,7 @@ def _rate(name: str, text: str) -> float:
     except ValueError:
         rate = math.nan
     if not 0 <= rate < math.inf:
-        fix = "give how often it happens a second, from 0 on, such as 0.02"
+        fix = "give a rate per second of at least 0, such as 0.02"
         raise UsageError(f"{_OPTION} {name}={text}: {text!r} is not a rate", fix=fix)
     return rate
 
@@ -199,7 +201,7 @@ def disturber_of(
         _refuse_unsupported(name, model.what, known, simulator)
         twin = next((other for other, made in models.items() if made.what == model.what), None)
         if twin is not None:
-            message = f"{_OPTION}: {twin} and {name} are both about {model.what!r}"
+            message = f"{_OPTION}: {twin} and {name} both inject disturbances of the kind {model.what!r}"
             raise UsageError(message, fix="choose one of the two")
         models[name] = model
     for one in fixed:
@@ -218,8 +220,8 @@ def _refuse_unsupported(name: str, what: str, known: Sequence[str] | None, simul
     if known is None or what in known or what in SENSOR_KINDS:
         return
     able = sorted(point for point in registered("disturbances") if point in (*known, *SENSOR_KINDS))
-    message = f"{_OPTION} {name}: {simulator} cannot do {what!r}"
-    raise UsageError(message, fix=f"it can do {', '.join(able)}" if able else "omit the option")
+    message = f"{_OPTION} {name}: {simulator} does not support the disturbance {what!r}"
+    raise UsageError(message, fix=f"it supports {', '.join(able)}" if able else "omit the option")
 
 
 def modules_of_models(words: Iterable[str]) -> list[str]:
@@ -244,7 +246,10 @@ def locate_model(name: str) -> DisturbanceModel:
         raise blamed(f"the disturbance {name!r} cannot be created", error) from error
     for part in ("what", "draw", "log_likelihood"):
         if not hasattr(made, part):
-            raise PluginError(f"{name!r} is not a disturbance model: it has no {part}", fix="see crashhunt.testing")
+            raise PluginError(
+                f"{name!r} is not a disturbance model: it has no {part}",
+                fix=f"define {part}, and test the model with crashhunt.testing",
+            )
     return made
 
 

@@ -142,7 +142,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
             SimulatorError: no episode is running, or its process cannot be forked.
         """
         if n < 1:
-            raise UsageError(f"n is {n}", fix="branch at least 1 copy")
+            raise UsageError(f"n is {n}", fix="give the number of copies, at least 1")
         if seed is not None and seed < 0:
             raise UsageError(f"seed is {seed}", fix="give 0 or more")
         if not isinstance(self._episodes, RemoteEpisodes):

@@ -100,7 +100,7 @@ class DisturbanceInjector:
         if odd is not None:
             raise InvalidEpisodeError(
                 f"the simulator does not support the disturbance {odd!r}",
-                fix=f"it can do {', '.join((*known, *SENSOR_KINDS))}",
+                fix=f"it supports {', '.join((*known, *SENSOR_KINDS))}",
             )
         # Of each sort, those that are still to come, the next one last.
         waiting = sorted(spec.disturbances, key=lambda one: one.step, reverse=True)

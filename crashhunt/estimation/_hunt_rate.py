@@ -273,7 +273,8 @@ def _by_argument(by: str, settings: HuntSettings) -> _Division:
         raise UsageError(f"--by: there is no argument {word!r}", fix=one_of(word, [*_CRASH_PROPERTIES, *short, *names]))
     if colon and not (count.isdecimal() and 1 <= int(count) <= _MAX_BINS):
         raise UsageError(
-            f"--by {by}: {count!r} bins", fix=f"give 1 to {_MAX_BINS} bins, such as {word}:{_DEFAULT_BINS}"
+            f"--by {by}: {count!r} is not a number of bins",
+            fix=f"give 1 to {_MAX_BINS} bins, such as {word}:{_DEFAULT_BINS}",
         )
     agent, name = names[key]
     distribution = space[agent, name]

@@ -379,7 +379,9 @@ class HuntResults:
     def _snapshot(self) -> Snapshot:
         found = latest_snapshot(self.directory)
         if found is None:
-            raise HuntDirectoryError("the hunt has not begun: it has no snapshot", where=str(self.directory))
+            raise HuntDirectoryError(
+                "the hunt has not begun: it has no snapshot", fix="run the hunt first", where=str(self.directory)
+            )
         return found
 
 

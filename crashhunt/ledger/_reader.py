@@ -258,7 +258,7 @@ class LedgerReader:
         seal = self._seal()
         rows = list(self._select(f"{self._shape.select('events')} ORDER BY rowid"))
         self._compare_seal(seal, "events", len(rows))
-        return [self._checked(row, "what it says of its states")[:3] for row in rows]
+        return [self._checked(row, "an entry on the state of the hunt")[:3] for row in rows]
 
     def replaced(self) -> list[TrialResult]:
         """Return the trials that were run again, with their former results."""
@@ -302,7 +302,7 @@ class LedgerReader:
         try:
             return cast(Facts, {row[0]: json.loads(row[1]) for row in rows if row[0] not in OWN_FACTS})
         except (ValueError, TypeError, RecursionError) as error:
-            raise damaged(self._path, f"a fact cannot be read: {error}") from None
+            raise damaged(self._path, f"a fact about the hunt cannot be read: {error}") from None
 
     def finished(self) -> set[int]:
         """Return the numbers of the finished trials."""
@@ -407,7 +407,9 @@ class LedgerReader:
         if seal is not None:
             said = {name: number for name, number in seal["outcomes"].items() if not outcomes or name in outcomes}
             if count != sum(said.values()) and self._seal() == seal:
-                raise damaged(self._path, f"it has {count} such trials, and {sum(said.values())} were written")
+                raise damaged(
+                    self._path, f"it has {count} trials with these outcomes, but {sum(said.values())} were written"
+                )
 
     def endings(self) -> Iterator[tuple[int, int, str, str, bool]]:
         """Yield the endings of trials in the order of their numbers, without decoding whole rows.
@@ -672,7 +674,7 @@ class LedgerReader:
     def _compare_seal(self, seal: Seal | None, name: str, found: object) -> None:
         # A writer may have come meanwhile; then it is another seal, or none. One of before may say less.
         if seal is not None and found != seal.get(name, found) and self._seal() == seal:
-            raise damaged(self._path, f"{name} are not those that were written")
+            raise damaged(self._path, f"its {name} differ from those that were written")
 
     def _outcomes(self) -> dict[str, int]:
         return dict(self._select("SELECT outcome, count(*) FROM trials GROUP BY outcome ORDER BY outcome"))

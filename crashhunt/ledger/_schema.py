@@ -182,7 +182,7 @@ def shape_of(database: sqlite3.Connection, path: Path) -> Shape:
         _refuse_unreadable(database, path, version)
     expected = {**FIRST, **(_LATER_TABLES if version >= _FIRST_VERSION_WITH_PROPOSALS else {})}
     for table in names & _LATER_TABLES.keys() - expected.keys():
-        raise damaged(path, f"it is not as version {version} is: with the table {table}")
+        raise damaged(path, f"it contains the table {table}, which version {version} does not have")
     return Shape(version, {table: _columns(database, path, version, table, expected[table]) for table in expected})
 
 
@@ -199,8 +199,10 @@ def _columns(
             return columns
     if there != expected:
         odd = sorted(set(expected) ^ set(there))
-        what = f"{', '.join(odd)} of" if there and odd else "the columns of" if there else "without"
-        raise damaged(path, f"it is not as version {version} is: {what} the table {table}")
+        if not there:
+            raise damaged(path, f"the table {table} of version {version} is missing")
+        what = f"the columns {', '.join(odd)}" if odd else "the order of the columns"
+        raise damaged(path, f"the table {table} differs from that of version {version} in {what}")
     return known
 
 
@@ -208,7 +210,7 @@ def _refuse_unreadable(database: sqlite3.Connection, path: Path, version: int) -
     """Refuse a ledger of a newer version, unless it records that this version can read it."""
     try:
         row = database.execute("SELECT key, value, digest FROM hunt WHERE key = ?", (_READER_FACT,)).fetchone()
-        if row is not None and int(json.loads(checked(row, "what reads it", path)[1])) <= VERSION:
+        if row is not None and int(json.loads(checked(row, "the minimum version of its reader", path)[1])) <= VERSION:
             return
     except (sqlite3.Error, ValueError, TypeError):
         pass
@@ -291,7 +293,7 @@ def migrate(database: sqlite3.Connection, version: int) -> None:
 Row: TypeAlias = tuple[Any, ...]
 """A row as SQLite returns it. The caller's query names its columns."""
 
-_CHECK_FIX = "crashhunt check {} says what can be saved"
+_CHECK_FIX = "run crashhunt check {} to see what can be recovered"
 
 
 def checked(row: Row, what: str, path: Path) -> Row:
@@ -301,7 +303,7 @@ def checked(row: Row, what: str, path: Path) -> Row:
         HuntDirectoryError: the row does not match its digest.
     """
     if digest_of_row(row[:-1]) != row[-1]:
-        raise damaged(path, f"{what} is not as it was written")
+        raise damaged(path, f"{what} has changed since it was written")
     return row
 
 

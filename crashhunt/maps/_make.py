@@ -218,13 +218,18 @@ def _put_in_place(building: Path, target: Path, directory: Path) -> None:
         # Another process has made it in the meantime: its folder stays as it is.
         if target.exists():
             fix = "name another folder"
-            raise HuntDirectoryError("the folder was made by another process", fix=fix, where=str(directory)) from error
+            raise HuntDirectoryError(
+                "another process has created this folder in the meantime", fix=fix, where=str(directory)
+            ) from error
         raise
 
 
 def _check_options(source: MapSource, options: MapOptions) -> None:
     if options.bbox is not None and source.path is None:
-        raise UsageError(f"--bbox cannot be used with --{source.kind}", fix="choose the size of the map instead")
+        raise UsageError(
+            f"--bbox cannot be used with --{source.kind}",
+            fix=f"omit --bbox, and choose the size of the map with --{source.kind}",
+        )
     if options.left_hand and source.kind == "net":
         fix = "omit the option: a network keeps the side that it was made for"
         raise UsageError("--lefthand cannot be used with --net", fix=fix)

@@ -87,7 +87,7 @@ class Tools:
                     code = child.wait(_TIME_LIMIT_S)
                 except subprocess.TimeoutExpired:
                     fix = "choose a smaller map, or a part of it with --bbox W,S,E,N"
-                    raise ScenarioError(f"{program} takes over {_TIME_LIMIT_S / 60:g} minutes", fix=fix) from None
+                    raise ScenarioError(f"{program} took more than {_TIME_LIMIT_S / 60:g} minutes", fix=fix) from None
                 finally:
                     if child is not None:
                         child.kill()
@@ -100,7 +100,7 @@ class Tools:
             raise ScenarioError(f"{program} has no space left for temporary files", fix=fix, where=str(folder.parent))
         if code < 0:
             fix = "free memory and disk space, or choose a smaller map"
-            raise ScenarioError(f"{program} was ended by signal {-code}", fix=fix)
+            raise ScenarioError(f"{program} was killed by signal {-code}", fix=fix)
         return ToolResult(code, log.read_text(encoding="utf-8", errors="replace"))
 
 

@@ -189,7 +189,7 @@ def parse_oracle(text: str) -> OracleChoice:
         kind = signature.arguments[key].kind if key in signature.arguments else None
         distribution = parse_spec(value, kind, where=f"--oracle {name}:{key}")
         if not isinstance(distribution, Constant):
-            fix = "give one value; what is searched are the arguments of agents and of the scenario"
+            fix = "give one value; a hunt varies only the arguments of agents and of the scenario"
             raise ArgumentError(f"{value!r} is not a single value", fix=fix, where=f"--oracle {name}:{key}")
         arguments[key] = distribution.value
     return OracleChoice(name, arguments, factory)

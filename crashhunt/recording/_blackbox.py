@@ -444,7 +444,7 @@ def read_black_box(path: Path) -> Iterator[Record]:
     """
     header = read_header(path)
     if header is None:
-        raise BundleError("no black box here", fix="the trial left no recording", where=str(path))
+        raise BundleError("the trial left no recording (black box)", fix="run the trial again", where=str(path))
     with path.open("rb") as file:
         file.seek(FIRST)
         data = file.read(max(0, min(header.committed, readable_bytes(os.fstat(file.fileno()))) - FIRST))

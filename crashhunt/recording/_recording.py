@@ -64,7 +64,7 @@ class Recording:
         self.records = tuple(records)
         self.compact = compact
         if not self.records or self.records[0].tag != PROLOGUE.tag:
-            raise BundleError("the recording has no beginning", fix="it was cut short or is not a recording")
+            raise BundleError("the recording has no beginning", fix="get an undamaged copy of the log")
         try:
             reading = _read(self.records)
         except (ValueError, IndexError, KeyError, TypeError, struct.error) as error:

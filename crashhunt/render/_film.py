@@ -75,7 +75,7 @@ class FilmOptions:
             if not value >= least or not math.isfinite(value):
                 raise UsageError(f"{name} is {value:g}", fix=f"give at least {least}")
         if max(self.size) > 8192:
-            raise UsageError(f"--size is {self.size[0]}x{self.size[1]}", fix="give at most 8192 each way")
+            raise UsageError(f"--size is {self.size[0]}x{self.size[1]}", fix="give at most 8192x8192")
 
 
 @dataclass(frozen=True, slots=True)

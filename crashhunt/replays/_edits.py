@@ -168,7 +168,7 @@ def _fixed(where: str, words: Sequence[str], agents: Sequence[str]) -> tuple[Dis
 def _value(where: str, field: str, text: str) -> Any:
     if field == "who":
         if text not in CELLS:
-            raise ArgumentError(f"{where}: {text!r} is not a place", fix=one_of(text, CELLS))
+            raise ArgumentError(f"{where}: {text!r} is not a place around the agent", fix=one_of(text, CELLS))
         return text
     try:
         value = float(text)

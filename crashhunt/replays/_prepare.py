@@ -230,7 +230,7 @@ def _in_scenario(
     if len(other.agents) != len(settings.agents):
         counts = f"{len(other.agents)} controlled vehicles, and the crash has {len(settings.agents)}"
         message = f"--scenario {name!r} has {counts}"
-        raise UsageError(message, fix="give one with as many")
+        raise UsageError(message, fix="give a scenario with as many controlled vehicles")
     ids = dict(zip(settings.agents, other.agents, strict=True))
     agents = {ids[agent]: chosen for agent, chosen in settings.agents.items()}
     shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}

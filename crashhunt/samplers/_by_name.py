@@ -61,7 +61,10 @@ class NamedSampler:
             self._blame("cannot be made", error)
         missing = [member for member in ("learns", "ask", "tell") if not hasattr(self._sampler, member)]
         if missing:
-            raise PluginError(f"the sampler {name!r} has no {missing[0]!r}", fix="see crashhunt.samplers.Sampler")
+            raise PluginError(
+                f"the sampler {name!r} has no {missing[0]!r}",
+                fix=f"define {missing[0]}, as crashhunt.samplers.Sampler describes",
+            )
         if self.learns and self.independent:
             raise PluginError(
                 f"the sampler {name!r} declares both learns and independent",

@@ -105,7 +105,7 @@ class SweepSampler(GridSampler):
         if len(varying) != 1:
             raise UsageError(
                 f"a sweep needs exactly one varying argument, not: {', '.join(varying) or 'nothing'}",
-                fix="name one, such as --arg speed=5:30:5",
+                fix="give one range, such as --arg speed=5:30:5, and constants for the others",
             )
 
 

@@ -225,8 +225,8 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
     if path.suffix == ".toml":
         if ego:
             bare = [known.endings[0] for known in configurations() if known.takes_ego]
-            message = f"--ego {ego!r} is for a bare {any_of(bare)}"
-            raise ScenarioError(message, fix="set the vehicle under [agents] instead", where=str(path))
+            message = f"--ego {ego!r} can be used only with a {any_of(bare)}, not with a scenario.toml"
+            raise ScenarioError(message, fix="choose the vehicle in the table [agents] of the file", where=str(path))
         scenario = _load_toml(path, kept=kept)
     else:
         scenario = _configuration(path).load(path, ego)

@@ -548,7 +548,7 @@ class Backend:
     def __post_init__(self) -> None:
         if self.table is not None and not is_dataclass(self.table):
             # What is no dataclass would neither be written down nor sent to a worker.
-            raise TypeError(f"the table of a backend is a dataclass, and {self.table!r} is none")
+            raise TypeError(f"the table of a backend must be a dataclass, but {self.table!r} is not a dataclass")
 
 
 # Which simulators have a descriptor, and where it is.
@@ -588,7 +588,7 @@ def backend_of(name: str) -> Backend | None:
         return None
     found = load_attribute(point.value, shown=name)
     if not isinstance(found, Backend):
-        message = f"the backend {name!r} is a {type(found).__name__}"
+        message = f"the backend {name!r} is a {type(found).__name__}, not a Backend"
         raise PluginError(message, fix="make it a crashhunt.scenario.Backend", where=point.value)
     return found
 

@@ -31,7 +31,7 @@ __all__ = ["Shrunk", "shrink", "shrunk_name"]
 
 Verdict = Literal["shrunk", "unchanged", "not_reproduced"]
 _MAX_CONFIRMATIONS = 3  # of what is left of a flaky crash
-_DISK_FIX = "free some space and run the same command again: what came of the trials is remembered"
+_DISK_FIX = "free some space and run the same command again, which reuses the results of finished trials"
 
 
 @dataclass(frozen=True, slots=True)

@@ -209,7 +209,7 @@ class GymSimulator:
                 "which is not a gymnasium.Env",
             )
             if takes_turns(made):
-                fix, what = "name its parallel_env", "whose agents take turns"
+                fix, what = "name the function parallel_env of the environment", "whose agents act in turns"
             raise self._mistake(f"this factory returned a {type(made).__name__}, {what}", fix=fix)
         return made
 

@@ -195,7 +195,8 @@ class Gate:
             raise UsageError(f"--most is {self.most}", fix="give at least 1")
         if self.most < len(self.hunts):
             raise UsageError(
-                f"--most is {self.most} for {len(self.hunts)} hunts", fix="give at least one pair for each hunt"
+                f"--most is {self.most}, but the gate compares {len(self.hunts)} hunts",
+                fix="give at least one pair for each hunt",
             )
         if not 0 <= self.margin < 1:
             raise UsageError(f"--margin is {self.margin:g}", fix="give a share from 0 to below 1, such as 0.01")
@@ -216,7 +217,9 @@ def _locked(place: Path) -> Iterator[None]:
         place.mkdir(exist_ok=True)
         if is_hunt(place) or (not (place / GATE).exists() and any(place.iterdir())):
             raise HuntDirectoryError(
-                "the folder is not empty and has no gate", fix="give --keep a new folder", where=str(place)
+                "the folder is not empty, and does not contain the hunts of a gate",
+                fix="give --keep a new folder",
+                where=str(place),
             )
         with (place / _LOCK).open("a") as lock:
             try:
@@ -298,7 +301,7 @@ class _Run:
             )
             if is_other:
                 raise HuntDirectoryError(
-                    "the directory has a gate with other versions, hunts or seeds",
+                    "the directory contains a gate with other versions, hunts or seeds",
                     fix="give --keep another directory", where=str(self._place),
                 )  # fmt: skip
             seed = before["seed"] if before is not None and given is None else given
@@ -411,8 +414,8 @@ class _Run:
             drivers = set(gate.head.agents.values())
             cases = [case for case in cases if drivers & _drivers_of(case)]
             if not cases:
-                message = f"--corpus {gate.corpus} has no case of {gate.head.word}"
-                raise UsageError(message, fix="omit the option, or give the corpus of that agent")
+                message = f"--corpus {gate.corpus} has no case in which the agent {gate.head.word} drives"
+                raise UsageError(message, fix="omit --corpus, or give a corpus with crashes of this agent")
         command = [sys.executable, "-m", "crashhunt", "corpus", "run", *map(str, cases), "--json"]
         command += ["--parallel", str(slots_of(gate.parallel))]
         if gate.trusted or tree is not None:  # a commit's corpus is trusted as its code is

@@ -85,7 +85,7 @@ def rerun(
         )
     busy = [hunt for hunt in hunts if hunt_state(hunt).state == "running"]
     if busy:
-        raise HuntDirectoryError("it is running", fix="wait for it, or stop it", where=str(busy[0]))
+        raise HuntDirectoryError("the hunt is running", fix="wait for it, or stop it", where=str(busy[0]))
     # First everything that may fail, so that nothing is moved away for nothing.
     requests = {hunt: _changed(_request(hunt), changes, hunt) for hunt in hunts}
     again, replaced = [], []
@@ -157,7 +157,7 @@ def _changed(asked: RunRequest, changes: Mapping[str, str], hunt: Path) -> RunRe
     for name, spec in changes.items():
         if name in _NUMBER_OPTIONS:
             if not spec.isdecimal():
-                raise UsageError(f"--set {name}={spec}", fix="give a whole number")
+                raise UsageError(f"--set {name}={spec}: {spec!r} is not a whole number", fix="give a whole number")
             number: Given = {name: int(spec)}
             request = replace(request, **number)
         elif owners is not None:
@@ -257,7 +257,7 @@ def _require_same_request(to: Path, request: RunRequest) -> None:
         raise HuntDirectoryError("the directory exists already", fix="give a new directory", where=str(to))
     state = hunt_state(to).state
     if state == "running":
-        raise HuntDirectoryError("it is running", fix="wait for it, or stop it", where=str(to))
+        raise HuntDirectoryError("the hunt is running", fix="wait for it, or stop it", where=str(to))
     if state == "error":
         fix = f"see crashhunt logs {to}, then crashhunt rerun {to}"
         raise HuntDirectoryError("the directory exists, and its hunt ended in an error", fix=fix, where=str(to))

@@ -32,17 +32,17 @@ class AgentContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that creates an agent."""
-        raise NotImplementedError("the contract suite needs a fixture named make")
+        raise NotImplementedError("the test class must define the fixture 'make'")
 
     @pytest.fixture
     def form(self) -> ActionForm:
         """Return the form of the agent's actions."""
-        raise NotImplementedError("the contract suite needs a fixture named form")
+        raise NotImplementedError("the test class must define the fixture 'form'")
 
     @pytest.fixture
     def observations(self) -> list[NDArray[np.generic]]:
         """Return observations of the agent, in order."""
-        raise NotImplementedError("the contract suite needs a fixture named observations")
+        raise NotImplementedError("the test class must define the fixture 'observations'")
 
     def test_it_acts_inside_its_space_and_by_its_seed_alone(
         self, make: Make, form: ActionForm, observations: list[NDArray[np.generic]]

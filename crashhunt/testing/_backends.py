@@ -46,12 +46,12 @@ class BackendContract:
     @pytest.fixture
     def name(self) -> str:
         """Return the name of the simulator."""
-        raise NotImplementedError("the contract suite needs a fixture named name")
+        raise NotImplementedError("the test class must define the fixture 'name'")
 
     @pytest.fixture
     def scenario(self) -> Path:
         """Return the folder of a scenario."""
-        raise NotImplementedError("the contract suite needs a fixture named scenario")
+        raise NotImplementedError("the test class must define the fixture 'scenario'")
 
     def _backend(self, name: str) -> Backend:
         found = backend_of(name)

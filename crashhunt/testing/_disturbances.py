@@ -30,7 +30,7 @@ class DisturbanceContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that creates a disturbance model."""
-        raise NotImplementedError("the contract suite needs a fixture named make")
+        raise NotImplementedError("the test class must define the fixture 'make'")
 
     def test_what_is_drawn_is_a_disturbance(self, make: Make) -> None:
         """A draw has a place around the agent, a finite strength, and a duration above 0 s."""

@@ -38,7 +38,7 @@ class ExecutorContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that creates an executor."""
-        raise NotImplementedError("the contract suite needs a fixture named make")
+        raise NotImplementedError("the test class must define the fixture 'make'")
 
     @pytest.fixture
     def executor(self, make: Make, tmp_path: Path) -> Iterator[Executor]:

@@ -30,7 +30,7 @@ class OracleContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that creates an oracle."""
-        raise NotImplementedError("the contract suite needs a fixture named make")
+        raise NotImplementedError("the test class must define the fixture 'make'")
 
     def test_it_has_a_name_and_states_which_outcomes_it_brings(self, make: Make) -> None:
         """The name and the outcomes with their categories are texts that reports can print."""

@@ -35,12 +35,12 @@ class SamplerContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that creates a sampler."""
-        raise NotImplementedError("the contract suite needs a fixture named make")
+        raise NotImplementedError("the test class must define the fixture 'make'")
 
     @pytest.fixture
     def space(self) -> Space:
         """Return a space that the sampler can sample."""
-        raise NotImplementedError("the contract suite needs a fixture named space")
+        raise NotImplementedError("the test class must define the fixture 'space'")
 
     def test_every_proposal_is_complete_and_inside_the_space(self, make: Make, space: Space) -> None:
         """A proposal has a value for every key and no other value, before and after results were reported."""

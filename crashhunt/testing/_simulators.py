@@ -55,7 +55,7 @@ class SimulatorContract:
     @pytest.fixture
     def make(self) -> Make:
         """Return a function that creates a simulator."""
-        raise NotImplementedError("the contract suite needs a fixture named make")
+        raise NotImplementedError("the test class must define the fixture 'make'")
 
     def _drive(self, simulator: Simulator, seed: int, reseeded: tuple[int, int] | None = None) -> list[_Shown]:
         """Return all outputs of an episode, as bytes and numbers."""

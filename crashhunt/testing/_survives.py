@@ -103,7 +103,7 @@ def assert_survives(
         if report.stopped_because == "interrupted":
             raise KeyboardInterrupt
         if report.stopped_because == "no_valid_trial":
-            raise CrashhuntError(f"no trial was valid: {report.reason}", fix="correct the scenario")
+            raise CrashhuntError(f"no trial could be set up: {report.reason}", fix="correct the scenario")
         if report.crashes:
             bundle = _smaller(report.crashes[0], budget, parallel)
             look = f"look at it: crashhunt show {place} --crash {bundle.id}" if directory else ""

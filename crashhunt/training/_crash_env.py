@@ -95,7 +95,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
             raise UsageError(f"agent is {agent!r}", fix="give the name of a controlled vehicle")
         if render_mode is not None:
             raise UsageError(
-                f"render_mode is {render_mode!r}", fix="omit the option; crashhunt replay --video makes films"
+                f"render_mode is {render_mode!r}", fix="omit render_mode; crashhunt replay --video makes films"
             )
         places = _places(crashes)
         record = _record_file(trained_on)
@@ -191,7 +191,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
         if len(found) == 1:
             return found[0]
         if found:
-            fix = "give the whole name, and hunts whose directories have different names"
+            fix = "give the whole name DIRECTORY/CRASH; the directories of the hunts need different names"
             raise UsageError(f"{len(found)} crashes are named {name!r}", fix=fix)
         if any(name in (crash.name, crash.bundle.id) for crash in self._split.held_out):
             raise UsageError(f"the crash {name!r} is in the test part", fix="choose one of env.unwrapped.crashes")

@@ -109,7 +109,7 @@ def read_trained_on(path: Path) -> TrainedOn:
         reason = error.strerror if isinstance(error, OSError) else error
         raise HuntDirectoryError(
             f"cannot be read: {reason}",
-            fix="restore it: without it, the training traffics are unknown",
+            fix="restore the file: without it, the training traffics are unknown",
             where=str(path),
         ) from None
     return TrainedOn(test=test, seeds=frozenset(data["seeds"]), hunt_seeds=frozenset(data["hunt_seeds"]))

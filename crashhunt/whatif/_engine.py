@@ -165,7 +165,9 @@ def _check(bundle: Bundle, interventions: Sequence[Intervention], options: WhatI
     last = bundle.result.steps - 1
     for one in interventions:
         if one.from_step is not None and not 0 <= one.from_step <= max(0, last):
-            raise UsageError(f"--from-step is {one.from_step}", fix=f"give 0 to {last}: it ends at step {last + 1}")
+            raise UsageError(
+                f"--from-step is {one.from_step}", fix=f"give 0 to {last}: the trial ends at step {last + 1}"
+            )
 
 
 def _from_step(interventions: Iterable[Intervention]) -> int | None:
@@ -278,7 +280,7 @@ class _Runs:
         result = ended.result
         if result.outcome is Outcome.INVALID and not result.was_killed_from_outside:
             message = result.failure.message if result.failure else "its trial could not be set up"
-            raise UsageError(f"the run cannot be set up: {message}", fix="change the intervention")
+            raise UsageError(f"the run cannot be set up: {message}", fix="give another change than this one")
         crashed = result.outcome in self._rerun.worker.crash_on
         return Run(
             number=number,

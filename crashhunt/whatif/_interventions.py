@@ -166,7 +166,7 @@ class LeaveOut:
         """
         for actor in self.actors:
             if actor not in entered:
-                fix = one_of(actor, entered) if entered else "drop --leave-out: the simulator does not support it"
+                fix = one_of(actor, entered) if entered else "omit --leave-out, which the simulator does not support"
                 raise UsageError(f"--leave-out {actor!r}: there is no such actor", fix=fix)
         return tuple(name for name in entered if name not in self.actors)
 
@@ -354,7 +354,7 @@ def _handover_to_same(bundle: Bundle, step: int, changes: Mapping[str, str], opt
         )
     odd = next((name for name in changes if name in bundle.result.spec.scenario_arguments), "")
     if odd:
-        message = f"--set {odd} is an argument of the scenario, which holds from the start"
+        message = f"--set {odd} is an argument of the scenario, which cannot change during the trial"
         raise UsageError(message, fix=f"omit {option}")
     vehicle = next(iter(vehicles), "")
     named = {name.removeprefix(f"{vehicle}.") if vehicle else name: value for name, value in changes.items()}

@@ -161,9 +161,9 @@ class TestOnnxPolicy(_Policy):
         (
             (8, 7),
             spaces.Discrete(9),
-            r"the shape \(1, 5\) for one observation, but needs \(1, 9\) for actions in Discrete\(9\)",
+            r"the shape \(1, 5\) for one observation, but must return \(1, 9\) for actions in Discrete\(9\)",
         ),
-        ((8, 7), BOX, r"needs \(1, 2\) for"),
+        ((8, 7), BOX, r"must return \(1, 2\) for"),
         ((5, 5), spaces.Discrete(5), r"does not accept observations of the shape \(1, 25\)"),
     ],
 )

@@ -271,7 +271,11 @@ def test_a_damaged_ledger_costs_its_own_row(hunt, shell, damage):
         assert any("crashhunt check" in line or "not a ledger" in line for line in said), said
         if damage in ("a fact", "a row"):
             checked = shell.crashhunt("check", str(hunt / "two"), expect=None)
-            told = "a fact is not as it was written" if damage == "a fact" else "trial 1 is not as it was written"
+            told = (
+                "a fact has changed since it was written"
+                if damage == "a fact"
+                else "trial 1 has changed since it was written"
+            )
             assert told in " ".join(said)
             assert told in checked.out + checked.err or damage == "a row"
 

@@ -72,12 +72,16 @@ def test_whose_it_is_must_be_said_where_there_are_several():
     with pytest.raises(UsageError, match=r"names no agent.*ego.stop@…"):
         parse_fixed(["stop@20=ahead:6:8"], ("ego", "van.2"))
     assert parse_fixed(["van.2.stop@20=ahead:6:8"], ("ego", "van.2"))[0].agent == "van.2"
-    with pytest.raises(UsageError, match="stop begins twice at step 20"):
+    with pytest.raises(UsageError, match="another stop already begins at step 20"):
         parse_fixed(["stop@20=ahead:6:8", "ego.stop@20=ahead:1:8"], ("ego",))
 
 
 @pytest.mark.parametrize(
-    ("what", "says"), [("cut_in", "cannot do 'cut_in'; it can do brake"), ("hop", "no kind of disturbance 'hop'")]
+    ("what", "says"),
+    [
+        ("cut_in", "does not support the disturbance 'cut_in'; it supports brake"),
+        ("hop", "no kind of disturbance 'hop'"),
+    ],
 )
 def test_what_the_simulator_cannot_do_is_refused(what, says):
     with pytest.raises(UsageError, match=says):

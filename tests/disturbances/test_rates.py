@@ -96,8 +96,8 @@ def fails():
     [
         ({"brake": 10.1}, "brake=10.1: the rate exceeds one disturbance per step of 0.1 s"),
         ({"braek": 1}, "no disturbance 'braek'"),
-        ({"cut_in": 1}, "the toy cannot do 'cut_in'"),
-        ({"brake": 1, "test_rates:other_brake": 1}, "both about 'brake'"),
+        ({"cut_in": 1}, "the toy does not support the disturbance 'cut_in'"),
+        ({"brake": 1, "test_rates:other_brake": 1}, "both inject disturbances of the kind 'brake'"),
         ({"test_rates:DT": 1}, "cannot be called"),
         ({"test_rates:fails": 1}, "cannot be created: OSError: no such table"),
         ({"os:getcwd": 1}, "not a disturbance model"),

@@ -62,7 +62,7 @@ def test_the_first_of_them_is_reported(repository):
 
 def test_what_is_no_revision_is_reported(toy, made_once):
     toy.crashhunt("run", "h", "1", "1", "80", "--scenario", "toy", "--arg", "speed=14", "--seed", "1")
-    assert "run it in the repository" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err
+    assert "run the command in the repository" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err
     git(toy.folder, "init", "-q")
     git(toy.folder, "commit", "-qm", "empty", "--allow-empty")
     assert "'v1' is not a commit" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err

@@ -109,7 +109,7 @@ def test_bad_input_is_one_line(hunt):
         (("--bar", "2/hour", "--per", "trial"), "give --per hour, or no --per"),
         (("--confidence", "100"), "--confidence is 100; give percent from 50 to 99.9999"),
         (("--by", "sped"), "--by: there is no argument 'sped'"),
-        (("--by", "speed:0"), "'0' bins; give 1 to 50 bins"),
+        (("--by", "speed:0"), "'0' is not a number of bins; give 1 to 50 bins"),
         (("--by", "kind:3"), "kind cannot be divided into bins; give --by kind"),
         (("h/hunt.toml",), "'h/hunt.toml' is a file; give the directory of a hunt or a suite"),
     ):

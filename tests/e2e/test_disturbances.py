@@ -126,10 +126,10 @@ def hunt_refused(shell, *more):
         ("brake", "'brake' has no rate; write NAME=RATE"),
         ("brake=-1", "'-1' is not a rate"),
         ("brake=11", "the rate exceeds one disturbance per step of 0.1 s"),
-        ("cut_in=0.1", "cannot do 'cut_in'; it can do brake, late_action"),
+        ("cut_in=0.1", "does not support the disturbance 'cut_in'; it supports brake, late_action"),
         ("none,brake=1", "none cannot be combined with other"),
         ("brake@101=ahead:4:2", "brake@101: a trial has only 9 steps"),
-        ("cut_in@5=left:4:2", "cannot do 'cut_in'; it can do brake, late_action"),
+        ("cut_in@5=left:4:2", "does not support the disturbance 'cut_in'; it supports brake, late_action"),
     ],
 )
 def test_what_cannot_be_meant_is_one_line_before_the_hunt(toy, words, says):
@@ -244,7 +244,10 @@ def test_what_every_trial_has_in_the_hunt_the_scenario_and_the_replay(toy):
         assert said in toy.crashhunt("replay", "h", "--set", change, expect=None).out
     for change, said in (
         ("disturbances.brake@101=ahead:1:1", "brake@101 cannot happen: the trial has 100 steps"),
-        ("disturbances.cut_in@40=left:1:1", "the toy cannot do the disturbance 'cut_in'; it can do brake, stop"),
+        (
+            "disturbances.cut_in@40=left:1:1",
+            "the toy does not support the disturbance 'cut_in'; it supports brake, stop",
+        ),
     ):
         assert said in toy.crashhunt("replay", "h", "--set", change, expect=2).err
     file.write_text(file.read_text().replace("stop@30=ahead:6.0", "stop@30=ahead:1.0"))

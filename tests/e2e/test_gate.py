@@ -82,7 +82,7 @@ def test_worse_agent_fails_the_gate_and_the_hunts_stay_for_compare(drivers):
     assert {**again, "base": 0, "head": 0} == {**found, "base": 0, "head": 0}
     assert len(specs(drivers.folder / "kept" / "head")) == trials  # decided before, so nothing runs
     refused = drivers.crashhunt("gate", CALM, TWIN, *TOY, *SEED, "--keep", "kept", expect=2)
-    assert "the directory has a gate with other versions, hunts or seeds" in refused.err
+    assert "the directory contains a gate with other versions, hunts or seeds" in refused.err
     refused = drivers.crashhunt("gate", CALM, WILD, *TOY, *SEED, "--keep", "kept", "--set", "gap_m=5", expect=2)
     assert "--set" in refused.err  # given twice
 
@@ -193,7 +193,7 @@ def test_crash_that_comes_back_in_the_corpus_of_head_is_worse_without_any_trial(
         (("drivers:Calm", "drivers:Wild", "--margin", "-1"), "--margin is -1; give a share from 0 to below 1"),
         (("drivers:Calm", "drivers:Wild", "--confidence", "3"), "--confidence is 3; give percent from 50"),
         (("drivers:Calm", "drivers:Wild", "--for", "soon"), "--for is soon; give a time above 0"),
-        (("drivers:Calm", "drivers:Wild", "--keep", "."), "the folder is not empty and has no gate"),
+        (("drivers:Calm", "drivers:Wild", "--keep", "."), "the folder is not empty, and does not contain"),
         (("drivers:Calm", "drivers:Wild", "--corpus", "no"), "--corpus no is not a folder in HEAD"),
         (("drivers:Calm", "drivers:Wild", "--scenario", "nowhere"), "nowhere"),
         (("drivers:Calm", "drivers:Wild", "--suite", "s.toml"), "--suite and --scenario exclude each other"),

@@ -229,7 +229,7 @@ def test_rerun_to_that_was_killed_before_it_ran_continues(damaged, monkeypatch):
         with pytest.raises(HuntDirectoryError, match=says):
             again(**options)
     with monkeypatch.context() as patched:
-        for state, says in (("running", "it is running"), ("error", "ended in an error")):
+        for state, says in (("running", "the hunt is running"), ("error", "ended in an error")):
             patched.setattr(_rerun, "hunt_state", lambda _, state=state: SimpleNamespace(state=state))
             with pytest.raises(HuntDirectoryError, match=says):
                 again()

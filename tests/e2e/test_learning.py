@@ -101,7 +101,7 @@ def test_a_damaged_proposal_is_found_and_the_others_are_saved(own):
     with closing(sqlite3.connect(own.folder / "h" / "ledger.sqlite")) as database, database:
         database.execute("UPDATE proposals SET spec = replace(spec, 'climb', 'draw') WHERE number = 50")
         assert database.total_changes == 1
-    assert "the proposal of trial 50 is not as it was written" in own.crashhunt("check", "h", expect=1).out
+    assert "the proposal of trial 50 has changed since it was written" in own.crashhunt("check", "h", expect=1).out
     assert "trial 50" in own.crashhunt("run", "h", *words, expect=2).err
     own.crashhunt("check", "h", "--salvage", "saved", expect=None)
     with closing(sqlite3.connect(own.folder / "saved" / "ledger.sqlite")) as database:

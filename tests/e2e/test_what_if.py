@@ -180,7 +180,7 @@ def test_futures_on_highway_env_exist_where_it_draws_random_numbers(shell, made_
         (("--set", "sped=1"), "'sped'"),
         (("--set", "speed=1:3"), "is not a single value"),
         (("--set", "speed=1:3", "--before", "1"), "is not a single value"),
-        (("--set", "gap_m=20", "--before", "1"), "holds from the start"),
+        (("--set", "gap_m=20", "--before", "1"), "cannot change during the trial"),
         (("--leave-out", "leader"), "--leave-out 'leader'"),
     ],
 )

@@ -232,5 +232,5 @@ def test_copies_get_a_seed_each_and_count_their_own_steps(monkeypatch):
     with pytest.raises(UsageError, match="a copy of an episode cannot be reset"):
         one.reset(seed=1)
     env.reset(seed=2)
-    with pytest.raises(UsageError, match="n is 0; branch at least 1"):
+    with pytest.raises(UsageError, match="n is 0; give the number of copies"):
         env.branch(0)

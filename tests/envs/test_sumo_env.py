@@ -243,7 +243,7 @@ def test_what_cannot_be_branched_is_refused_in_one_line(own, monkeypatch):
     with pytest.raises(UsageError, match="process of its own can be branched; make it with process=True"):
         here.branch(1)
     here.close()
-    with pytest.raises(UsageError, match="n is 0; branch at least 1"):
+    with pytest.raises(UsageError, match="n is 0; give the number of copies"):
         own.branch(0)
     env = SumoEnv("loop", process=True)
     with pytest.raises(SimulatorError, match="no episode is running, so there is nothing to branch; call reset"):

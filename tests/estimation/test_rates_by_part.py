@@ -66,9 +66,9 @@ def test_argument_is_named_alone_or_with_its_vehicle():
         ("gap", "there is no argument 'gap'", "ego.gap"),  # two arguments have this name
         ("sped", "there is no argument 'sped'", "speed"),
         ("kind:3", "--by kind:3: kind", "give --by kind"),
-        ("speed:0", "'0' bins", "give 1 to"),
-        ("speed:x", "'x' bins", "give 1 to"),
-        ("speed:999999", "'999999' bins", "give 1 to"),
+        ("speed:0", "'0' is not a number of bins", "give 1 to"),
+        ("speed:x", "'x' is not a number of bins", "give 1 to"),
+        ("speed:999999", "'999999' is not a number of bins", "give 1 to"),
     ],
 )
 def test_mistakes_in_a_division_name_the_fix(by, message, fix):

@@ -196,7 +196,7 @@ def test_without_a_seal_whole_rows_say_it(path):
         assert reader.result(0) == result(0)
         rows = reader.table()
         assert next(rows)[0] == 0
-        with pytest.raises(HuntDirectoryError, match="trial 1 is not as it was written"):
+        with pytest.raises(HuntDirectoryError, match="trial 1 has changed since it was written"):
             next(rows)
         assert [number for number, row in reader.intact_rows(range(5)) if row is not None] == [0, 2]
         assert [number for number, row in reader.intact_rows(range(5)) if row is None] == [1]
@@ -206,7 +206,7 @@ def test_without_a_seal_whole_rows_say_it(path):
     with closing(Ledger(path.with_name("other.sqlite"), writable=True)) as other:
         other.copy(row)
         assert other.result(2) == result(2)
-    with pytest.raises(HuntDirectoryError, match="trial 1 is not"):
+    with pytest.raises(HuntDirectoryError, match="trial 1 has changed"):
         Ledger(path, writable=True)
     writer.close()
 

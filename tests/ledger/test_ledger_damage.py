@@ -118,17 +118,23 @@ def test_no_trial_that_was_changed_is_given_out(whole, copy, statement):
 @pytest.mark.parametrize(
     ("statement", "says"),
     [
-        ("ALTER TABLE trials DROP COLUMN digest", "it is not as version 5 is: digest of the table trials"),
-        ("ALTER TABLE hunt DROP COLUMN digest", "digest of the table hunt"),
-        ("DROP TABLE events", "without the table events"),
+        (
+            "ALTER TABLE trials DROP COLUMN digest",
+            "the table trials differs from that of version 5 in the columns digest",
+        ),
+        ("ALTER TABLE hunt DROP COLUMN digest", "the table hunt differs from that of version 5 in the columns digest"),
+        ("DROP TABLE events", "the table events of version 5 is missing"),
         ("DROP INDEX trials_by_outcome", "no such index"),
-        ("PRAGMA user_version = 1", "it is not as version 1 is"),
-        ("PRAGMA user_version = 2", "it is not as version 2 is: with the table proposals"),
+        ("PRAGMA user_version = 1", "version 1"),
+        ("PRAGMA user_version = 2", "it contains the table proposals, which version 2 does not have"),
         ("PRAGMA user_version = 0", "its version is 0"),
-        ("DROP TABLE proposals", "without the table proposals"),
-        ("UPDATE hunt SET value = '61' WHERE key = 'planned'", "a fact is not as it was written"),
-        ("UPDATE hunt SET value = replace(value, '15', '16') WHERE key = 'seal'", "its seal is not as it was written"),
-        ("UPDATE events SET detail = 'no disk'", "what it says of its states is not as it was written"),
+        ("DROP TABLE proposals", "the table proposals of version 5 is missing"),
+        ("UPDATE hunt SET value = '61' WHERE key = 'planned'", "a fact has changed since it was written"),
+        (
+            "UPDATE hunt SET value = replace(value, '15', '16') WHERE key = 'seal'",
+            "its seal has changed since it was written",
+        ),
+        ("UPDATE events SET detail = 'no disk'", "an entry on the state of the hunt has changed since it was written"),
     ],
 )
 def test_tables_and_facts_that_were_changed_are_refused(copy, statement, says):
@@ -177,7 +183,7 @@ def test_one_that_was_killed_is_read_whole(tmp_path):
     change(killed, "UPDATE trials SET steps = 6 WHERE number = 5")
     found = answers(killed)
     assert (found["trials"], found["table"], found["one"]) == (None, None, None)
-    with pytest.raises(HuntDirectoryError, match="trial 5 is not as it was written"):
+    with pytest.raises(HuntDirectoryError, match="trial 5 has changed since it was written"):
         Ledger(killed, writable=True)
 
 

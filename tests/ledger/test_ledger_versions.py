@@ -165,7 +165,10 @@ def test_a_ledger_of_later_is_read_where_it_states_so_and_never_written(tmp_path
         Ledger(path, writable=True)
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("UPDATE trials SET mood = 0.4 WHERE number = 4")
-    with closing(Ledger(path)) as ledger, pytest.raises(HuntDirectoryError, match="trial 4 is not as it was written"):
+    with (
+        closing(Ledger(path)) as ledger,
+        pytest.raises(HuntDirectoryError, match="trial 4 has changed since it was written"),
+    ):
         list(ledger.results())
 
 
@@ -183,7 +186,7 @@ def test_a_proposal_that_is_gone_is_missed(tmp_path):
     write(path)
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("DELETE FROM proposals WHERE turn = 2")
-    with closing(Ledger(path)) as ledger, pytest.raises(HuntDirectoryError, match="proposals are not those"):
+    with closing(Ledger(path)) as ledger, pytest.raises(HuntDirectoryError, match="its proposals differ from those"):
         list(ledger.turns())
     with pytest.raises(HuntDirectoryError, match="missing or have changed"):
         Ledger(path, writable=True)
@@ -197,7 +200,7 @@ def test_a_row_that_was_changed_before_a_migration_is_still_known_to_be(tmp_path
     Ledger(path, writable=True).close()
     with closing(Ledger(path)) as ledger:
         assert ledger.result(2) == result(2, danger=False)
-        with pytest.raises(HuntDirectoryError, match="trial 4 is not as it was written"):
+        with pytest.raises(HuntDirectoryError, match="trial 4 has changed since it was written"):
             ledger.result(4)
 
 

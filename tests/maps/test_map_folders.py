@@ -128,7 +128,7 @@ def tools(tmp_path):
 
 
 def test_program_that_was_killed_is_named_with_its_signal(tools, tmp_path):
-    with pytest.raises(ScenarioError, match="killed was ended by signal 9") as caught:
+    with pytest.raises(ScenarioError, match="killed was killed by signal 9") as caught:
         tools.run("killed", [], tmp_path)
     assert "memory" in caught.value.fix
 

@@ -228,5 +228,5 @@ def test_what_is_too_short_or_of_others_has_no_header(tmp_path):
     for content in (b"", b"CRASHBB1", b"CRASHBB1" + bytes(30), b"CRASHBB2" + bytes(80)):
         path.write_bytes(content)
         assert read_header(path) is None
-        with pytest.raises(BundleError, match="no black box"):
+        with pytest.raises(BundleError, match="left no recording"):
             list(read_black_box(path))

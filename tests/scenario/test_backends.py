@@ -83,7 +83,7 @@ class Point:
 @pytest.mark.parametrize(
     ("target", "says"),
     [
-        ("crashhunt.base.layout:SCENARIO", "the backend 'other' is a str; make it a crashhunt.scenario.Backend"),
+        ("crashhunt.base.layout:SCENARIO", "the backend 'other' is a str, not a Backend; make it a crashhunt.scenario.Backend"),
         ("crashhunt.base.layout:SCENARIOS", "has no attribute 'SCENARIOS'; did you mean 'SCENARIO'?"),
         ("no_such_module:BACKEND", "'other' cannot be imported: No module named 'no_such_module'"),
     ],
@@ -102,7 +102,7 @@ def test_a_broken_backend_is_an_error_where_it_is_asked_for_and_nowhere_else(mon
 
 
 def test_a_table_that_is_no_dataclass_is_refused():
-    with pytest.raises(TypeError, match="a dataclass, and <class 'dict'> is none"):
+    with pytest.raises(TypeError, match="must be a dataclass, but <class 'dict'> is not"):
         Backend(table=dict)
 
 

@@ -111,7 +111,7 @@ def test_a_hunt_with_everything_that_people_have(town, shell, monkeypatch):
     [
         ('<include href="gone.xml"/>', ['<include href="gone.xml">', "there is no file"]),
         ('<variableSpeedSign id="v" lanes="south_0" file="gone.xml"/>', ["gone.xml", "there is no file"]),
-        ('<include href="${which}.xml"/>', ["an argument cannot choose it"]),
+        ('<include href="${which}.xml"/>', ["an argument of the scenario cannot choose the file"]),
         ('<include href="more.xml"/', ["not valid XML"]),
     ],
 )

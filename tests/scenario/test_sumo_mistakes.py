@@ -41,7 +41,7 @@ def town(tmp_path):
             "--ego 'nobody': the files of the scenario have no vehicle 'nobody'; there are left.0, van & co, odd.one",
         ),
         ("od.one", "did you mean 'odd.one'?"),
-        ("left", "'left' is a flow; name one of its vehicles: left.0, left.1"),
+        ("left", "'left' is a flow, not a vehicle; name one of its vehicles: left.0, left.1"),
         ("ego", "the files of the scenario have no vehicle 'ego'"),  # which is a type
         ("lft.2", "did you mean 'left.0'?"),
         ("route=wya", "--ego 'route=wya': the files of the scenario have no route 'wya'; did you mean 'way'?"),

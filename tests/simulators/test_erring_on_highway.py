@@ -275,7 +275,7 @@ def test_a_hunt_with_disturbances(shell):
     done = shell.crashhunt("run", "h", "1", "2", "20", *words)
     assert done.json["trials_run"] == 2
     assert (
-        "cannot do 'step_out'"
+        "does not support the disturbance 'step_out'"
         in shell.crashhunt(
             "run", "h2", "1", "2", "20", "--scenario", "highway", "--disturb", "step_out=1", expect=2
         ).err

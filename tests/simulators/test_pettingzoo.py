@@ -140,7 +140,7 @@ def test_episode_ends_with_the_learner(tmp_path, leaves_at):
     ("name", "options", "says"),
     [
         ("Chase", {"learner": "runer"}, "gym.learner = 'runer' is not an agent; did you mean 'runner'?"),
-        ("InTurns", {}, "this factory returned a InTurns, whose agents take turns; name its parallel_env"),
+        ("InTurns", {}, "this factory returned a InTurns, whose agents act in turns; name the function parallel_env"),
     ],
 )
 def test_mistake_is_one_line(tmp_path, name, options, says):

@@ -54,7 +54,10 @@ def test_hunt_has_what_was_asked_for(hunt, tmp_path):
 
 @pytest.mark.parametrize(
     ("why", "error", "message"),
-    [("interrupted", KeyboardInterrupt, "^$"), ("no_valid_trial", CrashhuntError, "no trial was valid: bad; correct")],
+    [
+        ("interrupted", KeyboardInterrupt, "^$"),
+        ("no_valid_trial", CrashhuntError, "no trial could be set up: bad; correct"),
+    ],
 )
 def test_hunt_without_verdict_is_no_success(hunt, why, error, message):
     hunt.stopped_because, hunt.reason = why, "bad"

@@ -42,8 +42,8 @@ __all__ = [
 
 # Find the Ray cluster, and check whether it answers, without an import of Ray.
 
-TOKEN_FIX = "put the one that the cluster was started with into RAY_AUTH_TOKEN, or into ~/.ray/auth_token"
-"""What to do about a token that is asked for."""
+TOKEN_FIX = "put the token with which the cluster was started into RAY_AUTH_TOKEN, or into ~/.ray/auth_token"
+"""The fix if the cluster requires a token."""
 OLDEST_RAY_VERSION = (2, 10)
 """The first Ray with which it works, as in pyproject.toml, where the reason is."""
 _PROBE_TIMEOUT_S = 5.0
@@ -53,7 +53,7 @@ _FRAME, _KIND, _SETTINGS = (
     3,
     4,
 )  # bytes of a frame's head, the place of its kind there, and the first kind that is sent
-_START_FIX = "start one with 'ray start --head', or give the address of one: --executor ray:HOST:PORT"
+_START_FIX = "start a cluster with 'ray start --head', or give the address of a cluster: --executor ray:HOST:PORT"
 
 
 class Meant(NamedTuple):

@@ -146,7 +146,7 @@ def unpack(packed: bytes, digest: str, root: Path) -> None:
                     path.chmod(0o755)
                 found[entry.filename] = _described(path)
         if digest_of_data(found) != digest:
-            raise ValueError("the digest of its content does not match")
+            raise ValueError("the digest of its content differs from the expected digest")
     except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise BundleError(f"the code archive {digest} is damaged: {error}", fix="run the hunt again") from None
 

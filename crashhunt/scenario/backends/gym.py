@@ -69,15 +69,15 @@ class GymSetup:
 
 def _check(scenario: Scenario, where: str) -> None:
     if len(scenario.agents) != 1:
-        message = f"agents = {sorted(scenario.agents)!r} are several, and a Gymnasium environment has one"
-        raise ScenarioError(message, fix="keep one", where=where)
+        message = f"agents = {sorted(scenario.agents)!r} are several agents, but a Gymnasium environment has one"
+        raise ScenarioError(message, fix="keep one agent", where=where)
     if scenario.observation is not None:
-        message = "observation = '' is not for Gymnasium environments, which show what they show"
-        raise ScenarioError(message, fix="remove it", where=where)
+        message = "observation = '' cannot be used with a Gymnasium environment, which defines its own observations"
+        raise ScenarioError(message, fix="remove the key observation", where=where)
 
     danger = scenario.table(GymSetup).danger
     if danger and not re.fullmatch(r"-?info\..+", danger):
-        fix = "write info.KEY, or -info.KEY of a number that is less the more dangerous it is"
+        fix = "write info.KEY for a number that grows with the danger, or -info.KEY for a number that falls with it"
         raise ScenarioError(f"gym.danger = {danger!r} does not exist", fix=fix, where=where)
 
 

@@ -48,7 +48,7 @@ class HighwaySetup:
 
 def _check(scenario: Scenario, where: str) -> None:
     if scenario.step_length_s != STEP_LENGTH_S:
-        message = f"step_length_s = {scenario.step_length_s!r} is not for highway-env"
+        message = f"step_length_s = {scenario.step_length_s!r} cannot be used with highway-env"
         raise ScenarioError(message, fix="set policy_frequency in highway.config", where=where)
 
 

@@ -231,7 +231,10 @@ def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) 
         name = waiting.pop(0)
         for nested in _references_of(folder, name):
             if inside and nested.startswith(f"..{os.sep}"):
-                message, fix = f"names {nested!r}, outside the scenario's folder", "move it inside, to be archived"
+                message, fix = (
+                    f"names the file {nested!r} outside the scenario's folder",
+                    "move the file into the folder, so that snapshots contain it",
+                )
                 raise ScenarioError(message, fix=fix, where=str(folder / name))
             if nested not in found and nested not in names:
                 found[nested] = None
@@ -279,7 +282,11 @@ def _targets(path: Path, _mtime_ns: int, _size: int) -> tuple[str, ...]:
         # As SUMO does it: relative to the file that names it, and ${NAME} is no variable here.
         target = os.path.normpath(path.parent / reference.value)
         if not os.path.isfile(target):  # noqa: PTH113
-            fix = "name one file; an argument cannot choose it" if "${" in target else "correct the path"
+            fix = (
+                "name one fixed file; an argument of the scenario cannot choose the file"
+                if "${" in target
+                else "correct the path"
+            )
             raise ScenarioError(f"{reference}: there is no file {target!r}", fix=fix, where=str(path))
         targets.append(target)
     return tuple(targets)
@@ -331,7 +338,7 @@ class StagedFiles:
                 text = _substitute(template, values)
             except (KeyError, ValueError) as error:
                 raise InvalidEpisodeError(
-                    f"{path.name} uses the scenario argument {error}",
+                    f"{path.name} uses the undeclared scenario argument {error}",
                     fix="declare it under [arguments]",
                     where=self._scenario.origin,
                 ) from None

@@ -98,7 +98,7 @@ def _check_vehicle(name: str, texts: list[bytes], key: str, where: str) -> None:
     flows = _ids(b"flow", texts)
     if name in flows and name not in _ids(b"vehicle|trip", texts):
         fix = f"name one of its vehicles: {name}.0, {name}.1, …"
-        raise ScenarioError(f"{key}: {name!r} is a flow", fix=fix, where=where)
+        raise ScenarioError(f"{key}: {name!r} is a flow, not a vehicle", fix=fix, where=where)
     # A flow's vehicles are FLOW.0, those of a calibrator CALIBRATOR.FLOW.0, the car of a person PERSON_0.
     parts = name.split(".")
     makers = [".".join(parts[:count]) for count in range(1, len(parts))]

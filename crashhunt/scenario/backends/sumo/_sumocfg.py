@@ -71,7 +71,7 @@ def read_config(path: Path) -> tuple[dict[str, str], list[str]]:
             continue
         name = canonical(element.tag)
         if name in options:
-            fix = "remove one of the two"
+            fix = "remove one of the two elements"
             raise ScenarioError(f"the option {element.tag} is given twice", fix=fix, where=str(path))
         options[name] = _resolved(value, used)
     notes = [
@@ -215,7 +215,7 @@ def _files(options: dict[str, str], path: Path, unset: str) -> tuple[Path, dict[
             where=str(path),
         )
     if len(named["net-file"]) != 1:
-        raise ScenarioError("the configuration names several net-files", fix="name one", where=str(path))
+        raise ScenarioError("the configuration names several net-files", fix="name one net-file", where=str(path))
     everything = [file for files in named.values() for file in files]
     read = [file for key in ("route-files", "additional-files") for file in named[key]]
     everything += [os.path.normpath(base / file) for file in nested_files(base, tuple(read))]
