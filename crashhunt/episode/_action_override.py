@@ -163,7 +163,7 @@ class HandedOver:
         self._step, self._seed = 0, 0
 
     def reset(self, seed: int) -> None:
-        """Begin an episode; the agent is reset later."""
+        """Begin to repeat recorded actions; the agent is reset after the last of them."""
         self._step, self._seed = 0, seed
         self._recorded.reset(seed)
 
@@ -283,7 +283,7 @@ class ReferenceDriver:
 
     @property
     def responses(self) -> list[JsonObject]:
-        """The periods in which the reference driver corrected the agent, or would have, as plain data by step."""
+        """The periods in which the reference driver corrected the agent or would have corrected it, as JSON data."""
         return [one.to_json() for one in self._responses]
 
     def reset(self, seed: int) -> None:

@@ -120,7 +120,7 @@ class DisturbanceInjector:
         waits.sort(key=lambda one: one.step, reverse=True)
 
     def replan(self, disturbances: Sequence[Disturbance]) -> None:
-        """Replace the disturbances that were planned for the steps after the next."""
+        """Replace the planned disturbances that begin after the next step."""
         for waits in (self._traffic_waits, self._agent_waits):
             waits[:] = [one for one in waits if one.step <= self._step + 1]
         for one in disturbances:

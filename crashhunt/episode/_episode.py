@@ -127,8 +127,8 @@ class Episode(Forkable, Ending):
         reset: function that resets the simulator; None for the simulator's own `reset`.
 
     Attributes:
-        spec: which trial.
-        simulator: where.
+        spec: specification of the trial.
+        simulator: the simulator in which the trial runs.
         names: names of all actors, in the order of their numbers; empty before the start.
         agents: agents by name. An agent that is replaced between two steps acts from the next step on.
         acting: the numbers of the agents that act in the next step.
@@ -339,7 +339,7 @@ class Episode(Forkable, Ending):
         self._disturbed.add(disturbance)
 
     def replan(self, disturbances: Sequence[Disturbance]) -> None:
-        """Replace the disturbances that are planned for the steps after the next, in the specification as well."""
+        """Replace the planned disturbances that begin after the next step, in the episode and in its specification."""
         if self._disturbed is not None:
             self._disturbed.replan(disturbances)
         begun = [one for one in self.spec.disturbances if one.step <= self.steps + 1]

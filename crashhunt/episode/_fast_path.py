@@ -57,7 +57,7 @@ _EVENT_ORACLES = (ReportedCollision, OffRoad, TrafficEvents, RedLight, WrongWay,
 
 
 class FastPath:
-    """Completes steps that the core could not complete, as long as no event needs Python code.
+    """Completes in Python the steps that the compiled core could not complete, so that the core can run the next steps.
 
     Args:
         at_once: the simulator's object that runs uneventful steps.

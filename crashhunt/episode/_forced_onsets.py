@@ -44,7 +44,7 @@ _WAIT_FACTOR_WITH_SECONDS: Final = 2 + SECONDS_PER_COPY  # such a copy waits for
 
 
 class OnsetForcer:
-    """Forks the copies of one root trial after another.
+    """Forks each root trial into copies in which a disturbance is forced.
 
     Args:
         words: the rates of disturbances, each as ``NAME=RATE``.

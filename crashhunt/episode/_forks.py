@@ -39,11 +39,11 @@ class Questions:
         tell: function called with texts for the user.
 
     Attributes:
-        what: name of the questions in the plural, as given to the constructor.
+        what: name of the forks in the plural, as given to the constructor.
         why_not: why this process runs no more forks, as text; empty if it still runs forks.
         unanswered: number of forks of this trial without a result.
         why_unanswered: the reason for the first missing result, as text; empty if all forks have a result.
-        may_be_answered: whether the cause was outside, so that another run of the trial may have all results.
+        may_be_answered: whether forks were killed from outside, so that another run of the trial may have all results.
         has_answer: whether the last fork has a result.
     """
 
@@ -168,5 +168,5 @@ class FirstCopy:
         self._tried = True
 
     def result(self, result: TrialResult) -> TrialResult:
-        """Return the argument unchanged."""
+        """Return the result unchanged, because this check adds nothing to it."""
         return result

@@ -217,7 +217,7 @@ class Nearness(Observer):
         self._driven = DrivenMeter(episode.names, episode.simulator.step_length_s)
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
-        """Measure the new scenes, once for several steps."""
+        """Measure the scenes since the last measurement, in one batch after every few steps."""
         if step and step % self.EVERY == 0:
             self._measure_frames()
             if sum(len(frame.columns) for frame in self._waiting) >= _SCENES_PER_BATCH:
@@ -282,7 +282,7 @@ class Recorder(Observer):
         self.action = box.action  # type: ignore[assignment, method-assign]
 
     def lend(self, steps: UsualSteps, roster: Roster) -> None:
-        """Let the core record the steps of the given actors."""
+        """Let the compiled core write the recording of its steps directly, for the given actors."""
         if roster is not self._roster:
             self._note_roster(roster)
         self._box.lend(steps, roster)

@@ -64,7 +64,7 @@ class Probed:
         """Return the strengths to try, as shares of the maximum, from the mildest on, in steps of a sixteenth.
 
         For durations, only shares that differ in whole steps are tried. With steps of 1 s, for example, no delay can be
-        a sixteenth of a second. The maximum itself counts as a sixteenth less.
+        a sixteenth of a second. The maximum itself has the share 15/16.
         """
         if self.grade == "whether":
             return (_HALF_STRENGTH,)
@@ -154,7 +154,7 @@ class Prober:
         return episode.steps % steps_of(self._every_s, episode.simulator.step_length_s) == 0
 
     def ask(self, episode: Episode) -> None:
-        """For each kind of disturbance, search for a milder one than before with which the episode soon crashes."""
+        """Search, for each kind, for a milder disturbance than those found before that soon makes the episode crash."""
         before = self.questions.unanswered
         self._ask(episode)
         asked = self.questions.unanswered == before

@@ -76,7 +76,7 @@ def run_episode(
     first_copy: FirstCopy | None = None,
     forcer: OnsetForcer | Splitter | None = None,
 ) -> TrialResult:
-    """Run one trial from its specification, recorded and measured, with seeded random generators of the process.
+    """Seed the process's random generators, run one trial from its specification, and record and measure the trial.
 
     Args:
         spec: specification of the trial.

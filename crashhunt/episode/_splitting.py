@@ -93,7 +93,7 @@ def split_path(path: SplitPath, levels: Sequence[float]) -> list[ForcedCopy]:
 
 
 def run_path(path: SplitPath, levels: Sequence[float]) -> list[ForcedCopy]:
-    """Run a path to its end, and copies of it; return how they ended, the path itself first."""
+    """Run a path and its copies to their ends; return how each ended, the path itself first."""
     ends: list[ForcedCopy] = []
     while not path.is_over:
         ends += split_path(path, levels)
@@ -102,7 +102,7 @@ def run_path(path: SplitPath, levels: Sequence[float]) -> list[ForcedCopy]:
 
 
 class Splitter:
-    """Runs the tree of copies of one root trial after another.
+    """Runs a tree of copies for each root trial.
 
     Args:
         crash_on: the outcomes that count as a crash.

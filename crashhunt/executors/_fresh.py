@@ -269,7 +269,7 @@ _STOP_CHECK_INTERVAL_S = 0.1  # how late a request to stop may be
 
 
 def snapshot_executor(settings: WorkerSettings, *, parallel: int = 1) -> Executor:
-    """Return an executor that runs trials with the code of a snapshot, including the snapshot's crashhunt.
+    """Return an executor that runs trials with the code of a snapshot, including the crashhunt in the snapshot.
 
     Snapshots of crashhunt 0.1.0 and before have no fork server: with them, every trial starts a new Python process.
     """

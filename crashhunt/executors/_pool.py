@@ -101,7 +101,7 @@ class ForkServerLink:
             self.control.send(json.dumps({"kill": slot}).encode())
 
     def receive(self) -> list[FromForkServer] | None:
-        """Return the supervisors that have ended, and how they ended; None if the fork server itself has ended.
+        """Return messages on supervisors that have ended, and how they ended; None if the fork server itself has ended.
 
         Raises:
             CrashhuntError: a module that trials need cannot be imported.

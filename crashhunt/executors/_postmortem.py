@@ -148,7 +148,7 @@ def killed_from_outside(spec: TrialSpec, why: str, exit_code: int) -> TrialResul
 
     Args:
         spec: the trial that was run.
-        why: number of the kills, and the steps at which they happened.
+        why: text with the number of the kills, and the steps at which they happened.
         exit_code: exit code of the trial's last process; negative for a signal.
     """
     return TrialResult(spec, Outcome.INVALID, failure=Failure(KILLED, why, exit_code=exit_code))

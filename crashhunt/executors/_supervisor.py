@@ -75,7 +75,8 @@ class EndedTrial:
     Args:
         result: result of the trial.
         notices: texts for the user.
-        braking: the full braking of the vehicle that collided, if the settings request it; else None.
+        braking: how the vehicle that collided brakes fully, and its deceleration; None if the settings do not request
+            it.
     """
 
     result: TrialResult
@@ -106,7 +107,7 @@ class Supervisor:
         self._made = self._trials = 0
 
     def run(self, spec: TrialSpec) -> EndedTrial:
-        """Run a trial, and return it. The scratch folder of the trial remains if the trial is kept.
+        """Run a trial, and return its result. The scratch folder of the trial remains if the trial is kept.
 
         Raises:
             LostTrialError: the process of the trial was killed from outside, or its zygote has ended.

@@ -73,7 +73,7 @@ class WarmTraffics:
     Args:
         limit: maximum number of suspended processes.
         notify: function called with texts for the user.
-        worth_s: minimum wall time of a warm-up for which a suspended process is kept, in s.
+        worth_s: a suspended process is kept only if its warm-up took at least this wall time, in s.
     """
 
     def __init__(self, limit: int, notify: Callable[[str], None], *, worth_s: float = _MIN_WARM_UP_S) -> None:

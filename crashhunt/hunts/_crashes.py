@@ -353,14 +353,14 @@ class Kinds:
         return list(parts.values())
 
     def next_to_judge(self) -> Bundle | None:
-        """Return the next crash to judge; None if there is currently none."""
+        """Return the next crash whose cause is to be searched for; None if there is currently none."""
         for division in self._divisions.values():
             if (number := division.choose()) is not None:
                 return self._signed[number][1]
         return None
 
     def count_to_judge(self) -> int:
-        """Return the number of crashes to judge."""
+        """Return the number of crashes whose cause is still to be searched for."""
         return sum(division.left for division in self._divisions.values())
 
     def settle(self, judged: Judged) -> None:
@@ -417,7 +417,7 @@ class Kinds:
 
     @property
     def until(self) -> int | None:
-        """The least trial number up to which enough crash types were found; None if there are not enough."""
+        """The least number N for which the trials 0 to N contain enough crash types; None if there are not enough."""
         firsts = self._counted(answered=True)
         if 0 < self._wanted <= len(firsts):
             self._until = firsts[self._wanted - 1]

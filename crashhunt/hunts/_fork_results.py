@@ -103,7 +103,7 @@ def verify_branches(copies: VerificationRuns) -> BranchReport | None:
 
 
 def likeliest(result: TrialResult) -> Found | None:
-    """Return the likeliest crashed branch of a trial as a trial from the start; None if no branch crashed."""
+    """Return a whole trial with the disturbances of the likeliest crashed branch; None if no branch crashed."""
     if result.branches is None or not result.branches.crashes:
         return None
     return _specification(result, max(result.branches.crashes, key=_log_likelihood))

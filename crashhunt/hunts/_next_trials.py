@@ -81,7 +81,8 @@ class Trials:
         unanswered: the finished trials that run again, in the order of their numbers, because some of their results are
             missing for an external reason. The sampler receives the result in the ledger, not the result of the second
             run, so a resumed hunt proposes the same trials.
-        lag: number of trials that run at a time; in a deterministic hunt, the maximum number.
+        lag: delay, in trials, with which a learning sampler receives results: the number of trials that run at a time;
+            in a deterministic hunt, the maximum delay.
         lag_grows: whether the first trials of a deterministic hunt have a smaller lag (`growing_lag`).
         disturber: object that draws the disturbances of trials; None if trials have no disturbances.
         forcings: object that returns the forcing of each root in rare mode; None in any other hunt.

@@ -52,9 +52,9 @@ class Preflight:
     Args:
         settings: settings of the hunt.
         planned: number of planned trials.
-        files: paths in the snapshot by path, for files that arguments name.
+        files: for each file that an argument names, its path in the snapshot.
         code: folders of the snapshot from which agents are imported.
-        listen: function called before the first result is counted; it may refuse the hunt.
+        listen: function called before the first result is counted; it may raise an error that ends the hunt.
     """
 
     def __init__(

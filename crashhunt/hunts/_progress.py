@@ -172,7 +172,7 @@ class HuntStatus:
         types_by_cause: number of crash types by cause; None if the hunt counts types.
         time_left_s: time until no more trials begin, in s of wall time; infinite without a limit.
         disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
-        stressed: the trial with the least robustness margin; None if there were no probes, or if no probe crashed.
+        stressed: the trial with the smallest robustness margin; None if there were no probes, or if no probe crashed.
         branched: number of branches that have crashed.
         not_fully_asked: number of trials in which a probe or branch has no result.
         search: trials of each strategy, and the last rise of the greatest criticality in this run.
@@ -386,7 +386,7 @@ class Progress:
         return None if watch is None else watch.running(now=now)
 
     def noted(self, *, now: bool = False) -> Noted:
-        """Return the facts about the present progress for the ledger.
+        """Return the present progress in the form that the ledger stores.
 
         Args:
             now: whether the rate must be up to date; otherwise it may be some moments old.

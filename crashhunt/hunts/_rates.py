@@ -161,7 +161,7 @@ _MAX_VERIFIED_ROOTS = 5  # roots; a crash of a copy is a crash only where it com
 
 
 class Forcings:
-    """The forcing of each root, learned from the blocks of roots before the previous block.
+    """Chooses the forcing of each root, from the results of the blocks of roots before the previous block.
 
     Args:
         settings: settings of the hunt.
@@ -240,7 +240,7 @@ class RareWatch:
 
     @property
     def lines(self) -> list[str]:
-        """Return notes on the hunt for the user, in addition to the estimate."""
+        """Return lines for the user that explain the estimate; empty if there are none."""
         return []
 
     def read(self, finished: int | None = None) -> None:
@@ -384,7 +384,7 @@ class SplittingWatch(RareWatch):
 
     @property
     def lines(self) -> list[str]:
-        """Return the levels, and the crash probability from each level, as lines for the user."""
+        """Return the levels, and the probability of a crash after each level is reached, as lines for the user."""
         if not self.shares:
             return []
         levels = ", ".join(f"{level:.2g}" for level in self.levels)

@@ -84,7 +84,7 @@ class ProbeReport:
 
     Args:
         margins: the robustness margin of each trial whose probes all have a result.
-        not_fully_asked: number of further trials, in which a probe has no result.
+        not_fully_asked: number of further trials in which at least one probe has no result.
         why_unasked: why a probe has no result in the first trial of ``not_fully_asked``; empty without such a trial.
         probes: number of forks that were run.
         steps: number of simulated steps of the forks.
@@ -129,7 +129,7 @@ class BranchReport:
     """The result of the branches of a hunt.
 
     Args:
-        trials: number of trials that could have branches.
+        trials: number of trials in which branches were possible.
         moments: number of steps after which forks continued.
         branches: number of forks.
         steps: number of simulated steps of the forks.

@@ -67,8 +67,9 @@ class ProbeSums(TypedDict):
     Args:
         trials: number of trials in which all probes have a result.
         not_fully_asked: number of further trials in which a probe has no result.
-        least: the least robustness margin of the trials in which all probes have a result; None if there is none.
-        trial: the number of the trial with the least margin; None if there is none.
+        least: the smallest robustness margin of the trials in which all probes have a result; None if there is no such
+            trial.
+        trial: the number of the trial with the smallest margin; None if there is no such trial.
         probes: number of probes.
         steps: number of simulated steps of the forks.
         left_out: number of probes that were skipped because the forks had used up their steps.
@@ -93,7 +94,7 @@ class BranchSums(TypedDict):
     """The results of the branches of a hunt in ``status --json``, with fields as in `ProbeSums`.
 
     Args:
-        trials: number of trials that could have branches.
+        trials: number of trials in which branches were possible.
         moments: number of steps after which forks continued.
         branches: number of branches.
         steps: number of simulated steps of the forks.
@@ -195,7 +196,7 @@ class HuntState(Serializable):
         trials_run: number of finished trials.
         outcomes: number of trials with each outcome.
         crashes: number of crashes, with or without a bundle.
-        crashes_saved: number of crashes with a bundle, if it is smaller (``--keep``); else None.
+        crashes_saved: number of crashes with a bundle, if ``--keep`` has deleted some bundles; else None.
         errors: number of trials that could not be set up, or ended in a software fault.
         rate_per_s: trials per second in the last run of the hunt.
         seconds_left: expected time to the last trial, to the time limit, or to the end of the phase, in s; None if
@@ -607,7 +608,7 @@ class LogReader:
 
     Args:
         hunt: directory of the hunt.
-        kinds: the kinds of logs to read.
+        kinds: the kinds of logs to read: ``run``, ``error`` and ``state``.
         trial: number of the only trial whose logs are read; None for all.
     """
 

@@ -58,7 +58,7 @@ __all__ = [
 
 
 class Confirmation:
-    """Confirms crashes one at a time, in its own thread. Meanwhile, the hunt has one slot less.
+    """Confirms crashes one at a time, in its own thread; meanwhile, the hunt runs one trial less at a time.
 
     With ``--by-cause``, the same thread also judges crashes, before it confirms others. Only one thread does both, so
     that the two results of a bundle cannot overwrite each other. Crashes that are not confirmed or judged at the end of
@@ -485,7 +485,7 @@ class Audit:
         self._executor.capacity = parallel
 
     def add(self, result: TrialResult) -> TrialResult:
-        """Keep the recording of a sampled trial, and return the trial in the form with which the hunt continues."""
+        """Keep the recording of a trial that is sampled for the audit; return the result with which the hunt continues."""
         if not self._settings.is_audited(result):
             return result
         number = result.spec.number
@@ -500,7 +500,7 @@ class Audit:
         return replace(result, kept=False)
 
     def look(self, timeout_s: float = 0.0) -> list[Difference]:
-        """Return the results since the previous call; wait at most ``timeout_s`` for a running trial."""
+        """Return the differences found since the previous call; wait at most ``timeout_s`` for a running trial."""
         if not self._waiting:
             return []
         found = []

@@ -83,7 +83,10 @@ class Point:
 @pytest.mark.parametrize(
     ("target", "says"),
     [
-        ("crashhunt.base.layout:SCENARIO", "the backend 'other' is a str, not a Backend; make it a crashhunt.scenario.Backend"),
+        (
+            "crashhunt.base.layout:SCENARIO",
+            "the backend 'other' is a str, not a Backend; make it a crashhunt.scenario.Backend",
+        ),
         ("crashhunt.base.layout:SCENARIOS", "has no attribute 'SCENARIOS'; did you mean 'SCENARIO'?"),
         ("no_such_module:BACKEND", "'other' cannot be imported: No module named 'no_such_module'"),
     ],

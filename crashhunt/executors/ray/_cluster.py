@@ -231,7 +231,8 @@ class Found:
     """A node of a Ray cluster.
 
     Args:
-        id: Ray's identifier of the node. name: name of the node for users.
+        id: Ray's identifier of the node.
+        name: name of the node for users.
         cpus: number of CPUs that can be used.
         free: number of CPUs that are not in use.
     """
@@ -308,7 +309,7 @@ class Cluster:
         return found
 
     def stand(self, node: str, slots: int) -> Any:
-        """Start an actor on a node, with a number of the node's CPUs."""
+        """Start an actor on a node; ``slots`` is the number of the node's CPUs that the actor uses."""
         strategy = self._affinity(node_id=node, soft=False)
         name = f"{_ACTOR_PREFIX}{slots}-{secrets.token_hex(8)}"
         return self._kind.options(num_cpus=slots, scheduling_strategy=strategy, name=name).remote()

@@ -187,7 +187,8 @@ class Folder:
     """A new folder with a short name that Ray accepts; such folders whose owners have ended are removed first.
 
     Args:
-        parent: folder in which it is created; by default the folder for temporary files, if its name is acceptable.
+        parent: folder in which the new folder is created; by default the folder for temporary files, if its name is
+            short enough for Ray.
     """
 
     def __init__(self, parent: Path | None = None) -> None:
@@ -209,7 +210,7 @@ class Folder:
 
 
 def owned(lock: Path) -> IO[str]:
-    """Create the lock of a folder and hold it as long as it is open. The lock becomes visible only after it is held."""
+    """Create the lock of a folder, and hold it until the returned file is closed. The file is locked when it appears."""
     part = lock.with_name(f".{lock.name}")
     file = part.open("w")
     fcntl.flock(file, fcntl.LOCK_EX)

@@ -17,7 +17,7 @@ Header = tuple[int, int, float, int, int, int, int]
 
 
 class BridgeJob(TypedDict):
-    """The job of a bridge.
+    """The settings of a bridge: the trials' settings, the cluster, and the number of parallel trials.
 
     ``address`` is empty for the hunt's own cluster, which has ``cpus`` CPUs and keeps its files in ``temporary``.
     ``versions`` and ``code`` must be equal on nodes. ``resumed`` is true if an earlier bridge of the same hunt had

@@ -26,7 +26,8 @@ class Trial:
     """A submitted trial.
 
     Args:
-        ticket: position of the trial in the order of submission. spec: specification of the trial as JSON.
+        ticket: position of the trial in the order of submission.
+        spec: specification of the trial as JSON.
         losses: number of times that the node of the trial was lost.
     """
 
@@ -50,8 +51,9 @@ class Node:
     """A machine that runs trials, or a part of a machine whose CPUs became free at different times.
 
     Args:
-        id: identifier of this part of a machine. machine: Ray's identifier of the machine. name: name of the machine
-            for users.
+        id: identifier of this part of a machine.
+        machine: Ray's identifier of the machine.
+        name: name of the machine for users.
         slots: number of trials that run at a time.
         actor: the actor that runs on the node.
         stood: time at which the actor was started, on the clock `time.monotonic`.

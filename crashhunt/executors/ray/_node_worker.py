@@ -44,7 +44,7 @@ class Work:
     """The trials of one hunt on this node.
 
     Args:
-        job: the job: settings, digest and folders of the archive, and number of trials at a time.
+        job: settings of the trials, digest and folders of the archive, and number of trials at a time.
     """
 
     def __init__(self, job: NodeJob) -> None:
