@@ -485,7 +485,7 @@ class Audit:
         self._executor.capacity = parallel
 
     def add(self, result: TrialResult) -> TrialResult:
-        """Keep the recording of a trial that is sampled for the audit; return the result with which the hunt continues."""
+        """Keep the recording of a trial that is sampled for the audit; return the result for the rest of the hunt."""
         if not self._settings.is_audited(result):
             return result
         number = result.spec.number

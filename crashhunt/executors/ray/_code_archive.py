@@ -210,7 +210,7 @@ class Folder:
 
 
 def owned(lock: Path) -> IO[str]:
-    """Create the lock of a folder, and hold it until the returned file is closed. The file is locked when it appears."""
+    """Create and hold the lock of a folder until the returned file is closed. The file is locked when it appears."""
     part = lock.with_name(f".{lock.name}")
     file = part.open("w")
     fcntl.flock(file, fcntl.LOCK_EX)
