@@ -95,6 +95,9 @@ class Parser(argparse.ArgumentParser):
         """
         if found := re.fullmatch(r"argument (\S+): ignored explicit argument (.+)", message):
             raise UsageError(f"{found[1]} takes no value, but {found[2]} is given", fix=f"write {found[1]} alone")
+        if found := re.fullmatch(r"argument (\S+): expected one argument", message):
+            fix = f"give one, as {found[1]}=VALUE if it begins with a hyphen"
+            raise UsageError(f"{found[1]} has no value", fix=fix)
         raise UsageError(message, fix=f"see {self.prog} --help")
 
 
@@ -175,7 +178,9 @@ def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
     names = {hunt: hunt.relative_to(directory).as_posix() for hunt in find_hunts(directory)}
     for run in runs:
         if not any(run in (name, name.partition("/")[0]) for name in names.values()):
-            raise UsageError(f"--run: there is no run {run!r}", fix=one_of(run, names.values()))
+            is_hunt = list(names.values()) == ["."]
+            fix = f"omit --run, because {directory} is a single hunt" if is_hunt else one_of(run, names.values())
+            raise UsageError(f"--run: there is no run {run!r}", fix=fix)
     return {hunt: name for hunt, name in names.items() if not runs or {name, name.partition("/")[0]} & set(runs)}
 
 

@@ -64,7 +64,8 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
             break
         time.sleep(0.5)
     if not found:
-        print("there is nothing to show", file=sys.stderr)
+        kept = f"no log of trial {options.trial} is kept; logs are of crashes, and with run --keep-trials of all trials"
+        print("there is nothing to show" if options.trial is None else kept, file=sys.stderr)
     return 0
 
 

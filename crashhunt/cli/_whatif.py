@@ -89,7 +89,7 @@ def add_whatif(commands: Commands) -> None:
         "snapshot. With --code current and --from-step K, today's code drives after step K",
     )  # fmt: skip
     whatif.add_argument(
-        "--times", metavar="N", type=integer, default=0, help="number of runs; default: 50 with --futures, otherwise 1"
+        "--times", metavar="N", type=integer, help="number of runs; default: 50 with --futures, otherwise 1"
     )
     whatif.add_argument(
         "--parallel", metavar="N", type=integer, default=0, help="number of runs at a time; default: one per core"
@@ -108,9 +108,10 @@ def _whatif(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.base.signals import stop_requests
     from crashhunt.plans import seconds_of
 
-    for name, value in (("times", options.times), ("parallel", options.parallel)):
-        if value < 0:
-            raise UsageError(f"--{name} is {value}", fix="give at least 1")
+    if options.times is not None and options.times < 1:
+        raise UsageError(f"--times is {options.times}", fix="give at least 1")
+    if options.parallel < 0:
+        raise UsageError(f"--parallel is {options.parallel}", fix="give at least 0 (0: one per core)")
     try:
         time_s = seconds_of(options.time)
     except ValueError:
@@ -132,7 +133,7 @@ def _whatif(options: argparse.Namespace, _words: list[str]) -> int:
                     asked,
                     WhatIfOptions(
                         code=options.code or ("current" if options.agent else "snapshot"),
-                        times=options.times,
+                        times=options.times or 0,
                         parallel=options.parallel or len(os.sched_getaffinity(0)),
                         time_s=time_s,
                         trusted=trusted,

@@ -19,6 +19,12 @@ from crashhunt.hunts import HuntState
 from crashhunt.suites import GateProgress
 
 
+def test_what_if_refuses_to_run_no_time():
+    options = cli.make_parser().parse_args(["whatif", "h", "--times", "0"])
+    with pytest.raises(UsageError, match="--times is 0; give at least 1"):
+        options.command(options, [])
+
+
 @pytest.mark.parametrize(
     ("verdicts", "code"),
     [(["below"], 0), (["below", "above"], 1), (["undecided", "above"], 1), (["below", "undecided"], 3), ([], 3)],

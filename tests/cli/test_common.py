@@ -38,6 +38,7 @@ def parser():
         (["h", "--json=3"], "--json takes no value, but '3' is given; write --json alone"),
         (["h", "--seed", "3.5"], "argument --seed: '3.5' is not a whole number; see crashhunt run --help"),
         (["h", "--share", "x"], "argument --share: 'x' is not a number; see crashhunt run --help"),
+        (["h", "--seed", "-3x"], "--seed has no value; give one, as --seed=VALUE if it begins with a hyphen"),
         ([], "the following arguments are required: DIR; see crashhunt run --help"),
     ],
 )
@@ -111,6 +112,9 @@ def test_runs_of_a_suite_are_chosen_by_hunt_or_number(tmp_path, monkeypatch):
     assert _common.chosen_runs(tmp_path, ["road"]) == {tmp_path / "road/0": "road/0"}
     with pytest.raises(UsageError, match="--run: there is no run 'town/2'; did you mean 'town/"):
         _common.chosen_runs(tmp_path, ["road", "town/2"])
+    places[:] = [tmp_path]
+    with pytest.raises(UsageError, match=r"no run 'town'; omit --run, because .+ is a single hunt"):
+        _common.chosen_runs(tmp_path, ["town"])
 
 
 def asked(monkeypatch, answer, *, terminal=True, stdin=True):

@@ -181,6 +181,12 @@ STAGED = "/some/where/.scratch/stage-17"
             "traffic.rou.xml, line 11",
             "is needed in flow 'left'; correct it there",
         ),
+        (
+            "TraCIException",  # which has no text of its own
+            "Error: Attribute 'number' in definition of flow 'left' Invalid Number Format (int range) 9e99.\n",
+            "traffic.rou.xml, line 11",
+            "SUMO says: Attribute 'number' in definition of flow 'left' Invalid Number Format (int range) 9e99",
+        ),
         ("something new", "", "scenario.toml", "SUMO says: something new; see [sumo]"),
     ],
 )

@@ -135,10 +135,10 @@ def _ids(tags: bytes, texts: list[bytes]) -> list[str]:
 _SET_UP_ERROR = "SUMO could not set up the episode: "
 _FIX_IN_FILE = "correct it there"
 # SUMO raises one of these, and says on its output what it means.
-_VAGUE_ERRORS = ("Process Error", "Could not parse commandline options.")
+_VAGUE_ERRORS = ("Process Error", "TraCIException", "Could not parse commandline options.")
 _STAGED_PATH = re.compile(r"/\S*?/stage-\d+/")
 _OPTION_ERROR = re.compile(r"No option with the name '([^']+)' exists|On processing option '--([^']+)'")
-_NUMBER_ERROR = re.compile(r"Invalid (?:Number|Bool) Format(?: \(\w+\))? (\S+)")
+_NUMBER_ERROR = re.compile(r"Invalid (?:Number|Bool) Format(?: \([\w ]+\))? (\S+)")
 _LINE_ERROR = re.compile(r"In file '([^']+)' At line/column (\d+)")
 _VEHICLE_ERROR = re.compile(r"(?:Invalid|departing) (\w+?)(?: definition)?(?: '[^']*')? for vehicle '([^']+)'")
 _KEY_BY_ATTRIBUTE = {"type": "type", "route": "route", "departLane": "depart_lane", "departPos": "depart_pos"}
