@@ -77,7 +77,7 @@ def _change_speed(vehicle: MDPVehicle, change: int) -> bool:
 
 
 def rewards(env: HighwayEnv) -> dict[str, float]:
-    """Return the result of `HighwayEnv._rewards`, with a faster limit of the speed."""
+    """Return the result of `HighwayEnv._rewards`, in which the speed is limited by faster code."""
     vehicle = env.vehicle
     neighbours = env.road.network.all_side_lanes(vehicle.lane_index)
     lane = vehicle.target_lane_index[2] if isinstance(vehicle, ControlledVehicle) else vehicle.lane_index[2]

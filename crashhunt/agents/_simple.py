@@ -54,7 +54,7 @@ class RandomAgent:
     """Draws an action from the action space and holds it for a while.
 
     Args:
-        hold_steps: number of steps for which it holds each action.
+        hold_steps: number of steps for which the agent holds each action.
         action_space: action space of the vehicle.
     """
 

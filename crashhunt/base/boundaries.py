@@ -71,7 +71,7 @@ class Boundary:
             self.wrap(error)
 
     def wrap(self, error: BaseException) -> NoReturn:
-        """Raise the wrapper of an exception that was raised by a call inside this boundary."""
+        """Raise a `ForeignError` that wraps an exception of a call inside this boundary."""
         raise ForeignError(self._party, self._place, error) from error
 
     def around(self, function: Callable[P, R]) -> Callable[P, R]:

@@ -155,7 +155,7 @@ FILES = dict[str, dict[str, int | str]]
 
 
 def typed(data: Plain, types: Plain) -> None:
-    """Check that a JSON object has some keys whose values have the given types.
+    """Check that a JSON object has all required keys, and that their values have the given types.
 
     Args:
         data: the JSON object.

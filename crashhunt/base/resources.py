@@ -65,7 +65,7 @@ def free_memory(root: Path = Path("/")) -> float:
     """Return the share of the memory that is free or can be reclaimed at once; 1 if the system does not report it.
 
     Args:
-        root: folder of the kernel's files.
+        root: folder that contains the kernel's folders ``proc`` and ``sys``.
     """
     with suppress(OSError, ValueError, KeyError, ZeroDivisionError):
         found = _status_values(root / "proc" / "meminfo")

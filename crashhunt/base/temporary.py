@@ -334,7 +334,7 @@ def temporary_name(path: Path, suffix: str = "") -> str:
 
 
 def remove_leftovers() -> None:
-    """Remove the temporary files of processes that have ended; only one folder is listed."""
+    """Remove the temporary files of processes that have ended, from the folder that contains all of them."""
     _things.swept = True
     place, prefix = _base_folder()
     try:

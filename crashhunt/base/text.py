@@ -62,7 +62,7 @@ def one_line(text: str) -> str:
 
 
 def count_of(number: int, noun: str) -> str:
-    """Return a number with its noun, which has a plural in s."""
+    """Return a number with its noun, such as ``1 trial`` or ``3 trials``; the plural is formed with s."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 

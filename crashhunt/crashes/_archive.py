@@ -46,7 +46,7 @@ class Archive:
 
     Args:
         directory: directory of the unpacked hunt.
-        made_by: name of the tool that made it, according to the file.
+        made_by: name of the tool that made the archive, as recorded in the archive.
         made_at: time of the export, as recorded in the archive.
         made_here: whether this user made the archive on this machine, which its signature proves.
     """

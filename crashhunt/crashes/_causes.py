@@ -249,7 +249,7 @@ def _length(recording: Recording, actor: str) -> float:
 
 
 def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[float, ...]:
-    """Return numbers that distinguish crashes of one type without runs, each divided by a difference that matters.
+    """Return numbers that compare crashes of one type without runs; each is divided by a difference that matters.
 
     The numbers are the length of the collision partner, and, 0.2 s, 1 s and 2 s before the crash, the speeds, the gap
     and the partner's lateral position. Without this position, changes to the left and to the right are alike.

@@ -316,7 +316,7 @@ class ContactRecord:
         return self.agent if faces == ("front", "rear") else self.other if faces == ("rear", "front") else ""
 
     def in_its_way_s(self, leader: str) -> float:
-        """Return for how long the leader had been in the path of the follower, in s."""
+        """Return for how long before the contact the leader had been in the path of the follower, in s."""
         lead, follow = self.way(leader), self.way(self.partner(leader))
         # The leader is the last point: where the road bends, the follower would not have gone straight on.
         ends = [self._at_contact(actor)[0] for actor in (follow.id, leader)]
@@ -402,7 +402,7 @@ class ContactRecord:
         return max(lately, default=0.0) - abs(float(aside)) > _SIDEWAYS_M
 
     def was_off_path(self, actor: str, back: int) -> bool:
-        """Return whether an actor was off the path of the other actor just before a scene."""
+        """Return whether an actor was off the path of the other actor just before the time with the index ``back``."""
         return any(
             abs(self.aside_m(actor, place)) > _BESIDE_M
             for place in range(back + 1)

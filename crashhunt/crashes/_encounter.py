@@ -372,7 +372,7 @@ class DangerCourse:
     nearest: tuple[str, float, int] | None = None
 
     def of_step(self, step: int) -> tuple[float, float] | None:
-        """Return the criticality of a trial over time; None if the agent is in no scene."""
+        """Return the agent's own criticality and its rear criticality after a step; None if the step has no scene."""
         if step not in self.steps:
             return None
         place = self.steps.index(step)
@@ -380,7 +380,7 @@ class DangerCourse:
 
 
 def danger_course(recording: Recording, agent: str) -> DangerCourse | None:
-    """Return the danger of a trial over time; None where the agent is in no scene."""
+    """Return the criticality of an agent in each step of a trial; None if no scene contains the agent."""
     steps = tuple(step.step for step in recording.all_steps if step.scene is not None)
     frames = [scene.frame for scene in recording.scenes()]
     if not any(agent in frame.roster.index for frame in frames):

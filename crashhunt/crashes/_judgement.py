@@ -228,7 +228,7 @@ class Attempt:
         return self.in_vain_from(0 if self.last_step is None else self.last_step + 1)
 
     def in_vain_from(self, step: int) -> bool:
-        """The first step from which on runs from all steps up to the crash crashed; None if there is no such step."""
+        """Return whether the runs from this step and from every later step up to the crash were made and crashed."""
         return all(self.endings.get(each) in ("hit", "other") for each in range(step, self.end))
 
     def to_json(self) -> JsonObject:

@@ -97,7 +97,7 @@ class Onset:
         planned: the forced disturbance and all later disturbances of the copy, in order.
         alone: only the forced disturbance, for a copy on which second disturbances are forced.
         number: number of the forced disturbance in its root trial.
-        place: position of its model in the order within a step.
+        place: position of the model in the order in which models begin disturbances within a step.
     """
 
     cell: str
@@ -136,7 +136,7 @@ def cell_of(name: str, how_strong: float | None = None) -> str:
 
 
 def first_forcing(sampler: DisturbanceSampler, last: int) -> Forcing:
-    """Return the forcing of the first roots: the original law, at most eight copies, second onsets on all copies.
+    """Return the forcing of the first roots: natural rates, at most eight copies, second disturbances on all copies.
 
     If only later roots had second onsets, crashes that need two onsets would have large weights in the first roots, and
     small weights in later roots. An estimate that has missed the large weights would look precise, but would be too

@@ -247,7 +247,7 @@ def _listed(tree: ast.Module) -> list[str] | None:
 
 
 def definition(module: str, name: str) -> _Definition | None:
-    """Return the definition of the class or function with a name, in whatever module it is; None for other objects."""
+    """Return the definition of a class or function, also if another module defines it; None for other objects."""
     origin, known = _public_names(module).get(name, (module, name))
     if (origin, known) != (module, name):
         return definition(origin, known)

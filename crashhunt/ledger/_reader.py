@@ -394,7 +394,7 @@ class LedgerReader:
         return map(self._result, self.plain_results(outcomes=outcomes))
 
     def plain_results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[JsonObject]:
-        """Yield the same trials as JSON data, which takes a third of the time.
+        """Yield the trials that `results` yields, but as JSON data, which takes a third of the time.
 
         Raises:
             HuntDirectoryError: a trial is damaged or missing; the trials before it have been yielded.

@@ -67,7 +67,7 @@ class Demand:
     Args:
         routes: routes of vehicles.
         vehicles_per_hour: vehicles per hour on all routes together, at demand 1.
-        walks: the edges of each person flow.
+        walks: for each flow of pedestrians, the edges along which they walk.
         ego_routes: ids of the routes from which the route of the controlled vehicle is drawn.
     """
 

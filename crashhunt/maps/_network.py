@@ -27,7 +27,7 @@ class NetworkLane:
     Args:
         length_m: length of the lane, in m.
         speed_mps: the speed limit, in m/s.
-        allowed: the vehicle classes that may use it; None for all.
+        allowed: the vehicle classes that may use the lane; None for all.
         disallowed: the vehicle classes that may not use the lane.
         shape: centre line of the lane, in m.
     """

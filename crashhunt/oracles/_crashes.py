@@ -31,7 +31,7 @@ class ReportedCollision:
     name = "reported"
 
     def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
-        """Return the reported collisions of the agents."""
+        """Return a finding for each collision of an agent that the simulator reports."""
         findings = []
         for contact in scene.contacts:
             for agent in agents:
@@ -76,7 +76,7 @@ class Overlap:
     name = "overlap"
 
     def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
-        """Return the overlaps of the agents."""
+        """Return a finding for each agent whose outline overlaps the outline of another actor."""
         findings = []
         previous = scene.previous if scene.swept else None
         for agent in agents:
@@ -99,7 +99,7 @@ class OffRoad:
     name = "off_road"
 
     def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
-        """Return the agents that left the road."""
+        """Return a finding for each agent that left the road."""
         findings = []
         for agent in scene.off_road:
             if agent in agents:

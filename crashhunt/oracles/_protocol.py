@@ -86,7 +86,7 @@ class BringsOutcomes(Protocol):
 
 
 def merge_findings(findings: Sequence[Finding]) -> Finding | None:
-    """Return the first finding, with the names of all oracles that detected the same; None if there is no finding."""
+    """Return the first finding, with the names of all oracles that detected its collision; None without a finding."""
     if not findings:
         return None
     first = findings[0]

@@ -146,8 +146,8 @@ class RateTest:
         """Add a number of equal units.
 
         Args:
-            events: number of events in each unit, from 0 to the greatest number.
-            exposure: exposure of each unit, from 0 to the maximum exposure.
+            events: number of events in each unit, from 0 to the maximum of the bets.
+            exposure: exposure of each unit, from 0 to the maximum of the bets.
             times: number of units to add.
 
         Raises:

@@ -78,7 +78,7 @@ class RateWatch:
         self._paced: Paced[RunningRate] = Paced(self._running)
 
     def add(self, result: TrialResult | Mapping[str, Any]) -> None:
-        """Add a finished trial, in any order, as a result or as data from a ledger."""
+        """Add a finished trial, as a result or as data from a ledger; the order of trials does not matter."""
         make = facts_of_plain if isinstance(result, dict) else facts_of
         self.add_facts(make(result, self._crash_on))  # type: ignore[arg-type]
 

@@ -228,7 +228,7 @@ class UnitSequence:
 
     @property
     def position(self) -> int:
-        """The number of trials, or traffic seeds, that ended before the first that has not."""
+        """The number of trials, or of traffic seeds, that have ended without a gap from number 0 on."""
         return self._next
 
     @property

@@ -201,7 +201,7 @@ class BlackBox:
         self.append(PROLOGUE.tag, 0, payload)
 
     def append(self, tag: int, aux: int, payload: bytes) -> None:
-        """Record rare data of any type."""
+        """Record data of any record type; use this method only for data that occur rarely."""
         self._stop_core()
         offset, length = self._offset, len(payload)
         if offset + length + 16 > self._reserved:

@@ -248,7 +248,7 @@ def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watc
 
 
 def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:
-    """Write an animated GIF; return the number of its pictures, among which equal ones in a row are one.
+    """Write an animated GIF; return the number of its pictures, in which consecutive equal pictures count once.
 
     Raises:
         HuntDirectoryError: the file cannot be written.

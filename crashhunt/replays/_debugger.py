@@ -65,7 +65,9 @@ _TARGET = "back"
 
 
 class Backwards(Observer):
-    """Observer that forks the process before each of the last steps; it must be registered before the debugger.
+    """Observer that forks the process before each of the last steps, so that the debugger can go back to these steps.
+
+    This observer must be registered before the debugger.
 
     Args:
         stop: the observer that stops the replay.

@@ -50,7 +50,7 @@ class Look:
         until: number of steps to run.
         stop_at: the step in which the debugger stops in ``act`` of the crashed agent; 0 for none.
         to_stderr: whether the output of the process goes to standard error.
-        quiet: whether the output of the process, among it the simulator's warnings, is not shown.
+        quiet: whether to hide the output of the process, including the simulator's warnings.
         panels: the first step whose panels are drawn, and the folder for the pictures.
         window: wall time between two steps in the simulator's window, in s; the window pauses before the crash. With
             None, no window opens.

@@ -289,7 +289,7 @@ class Story:
         return [f"{braking} could have avoided it until {until}: {runs}.{also}"]
 
     def about_judgement(self) -> list[str]:
-        """Return sentences on until when the crash could have been avoided, according to the runs of `judge`."""
+        """Return sentences on the last step from which the crash could be avoided, according to the runs of `judge`."""
         if self.judgement is None:
             return []
         why = about_why(self.judgement.why, self._at) if self.judgement.why is not None else []

@@ -97,7 +97,7 @@ COLUMNS = ("danger", "from behind")
 
 
 def window_of(recording: Recording, last_s: float, nearest: DangerousMoment | None) -> tuple[int, int]:
-    """Return the first and the last step to describe: the end of a crash, or the steps around a near miss."""
+    """Return the first and the last step to describe: the last seconds of a crash, or the steps around a near miss."""
     dt, end = recording.prologue.step_length_s, recording.steps
     if nearest is None:
         return end - round(last_s / dt), end
@@ -423,7 +423,7 @@ def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
 def describe_instead(omission: Omission) -> str:
     """Return what an agent did with its speed in place of braking; empty if it is unknown or ambiguous.
 
-    An agent may have sped up before it kept its speed, so the text contains the time over which it kept it.
+    An agent may have sped up before it kept its speed, so the text contains the time over which it kept its speed.
     """
     last = omission.last_speed_mps
     if omission.instead == "sped up" and last is None:  # an earlier version judged the crash

@@ -65,11 +65,11 @@ _TRIES = 4  # proposals of the model, of which the first inside the ball is used
 
 
 class Niches:
-    """Climbs one peak after the other.
+    """Searches near the peaks of criticality, one peak after the other.
 
     Args:
         cube: cube of the arguments.
-        like: a model whose fitted parameters are the initial ones of the models of peaks.
+        like: a model whose fitted parameters are the initial parameters of the model of each peak.
     """
 
     def __init__(self, cube: Cube, like: Model) -> None:
@@ -101,7 +101,7 @@ class Niches:
             self._foot = None
 
     def begin(self) -> None:
-        """Select the foot of another peak, unless one is being climbed."""
+        """Select a trial at which the search of another peak begins, unless a peak is already being searched."""
         if self._foot is not None or self._told < max(self._not_before, _LEAST):
             return
         self._not_before = self._told + _RETRY_AFTER
@@ -120,7 +120,7 @@ class Niches:
                 return
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
-        """Return a proposal of the model of this peak; None if there is no other peak."""
+        """Return a proposal of the model of the current peak; None if no peak is selected."""
         if self._foot is None:
             return None
         for _ in range(_TRIES):
@@ -197,7 +197,7 @@ class KnownCrashes:
         return trial.kind not in self._kinds if trial.kind else not self.cover(trial.point)
 
     def outside(self, trials: Sequence[ScoredTrial]) -> list[ScoredTrial]:
-        """Return the trials that are not near a known crash, not in its basin, and do not have its seed."""
+        """Return the trials that `cover` does not cover."""
         if not trials:
             return []
         covered = self._covered(np.array([trial.point for trial in trials])).tolist()
@@ -221,7 +221,7 @@ class KnownCrashes:
         return self.sift(again)
 
     def sift(self, trials: Sequence[ScoredTrial]) -> list[ScoredTrial]:
-        """Return the trials that are `outside`, and remember the others, because basins may change."""
+        """Return the trials that `cover` does not cover; remember the others, which may become uncovered later."""
         kept = self.outside(trials)
         numbers = {trial.number for trial in kept}
         self._covered_trials.extend(trial for trial in trials if trial.number not in numbers)
@@ -314,7 +314,7 @@ _KINDS = 0.5  # Jeffreys' prior of the number of new crash types
 
 
 class Portfolio:
-    """A model of criticality, in addition to Halton's sequence.
+    """Divides the trials between a model of criticality and Halton's sequence.
 
     Args:
         cube: cube of the arguments.

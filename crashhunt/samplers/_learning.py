@@ -95,7 +95,7 @@ class CmaEsSampler(Learning):
 
 
 class GuidedSampler(Learning):
-    """Gives a model of criticality a share of the trials by its success (`Portfolio`)."""
+    """Proposes trials by a model of criticality, whose share of the trials depends on its success (`Portfolio`)."""
 
     origin = "guided"
     version = 3  # 1 excluded neighbourhoods of known crashes, 2 excluded their basins, 3 does without mutation

@@ -43,7 +43,7 @@ _CATEGORY_DISTANCE_SQUARED = 0.5  # squared distance between two different value
 
 
 class Process:
-    """The process for given trials and parameters.
+    """The Gaussian process of the scores of given trials, with given parameters.
 
     Args:
         points: trials x arguments; a choice is the index of its value.

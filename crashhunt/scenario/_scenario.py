@@ -101,7 +101,7 @@ class ArgumentSetup:
     option: str = ""
 
     def argument(self, name: str, where: str) -> Argument:
-        """Return the argument with the given name."""
+        """Return the argument that this table describes, with the given name."""
         kind: Kind | None = kind_of(self.default) if self.default is not None else None
         distribution = parse_spec(self.range, kind, where=f"{where}.{name}.range") if self.range else None
         return Argument(
@@ -225,7 +225,7 @@ class Scenario:
 
     @property
     def origin(self) -> str:
-        """The place that error messages about the scenario name."""
+        """The file or name with which error messages identify the scenario."""
         return str(self.folder / self.file)
 
     @property
@@ -611,7 +611,7 @@ def configurations() -> Iterator[Configuration]:
 
 
 def titles(chosen: Callable[[Backend], bool]) -> str:
-    """Return as text the simulators for which something is meant."""
+    """Return the titles of the simulators for whose descriptor a function returns true, as text."""
     return listed(
         (backend.title or name for name, backend in installed_backends() if chosen(backend)), none="another simulator"
     )

@@ -158,7 +158,7 @@ class _Values:
         self._originals: dict[bytes, object] = {}
 
     def encode(self, value: object) -> NDArray[np.generic]:
-        """Return the text of a value."""
+        """Return an array of bytes with the text of a value."""
         array = encode_value(value)
         text = array.tobytes()
         if _OPAQUE_MARK in text:

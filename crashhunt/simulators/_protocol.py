@@ -116,7 +116,7 @@ class OfAnyLength(Protocol):
 
     @property
     def encoded_shape(self) -> tuple[int, ...]:
-        """The shape in the prologue of a recording: (-1,)."""
+        """The shape of encoded actions in the prologue of a recording: (-1,), which means any length."""
 
 
 class Simulator(Protocol):
@@ -291,7 +291,7 @@ class SupportsFullBraking(Protocol):
 
 
 class ReportsSurroundings(Protocol):
-    """A simulator that knows what a careful driver of an agent's vehicle would consider.
+    """A simulator that reports the surroundings of an agent's vehicle that a careful driver would consider.
 
     Counterfactual runs with a reference driver need this knowledge. Contract: `surroundings` changes nothing in the
     simulation.
@@ -361,7 +361,7 @@ class SupportsDisturbances(Protocol):
         """Return the identifier of the vehicle that the disturbance targets now; empty if no vehicle is there.
 
         Args:
-            disturbance: Gives the agent, and the place around the agent.
+            disturbance: The disturbance, which names the agent and the place around the agent.
         """
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance | None:
@@ -481,7 +481,7 @@ class FastStepper(Protocol):
     """The compiled object that runs a step and returns its outcome."""
 
     def is_unpatched(self, simulator: Simulator, /) -> bool:
-        """Return whether a step of the core equals a step of the simulator; false if a method of it is wrapped."""
+        """Return whether a step of the core equals that of the simulator; false if a method of the simulator is wrapped."""
 
     @property
     def roster(self) -> Roster:
@@ -491,7 +491,7 @@ class FastStepper(Protocol):
         """Set the vehicles in sight; return their data for `core`, or None if `core` cannot continue with them."""
 
     def resume(self) -> Scene | None:
-        """Let `core` continue from the simulator's state; return the scene, or None if that is not possible yet."""
+        """Bring `core` to the state of the simulator; return the scene, or None if that is not possible yet."""
 
     def catch_up(self) -> StepResult:
         """Set the simulator to the state of `core`; return the result that its last step would have returned."""
@@ -500,7 +500,7 @@ class FastStepper(Protocol):
         """Apply an encoded action; return whether the step can stay uneventful."""
 
     def finish(self, actions: Mapping[str, NDArray[np.generic]], /) -> StepResult:
-        """Complete a step that SUMO has simulated and that is not uneventful."""
+        """Complete an eventful step, which SUMO has already simulated."""
 
 
 class SupportsFastSteps(Protocol):

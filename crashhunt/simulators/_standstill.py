@@ -42,9 +42,9 @@ class Standstill:
         self._stood.pop(vehicle, None)
 
     def look(self, vehicle: str, speed: float) -> float:
-        """Count a step of a vehicle.
+        """Count a step in which a vehicle stands still; reset its count if it moves.
 
-        Return the limit in s in the step in which its standstill reaches the limit, else 0.
+        Returns the limit in s in the step in which the standstill reaches the limit, and 0 in all other steps.
         """
         if abs(speed) >= self.SPEED:
             if self._stood:

@@ -243,7 +243,7 @@ class SimulatorContract:
         simulator.close()
 
     def test_columns_have_a_name_each(self, make: Make) -> None:
-        """`NamesObservations`: there are as many names as the last axis is long, unless there are none."""
+        """`NamesObservations`: each entry of an observation's last axis has a name, or no entry has one."""
         simulator = make()
         observations, _ = simulator.reset(seed=1)
         names = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()

@@ -63,7 +63,7 @@ class WhatIfOptions:
 
     Args:
         code: the code that drives: the code of the ``snapshot``, or the ``current`` code.
-        times: number of runs; 0 for `FUTURES` if futures are requested, else for 1.
+        times: number of runs; 0 means `FUTURES` runs if futures are requested, and otherwise one run.
         parallel: number of runs at a time.
         time_s: wall-time limit of all runs, in s; None for no limit.
         trusted: whether the code of the crash may run; None to determine it.

@@ -106,7 +106,7 @@ class DangerMeter:
         self._sums: dict[str, float | None] = dict.fromkeys(agents)
 
     def add(self, frames: Sequence[Frame]) -> None:
-        """Add scenes, and sum up windows of scenes that are complete."""
+        """Add scenes, and compute the criticality of each window of scenes that they complete."""
         self._frames += frames
         self._count += sum(len(frame.columns) for frame in frames)
         if self._count >= _WINDOW:

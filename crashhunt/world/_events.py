@@ -74,7 +74,7 @@ class Link:
         source: the incoming lane.
         target: the outgoing lane.
         inside: the lanes inside the junction.
-        signalised: whether a traffic light controls it.
+        signalised: whether a traffic light controls the path.
         shape: the centre line inside the junction, as (x, y) pairs in m.
     """
 

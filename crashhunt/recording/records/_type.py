@@ -97,8 +97,8 @@ class RecordType:
         difference: function that returns the first difference between the records of two equal steps; for one agent if
             the topic contains ``{agent}``. The function is None if the record is never compared, or is compared with
             another type.
-        value: function that returns the value of the agent or actor of a divergence, or the value at an index, for the
-            steps around.
+        value: function that returns the value of the agent or actor of a divergence, or the value at an index, in the
+            steps around the divergence.
     """
 
     tag: int

@@ -113,7 +113,7 @@ class Puppets:
         return [(thing, path.actor) for path, thing in self.things]
 
     def enter(self, steps: int) -> None:
-        """Put exactly the actors on the road that were recorded at the step; keep objects that cannot be hit."""
+        """Put only the actors on the road that were recorded after a step; keep objects that cannot be hit."""
         road = self._road
         there = [thing for path, thing in self.things if self._is_present(path, steps)]
         known = {id(thing) for thing in road.vehicles}

@@ -68,11 +68,12 @@ class UsualSteps:
         events: Object that detects traffic events.
         kinematics: Object that makes observations.
         simulate: Function that simulates a step.
-        part: Wraps a function that does a part of a step, so that it raises the same errors as a whole step.
+        part: Function that wraps another function, which does a part of a step, so that it raises the same errors as a
+            whole step.
         present: Function that returns the state of the simulator.
         arrive: Function called with the new state of the simulator.
         apply: Function that applies an action and returns whether the step can stay uneventful.
-        finish: Function that completes a step which SUMO has simulated and which is not uneventful.
+        finish: Function that completes an eventful step, which SUMO has already simulated.
         from_left: Function that returns the distance in m from the centre line of an edge's leftmost lane to the centre
             line of another lane.
         start_m: The distance that the agent had driven at the start, in m.
@@ -142,7 +143,7 @@ class UsualSteps:
         return *seen, row, self._controlled
 
     def resume(self) -> Scene | None:
-        """Bring the simulator to the state of the core; return the result that its last step would have returned."""
+        """Bring the core to the state of the simulator; return the scene, or None if that is not possible yet."""
         self.catch_up()
         (scene, observations, steps), seen = self._present(), self._sight.plain
         lane, columns, agent = scene.agent_lanes.get(self._agent, ""), scene.columns, self._agent

@@ -164,7 +164,7 @@ class Sight:
         return self._roster
 
     def see(self, ids: tuple[str, ...]) -> None:
-        """Set the vehicles in sight, without persons."""
+        """Set which vehicles are in sight; no person is then in sight."""
         self._see(ids, ())
 
     def reads_right(self) -> bool:
