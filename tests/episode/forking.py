@@ -189,7 +189,7 @@ def ends(stage):
     return {"answers": list(answers.values()), "whys": whys, "raised": divides.raised, "left": copies[1].pid}
 
 
-def soak(stage, forks=10_000):
+def soak(stage, forks=2_000):
     """What so many copies leave behind in the process of which they are made."""
     scenario = load_scenario("loop")
     simulator = locate("simulators", "sumo")(scenario, stage)

@@ -114,9 +114,8 @@ def test_probes_find_the_mildest_that_crashes_and_change_nothing(ask):
 
 
 @pytest.mark.nightly
-@pytest.mark.timeout(1000)
-def test_ten_thousand_copies_leave_nothing(ask):
+def test_two_thousand_copies_leave_nothing(ask):
     begin, end = ask("soak").values()
     assert {**begin, "resident_mib": 0} == {**end, "resident_mib": 0}
     assert end["children"] == 0
-    assert end["resident_mib"] < begin["resident_mib"] + 8
+    assert end["resident_mib"] < begin["resident_mib"] + 1  # 0.5 KiB a copy
