@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 __all__ = [
+    "any_of",
     "count_of",
     "did_you_mean",
     "encodable",
