@@ -450,7 +450,9 @@ def _by_intervals(one: _Side, two: _Side, why_not: str, counts: tuple[int, int, 
 def _is_fixed_ahead(side: _Side) -> bool:
     """Return whether the number of trials did not depend on crashes, so that a single test at the end is valid."""
     settings = side.hunt.settings
-    return not (settings.seeds or settings.run.until_rate) and side.rate().estimate is not None
+    with closing(Ledger(side.hunt.directory / layout.LEDGER)) as ledger:
+        replanned = ledger.facts().get("replanned")  # with another TRIALS, perhaps because of the results
+    return not (settings.seeds or settings.run.until_rate or replanned) and side.rate().estimate is not None
 
 
 def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, PairTest, int]:

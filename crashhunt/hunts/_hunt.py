@@ -194,6 +194,7 @@ class Hunt:
             done_before=len(finished),
             heartbeat=time.time(),
             planned=settings.trials,
+            replanned=before.get("replanned") or (bool(finished) and before.get("planned") != settings.trials) or None,
             until=time.time() + settings.run.duration_s if settings.run.duration else None,
             hunt_seed=settings.seed,
             crash_on=list(settings.crash_on),

@@ -112,6 +112,7 @@ class Noted(TypedDict, total=False):
         heartbeat: time of the last sign of life of the hunt, in s since the epoch.
         done_before: number of trials that had ended at the start of this run.
         planned: number of planned trials; 0 if only the time is limited.
+        replanned: whether the number of planned trials was changed after some trials had ended.
         until: time at which the hunt's time limit ends, in s since the epoch; None if there is no time limit.
         hunt_seed: seed from which the trials of the hunt are drawn.
         independent: whether the trials were drawn independently of each other.
@@ -154,6 +155,7 @@ class Noted(TypedDict, total=False):
     heartbeat: float
     done_before: int
     planned: int
+    replanned: bool | None
     until: float | None
     hunt_seed: int
     independent: bool

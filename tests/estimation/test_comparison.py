@@ -110,6 +110,18 @@ def test_traffics_are_the_pairs_of_hunts_that_share_traffics(tmp_path):
     assert "have 8 traffics and one per trial (--seeds)" in pair.verdict
 
 
+def test_a_hunt_that_was_extended_has_no_p_value(tmp_path):
+    whole, extended = hunt(tmp_path / "whole", 20), hunt(tmp_path / "extended", 2)
+    assert crashhunt.compare(whole, extended).pairs[0].p_value is not None
+    with closing(Ledger(extended / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(replanned=True)
+    (pair,) = crashhunt.compare(whole, extended).pairs
+    assert pair.p_value is None
+    assert pair.answer == "second"
+    (pair,) = crashhunt.compare(whole, hunt(tmp_path / "elsewhere", 2, digest="b")).pairs
+    assert pair.p_value is not None
+
+
 def test_hunts_that_were_killed_or_stopped_are_compared_up_to_the_first_trial_that_has_not_ended(tmp_path):
     whole, killed = hunt(tmp_path / "whole", 20), hunt(tmp_path / "killed", 2, keep_going=False)
     with closing(Ledger(killed / "ledger.sqlite", writable=True)) as ledger:

@@ -91,7 +91,9 @@ def test_a_hunt_records_confirms_audits_and_keeps_near_misses(tmp_path):
     # The same command runs nothing again; more trials are added to those that are there.
     again = crashhunt.run(hunt, 2, 8, 60, **options)
     assert (again.outcomes, again.steps_total) == (report.outcomes, report.steps_total)
+    assert "replanned" not in facts_of(hunt)
     more = crashhunt.run(hunt, 1, 10, 60, **options)
+    assert facts_of(hunt)["replanned"] is True  # which forbids a p-value
     assert sum(more.outcomes.values()) == 10
     assert {number: rows(hunt)[number] for number in range(8)} == found
     for other in ({"seed": 5}, {"sampler": "sobol"}):
@@ -100,6 +102,11 @@ def test_a_hunt_records_confirms_audits_and_keeps_near_misses(tmp_path):
     anew = crashhunt.run(hunt, 2, 1, 60, overwrite=True, **OPTIONS)
     assert sum(anew.outcomes.values()) == 1
     assert rows(hunt) == {0: found[0]}
+
+
+def facts_of(hunt):
+    with closing(Ledger(hunt / "ledger.sqlite")) as ledger:
+        return ledger.facts()
 
 
 @pytest.mark.long
