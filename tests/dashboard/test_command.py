@@ -29,7 +29,7 @@ def fetched(url: str) -> bytes:
         return answer.read()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])
 def test_it_prints_its_address_and_runs_until_it_is_stopped(shell, number):
     process, address = begun(shell)
     try:

@@ -17,10 +17,9 @@ def results(folder):
     return [json.loads(text) for (text,) in rows]
 
 
-def test_ledger_has_the_distance_and_time_of_each_valid_trial(toy):
-    toy.crashhunt("run", "h", "2", "6", "60", "--scenario", "toy", "--seed", "3", "--keep-going")
-    found = results(toy.folder / "h")
-    assert len(found) == 6
+def test_ledger_has_the_distance_and_time_of_each_valid_trial(hunt):
+    found = results(hunt.folder / "h")
+    assert len(found) == 24
     for trial in found:
         assert trial["step_length_s"] == 0.1
         assert trial["driven_s"] == pytest.approx(trial["steps"] * 0.1)
@@ -120,10 +119,10 @@ def test_bad_input_is_one_line(hunt):
 
 
 def test_sampler_that_does_not_draw_independently_has_no_rate(toy):
-    toy.crashhunt("run", "h", "1", "4", *HUNT, "--keep-going", "--sampler", "halton")
+    toy.crashhunt("run", "h", "1", "2", *HUNT, "--keep-going", "--keep", "1", "--sampler", "grid")
     (rate,) = rates(toy, "h", "--per", "trial")
     assert rate["certain"] is None
-    assert "the sampler halton does not draw trials independently" in rate["why_not"]
+    assert "the sampler grid does not draw trials independently" in rate["why_not"]
     done = toy.crashhunt("rate", "h", "--bar", "0.1/trial", expect=3)
     assert "undecided about the bar of 0.10 per trial: there is no rate" in done.out
 
@@ -248,17 +247,17 @@ def test_hunt_in_rare_mode_has_no_plain_rate_and_status_reports_its_own(toy):
     )
 
 
-def test_status_reports_the_certain_interval_of_any_hunt_that_has_one(toy):
-    toy.crashhunt("run", "h", "2", "12", *HUNT, "--keep-going")
+def test_status_reports_the_certain_interval_of_any_hunt_that_has_one(hunt):
+    toy = hunt
     (state,) = toy.crashhunt("status", "h", "--json").json["hunts"]
     (rate,) = rates(toy, "h", "--per", "trial")
     assert state["rate"]["certain"] == rate["certain"]
-    assert (state["rate"]["trials"], state["rate"]["crashes"]) == (12, rate["crashes"])
+    assert (state["rate"]["trials"], state["rate"]["crashes"]) == (24, rate["crashes"])
     # A resumed hunt counts the trials of earlier runs.
-    toy.crashhunt("run", "h", "2", "16", *HUNT, "--keep-going")
+    toy.crashhunt("run", "h", "2", "28", *HUNT, "--keep-going", "--keep", "1")
     (state,) = toy.crashhunt("status", "h", "--json").json["hunts"]
     assert state["rate"]["certain"] == rates(toy, "h", "--per", "trial")[0]["certain"]
-    assert state["rate"]["trials"] == 16
+    assert state["rate"]["trials"] == 28
 
 
 def test_rare_mode_and_a_bar_exclude_each_other(toy):

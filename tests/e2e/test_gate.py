@@ -222,6 +222,7 @@ def test_agent_whose_module_ends_its_process_is_refused(drivers):
     assert "HEAD (gone:Driver): the hunt cannot run: 'gone:Driver' cannot be imported" in done.err
 
 
+@pytest.mark.nightly  # by day, suites/test_gate_of_hunts.py
 def test_no_valid_trial_exits_with_3(drivers):
     words = ("--set", "fail_reset=true", "--most", "40")
     done = drivers.crashhunt("gate", CALM, TWIN, *TOY, *words, expect=3)
@@ -314,6 +315,7 @@ def test_killed_gate_leaves_nothing_running_and_resumes_to_the_same_verdict(repo
     assert len(git(repository.folder, "worktree", "list").splitlines()) == 1
 
 
+@pytest.mark.nightly  # by day, suites/test_gate_parts.py locks the folder
 def test_two_gates_in_one_folder_exclude_each_other(drivers):
     process = begun(drivers, "--most", "5000")
     try:

@@ -184,7 +184,15 @@ def test_a_bundle_without_a_row_gets_one(toy):
 
 
 @pytest.mark.parametrize(
-    "words", [("status", "h"), ("scenarios",), ("trials", "h"), ("--help",), ("run", "-h"), ("--version",)]
+    "words",
+    [
+        ("status", "h"),
+        pytest.param(("trials", "h"), marks=pytest.mark.nightly),
+        ("scenarios",),
+        ("--help",),
+        ("run", "-h"),
+        ("--version",),
+    ],
 )
 def test_output_that_cannot_be_written_is_one_line(toy, words):
     if "h" in words:
