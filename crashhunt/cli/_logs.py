@@ -64,7 +64,7 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
             break
         time.sleep(0.5)
     if not found:
-        kept = f"no log of trial {options.trial} is kept; logs are of crashes, and with run --keep-trials of all trials"
+        kept = f"trial {options.trial} printed nothing, or its log was not kept; run --keep-trials keeps all logs"
         print("there is nothing to show" if options.trial is None else kept, file=sys.stderr)
     return 0
 

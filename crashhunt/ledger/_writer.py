@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sqlite3
 import time
 from contextlib import ExitStack, contextmanager, suppress
@@ -79,7 +80,8 @@ class Ledger(LedgerReader):
         try:
             if writable and not has_begun(path):
                 create(path)
-            database = opened(path, read_only=read_only or (not writable and is_untouched()))
+            may_write = os.access(path.parent, os.W_OK)  # not on a read-only file system, or in another user's folder
+            database = opened(path, read_only=read_only or (not writable and (is_untouched() or not may_write)))
             with ExitStack() as failed:
                 failed.callback(database.close)
                 super().__init__(database, path, shape_of(database, path))

@@ -43,6 +43,17 @@ def test_what_was_recorded_is_read_while_it_is_written(tmp_path):
     reader.close()
 
 
+def test_a_ledger_in_a_folder_that_is_not_writable_is_read(tmp_path, monkeypatch):
+    """On a read-only file system, SQLite cannot create its auxiliary files next to the ledger."""
+    path = tmp_path / "ledger.sqlite"
+    with closing(Ledger(path, writable=True)) as writer:
+        writer.record(result(1), snapshot="")
+    monkeypatch.setattr("os.access", lambda place, mode: place != tmp_path)
+    with closing(Ledger(path)) as reader:
+        assert reader.finished() == {1}
+        assert {file.name for file in tmp_path.iterdir()} == {"ledger.sqlite"}
+
+
 def test_what_is_recorded_together_is_there_at_once_and_whatever_happens(tmp_path):
     path = tmp_path / "ledger.sqlite"
     with closing(Ledger(path, writable=True)) as writer, closing(Ledger(path)) as reader:
