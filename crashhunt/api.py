@@ -191,12 +191,12 @@ def what_if(
             this step on.
         from_step: number of steps that stay as recorded.
         before_s: time before the crash at which the change begins, in s of simulation time; replaces ``from_step``.
-        agent: ``module:Name`` of an agent that takes control after the step.
+        agent: the agent that takes control after the step, as ``module:Name``.
         arguments: arguments of the agent that takes control.
         futures: whether to give the simulator's random generators another seed after the step, a different seed in each
             run.
-        overrule: ``brake``, ``left``, ``right``, ``keep_lane``, ``keep_speed``, ``reference_speed``,
-            ``reference_lanes`` or ``reference``; the manoeuvre that replaces the agent's actions after the step.
+        overrule: the manoeuvre that replaces the agent's actions after the step: ``brake``, ``left``, ``right``,
+            ``keep_lane``, ``keep_speed``, ``reference_speed``, ``reference_lanes`` or ``reference``.
         leave_out: ids of actors to remove from the start.
         interventions: further interventions, from `crashhunt.whatif`.
         code: the code that drives: the code of the ``snapshot``, or the ``current`` code, which is the default with

@@ -40,7 +40,7 @@ class KeepLaneWithSpeed:
         """Do nothing, because the agent has no state."""
 
     def act(self, observation: Any) -> object:
-        """Return (speed, 0), or the meta-action that brings the speed nearer."""
+        """Return (speed, 0), or the meta-action that brings the vehicle nearer to this speed."""
         if self._meta is None:
             return self.speed, 0
         error = self.speed - float(observation[0, 3])

@@ -20,7 +20,7 @@ __all__ = ["add_bisect"]
 
 
 def add_bisect(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``bisect`` to the parser."""
     bisect = commands.add_parser(
         "bisect",
         help="find the commit that introduced a crash",

@@ -19,7 +19,7 @@ __all__ = ["add_check"]
 
 
 def add_check(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``check`` to the parser."""
     check = commands.add_parser(
         "check",
         help="check that the files on disk are complete and unchanged",

@@ -167,7 +167,7 @@ def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
 
     Args:
         directory: directory of a hunt or a suite.
-        runs: ``ID/N``, or ``ID`` for all runs of this hunt; empty for all hunts.
+        runs: the runs to choose, each as ``ID/N``, or as ``ID`` for all runs of this hunt; empty for all hunts.
 
     Raises:
         HuntDirectoryError: the directory contains no hunt.

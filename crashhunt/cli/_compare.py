@@ -19,7 +19,7 @@ __all__ = ["add_compare"]
 
 
 def add_compare(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``compare`` to the parser."""
     compare = commands.add_parser(
         "compare",
         help="report which of several hunts crashes less",

@@ -30,7 +30,7 @@ put one of these lines where your shell starts:
 
 
 def add_completion(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``completion`` to the parser."""
     completion = commands.add_parser(
         "completion",
         help="print a shell script that adds tab completion",

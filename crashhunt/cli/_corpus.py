@@ -34,7 +34,7 @@ __all__ = ["add_corpus"]
 
 
 def add_corpus(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``corpus`` to the parser."""
     corpus = commands.add_parser(
         "corpus",
         help="keep crashes in a repository, and check that they stay fixed",

@@ -26,7 +26,7 @@ _DEFAULT_RUNS = 8  # `crashhunt.whatif.REPRESENTATIVES`, which takes longer to i
 
 
 def add_crashes(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``crashes`` to the parser."""
     crashes = commands.add_parser(
         "crashes",
         help="list the different crash types",

@@ -21,7 +21,7 @@ __all__ = ["add_dashboard"]
 
 
 def add_dashboard(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``dashboard`` to the parser."""
     dashboard = commands.add_parser(
         "dashboard",
         help="show hunts live in the browser",

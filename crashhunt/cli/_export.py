@@ -21,7 +21,7 @@ _FORMATS = {"commonroad": ".xml", "openscenario": ".xosc"}
 
 
 def add_export(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``export`` to the parser."""
     export = commands.add_parser(
         "export",
         help="write a crash into one file, for another machine or another tool",

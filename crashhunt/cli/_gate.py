@@ -45,7 +45,7 @@ _LINE_EVERY_S = 30.0  # where there is no terminal
 
 
 def add_gate(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``gate`` to the parser."""
     gate = commands.add_parser(
         "gate",
         help="give a verdict on a change: better, worse, no difference or undecided",

@@ -20,7 +20,7 @@ __all__ = ["add_guide"]
 
 
 def add_guide(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``guide`` to the parser."""
     guide = commands.add_parser(
         "guide",
         help="read the guide: tutorials, how to, reference, troubleshooting",

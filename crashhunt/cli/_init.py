@@ -26,7 +26,7 @@ _KIND_BY_OPTION = {"osm": "osm", "opendrive": "opendrive", "net": "net"}
 
 
 def add_init(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``init`` to the parser."""
     init = commands.add_parser(
         "init",
         help="make a scenario from a map",

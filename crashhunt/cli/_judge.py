@@ -32,7 +32,7 @@ __all__ = ["add_judge"]
 
 
 def add_judge(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``judge`` to the parser."""
     judge = commands.add_parser(
         "judge",
         help="find the last avoidable step and the causes of a crash, by running it again",

@@ -20,7 +20,7 @@ __all__ = ["add_logs"]
 
 
 def add_logs(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``logs`` to the parser."""
     logs = commands.add_parser(
         "logs",
         help="show the output and the errors of hunts and trials",

@@ -23,7 +23,7 @@ __all__ = ["add_rate", "exit_code_of"]
 
 
 def add_rate(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``rate`` to the parser."""
     rate = commands.add_parser(
         "rate",
         help="report how often an agent crashes, with a guarantee",

@@ -228,7 +228,7 @@ def _shot(
 
 
 def add_replay(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``replay`` to the parser."""
     replay = commands.add_parser(
         "replay",
         help="run a saved crash again, and report whether it is bit-identical",

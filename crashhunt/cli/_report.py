@@ -22,7 +22,7 @@ __all__ = ["add_report"]
 
 
 def add_report(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``report`` to the parser."""
     report = commands.add_parser(
         "report",
         help="write one HTML file that shows a hunt and animates its crashes",

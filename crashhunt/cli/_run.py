@@ -76,7 +76,7 @@ def short_help(parser: argparse.ArgumentParser) -> str:
 
 
 def add_run(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``run`` to the parser."""
     run = commands.add_parser(
         "run",
         help="hunt for a crash",

@@ -21,7 +21,7 @@ _MIN_BRAKING_MPS2: Final = 0.1
 
 
 def add_show(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``show`` to the parser."""
     show = commands.add_parser(
         "show",
         help="describe the last seconds of a crash or a near miss",

@@ -33,7 +33,7 @@ _DEFAULT_TRIALS = 500
 
 
 def add_shrink(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``shrink`` to the parser."""
     shrink = commands.add_parser(
         "shrink",
         help="minimize a crash while its crash type stays the same",

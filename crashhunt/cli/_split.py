@@ -20,7 +20,7 @@ _PARTS = ("training", "test")
 
 
 def add_split(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``split`` to the parser."""
     split = commands.add_parser(
         "split",
         help="divide crashes into a training and a test part",

@@ -27,7 +27,7 @@ _STATE_COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "
 
 
 def add_status(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``status`` to the parser."""
     status = commands.add_parser(
         "status",
         help="show the progress of hunts",

@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 
 def add_suite(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``suite`` to the parser."""
     suite = commands.add_parser(
         "suite",
         help="run many hunts from one file",
@@ -65,7 +65,7 @@ def add_suite(commands: Commands) -> None:
 
 
 def add_rerun(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``rerun`` to the parser."""
     rerun = commands.add_parser(
         "rerun",
         help="run failed hunts again, or a hunt with other settings in another directory",

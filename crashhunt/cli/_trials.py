@@ -19,7 +19,7 @@ __all__ = ["add_trials"]
 
 
 def add_trials(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``trials`` to the parser."""
     from crashhunt.trial import Outcome
 
     trials = commands.add_parser(

@@ -22,7 +22,7 @@ __all__ = ["add_trust_command"]
 
 
 def add_trust_command(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``trust`` to the parser."""
     trust = commands.add_parser(
         "trust",
         help="trust the code of hunts and crashes that you did not make on this machine",

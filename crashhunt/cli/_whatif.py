@@ -32,7 +32,7 @@ __all__ = ["add_whatif"]
 
 
 def add_whatif(commands: Commands) -> None:
-    """Add the command to the parser."""
+    """Add the command ``whatif`` to the parser."""
     whatif = commands.add_parser(
         "whatif",
         help="run a saved crash again with a change, many times, and count how often it crashes",

@@ -36,12 +36,13 @@ class Cause(Serializable):
     A cause contains no speeds, identifiers or times, because these differ between trials.
 
     Args:
-        kind: ``omission``, ``decision``, ``disturbance``, ``argument``, ``traffic``, ``software fault`` or ``unknown``.
+        kind: type of the cause: ``omission``, ``decision``, ``disturbance``, ``argument``, ``traffic``, ``software
+            fault`` or ``unknown``.
         what: For an omission, what the agent disregarded, as in `Omission`. For a lane change into an unsafe gap, ``gap
             left`` or ``gap right``. For a decision, the action of the agent; for a disturbance, its type; for an
             argument, its name.
         instead: the action of the agent in place of the omitted action.
-        actor: ``long`` if the disregarded actor is longer than a car, else empty.
+        actor: the text ``long`` if the disregarded actor is longer than a car, else empty.
     """
 
     kind: str

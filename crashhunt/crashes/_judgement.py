@@ -62,7 +62,8 @@ class Factor(Serializable):
     """A possible cause of a crash, and the runs without it.
 
     Args:
-        kind: ``argument``, ``seed``, ``disturbance``, ``other`` (a manoeuvre of another actor) or ``agent``.
+        kind: type of the factor: ``argument``, ``seed``, ``disturbance``, ``other`` (a manoeuvre of another actor) or
+            ``agent``.
         name: name of the argument or actor.
         what: for an argument ``default`` or ``drawn``; for a disturbance its type; else ``braked``, ``sped up``,
             ``changed lanes``, or ``there`` if the presence of the actor is the factor.

@@ -102,8 +102,8 @@ class Signature(Serializable):
             Gymnasium environment, the crash type that it reports, or its crash rule. For a traffic event, the type of
             the event. For a software fault, the exception, signal or exit code.
         lane_change: which of the two actors were changing lanes: ``agent``, ``other``, ``both`` or empty.
-        place: ``crossing`` where lanes of different directions overlap, ``road`` elsewhere; empty if the map is
-            unknown, or if the place does not matter.
+        place: the text ``crossing`` where lanes of different directions overlap, ``road`` elsewhere; empty if the map
+            is unknown, or if the place does not matter.
         where: for a software fault, the innermost functions of the agent's code; without any, the text of the message.
         disturbed: whether the agent was disturbed before the crash; a crash in undisturbed traffic is a different crash
             type.

@@ -39,8 +39,8 @@ class SumoEnv(gymnasium.Env[Any, Any]):
     Args:
         scenario: Name of a shipped scenario, or a path.
         agent: The controlled vehicle; by default the first agent of the scenario. The other agents keep their lane.
-        action: ``continuous`` is (target speed in m/s, lane change). ``meta`` is highway-env's DiscreteMetaAction. The
-            default is the scenario's own choice.
+        action: The form of the actions. With ``continuous``, an action is (target speed in m/s, lane change). With
+            ``meta``, it is a number of highway-env's DiscreteMetaAction. The default is the scenario's own choice.
         max_steps: Maximum number of steps of an episode; None for no limit.
         render_mode: None, or ``rgb_array``: `render` returns the scene from above, uint8, shape (540, 960, 3).
         process: Whether the environment runs in its own process, which costs up to a millisecond per step. libsumo has
@@ -98,7 +98,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
 
         Args:
             seed: Seed of the environment's random generator, which draws the seeds of this and of all later episodes.
-            options: ``{"arguments": {name: value}}``: scenario arguments that differ from their defaults.
+            options: Scenario arguments that differ from their defaults, as ``{"arguments": {name: value}}``.
 
         Raises:
             ArgumentError: The scenario has no argument of that name.

@@ -98,7 +98,7 @@ class Keeping:
         simulator: the simulator, which reports the speed of the vehicle.
         agent: identifier of the controlled vehicle.
         after: the step after which lane or speed are kept.
-        keeps: ``lane`` prevents lane changes, ``speed`` holds the speed.
+        keeps: what the vehicle keeps: ``lane`` prevents lane changes, ``speed`` holds the speed.
 
     Raises:
         InvalidEpisodeError: The action form has no known lanes and speeds.

@@ -154,7 +154,7 @@ class Prober:
         return episode.steps % steps_of(self._every_s, episode.simulator.step_length_s) == 0
 
     def ask(self, episode: Episode) -> None:
-        """Search, for each kind, for a milder disturbance than those found before that soon makes the episode crash."""
+        """For each kind, search for a disturbance that soon crashes the episode and is milder than any found before."""
         before = self.questions.unanswered
         self._ask(episode)
         asked = self.questions.unanswered == before

@@ -113,8 +113,8 @@ class Pair:
         excluded: number of trials of both hunts that do not count. A trial does not count if a trial with a lower
             number has not ended, or if the trial is invalid in one hunt. A trial on whose traffic an agent was trained
             does not count either.
-        answer: ``first`` or ``second``, the hunt that certainly crashes less; ``undecided``; empty if no answer is
-            possible.
+        answer: the hunt that certainly crashes less, ``first`` or ``second``; ``undecided`` if neither does; empty if
+            no answer is possible.
     """
 
     first: str

@@ -41,8 +41,8 @@ class GateCase:
 
     Args:
         name: name of the case's folder.
-        expected: ``still`` or ``fixed``.
-        got: ``still``, ``fixed``, ``changed`` or ``cannot_run``.
+        expected: the expected status: ``still`` or ``fixed``.
+        got: the status with HEAD: ``still``, ``fixed``, ``changed`` or ``cannot_run``.
         now: description of the present result.
     """
 

@@ -59,7 +59,7 @@ class Checked:
 
     Args:
         dir: path of the hunt or crash.
-        kind: ``hunt``, ``crash`` or ``file``.
+        kind: either ``hunt``, ``crash`` or ``file``.
         protected: whether every trial has a digest; the ledgers of early versions have none.
         trials: the numbers of the trials whose rows are unchanged since they were written.
         damaged_trials: reason for each damaged trial.

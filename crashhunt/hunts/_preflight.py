@@ -352,14 +352,16 @@ def _survey(scenario: Scenario, runs: list[RunToSurvey]) -> Json:
             found: Json = json.loads(answer.read_text(encoding="utf-8"))
             return found
         elif time.monotonic() >= deadline:
-            raise SimulatorError(f"simulating the plain traffic took over {MAX_WALL_TIME_S:g} s of wall time")
+            raise SimulatorError(
+                f"the simulation of the traffic without agents took more than {MAX_WALL_TIME_S:g} s of wall time"
+            )
         else:
             said = (folder / SURVEY_OUTPUT).read_text(encoding="utf-8", errors="replace").strip().splitlines()
             errors = (
                 [line for line in said if line.startswith("Error")] or said or [_describe_end(kept.process.returncode)]
             )
             kind = _SurveyKilledError if is_sent_from_outside(kept.process.returncode) else SimulatorError
-            raise kind(f"simulating the plain traffic failed: {errors[-1].strip()}")
+            raise kind(f"the simulation of the traffic without agents failed:  {errors[-1].strip()}")
     # The process and its folder are gone: the signal goes to the handler that was there before.
     signal.raise_signal(number)
     raise KeyboardInterrupt

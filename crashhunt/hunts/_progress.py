@@ -156,7 +156,7 @@ class HuntStatus:
     """The progress of a hunt, for the status screen.
 
     Args:
-        phase: ``hunting``, ``saving``, ``auditing``, ``done``, or a name of `PhaseStatus`.
+        phase: the current phase: ``hunting``, ``saving``, ``auditing``, ``done``, or a name of `PhaseStatus`.
         planned: total number of trials; 0 if only the time is limited.
         done: number of finished trials, including those of earlier runs of the hunt.
         outcomes: number of trials with each outcome.

@@ -445,7 +445,7 @@ def write_text(hunt: HuntResults, out: IO[str], form: str, *, outcomes: Sequence
     Args:
         hunt: the hunt.
         out: the text file to write to.
-        form: ``csv``, ``json`` (one array) or ``jsonl`` (one object per line).
+        form: the format: ``csv``, ``json`` (one array) or ``jsonl`` (one object per line).
         outcomes: outcomes of the trials to write; empty for all trials.
     """
     names = hunt.columns

@@ -189,8 +189,8 @@ class HuntState(Serializable):
 
     Args:
         dir: directory of the hunt.
-        state: ``queued``, ``running``, ``finished`` (no crash), ``crashed`` (a crash was found), ``error``,
-            ``interrupted`` or ``killed`` (its process ended without recording a reason).
+        state: the state of the hunt: ``queued``, ``running``, ``finished`` (no crash), ``crashed`` (a crash was found),
+            ``error``, ``interrupted`` or ``killed`` (its process ended without recording a reason).
         detail: the reason of an error.
         trials_planned: number of planned trials; 0 if only the time is limited.
         trials_run: number of finished trials.

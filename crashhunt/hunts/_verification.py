@@ -386,7 +386,10 @@ class VerificationRuns:
         return tuple(crashed[one.spec.number] for one in found if one.spec.number in crashed), len(unanswered)
 
     def crash(self, found: Found, folder: str) -> Bundle | None:
-        """Return the bundle of a crash that reproduces at the same step, and again bit-identically; it is kept.
+        """Run the crash of a fork from the start; return its bundle if two runs reproduce the crash.
+
+        The first run must crash at the same step as the fork, and the second run must be bit-identical to the first.
+        The bundle is kept.
 
         Args:
             found: the crash of a fork.

@@ -70,7 +70,8 @@ class RunningRate(TypedDict):
     """The current crash rate of a hunt, as ``status --json`` reports it.
 
     Args:
-        method: ``plain`` for counted trials, or ``rare`` for forks with forced disturbances together with plain trials.
+        method: either ``plain`` for counted trials, or ``rare`` for forks with forced disturbances together with plain
+            trials.
         per: the unit of exposure to which the rate refers, such as a trial or a kilometre.
         confidence: confidence of all intervals, in percent.
         units: number of independent units that count: trials, traffic seeds, or trials from which forks start.
@@ -82,7 +83,7 @@ class RunningRate(TypedDict):
         estimated: interval of the estimate; None if there are too few trials from which forks start.
         why_not: why the certain interval or the estimated interval is missing; empty if neither is missing.
         bar: threshold with which the rate is compared; None if there is no threshold.
-        verdict: ``below``, ``above`` or ``undecided``; empty if there is no threshold.
+        verdict: either ``below``, ``above`` or ``undecided``; empty if there is no threshold.
         trained_on: number of trials that do not count because an agent was trained on their traffic; missing if all
             trials count.
     """
@@ -145,8 +146,8 @@ class Noted(TypedDict, total=False):
             phase and at the end.
         ends_at: time at which the last trial is expected to end, in s since the epoch; None if it is unknown.
         failed_steps: number of simulated steps of confirmations that failed.
-        until_rate: ``bar`` (the threshold as the user gave it), ``decided_at`` (number of the deciding trial) and
-            ``verdict``; None if the hunt has no threshold.
+        until_rate: the progress towards a threshold: ``bar`` (the threshold as the user gave it), ``decided_at``
+            (number of the deciding trial) and ``verdict``; None if the hunt has no threshold.
         running_rate: the current crash rate; None if no rate is known.
     """
 

@@ -45,7 +45,7 @@ class MapSource:
     """The source of a map: a file or a shape.
 
     Args:
-        kind: kind of the map.
+        kind: format of the map file, or kind of the generated map.
         path: path of the file; None if the map is generated.
         shape: shape of a generated map: columns and rows of a grid, or arms and rings of a spider web.
     """

@@ -41,7 +41,8 @@ class Finding:
     """A traffic crash or a traffic event that an oracle has detected.
 
     Args:
-        outcome: ``collision``, ``off_road``, the type of an event, or an outcome that the oracle adds.
+        outcome: the outcome that was detected: ``collision``, ``off_road``, the type of an event, or an outcome that
+            the oracle adds.
         collision: the evidence of a crash.
         event: the evidence of a traffic event; its field ``what`` describes the event.
     """

@@ -102,7 +102,7 @@ class HuntOption:
 
     Args:
         name: name in Python and in files.
-        form: form of its values.
+        form: how values are written: as a flag, a number, a text, a list or a table.
         default: value if the user does not give the option.
         about: the rest of the option's declaration.
     """

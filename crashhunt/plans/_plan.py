@@ -80,7 +80,7 @@ def with_recorded_load_order(scenario: Scenario, recorded: str | None) -> Scenar
 
     Args:
         scenario: the scenario to run again.
-        recorded: ``load_order`` of the snapshot; None if the snapshot has none.
+        recorded: the value of ``load_order`` in the snapshot; None if the snapshot has none.
     """
     order = scenario.backend.load_order
     return scenario if order is None or recorded == FIXED else order.keep(scenario)
@@ -94,7 +94,7 @@ def load_order_change(scenario: Scenario, recorded: str | None) -> str:
 
     Args:
         scenario: the scenario to run again.
-        recorded: ``load_order`` of the snapshot; None if the snapshot has none.
+        recorded: the value of ``load_order`` in the snapshot; None if the snapshot has none.
     """
     order, now = scenario.backend.load_order, load_order_of(scenario)
     if order is None or recorded != FIXED or now == FIXED:
@@ -273,7 +273,7 @@ def plan_with_code(request: Request, *, survey: Surveyor | None = None) -> tuple
     """Resolve a user's request, and return the facts about the code that it names.
 
     Args:
-        request: the request of the user.
+        request: what the user asks for: scenario, agents, arguments and options.
         survey: function that returns the scenario with the vehicles that an agent can replace. The function is called
             last because it may take long, and invalid requests are refused before.
 

@@ -26,7 +26,7 @@ class RatePart:
 
     Args:
         by: the property that divides the parts: ``kind``, ``fault``, ``disturbance`` or an argument.
-        name: name of the part.
+        name: name of the part, such as a crash type or a range of the argument.
         trials: number of valid trials in the part.
         crashes: number of crashes in the part.
         estimate: crashes divided by exposure; None if the number of trials was not fixed in advance.
@@ -56,7 +56,7 @@ class CrashRate:
         dir: directory of the hunt.
         per: the unit of exposure to which the rate refers, such as a trial or a kilometre.
         confidence: confidence, in percent, of the certain interval, which is valid after any number of trials.
-        method: ``plain`` for counted trials, or ``rare`` for forks with forced disturbances.
+        method: either ``plain`` for counted trials, or ``rare`` for forks with forced disturbances.
         units: number of independent units that count: trials or traffic seeds.
         crashes: number of crashes in the units that ``units`` counts.
         trials: number of valid trials in the units that ``units`` counts.
@@ -69,7 +69,7 @@ class CrashRate:
         parts: parts of the rate, by disturbance and by the property that the user chose.
         steps: number of simulated steps of the trials.
         bar: threshold with which the rate is compared; None for no threshold.
-        verdict: ``below``, ``above`` or ``undecided``; empty if there is no threshold.
+        verdict: either ``below``, ``above`` or ``undecided``; empty if there is no threshold.
         why_undecided: reason why more trials cannot decide the comparison; empty if they can, or if it is decided.
     """
 

@@ -92,7 +92,7 @@ class RateWatch:
         return self.counter.add(unit)
 
     def interval(self) -> Interval | None:
-        """Return the certain interval; None if there is no unit, or if an exposure is unknown."""
+        """Return the interval that is valid at any time; None if there is no unit, or if an exposure is unknown."""
         return self.counter.interval(self.alpha)
 
     def running(self, *, now: bool = False) -> RunningRate:

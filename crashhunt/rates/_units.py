@@ -346,7 +346,7 @@ class RateCounter:
         return driven / (_S_PER_HOUR if self._per == "hour" else _M_PER_1000KM)
 
     def interval(self, alpha: float) -> Interval | None:
-        """Return the certain interval; None if there is no unit, or if an exposure is unknown."""
+        """Return the interval that is valid at any time; None if there is no unit, or if an exposure is unknown."""
         return None if self.test is None or self.why_not else self.test.interval(alpha)
 
     @property

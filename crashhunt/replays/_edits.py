@@ -41,9 +41,9 @@ def edited_disturbances(
 
     Args:
         planned: the planned disturbances of the trial.
-        name: ``disturbances`` for all of them, or ``disturbances.STEP`` or ``disturbances.KIND@STEP`` for one of them,
-            optionally followed by a dot and a field.
-        text: ``none``, a description of other disturbances, or the new value of the field.
+        name: the disturbances to change: ``disturbances`` for all of them, or ``disturbances.STEP`` or
+            ``disturbances.KIND@STEP`` for one of them, optionally followed by a dot and a field.
+        text: the new value: ``none``, a description of other disturbances, or the new value of the field.
         agents: the controlled vehicles; by default, the vehicles that are already disturbed.
 
     Raises:

@@ -80,10 +80,10 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
 
     Args:
         recording: recording of the episode.
-        fields: ``x``, ``y``, ``heading``, ``speed``, ``reward``, ``time_to_collision_s``, ``gap_m``,
-            ``required_deceleration`` (relative to the nearest actor), ``gap_to_other_m``, ``time_to_other_s``,
-            ``closing_speed`` (relative to the collision partner), ``observation[ROW,NAME]``, the components of the
-            action by name, or ``action`` for all components.
+        fields: names of the columns: ``x``, ``y``, ``heading``, ``speed``, ``reward``, ``time_to_collision_s``,
+            ``gap_m``, ``required_deceleration`` (relative to the nearest actor), ``gap_to_other_m``,
+            ``time_to_other_s``, ``closing_speed`` (relative to the collision partner), ``observation[ROW,NAME]``, the
+            components of the action by name, or ``action`` for all components.
         agent: identifier of the agent whose values are listed.
         other: identifier of the collision partner.
 

@@ -68,7 +68,7 @@ class Niches:
     """Searches near the peaks of criticality, one peak after the other.
 
     Args:
-        cube: cube of the arguments.
+        cube: the unit cube whose dimensions are the arguments that vary.
         like: a model whose fitted parameters are the initial parameters of the model of each peak.
     """
 
@@ -163,7 +163,7 @@ class KnownCrashes:
     The same traffic leads to the same crash even with other arguments, so no proposal reuses the seed of a crash.
 
     Args:
-        dimensions: dimensions of the space.
+        dimensions: number of arguments that vary.
     """
 
     def __init__(self, dimensions: int) -> None:
@@ -317,7 +317,7 @@ class Portfolio:
     """Divides the trials between a model of criticality and Halton's sequence.
 
     Args:
-        cube: cube of the arguments.
+        cube: the unit cube whose dimensions are the arguments that vary.
         space: the space of the arguments, as distributions.
         hunt: facts about the hunt, whose seed scrambles the sequence.
     """

@@ -131,7 +131,7 @@ class Model:
     """Proposes the candidate with the greatest chance to exceed the best score.
 
     Args:
-        cube: cube of the arguments.
+        cube: the unit cube whose dimensions are the arguments that vary.
         like: a model whose fitted parameters are the initial parameters of this model.
     """
 

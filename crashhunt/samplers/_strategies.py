@@ -38,7 +38,7 @@ class CmaEs:
     trials; the ten trials before a later run may include proposals of the previous run.
 
     Args:
-        cube: cube of the arguments.
+        cube: the unit cube whose dimensions are the arguments that vary.
 
     Raises:
         UsageError: the package is not installed.
@@ -105,7 +105,7 @@ class CrossEntropy:
     """A mixture of normal distributions around the elites.
 
     Args:
-        cube: cube of the arguments.
+        cube: the unit cube whose dimensions are the arguments that vary.
     """
 
     def __init__(self, cube: Cube) -> None:
@@ -159,7 +159,7 @@ class Mutation:
     """Proposes mutants of the trials in the corpus.
 
     Args:
-        cube: cube of the arguments.
+        cube: the unit cube whose dimensions are the arguments that vary.
     """
 
     def __init__(self, cube: Cube) -> None:

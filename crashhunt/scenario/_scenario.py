@@ -114,11 +114,11 @@ class AgentSetup:
     """``[agents.ID]``: one controlled vehicle and its agent. All keys but the first and the last apply to SUMO only.
 
     Args:
-        agent: ``module:attribute``, or the name of a registered agent.
+        agent: the agent that drives, as ``module:attribute`` or by the name of a registered agent.
         existing: whether the agent controls the vehicle ID of the traffic; otherwise, a vehicle with this id is added.
         replaces: name of a scenario argument that names a vehicle of the traffic. When this vehicle has entered, the
             controlled vehicle replaces it.
-        type: type of the added vehicle.
+        type: SUMO's vehicle type of the added vehicle.
         route: id of the added vehicle's route.
         edges: edges of the added vehicle's route, instead of ``route``; for two edges, the shortest route between them
             is used.

@@ -124,8 +124,8 @@ def shrink(
         bundle: the crash to minimize.
         budget: maximum number of trials.
         time_s: wall-time limit, in s; the two runs that confirm the result take additional time.
-        form: ``traffic``: the other actors drive themselves. ``scripted``: they follow recorded paths. ``either``: the
-            form depends on the number of remaining actors.
+        form: how the other actors move: by themselves (``traffic``), along recorded paths (``scripted``), or depending
+            on the number of remaining actors (``either``).
         parallel: number of runs at a time; 0 for one per core.
         watch: function called with the number of finished runs and the maximum number.
         stopped: function that returns whether to stop; called repeatedly.

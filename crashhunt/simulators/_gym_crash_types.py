@@ -25,7 +25,7 @@ def crash_cell(info: Mapping[str, object]) -> str:
     """Return a description of the last step, equal for similar steps.
 
     Args:
-        info: ``info`` of the last step. True flags and short texts are used; numbers are not.
+        info: the dictionary ``info`` of the last step. True flags and short texts are used; numbers are not.
     """
     words = []
     for key, value in info.items():

@@ -481,7 +481,7 @@ class FastStepper(Protocol):
     """The compiled object that runs a step and returns its outcome."""
 
     def is_unpatched(self, simulator: Simulator, /) -> bool:
-        """Return whether a step of the core equals that of the simulator; false if a method of it is wrapped."""
+        """Return whether a step of the core equals a step of the simulator: no method of the simulator is wrapped."""
 
     @property
     def roster(self) -> Roster:

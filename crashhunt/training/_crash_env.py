@@ -146,7 +146,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
 
         Args:
             seed: Seed for the draws of this and all further episodes; it also deletes the outcomes of earlier episodes.
-            options: ``crash`` is the name of the crash to begin with; an empty name selects a plain episode.
+            options: the entry ``crash`` is the name of the crash to begin with; an empty name selects a plain episode.
 
         Raises:
             UsageError: The crash is not in the training part, or an option does not exist.

@@ -38,12 +38,13 @@ class Overruled(Serializable):
     Args:
         agent: Identifier of the agent.
         after: The last step without the override; in the next step, an action is overridden for the first time.
-        manoeuvre: ``brake``; or ``left`` or ``right``, which also changes to the lane on that side in the first step.
-        keeps: ``lane`` or ``speed``: the agent still acts, but the vehicle keeps its lane or its current speed. In this
-            case, the manoeuvre has no effect.
-        reference: ``longitudinal``, ``lateral`` or ``both``: the agent still acts, and a reference driver corrects its
-            speeds, its lane changes, or both, where they are not safe. ``none``: the reference driver only reports
-            where it would correct the agent. In these cases, the manoeuvre and ``keeps`` have no effect.
+        manoeuvre: either ``brake``, or ``left`` or ``right``, which also changes to the lane on that side in the first
+            step.
+        keeps: either ``lane`` or ``speed``: the agent still acts, but the vehicle keeps its lane or its current speed.
+            In this case, the manoeuvre has no effect.
+        reference: either ``longitudinal``, ``lateral`` or ``both``: the agent still acts, and a reference driver
+            corrects its speeds, its lane changes, or both, where they are not safe. ``none``: the reference driver only
+            reports where it would correct the agent. In these cases, the manoeuvre and ``keeps`` have no effect.
     """
 
     agent: str

@@ -54,7 +54,7 @@ class Maneuver:
 
     Args:
         actor: identifier of the actor.
-        what: ``braked``, ``sped up`` or ``changed lanes``.
+        what: either ``braked``, ``sped up`` or ``changed lanes``.
         step: the step after which the manoeuvre began.
         speed: speed of the actor after this step, in m/s.
     """

@@ -111,9 +111,9 @@ class Overrule:
 
     Args:
         from_step: the last step that stays as recorded.
-        manoeuvre: ``brake`` as hard as the vehicle can, change lanes to the ``left`` or ``right`` and brake, or
-            ``keep_lane`` or ``keep_speed``. With ``reference_speed``, ``reference_lanes`` or ``reference``, a reference
-            driver corrects unsafe speeds, unsafe lane changes, or both.
+        manoeuvre: the manoeuvre: ``brake`` as hard as the vehicle can, change lanes to the ``left`` or ``right`` and
+            brake, or ``keep_lane`` or ``keep_speed``. With ``reference_speed``, ``reference_lanes`` or ``reference``, a
+            reference driver corrects unsafe speeds, unsafe lane changes, or both.
         agent: id of the agent; empty for the only agent.
     """
 
@@ -183,7 +183,7 @@ class HandOver:
 
     Args:
         from_step: number of recorded actions to repeat.
-        driver: ``module:Name`` of the new agent; empty for the recorded agent.
+        driver: the new agent, as ``module:Name``; empty for the recorded agent.
         arguments: arguments of the new agent. For the recorded agent, all other arguments keep their recorded values.
         agent: id of the vehicle; empty for the only controlled vehicle.
         option: option with which the user gave the arguments, for error messages.
@@ -297,7 +297,7 @@ def interventions_of(
         changes: new values from ``--set``; with a step, they apply only to the agent from this step on.
         from_step: the last step that stays as recorded.
         before_s: time before the crash at which the change begins, in s, instead of ``from_step``.
-        agent: ``module:Name`` of an agent that takes control, or ``ID=module:Name``.
+        agent: the agent that takes control, as ``module:Name`` or ``ID=module:Name``.
         arguments: arguments of the agent that takes control.
         futures: whether each run has other random numbers from the given step on.
         overrule: name of a manoeuvre that replaces the agent's actions from the given step on.

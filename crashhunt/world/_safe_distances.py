@@ -110,8 +110,8 @@ class Neighbor:
         speed_mps: speed of the actor along the lane, in m/s.
         braking_mps2: greatest deceleration of the actor, in m/s²; the usual one of its type.
         acceleration_mps2: greatest acceleration of the actor, in m/s².
-        kind: ``vehicle``, ``red light`` or ``crossing`` (an actor with a crossing path, before which the agent must
-            stop).
+        kind: type of the obstacle: ``vehicle``, ``red light`` or ``crossing`` (an actor with a crossing path, before
+            which the agent must stop).
     """
 
     actor: str

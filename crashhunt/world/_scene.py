@@ -66,7 +66,7 @@ class Contact:
         collider: identifier of the actor that drove into the other actor.
         victim: identifier of the actor that was hit.
         kind: the type of the collision, by the simulator's name.
-        lane: lane of the collision.
+        lane: name of the lane on which the collision happened.
         collider_speed: speed of the collider, in m/s.
         victim_speed: speed of the victim, in m/s.
     """
@@ -170,7 +170,7 @@ class Frame(NamedTuple):
     core: Core | None = None
 
     def scene(self, number: int) -> Scene:
-        """Return one of the scenes as a frame, without its time."""
+        """Return one of the scenes as a `Scene` whose time is not set."""
         count, row = len(self.roster), self.columns[number].tolist()
         points = list(zip(row[: 2 * count : 2], row[1 : 2 * count : 2], strict=True))
         heights = self.heights[number].tolist() if self.heights is not None else []

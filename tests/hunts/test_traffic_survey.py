@@ -148,7 +148,7 @@ def test_vehicles_that_stand_for_ever_are_a_gridlock(shell):
 def test_where_sumo_refuses_its_input_the_hunt_states_so(town):
     (town.folder / "r.rou.xml").write_text(f'<routes>{WAY}<vehicle id="a" route="gone" depart="1"/></routes>')
     done = town.crashhunt("run", "h", "1", "2", "20", *WORDS, expect=3)
-    assert "simulating the plain traffic failed" in done.err
+    assert "the simulation of the traffic without agents failed" in done.err
     assert done.json["stopped_because"] == "no_valid_trial"
 
 
@@ -219,7 +219,7 @@ def test_survey_that_is_killed_each_time_is_abandoned(town, monkeypatch):
     begun = kill_surveys(monkeypatch, signal.SIGKILL, first=9)
     scenario, settings = surveyed(town.folder)
     assert len(begun) == _preflight.MAX_ATTEMPTS
-    assert scenario.notes[1].endswith("simulating the plain traffic failed: signal 9")
+    assert scenario.notes[1].endswith("the simulation of the traffic without agents failed: signal 9")
     assert settings == surveyed(town.folder, survey=False, seed=settings.seed)[1]
 
 
@@ -227,7 +227,7 @@ def test_survey_that_fails_by_itself_is_run_once(town, monkeypatch):
     (town.folder / "r.rou.xml").write_text(f'<routes>{WAY}<vehicle id="a" route="gone" depart="1"/></routes>')
     begun = kill_surveys(monkeypatch, signal.SIGKILL, first=0)
     scenario, _ = surveyed(town.folder)
-    assert "simulating the plain traffic failed" in scenario.notes[1]
+    assert "the simulation of the traffic without agents failed" in scenario.notes[1]
     assert len(begun) == 1
 
 

@@ -60,7 +60,7 @@ class Meant(NamedTuple):
     """The cluster that the user has chosen.
 
     Attributes:
-        address: ``HOST:PORT``; empty for the hunt's own cluster.
+        address: the address ``HOST:PORT`` of the cluster; empty for the hunt's own cluster.
         environment: additional environment variables for Ray.
         spare: further environment variables for a cluster that requires a token.
     """
@@ -99,8 +99,8 @@ def cluster_of(argument: str) -> Meant:
     cannot use a cluster without a token.
 
     Args:
-        argument: ``HOST:PORT``; ``auto`` for a cluster that runs on this machine; ``local`` for the hunt's own cluster;
-            empty for a cluster on this machine, or else the hunt's own.
+        argument: the address ``HOST:PORT``; ``auto`` for a cluster that runs on this machine; ``local`` for the hunt's
+            own cluster; empty for a cluster on this machine, or else the hunt's own.
 
     Raises:
         UsageError: the address is invalid, or no cluster answers at the address.

@@ -76,7 +76,7 @@ class CodeArchive:
                 f"scenario and code have {total:.0f} MB, above the {LIMIT_MB} MB that crashhunt sends to other "
                 "machines; "
                 f"the largest file is {largest} ({sizes[largest] / _MEGABYTE:.0f} MB)",
-                fix="make it smaller, or list unneeded files in .gitignore",
+                fix="make this file smaller, or list unneeded files in .gitignore",
             )
         return cls(
             files, folders, next((folders[folder] for folder in settings.code if _is_same_snapshot(Path(folder))), "")

@@ -95,7 +95,7 @@ def array_difference(
     Args:
         step: number of the step.
         agent: identifier of the agent.
-        kind: ``observation`` or ``action``.
+        kind: either ``observation`` or ``action``.
         columns: names of the columns, if they are known.
         was: the recorded array.
         now: the replayed array.
@@ -126,7 +126,7 @@ def _array_record(tag: int, what: str) -> RecordType:
 
     Args:
         tag: tag of the record.
-        what: ``observation`` or ``action``, as in the fields of `AgentChannel` and `StepRecord`.
+        what: either ``observation`` or ``action``, as in the fields of `AgentChannel` and `StepRecord`.
     """
 
     def read(reading: Reading, aux: int, payload: bytes) -> None:

@@ -29,10 +29,10 @@ class CrashRule:
         info: a key of ``info`` whose true value means a crash.
         termination: whether the termination of the environment is a crash; truncation is no crash.
         reward_below: a step whose reward is below this value is a crash.
-        function: ``module:function``, called with observation, reward, terminated, truncated, info. A true result means
-            a crash; a text as the result describes the crash.
-        kind: ``module:function``, called with the same values for the step of a crash; it returns the crash type as
-            text. Without this function, ``info["crash_kind"]`` is the crash type if the value is a text.
+        function: your function, as ``module:function``, called with observation, reward, terminated, truncated, info. A
+            true result means a crash; a text as the result describes the crash.
+        kind: your function, as ``module:function``, called with the same values for the step of a crash; it returns the
+            crash type as text. Without this function, ``info["crash_kind"]`` is the crash type if the value is a text.
     """
 
     info: str = ""

@@ -61,7 +61,7 @@ def roadside(scene: Scene, agent: str, who: str, reach_m: float, junctions: Junc
     Args:
         scene: The current scene.
         agent: Identifier of a controlled vehicle.
-        who: ``left ahead`` or ``right ahead``; other places have no persons.
+        who: either ``left ahead`` or ``right ahead``; other places have no persons.
         reach_m: The distance that the person can walk in half of the disturbance's duration.
         junctions: The junction lanes of the network.
 

@@ -113,8 +113,8 @@ def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
     """Return the controlled vehicle that `--ego` selects.
 
     Args:
-        ego: ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty for ``any`` if a vehicle
-            departs.
+        ego: the controlled vehicle, as ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty
+            for ``any`` if a vehicle departs.
         files: paths of route files and additional files.
         begin: start of the simulation, in s.
         path: path of the configuration, for error messages.

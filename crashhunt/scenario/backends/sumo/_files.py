@@ -78,8 +78,8 @@ class FileReference:
     """An attribute of an XML file that names another file.
 
     Args:
-        tag: tag of the element.
-        attribute: name of the attribute.
+        tag: XML tag of the element that names the file.
+        attribute: name of the XML attribute that contains the file name.
         value: the file name, as written in the XML file.
         kind: whether SUMO reads or writes the file.
         offset: offset of the element in the XML file, in bytes.

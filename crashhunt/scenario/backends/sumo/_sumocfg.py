@@ -144,8 +144,8 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
 
     Args:
         path: path of the configuration.
-        ego: ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty for ``any`` if a vehicle
-            departs.
+        ego: the controlled vehicle, as ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty
+            for ``any`` if a vehicle departs.
 
     Raises:
         ScenarioError: the file is not a configuration of SUMO, or defines no vehicle and no route.
