@@ -361,7 +361,7 @@ def _survey(scenario: Scenario, runs: list[RunToSurvey]) -> Json:
                 [line for line in said if line.startswith("Error")] or said or [_describe_end(kept.process.returncode)]
             )
             kind = _SurveyKilledError if is_sent_from_outside(kept.process.returncode) else SimulatorError
-            raise kind(f"the simulation of the traffic without agents failed:  {errors[-1].strip()}")
+            raise kind(f"the simulation of the traffic without agents failed: {errors[-1].strip()}")
     # The process and its folder are gone: the signal goes to the handler that was there before.
     signal.raise_signal(number)
     raise KeyboardInterrupt

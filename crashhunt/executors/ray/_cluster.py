@@ -100,7 +100,7 @@ def cluster_of(argument: str) -> Meant:
 
     Args:
         argument: the address ``HOST:PORT``; ``auto`` for a cluster that runs on this machine; ``local`` for the hunt's
-            own cluster; empty for a cluster on this machine, or else the hunt's own.
+            own cluster. If the text is empty, a cluster on this machine is used, or else the hunt's own.
 
     Raises:
         UsageError: the address is invalid, or no cluster answers at the address.
