@@ -130,8 +130,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     lines += [f"Note: {note}" for note in report.notes]
     lines += _describe_audit(report)
     if report.stopped_because == "distinct":
-        found = describe_types(len(report.kinds or ()), report.types_by_cause, "crash type")
-        lines.append(f"Found {found} (--distinct {report.settings.run.distinct}).")
+        lines.append(f"Found {_wanted_types(report)} (--distinct {report.settings.run.distinct}).")
     if report.rate is not None:
         lines += describe_rates([report.rate]).splitlines()
     if report.copied is not None:
@@ -274,6 +273,16 @@ def _table_around(report: ReplayReport) -> list[str]:
         "  ".join([*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), row[3]]).rstrip()
         for row in cells
     ]
+
+
+def _wanted_types(report: HuntReport) -> str:
+    """Return as text the crash types that count for ``--distinct``: of the agent's own fault if only these count."""
+    groups = report.kinds or ()
+    if report.at_fault is None:
+        return describe_types(len(groups), report.types_by_cause, "crash type")
+    trials = set(report.at_fault)
+    count = sum(any(bundle.result.spec.number in trials for bundle in group.bundles) for group in groups)
+    return f"{describe_types(count, report.types_by_cause, 'crash type')} of the agent's own fault"
 
 
 def _describe_audit(report: HuntReport) -> list[str]:

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
+from crashhunt.crashes import Group, Signature
 from crashhunt.hunts import AuditReport, HuntReport
 from crashhunt.plans import HuntSettings, RunSettings
 from crashhunt.recording import Phase
@@ -67,6 +68,25 @@ def test_events_that_are_no_crashes_come_with_the_option_that_makes_them_crashes
         line.startswith("1 trial has incomplete answers") and line.endswith("run it again.") for line in incomplete
     )
     assert any(line.startswith("2 trials have") for line in lines(REPORT, unanswered=2))
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ({}, "Found 2 crash types (--distinct 1)."),
+        ({"types_by_cause": 3}, "Found 2 crash types, 3 by cause (--distinct 1)."),
+        ({"at_fault": (7,)}, "Found 1 crash type of the agent's own fault (--distinct 1)."),
+    ],
+)
+def test_types_that_were_hunted_for_are_counted(monkeypatch, more, says):
+    rear_end, swipe = (Signature(outcome="collision", role="collider", manner=each) for each in ("rear end", "swipe"))
+    bundles = [SimpleNamespace(id=f"{number}", result=SimpleNamespace(spec=SimpleNamespace(number=number), steps=9))
+               for number in (4, 7)]  # fmt: skip
+    kinds = tuple(Group(signature, (bundle,)) for signature, bundle in zip((rear_end, swipe), bundles, strict=True))
+    settings = replace(SETTINGS, run=RunSettings(keep_going=True, distinct=1))
+    report = replace(REPORT, settings=settings, stopped_because="distinct", kinds=kinds, **more)
+    monkeypatch.setattr("crashhunt.report._summary.describe_groups", lambda *_, **__: "")
+    assert says in describe_hunt(report).splitlines()
 
 
 HIT = Collision("ego", "collider", "ego", "x", ("overlap",), "overlap", 1.0, 2.0, "a_0", 9.0, 3.0)
