@@ -113,22 +113,17 @@ class Brancher(Observer):
         self.questions = Questions("branches", tell)
         self._branches = Branches()
         self._asleep: deque[_StoredFork] = deque()
-        self._frames: deque[Frame] = deque()
         self._disturber: DisturbanceSampler | None = None
-        self._second = 1  # in steps
-        self._draws = 0
-        self._rests_until = 0
-        self._drawn_steps = 0
-        self._strongest_at = 0  # when everything may be asked for again
         self._any = False  # whether there might have been any
 
     def begin(self, episode: Episode) -> None:
         """Begin the next episode, and compute the number of steps per second."""
         self._second = steps_of(1.0, episode.simulator.step_length_s)
-        self._frames = deque(maxlen=_WINDOW_S * self._second + 1)
-        self._branches, self._draws, self._rests_until = Branches(), 0, 0
+        self._frames: deque[Frame] = deque(maxlen=_WINDOW_S * self._second + 1)
+        self._branches, self._draws, self._drawn_steps = Branches(), 0, 0
+        self._rests_until = 0
+        self._strongest_at = 0  # the step from which all disturbances at once are tried again
         self.questions.begin_trial()
-        self._drawn_steps, self._strongest_at = 0, 0
         self._owner = os.getpid()
         self._any = False
 
