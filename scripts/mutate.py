@@ -122,6 +122,7 @@ _TESTS_ELSEWHERE = {
     "corpus": ("corpus/test_*.py", "e2e/test_corpus.py"),
     "corpus/_bisect.py": ("corpus/test_bisection.py", "e2e/test_bisect.py"),
     "crashes/_trust.py": ("crashes/test_trust.py", "e2e/test_foreign_hunts.py"),
+    "dashboard/_control.py": ("dashboard/test_dashboard_parts.py", "dashboard/test_control.py"),
     "envs": ("envs/test_*.py",),
     "episode/_action_override.py": (
         "episode/test_overruled_agents.py",

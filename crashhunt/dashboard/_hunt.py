@@ -53,7 +53,6 @@ class HuntView:
         self.found = found
         self._lock = threading.RLock()
         self._key: _Key = ()
-        self._replaced = 0
         self._file: tuple[int, int] = (0, 0)
         self._settings_key: tuple[int, int] = (0, 0)
         self._snapshots_key: tuple[int, int, int] | None = None

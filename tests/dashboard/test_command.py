@@ -46,6 +46,7 @@ def test_it_prints_its_address_and_runs_until_it_is_stopped(shell, number):
     assert err.splitlines() == [address["url"], "Ctrl-C ends the dashboard."]
 
 
+@pytest.mark.nightly  # by day, test_dashboard_parts.py and test_security.py
 def test_an_address_that_others_reach_has_a_random_token(shell):
     tokens = set()
     for _ in range(2):
