@@ -6,6 +6,7 @@ cannot ask whether to trust code, so it refuses untrusted code.
 
 from __future__ import annotations
 
+import codecs
 import itertools
 import os
 import re
@@ -153,10 +154,11 @@ class Jobs:
     def _follow(self, job: _Job, process: subprocess.Popen[bytes]) -> None:
         """Collect the output of a process until the process ends."""
         assert process.stdout is not None
-        text = ""
+        # A part may end within a character or within an escape sequence.
+        text, decode = "", codecs.getincrementaldecoder("utf-8")("replace").decode
         with process.stdout:
             while part := os.read(process.stdout.fileno(), 65_536):
-                text = (text + _TERMINAL_ESCAPES.sub("", part.decode("utf-8", "replace")))[-_MAX_OUTPUT_CHARACTERS:]
+                text = _TERMINAL_ESCAPES.sub("", text + decode(part))[-_MAX_OUTPUT_CHARACTERS:]
                 with self._changed:
                     job.output = visible(text)
         code = process.wait()

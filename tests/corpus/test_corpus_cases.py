@@ -41,10 +41,10 @@ def test_case_names_its_crash_and_what_is_expected(case):
 def test_case_has_exactly_one_crash(case):
     (crash,) = (case.path / "crashes").iterdir()
     shutil.copytree(crash, crash.with_name("000001-collision"))
-    with pytest.raises(BundleError, match="the case has 2 crashes; it must have 1"):
+    with pytest.raises(BundleError, match=r"\b2 crashes"):
         case.bundle()
     shutil.rmtree(case.path / "crashes")
-    with pytest.raises(BundleError, match="the case has 0 crashes; it must have 1"):
+    with pytest.raises(BundleError, match=r"\b(0|no) crash"):
         case.bundle()
 
 
