@@ -183,7 +183,7 @@ _road_kinds: dict[type, _RoadKind] = {}
 
 
 def is_known(road: Road) -> bool:
-    """Return whether the kernel may decide for and move a road's vehicles: class and highway-env are unchanged."""
+    """Return whether the kernel may drive a road's vehicles, because the road's class and highway-env are unchanged."""
     return _kind_of(road).is_known and _is_usual(road)
 
 

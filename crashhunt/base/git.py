@@ -54,7 +54,7 @@ def work_tree(folder: Path) -> Path | None:
 
 
 def tracked_files(top: Path) -> frozenset[str]:
-    """Return the names of all files that git tracks in a work tree, relative to its root, with ``/``."""
+    """Return the names of all files that git tracks in a work tree, relative to its root, with ``/`` as separator."""
     found = _run_git(top, "rev-parse", "--absolute-git-dir")
     if not found:
         return frozenset()

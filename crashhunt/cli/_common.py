@@ -203,7 +203,10 @@ def pairs(words: list[str], option: str, *, named: bool = True) -> dict[str, str
         elif not equals or not name:
             raise UsageError(f"{option} {word!r} has no name", fix=f"write {option} NAME=VALUE")
         if name in found:
-            raise UsageError(f"{option} {word!r}: {name or 'it'!r} is given twice", fix="give it once")
+            raise UsageError(
+                f"{option} {word!r}: {repr(name) if name else 'an agent without ID='} is given twice",
+                fix="give it once",
+            )
         found[name] = value
     return found
 
@@ -355,7 +358,7 @@ def tell(options: argparse.Namespace, summary: str, annotations: Sequence[str]) 
 
 
 def add_options(groups: Mapping[str, argparse._ArgumentGroup], names: Collection[str] = ()) -> None:
-    """Add every option that the command line has to its group of the help.
+    """Add each option of the command line to its group in the help.
 
     Args:
         groups: groups of the help by name.

@@ -78,7 +78,7 @@ def add_gate(commands: Commands) -> None:
     )
     how.add_argument(
         "--max-steps", metavar="N", type=integer, default=None,
-        help=f"maximum number of steps of a trial; default: {_MAX_STEPS}, or as in the suite",
+        help=f"maximum number of steps of a trial; default: {_MAX_STEPS}, or with --suite, as in the suite",
     )  # fmt: skip
     how.add_argument(
         "--margin", metavar="SHARE", default=str(_MARGIN),

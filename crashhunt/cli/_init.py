@@ -53,7 +53,7 @@ def add_init(commands: Commands) -> None:
         help="range LOW:HIGH of the factor that multiplies the traffic (default: %(default)s); init reduces the "
         "traffic until it does not jam at the factor HIGH",
     )  # fmt: skip
-    how.add_argument("--people", action="store_true", help="add persons on foot, on sidewalks and crossings")
+    how.add_argument("--people", action="store_true", help="add pedestrians, and sidewalks and crossings for them")
     how.add_argument("--bicycles", action="store_true", help="add cyclists, and lanes for bicycles")
     how.add_argument("--lefthand", action="store_true", help="make the traffic drive on the left")
     how.add_argument(

@@ -73,7 +73,7 @@ def _rate(options: argparse.Namespace, _words: list[str]) -> int:
             raise UsageError(f"--bar is {options.bar}", fix=fix)
         bar, unit = rate_of(options.bar)
         if per not in (None, unit):
-            raise UsageError(f"--per is {per} and --bar is {options.bar}", fix=f"give --per {unit}, or no --per")
+            raise UsageError(f"--per {per} contradicts --bar {options.bar}", fix=f"give --per {unit}, or no --per")
         per = unit
     per = per or ("trial" if options.by else None)
     hunts = dict.fromkeys(hunt for directory in options.directories for hunt in find_hunts(directory))

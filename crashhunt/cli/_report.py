@@ -38,7 +38,7 @@ def add_report(commands: Commands) -> None:
         metavar="N",
         type=integer,
         default=20,
-        help="maximum number of crashes to animate, and maximum number of near misses; default: 20",
+        help="animate at most N crashes and at most N near misses; default: 20",
     )
     add_json(report)
     report.set_defaults(command=_report)

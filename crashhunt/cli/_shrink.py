@@ -75,9 +75,10 @@ def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.plans import seconds_of
     from crashhunt.shrinking import shrink
 
-    for name, value in (("--budget", options.budget - 1), ("--parallel", options.parallel)):
-        if value < 0:
-            raise UsageError(f"{name} is {vars(options)[name[2:]]}", fix="give at least 1")
+    if options.budget < 1:
+        raise UsageError(f"--budget is {options.budget}", fix="give at least 1")
+    if options.parallel < 0:
+        raise UsageError(f"--parallel is {options.parallel}", fix="give at least 0 (0: one per core)")
     try:
         time_s = seconds_of(options.time)
     except ValueError:

@@ -50,8 +50,8 @@ def add_suite(commands: Commands) -> None:
     run.add_argument("file", metavar="FILE", type=Path, help="the file that lists the hunts, such as suite.toml")
     run.add_argument("directory", metavar="DIR", type=Path, help="directory of the suite; created if it does not exist")
     run.add_argument("parallel", metavar="PARALLEL", type=integer, nargs="?", default=0,
-                     help="number of trials of all hunts together that "
-                     "run at a time; default: one per core")  # fmt: skip
+                     help="number of trials that run at a time, "
+                     "counted over all hunts; default: one per core")  # fmt: skip
     add_options_of_machine(run)
     add_trust(run)
     add_json(run)
@@ -92,8 +92,8 @@ def add_rerun(commands: Commands) -> None:
         "killed in NEW, it continues",
     )
     rerun.add_argument("--parallel", metavar="N", type=integer, default=0,
-                       help="number of trials of all hunts together that "
-                       "run at a time; default: one per core")  # fmt: skip
+                       help="number of trials that run at a time, "
+                       "counted over all hunts; default: one per core")  # fmt: skip
     add_options_of_machine(rerun)
     add_trust(rerun)
     add_json(rerun)

@@ -81,7 +81,7 @@ def add_whatif(commands: Commands) -> None:
         "let a reference driver correct unsafe speeds, unsafe lane changes, or both",
     )  # fmt: skip
     whatif.add_argument(
-        "--leave-out", metavar="ID,…", default="", help="run the trial without these actors; ids of the actors"
+        "--leave-out", metavar="ID,…", default="", help="run the trial without the actors that have these ids"
     )
     whatif.add_argument(
         "--code", choices=("snapshot", "current"), default=None,

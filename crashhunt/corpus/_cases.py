@@ -88,7 +88,7 @@ class Case:
         if len(found) != 1:
             message = f"the corpus case contains {len(found)} crashes, not exactly one"
             raise BundleError(
-                message, fix="restore it from the repository, or add the crash again", where=str(self.path)
+                message, fix="restore the case from the repository, or add the crash again", where=str(self.path)
             )
         return found[0]
 
@@ -173,7 +173,7 @@ def find_cases(places: list[Path]) -> list[Path]:
             what = "has no case of a corpus" if place.is_dir() else "does not exist"
             fix = "" if place.is_dir() else near_path(place)
             raise BundleError(
-                f"{str(place)!r} {what}", fix=f"{fix}add one with crashhunt corpus add BUNDLE --to FOLDER"
+                f"{str(place)!r} {what}", fix=f"{fix}add a case with crashhunt corpus add BUNDLE --to FOLDER"
             )
         found |= dict.fromkeys(inside)
     return list(found)

@@ -532,7 +532,7 @@ def snapshot_of(bundle: Bundle) -> Snapshot:
 
 
 def authenticate_bundle(bundle: Bundle) -> str:
-    """Return the authentication code of a bundle that this process writes; empty if the code is not from this user.
+    """Return the authentication code of a bundle that this process writes; empty if its snapshot is not this user's.
 
     Without this condition, a crash that was minimized or confirmed in another person's hunt would count as made here.
     """

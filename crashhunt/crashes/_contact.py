@@ -453,7 +453,7 @@ class ContactRecord:
         return len(junctions) > 1
 
     def speed_mps(self, actor: str, before_s: float) -> float:
-        """Return the speed of an actor the given time before the contact, or at its first recorded step."""
+        """Return an actor's speed the given time before the contact, or at its first recorded step if that is later."""
         return float(self.way(actor).speeds[int(np.argmin(np.abs(self.times - before_s)))])
 
     def stood_s(self, actor: str) -> float:

@@ -107,7 +107,7 @@ class Jobs:
         words = [sys.executable, "-m", "crashhunt", COMMANDS[name], "--crash", crash, "--", str(path)]
         with self._changed:
             if sum(job.state == "waiting" for job in self._jobs) >= _MAX_WAITING:
-                raise UsageError(f"{_MAX_WAITING} jobs are waiting", fix="wait until some of them have ended")
+                raise UsageError(f"too many jobs are waiting: {_MAX_WAITING}", fix="wait until some of them have ended")
             job = _Job(number=next(self._numbers), hunt=hunt, crash=crash, name=name, words=words)
             self._jobs.append(job)
             if self._thread is None:

@@ -270,7 +270,7 @@ def plan(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario,
 
 
 def plan_with_code(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario, HuntSettings, CodeFacts]:
-    """Resolve a user's request, and return the facts about the code that it names.
+    """Resolve a user's request; also return the declarations of the code that the request names.
 
     Args:
         request: what the user asks for: scenario, agents, arguments and options.

@@ -241,7 +241,9 @@ def read_settings(path: Path) -> HuntSettings:
     except (ValueError, RecursionError) as error:
         raise HuntDirectoryError(f"not valid TOML: {error}", fix="correct the file", where=str(path)) from None
     except OSError as error:
-        raise HuntDirectoryError(f"cannot be read: {error.strerror}", where=str(path)) from None
+        raise HuntDirectoryError(
+            f"cannot be read: {error.strerror}", fix="check that the file exists and may be read", where=str(path)
+        ) from None
     known, later = known_part(HuntSettings, data)
     # A key that resembles a missing one is a typing error or damage, not a key of a later version.
     wrong = {key: later[key] for key in [slip(later, known, HuntSettings)] if key}

@@ -321,7 +321,7 @@ class BlackBox:
         self._offset, self._step = end, step
 
     def mark(self, phase: int, agent: int = 0) -> None:
-        """Write the position of the process, and commit the records."""
+        """Write the current phase and agent of the process into the header, and commit all records until now."""
         self._stop_core()
         _PROGRESS.pack_into(self._map, _PROGRESS_OFFSET, self._offset, self._step, phase, agent)
 

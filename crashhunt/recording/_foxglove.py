@@ -179,7 +179,9 @@ def read_lanes(path: Path) -> list[tuple[NDArray[np.float64], NDArray[np.float64
                 ]
                 return list(zip(lines[0::2], lines[1::2], strict=True))
     except OSError as error:
-        raise BundleError(f"cannot be read: {error.strerror}", where=str(path)) from None
+        raise BundleError(
+            f"cannot be read: {error.strerror}", fix="check that the file exists and may be read", where=str(path)
+        ) from None
     except (McapError, DecodeError, ValueError, KeyError, EOFError, struct.error) as error:
         raise BundleError(
             f"the map of the recording is damaged: {error}", fix="get an undamaged copy", where=str(path)

@@ -71,7 +71,7 @@ class ReplayOptions:
 
     Args:
         code: what controls the agents: the code of the snapshot, the current code, or the recorded actions.
-        changes: new value by name of an argument: ``NAME`` or ``AGENT.NAME``.
+        changes: new value of each argument, by ``NAME`` or ``AGENT.NAME``.
         force: whether to replay from a damaged snapshot.
         times: number of replays.
         scenario: name or path of another scenario in which to drive; empty for the scenario of the crash.

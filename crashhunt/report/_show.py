@@ -60,8 +60,9 @@ class Story:
         bundle: the crash or near miss.
         last_s: duration to describe, in s. For a near miss, half of this duration lies before the nearest moment and
             half after.
-        braking: a deceleration, in m/s². The story then contains the calculated last step at which braking with it
-            would have avoided the crash. Without a deceleration, the story contains the result of the hunt's own runs.
+        braking: a deceleration, in m/s². The story then contains the calculated last step at which braking with this
+            deceleration would have avoided the crash. Without a deceleration, the story contains the result of the
+            hunt's own runs.
     """
 
     def __init__(self, bundle: Bundle, *, last_s: float = 5.0, braking: float | None = None) -> None:

@@ -77,7 +77,7 @@ class GridSampler:
         return math.prod(len(values) for _, values in self._axes)
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
-        """Return the combination for the number of the trial."""
+        """Return the combination of values that belongs to the trial's number."""
         chosen: dict[Key, Value] = {}
         for key, values in reversed(self._axes):
             number, index = divmod(number, len(values))
@@ -187,7 +187,7 @@ class HaltonSampler:
         self._points: Any = None
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
-        """Return the arguments for the number of the trial."""
+        """Return the arguments that belong to the trial's number in the sequence."""
         return Proposal(self._cube.arguments(self.point(number)))
 
     def tell(self, result: TrialResult) -> None:

@@ -358,7 +358,9 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
     except (ValueError, RecursionError) as error:
         raise ScenarioError(f"not valid TOML: {error}", fix="correct the file", where=str(path)) from None
     except OSError as error:
-        raise ScenarioError(f"cannot be read: {error.strerror}", where=str(path)) from None
+        raise ScenarioError(
+            f"cannot be read: {error.strerror}", fix="check that the file exists and may be read", where=str(path)
+        ) from None
     for key in _INTERNAL_FIELDS:
         if key in data:
             raise ScenarioError(f"unknown key {key!r}", fix="remove it", where=str(path))

@@ -256,7 +256,7 @@ class Scenario:
         return found
 
     def with_table(self, table: object) -> Scenario:
-        """Return this scenario with its table of the same dataclass replaced."""
+        """Return this scenario with the given table in place of its table of the same dataclass."""
         return replace(
             self, tables={name: table if type(old) is type(table) else old for name, old in self.tables.items()}
         )

@@ -118,7 +118,9 @@ class Suite:
             raise UsageError(f"not valid TOML: {error}", fix="correct the file", where=str(file)) from None
         whole = validate(_File, data, where=str(file), error=UsageError)
         if whole.schema != 1:
-            raise UsageError(f"schema = {whole.schema}", fix="this crashhunt reads schema 1", where=str(file))
+            raise UsageError(
+                f"schema = {whole.schema} is not supported", fix="this crashhunt reads schema 1", where=str(file)
+            )
         if not whole.hunts:
             raise UsageError("the file lists no hunts", fix="add [[hunts]]", where=str(file))
         entries = []

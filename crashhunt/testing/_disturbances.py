@@ -55,7 +55,7 @@ class DisturbanceContract:
             assert len({*drawn}) == 1, f"draw {number}"
 
     def test_the_likelihood_is_that_of_the_draws(self, make: Make) -> None:
-        """Each draw has a positive probability and occurs that often, and all probabilities add up to at most 1."""
+        """Each draw has a positive probability and occurs with it, and the probabilities add up to at most 1."""
         model = make()
         counts = Counter(_draws(model, seed=5))
         total = 0.0

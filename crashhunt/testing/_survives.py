@@ -134,7 +134,7 @@ def _asking(options: HuntOptions, example: Example) -> HuntOptions:
         if not isinstance(given, Mapping):
             raise UsageError(
                 f"example: the arguments of {agent!r} are {given!r}",
-                fix="give those of each agent by its id: {'ego': {'speed': 20.0}}",
+                fix="give the arguments of each agent by the agent's id: {'ego': {'speed': 20.0}}",
             )
         arguments |= {f"{agent}.{name}": value for name, value in given.items()}
     return replace(

@@ -291,7 +291,7 @@ def _check(before_s: float, after_s: float, share: float, max_steps: int | None,
     if not 0 <= share <= 1:
         raise UsageError(f"share is {share:g}", fix="give a probability from 0 to 1")
     if max_steps is not None and (not isinstance(max_steps, Integral) or max_steps < 1):
-        raise UsageError(f"max_steps is {max_steps!r}", fix="give at least 1, or None for that of the hunt")
+        raise UsageError(f"max_steps is {max_steps!r}", fix="give at least 1, or None for the maximum of the hunt")
     if not math.isfinite(crash_reward):
         raise UsageError(f"crash_reward is {crash_reward:g}", fix="give a finite number, such as -10")
 

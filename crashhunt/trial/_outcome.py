@@ -59,7 +59,7 @@ class Outcome(StrEnum):
         if outcome.is_own:
             _CATEGORIES[name] = category
         elif outcome.category != category:
-            raise ValueError(f"{name!r} is a {outcome.category}, not a {category}")
+            raise ValueError(f"the outcome {name!r} is a {outcome.category}, not a {category}")
         return outcome
 
     @classmethod

@@ -212,7 +212,7 @@ class Range:
         return min(max((value - self.low) / (self.high - self.low), 0.0), 1.0)
 
     def grid(self, points: int) -> tuple[Value, ...]:
-        """Return all values of a stepped range, else at most ``points`` evenly spaced values with both ends."""
+        """Return all values of a stepped range, or at most ``points`` evenly spaced values that include both ends."""
         if self.step is not None or (self.integer and not self.log and self.steps <= points):
             return tuple(self._at(index) for index in range(self.steps))
         if points == 1 or self.low == self.high:

@@ -324,7 +324,10 @@ def interventions_of(
     found: list[Intervention] = [*more]
     vehicle, equals, driver = agent.partition("=") if "=" in agent else ("", "", agent)
     if equals and not (vehicle and driver):
-        raise UsageError(f"--agent is {agent!r}", fix="write --agent MODULE:NAME or --agent ID=MODULE:NAME")
+        raise UsageError(
+            f"--agent {agent!r} is not of the form MODULE:NAME",
+            fix="write --agent MODULE:NAME or --agent ID=MODULE:NAME",
+        )
     if agent:
         found.append(HandOver(from_step=step or 0, driver=driver, arguments=arguments or {}, agent=vehicle))
     elif step is not None and (changes or code == "current"):

@@ -459,7 +459,7 @@ class Paths(Serializable):
         return replace(self, agents=left, others=(*more, *self.others))
 
     def cut(self, begin: int, end: int, step_length_s: float) -> Paths:
-        """Return the part of the paths from after step ``begin`` to after step ``end``, counted from ``begin``."""
+        """Return the paths from after step ``begin`` to after step ``end``, with steps counted from ``begin``."""
         parts = [[part for path in some if (part := path.cut(begin, end))] for some in (self.agents, self.others)]
         time_s = self.time_s + begin * step_length_s
         return Paths(time_s=time_s, steps=min(end, self.steps) - begin, agents=tuple(parts[0]), others=tuple(parts[1]))

@@ -64,7 +64,7 @@ def test_rate_is_measured_as_asked(monkeypatch, capsys, words, asked, code):
 
 
 def test_rate_refuses_two_units():
-    with pytest.raises(UsageError, match="--per is trial and --bar is 2/hour; give --per hour, or no --per"):
+    with pytest.raises(UsageError, match="--per trial contradicts --bar 2/hour; give --per hour, or no --per"):
         run("rate", "a", "--bar", "2/hour", "--per", "trial")
     with pytest.raises(UsageError, match="--bar is 2"):
         run("rate", "a", "--bar", "2")

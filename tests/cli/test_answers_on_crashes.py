@@ -389,10 +389,10 @@ def test_whatif_asks_for_the_change_that_is_named(opened, monkeypatch, capsys, s
     ("words", "message"),
     [
         (["whatif", "h", "--times", "-1"], "--times is -1; give at least 1"),
-        (["whatif", "h", "--parallel", "-1"], "--parallel is -1; give at least "),
+        (["whatif", "h", "--parallel", "-1"], "--parallel is -1; give at least 0 (0: one per core)"),
         (["whatif", "h", "--for", "soon"], "--for is 'soon'; give a time above 0, such as 90s"),
         (["shrink", "h", "--budget", "0"], "--budget is 0; give at least 1"),
-        (["shrink", "h", "--parallel", "-1"], "--parallel is -1; give at least "),
+        (["shrink", "h", "--parallel", "-1"], "--parallel is -1; give at least 0 (0: one per core)"),
         (["shrink", "h", "--for", "soon"], "--for is 'soon'; give a time above 0, such as 90s"),
         (["show", "h", "--last-seconds", "0"], "--last-seconds is 0; give a number above 0"),
         (["show", "h", "--last-seconds", "inf"], "--last-seconds is inf"),

@@ -83,7 +83,7 @@ def test_help_that_cannot_be_written_is_an_error(parser):
         (["a"], True, "--arg 'a' has no name; write --arg NAME=VALUE"),
         (["=a"], False, "--arg '=a' has no name; write --arg NAME=VALUE"),
         (["a=1", "a=2"], True, "--arg 'a=2': 'a' is given twice; give it once"),
-        (["x", "y"], False, "--arg 'y': 'it' is given twice; give it once"),
+        (["x", "y"], False, "--arg 'y': an agent without ID= is given twice; give it once"),
     ],
 )
 def test_pairs_are_divided_at_the_first_sign(words, named, found):

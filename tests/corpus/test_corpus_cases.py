@@ -105,7 +105,7 @@ def test_cases_are_found_at_any_depth_and_not_in_hidden_folders(case, tmp_path):
     with pytest.raises(BundleError) as caught:
         find_cases([kept, tmp_path / "empty"])
     assert caught.value.message == f"'{tmp_path / 'empty'}' has no case of a corpus"
-    assert caught.value.fix == "add one with crashhunt corpus add BUNDLE --to FOLDER"
+    assert caught.value.fix == "add a case with crashhunt corpus add BUNDLE --to FOLDER"
     with pytest.raises(BundleError) as caught:
         find_cases([tmp_path / "kep"])
     assert caught.value.message == f"'{tmp_path / 'kep'}' does not exist"

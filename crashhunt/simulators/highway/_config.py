@@ -48,7 +48,9 @@ def configured(default: Config, scenario: Scenario, arguments: Mapping[str, Valu
     policy, simulation = config["policy_frequency"], config["simulation_frequency"]
     if not 0 < policy <= simulation:
         message = f"must be above 0 and at most simulation_frequency, {simulation}"
-        raise mistake(scenario, "config.policy_frequency", policy, message, "change one of the two frequencies")
+        raise mistake(
+            scenario, "config.policy_frequency", policy, message, "change policy_frequency or simulation_frequency"
+        )
     _set_controlled_vehicles(scenario, config)
     _use_tuples(config["observation"])
     return config

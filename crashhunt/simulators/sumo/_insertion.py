@@ -37,7 +37,7 @@ def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]
         if vehicle in found:
             raise InvalidEpisodeError(
                 f"{found[vehicle]} and {agent} both replace the vehicle {vehicle!r}",
-                fix="give each its own candidates",
+                fix="give each of the two vehicles its own candidates",
             )
         found[vehicle] = agent
     return found
@@ -45,7 +45,7 @@ def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]
 
 @contextmanager
 def steps_counted(simulator: CountsSetUp, step_length_s: float) -> Iterator[None]:
-    """Return a context that counts the simulated steps inside it, even if it fails."""
+    """Return a context that counts the steps simulated inside it, even if an exception ends the context."""
     began = libsumo.simulation.getTime()
     try:
         yield

@@ -60,7 +60,9 @@ def read_config(path: Path) -> tuple[dict[str, str], list[str]]:
     except (ET.ParseError, UnicodeDecodeError, LookupError, ValueError) as error:
         raise ScenarioError(f"not valid XML: {error}", fix="correct the file", where=str(path)) from None
     except OSError as error:
-        raise ScenarioError(f"cannot be read: {error.strerror}", where=str(path)) from None
+        raise ScenarioError(
+            f"cannot be read: {error.strerror}", fix="check that the file exists and may be read", where=str(path)
+        ) from None
     options: dict[str, str] = {}
     used: dict[str, str] = {}
     for element in root.iter():
