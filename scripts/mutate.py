@@ -191,6 +191,7 @@ _TESTS_ELSEWHERE = {
     "hunts/_crashes.py": ("hunts/test_kinds.py", "hunts/test_tally.py", "hunts/test_whole_hunts.py"),
     "hunts/_fork_results.py": ("hunts/test_from_the_start.py", "hunts/test_whole_hunts.py", "e2e/test_branches.py"),
     "hunts/_hunt.py": (
+        "hunts/test_hunt_parts.py",
         "hunts/test_rare_hunts.py",
         "hunts/test_states_and_reports.py",
         "hunts/test_whole_hunts.py",
@@ -209,8 +210,19 @@ _TESTS_ELSEWHERE = {
     "hunts/_rates.py": ("hunts/test_rare_hunts.py", "e2e/test_crash_rates.py"),
     "hunts/_reports.py": ("hunts/test_rare_hunts.py", "hunts/test_states_and_reports.py", "hunts/test_whole_hunts.py"),
     "hunts/_results.py": ("hunts/test_results.py", "hunts/test_trial_rows.py"),
-    "hunts/_state.py": ("hunts/test_directory.py", "hunts/test_phases.py", "hunts/test_states_and_reports.py"),
-    "hunts/_verification.py": ("hunts/test_from_the_start.py", "hunts/test_whole_hunts.py", "e2e/test_audit.py"),
+    "hunts/_state.py": (
+        "hunts/test_directory.py",
+        "hunts/test_hunt_parts.py",
+        "hunts/test_logs.py",
+        "hunts/test_phases.py",
+        "hunts/test_states_and_reports.py",
+    ),
+    "hunts/_verification.py": (
+        "hunts/test_from_the_start.py",
+        "hunts/test_hunt_parts.py",
+        "hunts/test_whole_hunts.py",
+        "e2e/test_audit.py",
+    ),
     # These are fast, and their tests lie by what a user does, not by module.
     "maps": ("maps/test_*.py",),
     "recording": ("recording/test_*.py",),

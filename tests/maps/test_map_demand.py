@@ -159,7 +159,7 @@ def test_route_file_has_flows_of_vehicles_and_persons():
         '<vTypeDistribution id="cars-trucks" vTypes="car truck" probabilities="100 ${trucks_per_100_cars}"/>',
         '<route id="r0" edges="a b"/>',
         '<routeDistribution id="ego-route" routes="${ego_route}"/>',
-        '<flow id="r0" type="cars-trucks-cyclists" route="r0" begin="0" end="86400" period="exp(0.2)" ',
+        '<flow id="r0" type="cars-trucks-cyclists" route="r0" begin="0" end="86400" period="exp(0.2)"',
         ' departLane="best" departSpeed="max" departPos="base"/>',
         '<personFlow id="w0" begin="0.0" end="86400" perHour="${persons_per_path}">',
         '<personFlow id="w1" begin="60.0" end="86400" perHour="${persons_per_path}">',
@@ -277,7 +277,7 @@ def test_folder_of_a_made_scenario_is_new_or_empty(tmp_path):
         (tmp_path / name).mkdir()
     _put_in_place(tmp_path / "one", tmp_path / "two", tmp_path / "two")
     assert not (tmp_path / "one").exists()
-    with pytest.raises(HuntDirectoryError, match="the folder was made by another process"):
+    with pytest.raises(HuntDirectoryError, match="another process has created this folder"):
         _put_in_place(tmp_path / "two", tmp_path / "empty", tmp_path / "empty")
     with pytest.raises(OSError, match="No such file"):
         _put_in_place(tmp_path / "gone", tmp_path / "new", tmp_path / "new")

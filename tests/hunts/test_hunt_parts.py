@@ -1,0 +1,610 @@
+"""The parts of a hunt without any trial: when it cancels, what it notes, and how its crashes run again."""
+
+from __future__ import annotations
+
+import math
+import os
+import queue
+import threading
+import time
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UntrustedError
+from crashhunt.executors import PoolExecutor
+from crashhunt.hunts import _hunt, _state, _verification
+from crashhunt.hunts._hunt import Hunt
+from crashhunt.hunts._state import HuntDirectory, LogReader
+from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReruns, is_settled
+from crashhunt.ledger import Ledger
+from crashhunt.plans import HuntSettings, RunSettings, read_settings
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
+
+SETTINGS = HuntSettings(
+    scenario="toy", scenario_digest="0", trials=9, max_steps=20, seed=3, run=RunSettings(parallel=2)
+)
+
+
+def result(number, outcome=Outcome.SURVIVED, **more):
+    return TrialResult(TrialSpec(number, number, {}, {}, 20), outcome, steps=5, **more)
+
+
+@pytest.fixture
+def hunt(tmp_path):
+    """Makes a hunt with such options of its run."""
+
+    def make(settings=SETTINGS, **run):
+        found = Hunt(tmp_path / "h", SimpleNamespace(origin="scenario.toml"), settings)
+        found.settings = replace(settings, run=replace(settings.run, **run))
+        found._disturber = None
+        return found
+
+    return make
+
+
+def test_trials_above_a_wanted_crash_are_cancelled(hunt):
+    cancelled = []
+    executor = SimpleNamespace(cancel=lambda *, above: cancelled.append(above))
+    assert hunt(deterministic=True)._cancelled(executor, {1, 4, 5}, 4) == {1, 4}
+    assert hunt(deterministic=False)._cancelled(executor, {1, 4, 5}, 4) == set()
+    assert cancelled == [4, -1]
+
+
+def test_results_reach_the_sampler_late_enough_for_every_worker(hunt):
+    assert _hunt._under_way(3) == 6
+    assert hunt(deterministic=False)._result_lag({"lag": 7}) == (4, False)
+    assert hunt(deterministic=True)._result_lag({"lag": 7}) == (7, False)
+    assert hunt(deterministic=True)._result_lag({"lag": 7, "lag_grows": True}) == (7, True)
+    assert hunt(deterministic=True)._result_lag({}) == (max(_hunt.GREATEST_LAG, 4), True)
+    assert hunt(parallel=1000, deterministic=True)._result_lag({}) == (2000, True)
+
+
+def test_end_of_a_hunt_is_expected_by_trials_and_by_time(hunt):
+    progress = SimpleNamespace(
+        outcomes={"survived": 4}, time_left_s=math.inf,
+        remaining=SimpleNamespace(seconds_left=lambda now, left, parallel: asked.append((left, parallel)) or 60.0),
+    )  # fmt: skip
+    asked = []
+    hunt()._expect_end(progress, 3)
+    assert asked == [(5, 3)]
+    assert progress.parallel == 3
+    assert progress.ends_at == pytest.approx(time.time() + 60, abs=5)
+    progress.time_left_s = 20.0
+    hunt()._expect_end(progress, 3)
+    assert progress.ends_at == pytest.approx(time.time() + 20, abs=5)
+    progress.outcomes = {"survived": 9}
+    hunt()._expect_end(progress, 3)
+    assert len(asked) == 2
+    assert progress.ends_at == pytest.approx(time.time(), abs=5)
+    hunt(replace(SETTINGS, trials=0))._expect_end(progress, 3)
+    assert progress.ends_at is None
+    progress.outcomes, progress.time_left_s = {}, math.inf
+    progress.remaining.seconds_left = lambda *given: math.inf
+    hunt()._expect_end(progress, 3)
+    assert progress.ends_at is None
+
+
+class Notes:
+    """In place of a ledger: it notes what it is told."""
+
+    def __init__(self):
+        self.remarks, self.facts, self.entered, self.restored = [], [], [], False
+
+    def remark(self, text):
+        self.remarks.append(text)
+
+    def note(self, **facts):
+        self.facts.append(facts)
+
+    def enter(self, state, detail="", **facts):
+        self.entered.append((state, detail, facts))
+
+    def restore(self):
+        return self.restored
+
+
+def test_notices_of_workers_and_differences_of_the_audit_are_noted(hunt):
+    ledger, looks, counted = Notes(), [], []
+    progress = SimpleNamespace(notes=[], look_at=looks.append)
+    for share in (0.0, 0.5):
+        found = hunt(audit=share)
+        found._heard = SimpleNamespace(take=lambda executor: ["a", "b"] if executor == "executor" else [])
+        found._audits_left = SimpleNamespace(note=lambda *given: counted.append(given))
+        audit = SimpleNamespace(look=lambda wait_s: ["differs"] if wait_s == 0.25 else [])
+        found._receive_results("executor", audit, ledger, progress, wait_s=0.25)
+    assert ledger.remarks == ["a", "b", "audit: differs"] * 2
+    assert progress.notes == ["a", "b"] * 2
+    assert looks == ["executor"] * 2
+    assert counted == [(audit, progress)]
+
+
+def test_rest_of_an_audit_is_a_phase_of_its_own(hunt):
+    found, phases = hunt(), []
+    audit = SimpleNamespace(waiting=3, parallel=0)
+    clock = SimpleNamespace(
+        begin=lambda name, total: phases.append((name, total)), advance=lambda: phases.append("one"),
+        tick=lambda: phases.append("tick"),
+    )  # fmt: skip
+
+    def receive(executor, given, ledger, progress, *, wait_s):
+        assert (given, wait_s) == (audit, _hunt._TICK_S)
+        audit.waiting -= 2 if audit.waiting == 3 else 1
+
+    found._receive_results = receive
+    found._finish_audit(clock, None, audit, None, None)
+    assert phases == [("auditing", 3), "one", "one", "tick", "one", "tick"]
+    assert audit.parallel == found._parallel_here == 2
+    audit.waiting, found._stops = 3, (2,)
+    phases.clear()
+    found._finish_audit(clock, None, audit, None, None)
+    assert phases == []
+
+
+def test_ledger_that_was_removed_is_written_again_with_a_note(hunt):
+    ledger, progress = Notes(), SimpleNamespace(notes=[])
+    hunt()._restore_ledger(ledger, progress)
+    assert (ledger.remarks, progress.notes) == ([], [])
+    ledger.restored = True
+    hunt()._restore_ledger(ledger, progress)
+    assert ledger.remarks == progress.notes
+    assert "was removed while the hunt ran" in ledger.remarks[0]
+
+
+def test_hunt_that_fails_records_why(hunt, monkeypatch):
+    found, ledger, removed = hunt(), Notes(), []
+    monkeypatch.setattr(_hunt, "remove_scratch", removed.append)
+    found._fail(ledger, "no disk")
+    assert ledger.entered == [("error", "no disk", {})]
+    assert removed == [found._place.scratch]
+    found._progress = SimpleNamespace(noted=lambda *, now: {"kinds": now})
+    found._fail(ledger, "bad \udcff")
+    state, detail, facts = ledger.entered[1]
+    assert (state, facts) == ("error", {"kinds": True})
+    detail.encode()
+
+    def fails(*given, **more):
+        raise CrashhuntError("no disk", fix="x")
+
+    ledger.enter = fails
+    found._fail(ledger, "no disk")
+
+
+@pytest.mark.parametrize(
+    ("error", "raised", "why"),
+    [
+        (CrashhuntError("no map", fix="draw one"), CrashhuntError, "no map; draw one"),
+        (OSError(28, "No space left", "/h/box"), HuntDirectoryError, "No space left: /h/box"),
+        (ValueError("odd"), ValueError, "ValueError: odd"),
+    ],
+)
+def test_error_of_a_hunt_is_in_its_ledger(hunt, monkeypatch, error, raised, why):
+    found, failed, noted, removed = hunt(), [], [], []
+
+    @contextmanager
+    def locked():
+        yield
+
+    @contextmanager
+    def stops():
+        yield ()
+
+    ledger = SimpleNamespace(note=lambda **facts: noted.append(facts), close=lambda: noted.append("closed"))
+    found._place = SimpleNamespace(locked=locked, claim=lambda *given, **more: SETTINGS, scratch="scratch")
+    monkeypatch.setattr(_hunt, "stop_requests", stops)
+    monkeypatch.setattr(_hunt, "Ledger", lambda path, *, writable: ledger if writable else None)
+    monkeypatch.setattr(_hunt, "remove_scratch", removed.append)
+    monkeypatch.setattr(found, "_fail", lambda given, reason: failed.append((given, reason)))
+
+    def run(given, watch):
+        watch("status")
+        raise error
+
+    monkeypatch.setattr(found, "_run", run)
+    with pytest.raises(raised):
+        found.run()
+    assert failed == [(ledger, why)]
+    assert noted[0]["owner"] is None
+    assert noted[0]["heartbeat"] == pytest.approx(time.time(), abs=5)
+    assert (noted[1], removed) == ("closed", ["scratch"])
+    monkeypatch.setattr(found, "_run", lambda given, watch: "report")
+    assert found.run() == "report"
+
+
+def test_trial_is_written_recorded_and_counted(hunt, monkeypatch):
+    calls = []
+    found = hunt(replace(SETTINGS, crash_on=(Outcome.COLLISION,)))
+    found._unanswered = SimpleNamespace(account=lambda given, progress: given.spec.number < 90)
+    found._copied = SimpleNamespace(add=lambda given: calls.append(("copied", given.spec.number)))
+    ledger = SimpleNamespace(record=lambda given, *, snapshot: calls.append(("row", given.spec.number, snapshot)))
+    trials = SimpleNamespace(ended=lambda given: calls.append(("ended", given.spec.number)))
+    progress = SimpleNamespace(
+        kinds=object(), count=lambda given, *, crashed, planned: calls.append(("counted", crashed, planned)),
+        save=lambda bundle: calls.append(("saved", bundle)),
+    )  # fmt: skip
+    monkeypatch.setattr(_hunt, "write_trial", lambda folder, given, scratch: calls.append(("files", scratch.name)))
+    monkeypatch.setattr(_hunt, "read_map", lambda scratch, trial: "lanes")
+
+    def write(folder, given, trial, **more):
+        calls.append(("bundle", folder == found.directory, trial.name, more))
+        return "bundle"
+
+    monkeypatch.setattr(_hunt, "write_bundle", write)
+
+    def record(given):
+        calls.clear()
+        found._record_trial(given, ledger, SimpleNamespace(digest="0f"), trials, progress)
+        return list(calls)
+
+    assert record(result(4)) == [("row", 4, "0f"), ("counted", False, 9), ("copied", 4), ("ended", 4)]
+    assert record(result(5, kept=True))[0] == ("files", "trial-000005")
+    assert record(result(6, Outcome.INVALID)) == [("row", 6, "0f"), ("counted", False, 9), ("ended", 6)]
+    assert record(result(99)) == [("ended", 99)]
+    crash = result(7, Outcome.COLLISION)
+    more = {"hunt_seed": 3, "snapshot": "0f", "lanes": "lanes"}
+    assert record(crash) == [
+        ("bundle", True, "trial-000007", more), ("saved", "bundle"), ("row", 7, "0f"), ("counted", True, 9),
+        ("ended", 7),
+    ]  # fmt: skip
+    progress.kinds = None  # it is saved once it is the one that ends the hunt
+    assert record(crash) == [("counted", True, 9), ("ended", 7)]
+    found._disturber = SimpleNamespace(log_likelihood_of=lambda given: -given.spec.number)
+    ledger.record = lambda given, *, snapshot: calls.append(given.log_likelihood)
+    assert record(result(8))[0] == -8
+
+
+def test_phases_after_the_last_trial_are_shown_and_noted_now_and_then(hunt, monkeypatch):
+    found, ledger, seen = hunt(), Notes(), []
+    clock = SimpleNamespace(now=100.0)
+    monkeypatch.setattr(_hunt.time, "monotonic", lambda: clock.now)
+    monkeypatch.setattr(found, "_status", lambda progress, phase: (phase, progress.phase.done))
+    progress = SimpleNamespace(phase=None, ends_at=5.0, noted=lambda: {"done": progress.phase.done}, notes=[])
+    show = found._show_phase(ledger, progress, seen.append)
+    for now, name, done in ((0.0, "a", 0), (0.5, "a", 1), (1.5, "a", 2), (1.6, "b", 0), (1.7, "b", 1)):
+        clock.now = 100.0 + now
+        show(SimpleNamespace(name=name, done=done))
+    assert seen == [("a", 0), ("a", 1), ("a", 2), ("b", 0), ("b", 1)]
+    assert ledger.facts == [{"done": 0}, {"done": 2}, {"done": 0}]
+    assert progress.ends_at is None
+
+
+def test_earlier_runs_count_on_the_screen(hunt, monkeypatch):
+    found = hunt()
+    ledger = SimpleNamespace(
+        tried_by_origin=lambda crash_on: ("tried", tuple(crash_on)), result=lambda number: f"result {number}"
+    )
+    resumed = []
+
+    def counts(branches, probes, before=None):
+        monkeypatch.setattr(_hunt, "sums_of_branches", lambda given, facts: branches)
+        monkeypatch.setattr(_hunt, "sums_of_probes", lambda given, facts: probes)
+        progress = SimpleNamespace(
+            outcomes={"a": 3, "b": 4}, searching=SimpleNamespace(resume=lambda *given: resumed.append(given)),
+            stressed=None,
+        )  # fmt: skip
+        found._resume_counts(ledger, progress, before or {}, SETTINGS)
+        return progress.branched, progress.not_fully_asked, progress.stressed
+
+    assert counts(None, None) == (0, 0, None)
+    assert resumed == []
+    probes = {"crashed_trials": 1, "trial": 7, "not_fully_asked": 2}
+    assert counts({"crashed": 5, "not_fully_asked": 3}, probes, {"origins": 1}) == (5, 5, "result 7")
+    assert resumed == [(7, ("tried", tuple(SETTINGS.crash_on)))]
+    assert counts(None, {**probes, "crashed_trials": 0})[2] is None
+    assert counts(None, {**probes, "trial": None})[2] is None
+
+
+def test_rate_of_a_hunt_depends_on_why_it_ended(monkeypatch, tmp_path):
+    made = []
+
+    @dataclass(frozen=True)
+    class Rate:
+        excluded: dict
+        verdict: str = ""
+        why_undecided: str = ""
+
+    def make(name, per, counter, sequence, **more):
+        made.append((name, per, counter, sequence, more))
+        return Rate({"after_unfinished": 2, "invalid": 1})
+
+    monkeypatch.setattr(_hunt, "make_rate", make)
+    watch = SimpleNamespace(per="trial", counter="c", sequence="s", alpha=0.05, bar=0.1, decided_at=None,
+                            verdict="below", why_undecided="few")  # fmt: skip
+    assert _hunt._rate_of(tmp_path, None, "rate") is None
+    found = _hunt._rate_of(tmp_path, watch, "rate")
+    assert (found.verdict, found.why_undecided, found.excluded) == (
+        "below", "few", {"after_unfinished": 2, "invalid": 1},
+    )  # fmt: skip
+    watch.decided_at = 0
+    assert _hunt._rate_of(tmp_path, watch, "all_trials").excluded == {"invalid": 1}
+    _hunt._rate_of(tmp_path, watch, "interrupted")
+    assert [more["why_no_estimate"] for *_, more in made] == ["", "", "the number of trials was not fixed ahead"]
+    assert made[0][:4] == (str(tmp_path), "trial", "c", "s")
+    assert (made[0][4]["confidence"], made[0][4]["bar"]) == (pytest.approx(95.0), 0.1)
+
+
+# The directory of a hunt.
+
+
+def test_directory_has_one_hunt_at_a_time(tmp_path):
+    place = HuntDirectory(tmp_path / "h")
+    with place.locked():
+        assert (tmp_path / "h/.lock").read_text() == str(os.getpid())
+        with pytest.raises(BusyError, match=f"process {os.getpid()}"), HuntDirectory(tmp_path / "h").locked():
+            pass
+        place.has_begun = True
+        assert place.scratch.parent == (tmp_path / "h").absolute()
+        place.claim(SETTINGS, ["crashhunt"], overwrite=False, seed_given=True)
+        assert place.scratch.is_dir()
+    assert not place.scratch.exists()
+    with HuntDirectory(tmp_path / "h").locked():
+        pass
+    (tmp_path / "file").touch()
+    with pytest.raises(HuntDirectoryError, match="is a file"), HuntDirectory(tmp_path / "file").locked():
+        pass
+    with pytest.raises(HuntDirectoryError, match="cannot be used: No such"), HuntDirectory(tmp_path / "a/b").locked():
+        pass
+
+
+def test_directory_keeps_its_hunt_unless_it_is_overwritten(tmp_path):
+    place = HuntDirectory(tmp_path)
+
+    def claim(settings, **options):
+        with place.locked():
+            return place.claim(settings, ["crashhunt"], **{"overwrite": False, "seed_given": True} | options)
+
+    claim(SETTINGS)
+    other = replace(SETTINGS, seed=5)
+    with pytest.raises(HuntDirectoryError, match="the directory contains another hunt: seed"):
+        claim(other)
+    assert claim(other, seed_given=False).seed == 3
+    many = replace(other, max_steps=7, crash_on=(), scenario="loop", scenario_digest="1", oracles=("overlap",))
+    with pytest.raises(HuntDirectoryError) as caught:
+        claim(many)
+    assert caught.value.message.count(";") == 4
+    assert caught.value.message.endswith(" more")
+    (tmp_path / "crashes").mkdir()
+    (tmp_path / "mine.txt").touch()
+    (tmp_path / ".scratch-of-another").mkdir()
+    assert claim(other, overwrite=True).seed == 5
+    assert read_settings(tmp_path / layout.HUNT).seed == 5
+    assert {path.name for path in tmp_path.iterdir()} == {".lock", layout.HUNT, "mine.txt"}
+
+
+def test_logs_are_read_from_their_ends_with_their_titles(tmp_path, monkeypatch):
+    monkeypatch.setattr(_state, "_MAX_LOG_BYTES", 10)
+    for folder, text in (("", "x" * 20), ("crashes/000007-collision", "crash"), ("trials/000003", "trial"),
+                         ("crashes/notes", "other")):  # fmt: skip
+        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+        (tmp_path / folder / "run.log").write_text(text)
+    (tmp_path / "trials/000003/error.log").write_text("it failed")
+    (tmp_path / "crashes/000007-collision/error.log").write_text(" \n")
+    reader = LogReader(tmp_path, ("run", "error"))
+    assert list(reader.fresh()) == [
+        ("run", "x" * 10), ("trial 3, run", "trial"), ("trial 3, error", "it failed"), ("trial 7, run", "crash"),
+    ]  # fmt: skip
+    assert list(reader.fresh()) == []
+    with (tmp_path / "run.log").open("a") as file:
+        file.write("more")
+    assert list(reader.fresh()) == [("run", "more")]
+    assert list(LogReader(tmp_path, ("error",), trial=3).fresh()) == [("trial 3, error", "it failed")]
+    assert list(LogReader(tmp_path, ("run", "state"), trial=7).fresh()) == [("trial 7, run", "crash")]
+    with closing(Ledger(tmp_path / layout.LEDGER, writable=True)) as ledger:
+        ledger.enter("running")
+    states = LogReader(tmp_path, ("state",))
+    ((title, text),) = states.fresh()
+    assert title == "state"
+    assert text.endswith("  running")
+    with closing(Ledger(tmp_path / layout.LEDGER, writable=True)) as ledger:
+        ledger.enter("error", "no disk")
+    ((_, text),) = states.fresh()
+    assert text.endswith("  error  no disk")
+    assert "\n" not in text
+
+
+# Crashes that run again.
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """In place of the bundle of a crash."""
+
+    id: str
+    path: Path = Path()
+    confirmed: bool | None = None
+    result: object = result(0)
+    snapshot: str = "0f"
+    written: list = None
+
+    def write(self):
+        self.written.append(self)
+
+
+def reruns(tmp_path, stops=(), **more):
+    given = {"place": SimpleNamespace(path=tmp_path, scratch=tmp_path / "scratch"), "ledger": None,
+             "settings": SETTINGS, "parallel": 2, "notes": [], "failed": [], "stops": stops,
+             "executors": "executors", "phases": None, "taken": "0f"}  # fmt: skip
+    return TrialReruns(**given | more)
+
+
+def test_crash_is_confirmed_once_and_written_if_it_is_still_there(tmp_path, monkeypatch):
+    asked, written = [], []
+    bundle = Bundle("a", tmp_path, written=written)
+
+    def confirm(given, stopped, *, failed, executors, trusted):
+        asked.append((given, stopped(), failed, executors, trusted))
+        return found
+
+    monkeypatch.setattr(_verification, "confirm", confirm)
+    monkeypatch.setattr(_verification, "is_bundle_made_here", lambda given: True)
+    again, found = reruns(tmp_path), replace(bundle, confirmed=True)
+    assert again.confirm_one(bundle) is found
+    assert written == [found]
+    assert asked == [(bundle, False, again.failed, "executors", True)]
+    assert again.confirm_one(replace(bundle, snapshot="other")) is found
+    assert asked[-1][-1] is None
+    for unchanged in (
+        lambda: again.confirm_one(found),
+        lambda: again.confirm_one(bundle, lambda: True),
+        lambda: reruns(tmp_path, stops=(2,)).confirm_one(bundle),
+    ):
+        count = len(asked)
+        assert unchanged() in (found, bundle)
+        assert len(asked) == count
+    half = replace(found, result=result(0, why_no_escape="killed"))
+    assert not is_settled(half)
+    assert again.confirm_one(half) is found
+    written.clear()
+    gone = replace(bundle, path=tmp_path / "gone")
+    assert again.confirm_one(gone) is gone
+    found = None
+    assert again.confirm_one(bundle) is bundle
+    assert written == []
+
+    def refuses(*given, **more):
+        raise UntrustedError("it is not yours", fix="trust it")
+
+    monkeypatch.setattr(_verification, "confirm", refuses)
+    for _ in range(2):
+        assert again.confirm_one(bundle) is bundle
+    assert again.notes == ["a was not confirmed: it is not yours; trust it"]
+
+
+def test_crashes_are_confirmed_in_a_phase_and_stay_in_order(tmp_path):
+    began = []
+    phases = SimpleNamespace(
+        begin=lambda *given: began.append(given),
+        run=lambda function, items, *, counts: [replace(item, confirmed=True) for item in items],
+    )
+    again = reruns(tmp_path, phases=phases)
+    crashes = [Bundle("a"), Bundle("b", confirmed=False), Bundle("c")]
+    assert [(one.id, one.confirmed) for one in again.confirm(crashes)] == [("a", True), ("b", False), ("c", True)]
+    assert began == [("confirming", 3, 1)]
+    assert again.confirm(crashes[1:2]) == crashes[1:2]
+    assert len(began) == 1
+
+
+def test_cause_of_a_crash_is_written_unless_it_was_stopped(tmp_path, monkeypatch):
+    written, asked = [], []
+    bundle = Bundle("a", tmp_path, written=written)
+    other = replace(bundle, confirmed=True)
+    answer = ["cause", other]
+
+    def find(given, options, *, stopped):
+        asked.append((options.force, options.trusted, stopped()))
+        if isinstance(answer[0], Exception):
+            raise answer[0]
+        return tuple(answer)
+
+    monkeypatch.setattr(_verification, "find_cause", find)
+    monkeypatch.setattr(_verification, "is_bundle_made_here", lambda given: False)
+    again = reruns(tmp_path)
+    assert again.judge_one(bundle) == Judged(other, "cause")
+    assert written == [other]
+    assert asked == [(True, None, False)]
+    answer[1] = bundle
+    again.judge_one(bundle)
+    answer[1] = other
+    again.judge_one(replace(bundle, path=tmp_path / "gone"))
+    assert written == [other]
+    answer[1] = other
+    assert again.judge_one(bundle, lambda: True) == Judged(bundle, is_stopped=True)
+    assert reruns(tmp_path, stops=(2,)).judge_one(bundle) == Judged(bundle, is_stopped=True)
+    answer[0] = CrashhuntError("no map", fix="x")
+    assert again.judge_one(bundle) == again.judge_one(bundle) == Judged(bundle)
+    assert again.notes == ["a was not judged: no map"]
+    assert written == [other]
+
+
+def test_trials_run_again_with_the_code_that_they_ran_with(tmp_path, monkeypatch):
+    made, removed, closed = [], [], []
+    again = reruns(
+        tmp_path, ledger=SimpleNamespace(snapshot_of=lambda number: "0f" if number < 5 else "99"),
+        phases=SimpleNamespace(tick=lambda: None),
+    )  # fmt: skip
+    again.place.scratch.mkdir()
+    monkeypatch.setattr(_verification, "Snapshot", lambda path: path)
+    monkeypatch.setattr(_verification, "is_snapshot_trusted", lambda snapshot: snapshot.name == "trusted")
+    monkeypatch.setattr(_verification, "settings_again", lambda *given: given)
+    monkeypatch.setattr(_verification, "remove_scratch", removed.append)
+
+    def executor(settings, *, parallel):
+        made.append((settings, parallel))
+        return SimpleNamespace(close=lambda: closed.append(True))
+
+    def run(given, specs, *, stopped, check_every_s):
+        assert not stopped()
+        assert check_every_s == _verification._STOP_CHECK_S
+        yield from ((place, result(one.number)) for place, one in enumerate(specs))
+
+    monkeypatch.setattr(_verification, "snapshot_executor", executor)
+    monkeypatch.setattr(_verification, "run_trials", run)
+    specs = [TrialSpec(number, 1, {}, {}, 9) for number in (1, 7, 2)]
+    found = list(again.run(specs, "near"))
+    scratch = tmp_path / "scratch/near"
+    assert found == [Again(result=result(number), runs=again, snapshot="0f", scratch=scratch, folder="near")
+                     for number in (1, 2)]  # fmt: skip
+    assert made == [((SETTINGS, tmp_path / layout.SNAPSHOTS / "0f", scratch), 2)]
+    assert (removed, closed) == ([scratch], [True])
+    (note,) = again.notes
+    assert note.startswith("1 trials for near did not run again: nothing proves that you took the snapshot 99 ")
+    written = []
+    monkeypatch.setattr(_verification, "read_map", lambda folder, trial: (folder, trial.name))
+    monkeypatch.setattr(_verification, "write_bundle", lambda *given, **more: written.append((given, more)) or "bundle")
+    assert found[0].write(result(1), confirmed=True) == "bundle"
+    (((where, what, trial), more),) = written
+    assert (where, what, trial.name) == (tmp_path, result(1), "trial-000001")
+    assert more == {"hunt_seed": 3, "snapshot": "0f", "lanes": (scratch, "trial-000001"), "place": "near",
+                    "confirmed": True}  # fmt: skip
+
+
+class Runs:
+    """In place of what runs crashes again: it waits until it may go on."""
+
+    def __init__(self):
+        self.asked, self.go, self.held = queue.SimpleQueue(), threading.Event(), []
+
+    def confirm_one(self, bundle, stopped):
+        self.asked.put(("confirm", bundle.id))
+        assert self.go.wait(20)
+        return bundle if stopped() else replace(bundle, confirmed=True)
+
+    def judge_one(self, bundle, stopped):
+        self.asked.put(("judge", bundle.id))
+        assert self.go.wait(20)
+        return Judged(bundle, "cause")
+
+
+def test_crashes_are_confirmed_while_the_hunt_runs():
+    runs, settled = Runs(), []
+    executor = PoolExecutor.__new__(PoolExecutor)
+    executor.held_back = 0
+    wanted = [Bundle("b"), None, None, None]
+    kinds = SimpleNamespace(settle=settled.append, next_to_judge=lambda: wanted.pop(0) if wanted else None)
+    progress = SimpleNamespace(kinds=None, crashes=[Bundle("a"), Bundle("b"), Bundle("c", confirmed=False)])
+    progress.replace = lambda crashes: setattr(progress, "crashes", crashes)
+    confirmation = Confirmation(runs, executor)
+    confirmation.look(progress)  # the first crash ends the hunt
+    assert confirmation._thread is None
+    progress.kinds = kinds
+    confirmation.look(progress)
+    assert runs.asked.get(timeout=20) == ("confirm", "a")
+    assert executor.held_back == 1
+    confirmation.look(progress)
+    runs.go.set()
+    assert [runs.asked.get(timeout=20) for _ in range(2)] == [("judge", "b"), ("confirm", "b")]
+    deadline = time.monotonic() + 20
+    while len(settled) < 1 or sum(bool(one.confirmed) for one in progress.crashes) < 2:
+        assert time.monotonic() < deadline
+        confirmation.look(progress)
+        time.sleep(0.001)
+    assert [one.confirmed for one in progress.crashes] == [True, True, False]
+    assert settled == [Judged(Bundle("b"), "cause")]
+    confirmation.close(progress)
+    assert not confirmation._thread.is_alive()
+    assert executor.held_back == 0
+    assert runs.asked.empty()
