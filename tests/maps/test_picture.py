@@ -287,7 +287,7 @@ def test_labels_stay_apart_in_every_direction(place, labels):
     assert len([call for call in calls if call[0] == "text"]) == labels
 
 
-def test_text_without_half_of_its_letters_is_left_out():
+def test_text_without_half_of_its_letters_is_empty():
     pytest.importorskip("PIL")
     assert drawable("Øst") == "Ost"
     assert drawable("東京 a") == " a"

@@ -198,7 +198,7 @@ def test_scenario_file_that_cannot_be_read_is_one_line(tmp_path):
     file.write_text('simulator = "toy"\n[agents.ego]\n')
     assert refusal(load_scenario, file)[:2] == ("the key 'schema' is missing", "add schema = 1")
     load_scenario(file, kept=True)
-    assert refusal(load_scenario, file, ego="f.0")[0].startswith("--ego 'f.0' is for a bare ")
+    assert refusal(load_scenario, file, ego="f.0")[0].startswith("--ego 'f.0' ")
 
 
 def test_scenario_file_that_the_system_refuses_is_one_line(tmp_path, monkeypatch):
@@ -366,8 +366,9 @@ def test_files_are_followed_and_stay_inside_the_folder(tmp_path):
     (tmp_path / "in/c.xml").write_text('<routes><include href="../out.xml"/></routes>')
     assert nested_files(tmp_path / "in", ("a.xml",)) == ("b.xml", "c.xml", "../out.xml")
     said, advice, where = refusal(nested_files, tmp_path / "in", ("a.xml",), inside=True)
-    assert said == "names '../out.xml', outside the scenario's folder"
-    assert (advice, where) == ("move it inside, to be archived", str(tmp_path / "in/c.xml"))
+    assert "'../out.xml'" in said
+    assert advice.startswith("move ")
+    assert where == str(tmp_path / "in/c.xml")
     (tmp_path / "in/c.xml").write_text('<routes><include href="no.xml"/></routes>')
     assert refusal(nested_files, tmp_path / "in", ("c.xml",))[1] == "correct the path"
     (tmp_path / "in/d.xml").write_text('<routes><include href="${who}.xml"/></routes>')
@@ -375,7 +376,7 @@ def test_files_are_followed_and_stay_inside_the_folder(tmp_path):
 
 
 @pytest.mark.parametrize(("count", "more"), [(0, None), (1, ""), (2, " and 1 more"), (3, " and 2 more")])
-def test_output_that_is_left_out_is_said_once(tmp_path, count, more):
+def test_discarded_output_is_reported_once(tmp_path, count, more):
     loops = "".join(f'<inductionLoop id="{number}" file="o{number}.xml"/>' for number in range(count))
     (tmp_path / "a.xml").write_text(f"<additional>{loops}</additional>")
     found = written_by(tmp_path, ("a.xml", "a.xml"))
@@ -474,7 +475,7 @@ def test_options_of_every_device_are_harmless_and_those_of_windows_are_not():
         ('period="exp(0.5)"', 2.0), ('begin="0" end="90" number="30"', 3.0),
     ],
 )  # fmt: skip
-def test_vehicles_of_a_flow_are_as_far_apart_as_it_says(flow, interval_s):
+def test_interval_of_a_flow_follows_its_attributes(flow, interval_s):
     assert _ego._interval(ET.fromstring(f"<flow {flow}/>"), 0.0) == pytest.approx(interval_s)
 
 

@@ -157,7 +157,7 @@ def test_folder_of_a_gate_is_empty_or_has_a_gate_and_has_one_at_a_time(tmp_path)
     for name in ("gate.json", ".lock"):
         (place / name).unlink()
     (place / "notes").touch()
-    with pytest.raises(HuntDirectoryError, match="the folder is not empty and has no gate"), _gate._locked(place):
+    with pytest.raises(HuntDirectoryError, match="the folder is not empty"), _gate._locked(place):
         pass
     (place / "gate.json").touch()
     with _gate._locked(place):
@@ -263,7 +263,7 @@ def test_corpus_of_an_agent_has_its_cases_only(corpus, tmp_path):
     run._run_corpus()
     assert corpus.ran[-1][0][-1] == "--trust"
     corpus.cases = [Path("x/2")]
-    with pytest.raises(UsageError, match="--corpus cases has no case of mine:New"):
+    with pytest.raises(UsageError, match=r"--corpus cases has no case .*mine:New"):
         run._run_corpus()
 
 
