@@ -108,8 +108,8 @@ class ContactRecord:
     def before(self) -> list[Scene]:
         """The last scenes before the contact with both actors; they cover at least 4 s if the recording is that long.
 
-        The first scene is the last scene that is at least 4 s before the contact. Otherwise, the time of the contact
-        within a long step would decide how much time the fault rules examine.
+        The result begins with the latest scene that is at least 4 s before the contact. Otherwise, the time of the
+        contact within a long step would decide how much time the fault rules examine.
         """
         found: list[Scene] = []
         for scene in reversed(self.scenes):

@@ -407,7 +407,7 @@ class Progress:
         return {"heartbeat": time.time(), **audits, **nodes, **kinds, **in_vain, **bar, **phase, **rate}
 
     def about_kinds(self, *, running: bool = False) -> tuple[tuple[Group, ...] | None, float | None, int | None]:
-        """Return the fields of `HuntStatus` about crash types; `running` is that of `Kinds.groups`."""
+        """Return the fields of `HuntStatus` about crash types; `running` has the same meaning as for `Kinds.groups`."""
         if self.kinds is None:
             return None, None, None
         newest, trial = self.kinds.newest, self.kinds.newest_trial

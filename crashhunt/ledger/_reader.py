@@ -555,7 +555,7 @@ class LedgerReader:
         return self._count("replaced")
 
     def steps_by_outcome(self) -> dict[str, tuple[int, int, int]]:
-        """Return for each outcome the number of trials, and their least and greatest number of steps, from an index."""
+        """Return for each outcome the number of trials, and their least and greatest number of steps."""
         rows = self._select("SELECT outcome, count(*), min(steps), max(steps) FROM trials GROUP BY outcome")
         return {outcome: (trials, least, most) for outcome, trials, least, most in rows}
 

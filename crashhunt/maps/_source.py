@@ -76,7 +76,7 @@ class MapSource:
 
 
 def kind_of_file(path: Path) -> Kind | None:
-    """Return the kind of map that a file's name ending means; None for other files."""
+    """Return the kind of map that a file has according to the ending of its name; None for other files."""
     for kind, endings in ENDINGS.items():
         if path.name.lower().endswith(endings):
             return kind  # type: ignore[return-value]

@@ -153,7 +153,7 @@ def _write_map(log: LogWriter, recording: Recording, scenes: Sequence[Scene], la
 
 
 def lane_borders(lanes: Sequence[Lane]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the right and the left border of each lane, shape (n, 2), in m, as `read_lanes` does of a log."""
+    """Return the right and the left border of each lane, shape (n, 2), in m, in the form of `read_lanes`."""
     shapes = [(lane, np.array(lane.shape, dtype=float).reshape(-1, 2)) for lane in lanes]
     return [
         (_shifted(shape, -0.5 * lane.width), _shifted(shape, 0.5 * lane.width))

@@ -237,7 +237,7 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
 
 
 def endings() -> tuple[str, ...]:
-    """Return the file name endings of scenarios for messages: ``.toml``, and those of simulators' configurations."""
+    """Return the file name endings of scenarios, for messages: those of simulators' configurations, and ``.toml``."""
     return (".toml", *(configuration.endings[0] for configuration in configurations()))
 
 

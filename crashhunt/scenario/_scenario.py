@@ -225,7 +225,7 @@ class Scenario:
 
     @property
     def origin(self) -> str:
-        """The file or name with which error messages identify the scenario."""
+        """The path with which error messages identify the scenario."""
         return str(self.folder / self.file)
 
     @property

@@ -92,7 +92,7 @@ class ExecutorContract:
             self._see_nodes(executor, executor, len(specs))
 
     def test_a_failure_costs_its_own_trial_only(self, executor: Executor) -> None:
-        """Trials between an exception, an exit, a segmentation fault and a hang have the same results as alone."""
+        """Trials that run next to an exception, an exit, a segmentation fault and a hang have their usual results."""
         # The hang comes first: the other worker does the rest while it is waited for.
         failures = {1: "hang_at_step", 3: "fail_at_step", 5: "exit_at_step", 7: "segfault_at_step"}
         for number in range(9):
@@ -119,7 +119,7 @@ class ExecutorContract:
         assert set(self._collect(executor, 1)) == {9}
 
     def test_it_states_how_much_it_runs_and_where_that_is(self, executor: Executor) -> None:
-        """A running trial has a known or unknown progress; trials that were not submitted have no progress."""
+        """The progress of running trials is reported or unknown; trials that were not submitted have no progress."""
         assert executor.capacity == 2
         assert dict(executor.where()) == {}
         executor.submit(self._spec(3, hang_at_step=5))

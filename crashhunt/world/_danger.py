@@ -256,7 +256,7 @@ class _Way:
         return ahead, behind
 
     def reaches_from_behind(self, others: Others) -> tuple[Array, Array]:
-        """Return the distances ahead as `first_contacts` does, but only for actors that drive in the same direction."""
+        """Return the distances ahead as in `first_contacts`, only for actors that drive in the same direction."""
         ahead, _ = self.first_contacts(others)
         there = np.isfinite(ahead)
         heading = np.interp(self.along[others.sample[there]] + ahead[there], self._at, self._heading)

@@ -55,7 +55,7 @@ def contact_of(
     actor_of: Callable[[RoadObject], Actor],
     lane: str,
 ) -> Contact:
-    """Return the contact of a controlled vehicle that has just crashed, with the nearest crashed object.
+    """Return the contact between a controlled vehicle that has just crashed and the nearest crashed object.
 
     Args:
         agent: The agent's identifier.

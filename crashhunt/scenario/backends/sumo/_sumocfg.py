@@ -140,9 +140,9 @@ _PATIENCE_S = 300.0
 def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
     """Turn a SUMO configuration into a scenario.
 
-    The network, routes, additional files and options of the configuration are kept. The output files that it names are
-    not written. Options that a trial sets itself (the seed, the number of threads) are ignored. The notes list both.
-    The demand becomes the scenario argument ``scale``.
+    The network, routes, additional files and options of the configuration are kept. The output files that the
+    configuration names are not written. Options that a trial sets itself (the seed, the number of threads) are ignored.
+    The notes list both. The demand becomes the scenario argument ``scale``.
 
     Args:
         path: path of the configuration.
