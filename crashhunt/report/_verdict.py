@@ -203,7 +203,7 @@ def _avoided(story: CrashFacts, omission: Omission | None) -> str:
     """Return which run avoided the crash, or that no run did; empty if this is unknown."""
     judgement, tried = story.judgement, story.bundle.result.escape
     if omission is not None:
-        return f"{_omitted(story.agent, omission)}with a reference driver there is no crash"
+        return f"{_omitted(story.agent, omission)}with a reference driver this crash does not happen"
     if judgement is not None and judgement.runs:
         if judgement.verdict == "invalid":
             return "no run avoids it: the trial starts in an unavoidable situation"
@@ -225,7 +225,7 @@ def _avoided(story: CrashFacts, omission: Omission | None) -> str:
 def _if_it(story: CrashFacts, how: str, step: int, changed: tuple[str, ...]) -> str:
     """Return that a run with changes from a step on avoids the crash, and the agent's other changes in that run."""
     also = "".join(f" and {each.removeprefix(f'{story.agent} ')}" for each in changed)
-    return f"if {story.agent} {how} {story.before_contact_s(step):.1f} s before{also}, there is no crash"
+    return f"if {story.agent} {how} {story.before_contact_s(step):.1f} s before{also}, this crash does not happen"
 
 
 def _omitted(agent: str, omission: Omission) -> str:

@@ -145,14 +145,17 @@ def omitted(**more):
         ({}, f"{TOUCHED}."),
         (
             {"escape": Escape(30, 31)},
-            f"{TOUCHED}; if ego brakes 1.0 s before, there is no crash.",
+            f"{TOUCHED}; if ego brakes 1.0 s before, this crash does not happen.",
         ),
         ({"escape": Escape(why_not="the run differed")}, f"{TOUCHED}."),
         ({"escape": Escape(None, 0)}, f"{TOUCHED}."),
-        ({"judgement": Judgement((attempt(25),))}, f"{TOUCHED}; if ego brakes 1.5 s before, there is no crash."),
+        (
+            {"judgement": Judgement((attempt(25),))},
+            f"{TOUCHED}; if ego brakes 1.5 s before, this crash does not happen.",
+        ),
         (
             {"judgement": Judgement((attempt(25, changed=("ego does not change lanes",)),))},
-            f"{TOUCHED}; if ego brakes 1.5 s before and does not change lanes, there is no crash.",
+            f"{TOUCHED}; if ego brakes 1.5 s before and does not change lanes, this crash does not happen.",
         ),
         (
             {"judgement": Judgement((attempt(-1),))},
@@ -161,23 +164,23 @@ def omitted(**more):
         ({"judgement": Judgement((), why_not="interrupted")}, f"{TOUCHED}."),
         (
             {"judgement": omitted()},
-            f"{TOUCHED}; ego did not brake and sped up; with a reference driver there is no crash.",
+            f"{TOUCHED}; ego did not brake and sped up; with a reference driver this crash does not happen.",
         ),
         (
             {"judgement": omitted(instead="kept its speed", kept_s=2.04)},
             (
                 f"{TOUCHED}; ego did not brake and kept its speed for the last 2.0 s; "
-                "with a reference driver there is no crash."
+                "with a reference driver this crash does not happen."
             ),
         ),
         (
             {"judgement": omitted(instead="kept its speed", kept_s=0.2)},
-            f"{TOUCHED}; ego did not brake; with a reference driver there is no crash.",
+            f"{TOUCHED}; ego did not brake; with a reference driver this crash does not happen.",
         ),
         ({"judgement": omitted(actor="y")}, f"{TOUCHED}."),  # about another actor than the page
         (
             {"judgement": omitted(kind="red light", actor="")},
-            f"{TOUCHED}; ego did not stop for a red light; with a reference driver there is no crash.",
+            f"{TOUCHED}; ego did not stop for a red light; with a reference driver this crash does not happen.",
         ),
     ],
 )
@@ -190,7 +193,7 @@ def test_braking_is_no_answer_where_the_agent_changed_lanes():
     found = verdict_of(story(escape=Escape(39), poses=jump(-1, 4.0)))
     assert found == "ego changed to the left lane into x; x was alongside."
     found = verdict_of(story(escape=Escape(39, changed=("ego does not change lanes",)), poses=jump(-1, 4.0)))
-    words = "if ego brakes 0.1 s before and does not change lanes, there is no crash"
+    words = "if ego brakes 0.1 s before and does not change lanes, this crash does not happen"
     assert found == f"ego changed to the left lane into x; x was alongside; {words}."
 
 
@@ -202,7 +205,8 @@ def test_contact_that_the_outlines_contradict_is_not_described():
 
 def test_lane_change_of_the_reference_runs_gives_the_gap():
     found = omitted(instead="changed lanes", kind="behind left", faculty="lateral", gap_m=6.0, actor_speed_mps=20.0)
-    words = "ego changed to the left lane into x; the gap was {} (6.0 m); with a reference driver there is no crash."
+    words = "ego changed to the left lane into x; the gap was {} (6.0 m); with a reference driver this crash does not "
+    words += "happen."
     assert verdict_of(story(judgement=found, poses=jump(-1, 4.9))) == words.format("0.3 s")
     ahead = omitted(instead="changed lanes", kind="ahead left", faculty="lateral", gap_m=6.0, speed_mps=10.0)
     assert verdict_of(story(judgement=ahead, poses=jump(-1, 4.9))) == words.format("0.6 s")  # ego is behind
@@ -213,8 +217,8 @@ def test_road_departure_names_the_missing_lane():
     left = story(judgement=found)
     left.contact, left.other, left.bundle.result.summary = None, "", "ego left the road at step 13"
     assert verdict_of(left) == (
-        "ego left the road at step 13; ego changed to the left, where it has no lane; with a reference driver there is "
-        "no crash."
+        "ego left the road at step 13; ego changed to the left, where it has no lane; with a reference driver this crash "
+        "does not happen."
     )
 
 
