@@ -217,8 +217,8 @@ def test_road_departure_names_the_missing_lane():
     left = story(judgement=found)
     left.contact, left.other, left.bundle.result.summary = None, "", "ego left the road at step 13"
     assert verdict_of(left) == (
-        "ego left the road at step 13; ego changed to the left, where it has no lane; with a reference driver this crash "
-        "does not happen."
+        "ego left the road at step 13; ego changed to the left, where it has no lane; with a reference driver this "
+        "crash does not happen."
     )
 
 
