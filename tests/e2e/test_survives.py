@@ -81,7 +81,7 @@ def test_an_agent_that_needs_arguments_has_those_of_the_example_and_no_others(to
         assert_survives("needs_speed:Needs", "toy", max_steps=80, example=example)
     for wrong, error, said in (
         ({"seeds": 1}, UsageError, "did you mean 'seed'"),
-        ({"arguments": {"speed": 21.0}}, UsageError, "of each agent by its id"),
+        ({"arguments": {"speed": 21.0}}, UsageError, "of each agent by the agent's id"),
         ({"arguments": {"eg": {"speed": 21.0}}}, ArgumentError, "takes no argument 'eg.speed'"),
         ({"scenario_arguments": {"gap": 20.0}}, ArgumentError, "no argument 'gap'; did you mean 'gap_m'"),
     ):
