@@ -24,8 +24,8 @@ def add_logs(commands: Commands) -> None:
     logs = commands.add_parser(
         "logs",
         help="show the output and the errors of hunts and trials",
-        description="Show the output of hunts and trials (run), why they failed (error), and when the state of a hunt "
-        "changed (state). Only crashes and kept trials have logs.",
+        description="Show three types of logs: the output of hunts and trials (type run), the errors that ended them "
+        "(type error), and the changes of a hunt's state (type state). Only crashes and kept trials have logs.",
     )
     logs.add_argument("directory", metavar="DIR", type=Path, help="directory of a hunt or a suite")
     logs.add_argument("--run", metavar="ID", default="", help="show only this run of a suite, such as town/0")

@@ -67,7 +67,7 @@ def add_film_options(parser: argparse.ArgumentParser) -> None:
     )
     film.add_argument("--video", metavar="FILE", type=Path, help="write an MP4 file")
     film.add_argument("--gif", metavar="FILE", type=Path, help="write an animated GIF")
-    film.add_argument("--frames", metavar="DIR", type=Path, help="write a folder of PNG files")
+    film.add_argument("--frames", metavar="DIR", type=Path, help="write the pictures as PNG files into this folder")
     film.add_argument(
         "--fps",
         metavar="N",

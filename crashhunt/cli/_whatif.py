@@ -61,8 +61,8 @@ def add_whatif(commands: Commands) -> None:
     )
     whatif.add_argument(
         "--agent", metavar="MODULE:NAME", default="",
-        help="another agent that drives after step K. Up to step K, the recorded actions are repeated, and then the "
-        "agent is reset. ID=MODULE:NAME for one of several vehicles; without --from-step, K is 0",
+        help="another agent, which drives after the step K of --from-step, or from the start. Up to step K, the "
+        "recorded actions are repeated; then the agent is reset. If there are several agents, write ID=MODULE:NAME",
     )  # fmt: skip
     whatif.add_argument(
         "--arg",
@@ -77,8 +77,9 @@ def add_whatif(commands: Commands) -> None:
     )  # fmt: skip
     whatif.add_argument(
         "--overrule", metavar="HOW", choices=get_args(Manoeuvre), default="",
-        help="from step K on, override the agent: brake, change lanes and brake, keep the lane, or keep the speed. Or "
-        "let a reference driver correct unsafe speeds, unsafe lane changes, or both",
+        help="from step K on, override the agent: brake; left or right (change lanes, and brake); keep_lane; or "
+        "keep_speed. Or let a reference driver correct unsafe speeds (reference_speed), unsafe lane changes "
+        "(reference_lanes) or both (reference)",
     )  # fmt: skip
     whatif.add_argument(
         "--leave-out", metavar="ID,…", default="", help="run the trial without the actors that have these ids"

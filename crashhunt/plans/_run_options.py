@@ -163,8 +163,8 @@ class TrialOptions(_Options):
     )  # fmt: skip
     branch: bool = option(
         False, "whether copies of a trial continue with other disturbances when another actor is near",
-        help="when another actor is near, fork the running trial and continue the forks with several disturbances, "
-        "from this moment and from some seconds earlier; needs --disturb",
+        help="when another actor is near, fork the running trial at this moment and some seconds earlier, and "
+        "continue each fork with other disturbances; needs --disturb",
         flag="--branch", group="faults",
     )  # fmt: skip
     rare: bool = option(
@@ -226,7 +226,7 @@ class RunOptions(_Options):
     )  # fmt: skip
     keep: int = option(
         0, "number of bundles to keep of each crash type, the shortest crashes first; 0: all",
-        help="keep only the N shortest bundles of each crash type; the ledger keeps all crashes. Requires "
+        help="keep only the bundles of the N shortest crashes of each type; the ledger keeps all crashes. Requires "
         "--keep-going, --distinct or --rare; 0: keep all",
         brief="keep only the N shortest crashes of each type",
         flag="--keep", group="kept", metavar="N", check=at_least(0, zero="keep all"),
