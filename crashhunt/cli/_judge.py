@@ -114,7 +114,11 @@ def _unjudged(options: argparse.Namespace) -> list[Bundle]:
     from crashhunt.trial import Outcome
 
     if options.directory.is_file():
-        raise UsageError("--all needs the directory of a hunt", fix="omit --all", where=str(options.directory))
+        raise UsageError(
+            "--all needs the directory of a hunt",
+            fix="give the directory of a hunt, or omit --all",
+            where=str(options.directory),
+        )
     bundles = [bundle for hunt in find_hunts(options.directory) for bundle in list_bundles(hunt)]
     return [
         bundle

@@ -59,7 +59,7 @@ class GateCase:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioCounts:
-    """The pairs of one hunt of BASE and HEAD.
+    """The numbers of trial pairs in one hunt that both BASE and HEAD run.
 
     Args:
         name: name of the hunt: its id and run in the suite, or the name of the scenario.

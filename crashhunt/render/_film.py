@@ -156,7 +156,7 @@ def check_places(*, video: Path | None = None, gif: Path | None = None, folder: 
             raise UsageError(f"{option} {str(place)!r} does not end in {ending}", fix="add this ending")
         if not place.parent.is_dir():
             raise UsageError(
-                f"{option} {str(place)!r}: there is no folder {str(place.parent)!r}", fix="create it first"
+                f"{option} {str(place)!r}: there is no folder {str(place.parent)!r}", fix="create this folder first"
             )
     if folder is not None and folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise UsageError(f"--frames {str(folder)!r} is not an empty folder", fix="give a new folder")

@@ -325,7 +325,7 @@ def argument_values(scenario: Scenario) -> dict[str, Value]:
 
 
 class HasDigest(TypedDict):
-    """The recorded properties of a file."""
+    """The recorded properties of a file, of which only the digest is needed."""
 
     blake2b: str
 

@@ -306,7 +306,7 @@ def test_where_no_scene_states_it_the_environment_names_its_danger(tmp_path, dan
 def test_a_danger_that_names_nothing_or_is_no_number_is_one_line(tmp_path):
     scenario = scenario_of("Near-v0")
     for danger in ("distance", "info.", "-reward"):
-        with pytest.raises(ScenarioError, match=f"gym.danger = '{danger}' does not exist"):
+        with pytest.raises(ScenarioError, match=f"gym.danger = '{danger}' is not of the form"):
             BACKEND.check(scenario.with_table(replace(scenario.table(GymSetup), danger=danger)), "scenario.toml")
     simulator = GymSimulator(scenario.with_table(replace(scenario.table(GymSetup), danger="info.word")), tmp_path)
     simulator.reset(seed=1)

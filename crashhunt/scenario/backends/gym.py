@@ -78,7 +78,7 @@ def _check(scenario: Scenario, where: str) -> None:
     danger = scenario.table(GymSetup).danger
     if danger and not re.fullmatch(r"-?info\..+", danger):
         fix = "write info.KEY for a number that grows with the danger, or -info.KEY for a number that falls with it"
-        raise ScenarioError(f"gym.danger = {danger!r} does not exist", fix=fix, where=where)
+        raise ScenarioError(f"gym.danger = {danger!r} is not of the form info.KEY or -info.KEY", fix=fix, where=where)
 
 
 def _modules(scenario: Scenario) -> Iterable[str]:

@@ -83,7 +83,7 @@ def _set_controlled_vehicles(scenario: Scenario, config: Config) -> None:
         config["controlled_vehicles"] = count
     elif count > 1:
         message = f"has one controlled vehicle; the scenario has {count} agents"
-        raise mistake(scenario, "id", scenario.table(HighwaySetup).id, message, "name one agent")
+        raise mistake(scenario, "id", scenario.table(HighwaySetup).id, message, "name only one agent")
     if count > 1:
         for key in ("action", "observation"):
             if not config[key]["type"].startswith("MultiAgent"):

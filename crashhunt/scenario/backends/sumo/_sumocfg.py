@@ -230,7 +230,7 @@ def _times(options: dict[str, str], path: Path) -> tuple[float, float]:
     begin = seconds(options.get("begin", "0"), path)
     end = seconds(options.get("end", "-1"), path)
     if 0 <= end < begin:
-        raise ScenarioError(f"end = {end:g} is before begin = {begin:g}", fix="correct one of the two", where=str(path))
+        raise ScenarioError(f"end = {end:g} is before begin = {begin:g}", fix="correct begin or end", where=str(path))
     # SUMO counts in whole milliseconds.
     step_length = round(seconds(options.get("step-length", "1"), path), 3)
     if not 0 < step_length < float("inf"):
