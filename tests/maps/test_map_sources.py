@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 
 from crashhunt.errors import CrashhuntError, ScenarioError, UsageError
 from crashhunt.maps import MapSource, _source, check_source, parse_bbox, parse_shape
-from crashhunt.maps._source import _MAX_BYTES, fix_of_bbox, kind_of_file
+from crashhunt.maps._source import _MAX_BYTES, _overlaps, fix_of_bbox, kind_of_file
 
 OSM = b'<?xml version="1.0"?><osm version="0.6"></osm>'
 
@@ -237,3 +237,27 @@ def test_any_content_is_accepted_or_refused_in_one_line(tmp_path_factory, conten
     except CrashhuntError as error:
         assert error.fix
         assert math.isfinite(len(str(error)))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_boxes_that_only_touch_do_not_overlap(axis):
+    def moved(by):
+        box = [0.0, 0.0, 10.0, 10.0]
+        box[axis] += by
+        box[axis + 2] += by
+        return tuple(box)
+
+    here = moved(0.0)
+    for by, overlaps in ((-10.0, False), (-9.9, True), (0.0, True), (9.9, True), (10.0, False), (30.0, False)):
+        assert _overlaps(here, moved(by)) is overlaps
+        assert _overlaps(moved(by), here) is overlaps
+
+
+def test_largest_pbf_that_is_read_has_50_mb(tmp_path):
+    path = tmp_path / "m.osm.pbf"
+    path.write_bytes(b"    OSMHeader")
+    with path.open("r+b") as file:
+        file.truncate(50_000_000)  # sparse
+        check_source(source(path))
+        file.truncate(50_000_001)
+    assert "50 MB" in refusal(path).message
