@@ -392,7 +392,7 @@ def _is_request_trusted(file: Path) -> bool:
         data = json.loads(file.read_bytes())
         code = data.pop("authentication_code", None)
         return is_authentic(PURPOSE_OF_REQUEST, data, code) or is_fingerprint_trusted(_fingerprint(file))
-    except (OSError, ValueError, AttributeError, RecursionError):
+    except (OSError, ValueError, AttributeError, TypeError, RecursionError):
         return False
 
 

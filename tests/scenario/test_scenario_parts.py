@@ -222,6 +222,7 @@ def test_unknown_keys_are_kept_only_from_a_later_version(tmp_path):
     assert plain.added == {}
     assert plain == replace(plain, added={"later": 1})  # which changes no result
     assert plain.observation == ObservationSetup()
+    assert plain.observation.normalize is False
     assert plain.step_length_s == STEP_LENGTH_S == 0.1
     assert plain.name == tmp_path.name
     assert scenario_from_dict(data | {"name": "mine"}, where="s", folder=tmp_path).name == "mine"
@@ -485,9 +486,10 @@ def test_gridlock_leaves_the_vehicles_before_it():
     before = _ego._entering_before_gridlock
     assert before(None, departures) == departures
     early = [one for one in departures if one.depart_s < 900 - _ego.GRIDLOCK_BUILDS_UP_S]
-    assert before(900.0, departures) == (
-        early if len(early) >= _ego.FEW_CANDIDATES else [one for one in departures if one.depart_s < 900]
-    )
+    assert before(900.0, departures) == early
+    few = _ego.GRIDLOCK_BUILDS_UP_S + 10 * (_ego.FEW_CANDIDATES - 1)
+    assert len(before(few + 0.5, departures)) == _ego.FEW_CANDIDATES
+    assert len(before(few, departures)) == few / 10  # too few depart before it builds up
     assert [one.depart_s for one in before(25.0, departures)] == [0.0, 10.0, 20.0]
     assert before(0.0, departures) == departures
 

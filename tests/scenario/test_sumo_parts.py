@@ -23,10 +23,6 @@ def departures(*given, off_road=False):
     return [Departure(vehicle, float(time_s), off_road) for vehicle, time_s in given]
 
 
-def test_observations_are_not_scaled_unless_that_is_asked_for():
-    assert ObservationSetup().normalize is False
-
-
 @pytest.mark.parametrize(("text", "time_s"), [("90", 90.0), ("1:30", 90.0), ("0:01:30.5", 90.5), ("1:0:0:0", 216000.0)])
 def test_time_of_sumo_is_in_seconds_or_with_colons(text, time_s):
     assert seconds(text, HERE) == time_s
@@ -106,6 +102,11 @@ def test_vehicles_of_files_have_their_departures(files):
         "f.2": (120.0, False), "n.0": (0.0, False), "n.1": (25.0, False), "odd.0": (9.0, False),
         "zero.0": (4.0, False), **trains,
     }  # fmt: skip
+    (files[0].parent / "more.xml").write_text('<routes><vehicle id="m" depart="8"/></routes>')
+    (files[0].parent / "speeds.txt").write_text("no XML")
+    nested = '<include href="more.xml"/><variableSpeedSign id="s" lanes="a_0" file="speeds.txt"/></routes>'
+    files[0].write_text(FILE.replace("</routes>", nested))
+    assert {one.vehicle for one in _ego._departures(files)} == {*found, "m"}
     for vehicle, depart_s in (("f.2", 120.0), ("v", 5.0), ("t", 7.0), ("odd.3", 0.0), ("zero.1", 0.0), ("x", 0.0)):
         assert _ego._departure_of(vehicle, files) == depart_s
 
