@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 
 import pytest
 
@@ -36,4 +37,5 @@ def test_the_one_that_has_not_found_what_it_was_after_tries_them_again(tmp_path,
         ledger.enter(ended)
     kinds = [{"words": "rear end", "count": 1, "first": "000001-collision", "shortest": "000001-collision"}]
     state = HuntState(str(tmp_path), "crashed", outcomes={"invalid": 1, "collision": 1}, crashes=1, kinds=kinds)
+    assert _replace_invalid(tmp_path, replace(state, outcomes={"collision": 1})) == 0
     assert _replace_invalid(tmp_path, state) == again

@@ -48,7 +48,7 @@ def hunt(tmp_path):
 # The process of a hunt.
 
 
-def test_process_of_a_hunt_runs_where_its_request_says(hunt, monkeypatch, tmp_path):
+def test_process_of_a_hunt_runs_in_the_folder_of_its_request(hunt, monkeypatch, tmp_path):
     started = []
     monkeypatch.setattr(subprocess, "Popen", lambda command, **given: started.append((command, given)) or "process")
     assert _processes._start(hunt, {"parallel": 2}, {"A": "1"}) == "process"
