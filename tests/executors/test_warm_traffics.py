@@ -89,6 +89,7 @@ def test_shared_warm_up_changes_no_result(pool, tmp_path, scenario):
     assert Recording(read_black_box(folder / "blackbox.bin")).digest == own[5].digest
 
 
+@pytest.mark.nightly  # by day, test_zygotes.py makes room for copies that are made up
 def test_with_more_traffics_than_copies_the_first_are_kept(pool):
     with pool(2) as sharing:
         found = run(sharing, *(spec(number, number % 3) for number in range(9)))
@@ -114,6 +115,7 @@ def test_trial_in_shared_traffic_dies_as_it_does_alone(pool, tmp_path):
         assert stack.count("Fatal Python error") == 1
 
 
+@pytest.mark.nightly  # by day, test_zygotes.py kills the trial of a made-up copy
 def test_hanging_trial_in_shared_traffic_is_killed_alone(pool):
     with pool(2, timeout_s=0.5) as sharing:
         found = run(sharing, spec(0, 1), spec(1, 1, "hangs"), spec(2, 1))
@@ -131,6 +133,7 @@ def test_trial_runs_again_when_its_warmed_up_copy_was_killed(pool):
     assert notes == ["trial 1 was ended by SIGKILL from outside, and is run again"]
 
 
+@pytest.mark.nightly  # by day, test_zygotes.py has copies that cannot be forked
 def test_traffic_that_cannot_be_forked_is_not_shared(pool):
     with pool(2, simulator="sharing:Threads") as sharing:
         found = run(sharing, spec(0, 1), spec(1, 1), spec(2, 2))

@@ -55,6 +55,7 @@ class Killed:
         pass
 
 
+@pytest.mark.nightly  # by day, test_verdicts.py confirms with replays that are made up
 def test_replay_that_is_killed_leaves_a_crash_unconfirmed(bundle, monkeypatch, toy):
     with monkeypatch.context() as patched:
         patched.setattr(_fresh, "FreshProcessExecutor", Killed)
