@@ -284,6 +284,7 @@ def test_descriptors_say_what_simulators_do(town):
     gym = Scenario(simulator="gym", tables={"gym": setup})
     assert set(gym.modules()) == {"a", "b", "c", "d"}
     assert SUMO.survey.refine is not None
+    assert SUMO.right_of_way(load_scenario("intersection")).links
     with_core = SUMO.core.switched_off(town)
     assert with_core.table(SumoSetup).native is False
     assert SUMO.core.why_not(with_core) == "the scenario says so"
