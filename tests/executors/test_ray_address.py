@@ -66,16 +66,16 @@ def listener(answer):
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("127.0.0.1:1", "--executor ray:127.0.0.1:1: no cluster answers there (Connection refused); start one with"),
+        ("127.0.0.1:1", "--executor ray:127.0.0.1:1: no cluster answers there (Connection refused); start a cluster with"),
         ("nowhere", "--executor ray:nowhere is not an address HOST:PORT; write --executor ray:nowhere:6379"),
         ("a:b", "--executor ray:a:b is not an address HOST:PORT; write --executor ray:a:6379"),
-        (".x:1", "--executor ray:.x:1: no machine can have that name; start one with"),
+        (".x:1", "--executor ray:.x:1: no machine can have that name; start a cluster with"),
         ("ray://x:10001", "--executor ray:ray://x:10001 is an address of the Ray Client, which hunts do not support"),
         (
             "http://x:8265",
             "--executor ray:http://x:8265 is an address of a service such as Ray's dashboard, which hunts",
         ),
-        ("auto", "--executor ray:auto: no Ray cluster runs on this machine; start one"),
+        ("auto", "--executor ray:auto: no Ray cluster runs on this machine; start a cluster"),
     ],
 )
 def test_an_address_that_leads_nowhere_is_one_line(settings, argument, message):
@@ -90,9 +90,9 @@ def test_an_address_that_leads_nowhere_is_one_line(settings, argument, message):
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (b"HTTP/1.0 400 Bad Request\r\n\r\n", "what answers there is not the head of a Ray cluster; start one"),
-        (b"", "what answers there is not the head of a Ray cluster; start one"),
-        (None, "a process listens there and does not answer; start one"),
+        (b"HTTP/1.0 400 Bad Request\r\n\r\n", "what answers there is not the head of a Ray cluster; start a cluster"),
+        (b"", "what answers there is not the head of a Ray cluster; start a cluster"),
+        (None, "a process listens there and does not answer; start a cluster"),
     ],
 )
 def test_the_one_that_answers_and_is_no_cluster_is_reported_from_one(monkeypatch, answer, message):
@@ -143,7 +143,7 @@ def test_a_token_goes_to_no_one_but_a_cluster_that_runs_here(monkeypatch, tmp_pa
         monkeypatch.setenv("RAY_AUTH_MODE", "token")
         assert cluster_of("") == (address, {}, {})
         (tmp_path / ".ray" / "auth_token").unlink()
-        with pytest.raises(UsageError, match="RAY_AUTH_MODE is token, but there is no token; put the one that"):
+        with pytest.raises(UsageError, match="RAY_AUTH_MODE is token, but there is no token; put the token with"):
             cluster_of("")
     monkeypatch.delenv("RAY_ADDRESS")
     assert cluster_of("").address == "", "one that has ended is none"
