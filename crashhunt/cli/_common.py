@@ -173,9 +173,9 @@ def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
         HuntDirectoryError: the directory contains no hunt.
         UsageError: the run does not exist.
     """
-    from crashhunt.hunts import find_hunts
+    from crashhunt.hunts import find_searches
 
-    names = {hunt: hunt.relative_to(directory).as_posix() for hunt in find_hunts(directory)}
+    names = {hunt: hunt.relative_to(directory).as_posix() for hunt in find_searches(directory)}
     for run in runs:
         if not any(run in (name, name.partition("/")[0]) for name in names.values()):
             is_hunt = list(names.values()) == ["."]

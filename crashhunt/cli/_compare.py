@@ -39,12 +39,12 @@ def add_compare(commands: Commands) -> None:
 
 def _compare(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.estimation import compare
-    from crashhunt.hunts import find_hunts
+    from crashhunt.hunts import find_searches
     from crashhunt.report import comparison_page, describe_comparison
 
     hunts = []
     for directory in options.directories:
-        for hunt in find_hunts(directory):
+        for hunt in find_searches(directory):
             if hunt == directory or (hunt / layout.HUNT).exists():
                 hunts.append(hunt)
             else:

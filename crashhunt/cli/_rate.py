@@ -62,7 +62,7 @@ def add_rate(commands: Commands) -> None:
 
 def _rate(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.estimation import measure_rates
-    from crashhunt.hunts import find_hunts
+    from crashhunt.hunts import find_searches
     from crashhunt.plans import check_rate, rate_of
     from crashhunt.report import describe_rates, rates_page, write_rates_csv
 
@@ -76,7 +76,7 @@ def _rate(options: argparse.Namespace, _words: list[str]) -> int:
             raise UsageError(f"--per {per} contradicts --bar {options.bar}", fix=f"give --per {unit}, or no --per")
         per = unit
     per = per or ("trial" if options.by else None)
-    hunts = dict.fromkeys(hunt for directory in options.directories for hunt in find_hunts(directory))
+    hunts = dict.fromkeys(hunt for directory in options.directories for hunt in find_searches(directory))
     rates = [
         rate
         for hunt in hunts

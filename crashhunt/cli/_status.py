@@ -62,9 +62,9 @@ def _status(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _states(directories: list[Path]) -> list[HuntState]:
-    from crashhunt.hunts import find_hunts, hunt_state
+    from crashhunt.hunts import find_searches, hunt_state
 
-    return [hunt_state(hunt) for directory in directories for hunt in find_hunts(directory)]
+    return [hunt_state(hunt) for directory in directories for hunt in find_searches(directory)]
 
 
 def states_console(*, stderr: bool = False) -> Console:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.hunts import is_hunt
+from crashhunt.hunts import is_case, is_hunt
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -115,6 +115,8 @@ class Catalog:
             if looked > _MAX_FOLDERS:
                 self.is_cut = True
                 return
+            if is_case(folder):
+                continue
             if is_hunt(folder):
                 yield folder
                 continue

@@ -6,6 +6,7 @@ import fcntl
 import json
 import math
 import os
+import shlex
 import shutil
 import socket
 import time
@@ -47,7 +48,9 @@ __all__ = [
     "copies_to_come",
     "draws_independently",
     "find_hunts",
+    "find_searches",
     "hunt_state",
+    "is_case",
     "is_hunt",
     "ledger_owner",
     "state_of_facts",
@@ -281,6 +284,27 @@ def find_hunts(directory: Path) -> list[Path]:
             f"there is no hunt in {str(directory)!r}", fix="give a directory that crashhunt run or suite run made"
         )
     return sorted(found, key=_ordered_states)
+
+
+def is_case(directory: Path) -> bool:
+    """Return whether a directory is a case of a corpus, which has the layout of a hunt without a ledger."""
+    return (Path(directory) / layout.CASE).exists()
+
+
+def find_searches(directory: Path) -> list[Path]:
+    """Return the directories of hunts as `find_hunts` does, without the cases of a corpus.
+
+    Raises:
+        HuntDirectoryError: the directory contains no hunt.
+    """
+    found = find_hunts(directory)
+    hunts = [hunt for hunt in found if not is_case(hunt)]
+    if not hunts:
+        raise HuntDirectoryError(
+            f"{str(directory)!r} has cases of a corpus, but no hunt",
+            fix=f"run crashhunt corpus list {shlex.quote(str(directory))}, or give the directory of a hunt",
+        )
+    return hunts
 
 
 def hunt_state(directory: Path) -> HuntState:

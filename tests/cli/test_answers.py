@@ -51,7 +51,7 @@ def test_rate_is_measured_as_asked(monkeypatch, capsys, words, asked, code):
         return [SimpleNamespace(verdict="above", to_json=lambda: {"hunt": hunt})]
 
     monkeypatch.setattr("crashhunt.estimation.measure_rates", measure)
-    monkeypatch.setattr("crashhunt.hunts.find_hunts", lambda directory: [f"{directory}/0", f"{directory}/1"])
+    monkeypatch.setattr("crashhunt.hunts.find_searches", lambda directory: [f"{directory}/0", f"{directory}/1"])
     monkeypatch.setattr("crashhunt.report.describe_rates", lambda rates: f"{len(rates)} rates")
     for json_words in ([], ["--json"]):
         calls.clear()

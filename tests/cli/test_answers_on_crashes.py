@@ -98,7 +98,7 @@ def grouped(monkeypatch):
     def requests():
         yield asked["stops"]
 
-    monkeypatch.setattr("crashhunt.hunts.find_hunts", lambda directory: [f"{directory}/0", f"{directory}/1"])
+    monkeypatch.setattr("crashhunt.hunts.find_searches", lambda directory: [f"{directory}/0", f"{directory}/1"])
     monkeypatch.setattr("crashhunt.crashes.list_bundles", lambda hunt: [f"{hunt} crash"])
     monkeypatch.setattr("crashhunt.hunts.dropped_crashes", lambda hunts: len(hunts))
     monkeypatch.setattr("crashhunt.crashes.group_crashes", group_crashes)

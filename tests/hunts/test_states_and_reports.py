@@ -19,7 +19,17 @@ import crashhunt
 from crashhunt.base import layout
 from crashhunt.episode import WorkerSettings
 from crashhunt.errors import CrashhuntError, HuntDirectoryError
-from crashhunt.hunts import HuntStatus, _hunt as hunt_module, check, find_hunts, hunt_state, is_hunt, load, salvage
+from crashhunt.hunts import (
+    HuntStatus,
+    _hunt as hunt_module,
+    check,
+    find_hunts,
+    find_searches,
+    hunt_state,
+    is_hunt,
+    load,
+    salvage,
+)
 from crashhunt.hunts._next_trials import Unanswered, find_unanswered
 from crashhunt.hunts._progress import Progress
 from crashhunt.hunts._state import draws_independently, ledger_owner, sums_of_branches, sums_of_probes
@@ -167,6 +177,20 @@ def test_hunts_of_a_suite_are_in_the_order_of_their_numbers(tmp_path):
         (tmp_path / name / "hunt.toml").touch()
     found = [path.relative_to(tmp_path).as_posix() for path in find_hunts(tmp_path)]
     assert found == ["a/2", "a/10", "b"]  # one that was replaced or is hidden is none, nor what lies deeper
+
+
+def test_cases_of_a_corpus_are_not_hunts(tmp_path):
+    for name in ("hunt", "crashes/000003-collision-ed0ffe", "crashes/000003-collision-ed0ffe/snapshots/abc"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "hunt.toml").touch()
+    (tmp_path / "crashes/000003-collision-ed0ffe" / layout.CASE).touch()
+    assert find_searches(tmp_path) == [tmp_path / "hunt"]
+    with pytest.raises(HuntDirectoryError, match="cases of a corpus, but no hunt; run crashhunt corpus list"):
+        find_searches(tmp_path / "crashes")
+    pytest.importorskip("starlette")  # of the extra dashboard
+    from crashhunt.dashboard._catalog import Catalog
+
+    assert [found.path for found in Catalog([tmp_path]).hunts().values()] == [tmp_path / "hunt"]
 
 
 def test_trials_are_independent_where_the_sampler_said_so(hunt):
