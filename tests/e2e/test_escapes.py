@@ -31,7 +31,7 @@ def test_a_rear_end_collision_could_be_avoided_until_the_step_that_is_reported(t
     for bundle in bundles:
         escape = bundle.result.escape
         assert escape is None or escape.step is None or escape.step < bundle.result.steps
-        assert escape is None or escape.why_not or escape.how == "at 8 m/s², all that it can do,"
+        assert escape is None or escape.why_not or escape.how == "at 8 m/s², the maximum of the vehicle,"
 
 
 @pytest.mark.nightly
