@@ -61,7 +61,7 @@ def test_compare_prints_a_text_a_table_or_json(monkeypatch, capsys, tmp_path):
     hunts = {"suite": [tmp_path / "begun", tmp_path / "later"], "hunt": [Path("hunt")]}
     asked, pages = [], []
     found = SimpleNamespace(to_json=lambda: {"hunts": 2}, write_csv=lambda file: file.write("dir\n"))
-    monkeypatch.setattr("crashhunt.hunts.find_hunts", lambda directory: hunts[str(directory)])
+    monkeypatch.setattr("crashhunt.hunts.find_searches", lambda directory: hunts[str(directory)])
     monkeypatch.setattr("crashhunt.estimation.compare", lambda *words: asked.append(words) or found)
     monkeypatch.setattr("crashhunt.report.describe_comparison", lambda comparison: "better")
     monkeypatch.setattr("crashhunt.report.comparison_page", lambda *words: pages.append(words))
@@ -98,7 +98,7 @@ def grouped(monkeypatch):
     def requests():
         yield asked["stops"]
 
-    monkeypatch.setattr("crashhunt.hunts.find_searches", lambda directory: [f"{directory}/0", f"{directory}/1"])
+    monkeypatch.setattr("crashhunt.hunts.find_hunts", lambda directory: [f"{directory}/0", f"{directory}/1"])
     monkeypatch.setattr("crashhunt.crashes.list_bundles", lambda hunt: [f"{hunt} crash"])
     monkeypatch.setattr("crashhunt.hunts.dropped_crashes", lambda hunts: len(hunts))
     monkeypatch.setattr("crashhunt.crashes.group_crashes", group_crashes)
