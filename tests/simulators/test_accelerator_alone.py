@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from types import SimpleNamespace
 
 import highway_env
 import numpy as np
@@ -16,7 +17,7 @@ from highway_env.road.lane import StraightLane
 from highway_env.vehicle import behavior, dynamics
 from highway_env.vehicle.controller import ControlledVehicle
 
-from crashhunt.accelerator import Onlooker, _roads, kind_of, switch_off, switch_on
+from crashhunt.accelerator import Onlooker, _roads, _switch, kind_of, switch_off, switch_on
 from crashhunt.simulators.highway import restore_classes
 
 assert highway_env
@@ -382,3 +383,34 @@ def test_observers_that_wait_for_a_crash_are_called_after_its_sub_step():
     assert 0 < first < 7  # within the first step, and not in its last sub-step
     # The sub-steps up to the crash, those left of the step, and those of the next two.
     assert few == [every[1::2][number] for number in (first, 7, 15, 23)]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "drives"),
+    [
+        ([(True, True)], True), ([(True, True), (True, False)], False), ([(False, True)], False),
+        ([(False, False)], False), ([], True),
+    ],
+)  # fmt: skip
+def test_kernel_drives_all_only_where_each_vehicle_decides_and_moves_as_it_knows(monkeypatch, kinds, drives):
+    place = made().road
+    found = [SimpleNamespace(drives=decides, moves=moves) for decides, moves in kinds]
+    monkeypatch.setattr(_roads, "kinds_of", lambda vehicles: found if vehicles is place.vehicles else [])
+    prepared = _roads.Prepared(place)
+    prepared.checked = True
+    assert prepared.drives_all() is drives
+    assert not prepared.checked  # the vehicles have not been compared with the kernel's
+
+
+def test_lanes_of_a_grid_are_marked_once(monkeypatch):
+    """The result is highway-env's either way, so only a count shows that its own slower code does not run as well."""
+    config = {"observation": {"type": "OccupancyGrid", "features": ["presence", "on_road"]}}
+    seen = both(lambda: HighwayEnvFast(config), lambda env: env.reset(seed=3)[0].tobytes())
+    assert seen[0] == seen[1]
+    ran = []
+    monkeypatch.setitem(
+        _switch.originals, "OccupancyGridObservation.fill_road_layer_by_lanes", lambda *_: ran.append(1)
+    )
+    env = HighwayEnvFast(config)
+    assert env.reset(seed=3)[0].tobytes() == seen[1]
+    assert ran == []

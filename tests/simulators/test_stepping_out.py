@@ -17,7 +17,7 @@ from onlookers import Steady, Watch
 from crashhunt.episode import Episode
 from crashhunt.oracles import Overlap
 from crashhunt.scenario import load_scenario
-from crashhunt.simulators.sumo import SumoSimulator, _disturbances
+from crashhunt.simulators.sumo import SumoSimulator, _disturbances, _simulator
 from crashhunt.simulators.sumo._disturbances import JunctionLanes, SteppingOut, _between, _nearest, can_step_out
 from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
@@ -84,6 +84,18 @@ def test_a_walker_steps_out_and_walks_on_where_it_was_going(drive):
     walked = np.diff(points[80:, 0])  # it goes on where it was going
     assert (len(points), walked.min() > 0.05, walked.max() < 0.2) == (121, True, True)
     assert np.array(plain.of("person walker", "points"))[:20].tolist() == points[:20].tolist()
+
+
+def test_scene_has_the_headings_and_speeds_of_persons_and_vehicles(drive):
+    _, watch = drive(EGO + WALKER, steps=5)
+    core = _simulator.core_for(_simulator.VERSION, _simulator.sumo.__file__)
+    for step, scene in enumerate(watch.scenes):
+        assert [actor.id for actor in scene.roster.actors] == ["ego", "person walker"]
+        assert [*scene.headings] == [0.0, 0.0]  # both go east
+        assert scene.speeds[0] == pytest.approx(10.0 - 0.45 * step)  # it brakes with 4.5 m/s²
+        assert (scene.speeds[1] > 1.0) == (step > 0)
+        assert scene.points[1][1] < scene.points[0][1]
+        assert scene.core is core  # which is no longer used after it has read something wrong
 
 
 def test_no_one_steps_out_faster_than_its_type_can_nor_further_than_it_is_back_in_time(drive):
