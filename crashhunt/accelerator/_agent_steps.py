@@ -25,7 +25,7 @@ _ORIGINALS = [vars(owner).get(name) for owner, name in _MEMBERS]
 
 
 def choose(env: AbstractEnv, action: object) -> bool:
-    """Apply the result of `DiscreteMetaAction.act` that remains after the next `Road.act`.
+    """Apply that part of `DiscreteMetaAction.act` whose effect remains after the next `Road.act`.
 
     `MDPVehicle.act` chooses a target speed or lane, and then computes steering and acceleration. `Road.act` computes
     both again from the same state before any code reads them.

@@ -93,7 +93,7 @@ def _keep(building: Path, folder: Path) -> None:
             remove_tree(folder)  # damaged
         else:
             return
-    raise HuntDirectoryError("the cache of maps cannot be written", fix="remove it", where=str(folder))
+    raise HuntDirectoryError("the cache of maps cannot be written", fix="remove this folder", where=str(folder))
 
 
 def _remove_old(cache: Path, newest: Path) -> None:

@@ -93,7 +93,7 @@ MAX_EXCLUDED: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Root:
-    """The estimates from one root: a plain trial from which copies were forked.
+    """The estimates from one root, which is a trial from which copies were forked.
 
     Args:
         undisturbed: estimate of the probability of a crash on which no disturbance had an effect.

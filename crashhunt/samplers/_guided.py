@@ -208,8 +208,8 @@ class KnownCrashes:
     def see(self, trial: ScoredTrial) -> list[ScoredTrial]:
         """Add a trial without a crash; return all trials that are worth learning from since it is known.
 
-        Usually, the result is the trial itself, or empty if the trial is covered. Covered trials follow when they turn
-        out to be at another peak than the known crashes.
+        Usually, the result is the trial itself, or empty if the trial is covered. Earlier covered trials are added to a
+        later result if they turn out to be at another peak than the known crashes.
         """
         self._seen.append(trial)
         self._since_basins += 1

@@ -160,7 +160,7 @@ def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float
 
 
 def by_step(times: Array, found: Array, count: int, step_length_s: float) -> Array:
-    """Return the criticality of `count` scenes: of the sample before each scene, or the greatest within its step."""
+    """Return the criticality of each scene: of the latest sample before it, or the greatest sample in its step."""
     steps = np.clip(np.ceil(times / step_length_s - 1e-6).astype(int), 0, max(0, count - 1))
     held = np.zeros(count)
     np.maximum.at(held, steps, found)
