@@ -197,7 +197,11 @@ _TESTS_ELSEWHERE = {
         "hunts/test_whole_hunts.py",
         "e2e/test_hunt.py",
     ),
-    "hunts/_next_trials.py": ("hunts/test_next_trials.py", "hunts/test_whole_hunts.py"),
+    "hunts/_next_trials.py": (
+        "hunts/test_next_trials.py",
+        "hunts/test_verified_runs.py",
+        "hunts/test_whole_hunts.py",
+    ),
     "hunts/_preflight.py": ("hunts/test_preflight.py", "hunts/test_traffic_survey.py"),
     "hunts/_progress.py": (
         "hunts/test_from_the_start.py",
@@ -205,6 +209,7 @@ _TESTS_ELSEWHERE = {
         "hunts/test_phases.py",
         "hunts/test_searching.py",
         "hunts/test_tally.py",
+        "hunts/test_verified_runs.py",
         "hunts/test_whole_hunts.py",
     ),
     "hunts/_rates.py": ("hunts/test_rare_hunts.py", "e2e/test_crash_rates.py"),
@@ -220,6 +225,7 @@ _TESTS_ELSEWHERE = {
     "hunts/_verification.py": (
         "hunts/test_from_the_start.py",
         "hunts/test_hunt_parts.py",
+        "hunts/test_verified_runs.py",
         "hunts/test_whole_hunts.py",
         "e2e/test_audit.py",
     ),
