@@ -6,12 +6,14 @@ import json
 import socket
 import threading
 import time
+import zlib
 from types import SimpleNamespace
 
 import pytest
 
+from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
-from crashhunt.episode import WorkerSettings
+from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors.ray import RayExecutor, _bridge, _executor
 from crashhunt.executors.ray._cluster import Found, Lost, Meant
 from crashhunt.executors.ray._messages import EndedTrial, News
@@ -181,8 +183,6 @@ def test_a_node_gets_ready_and_runs_what_is_submitted(begin):
 
 
 def test_what_is_kept_is_written_before_the_hunt_hears_of_it(begin, tmp_path):
-    import zlib
-
     bridge, cluster, after = begin(a=1)
     submit(bridge, 0)
     after()
@@ -498,3 +498,39 @@ def hunt(bridge, *messages):
         bridge._control, control = theirs, bridge._control
         bridge._listen()
     bridge._control, bridge._closing = control, False
+
+
+def test_cluster_without_a_free_cpu_is_refused_after_a_moment(begin):
+    for others, says in ((2, "none of its 2 CPUs is free"), (0, "none of its nodes has a CPU")):
+        _, cluster, after = begin(a=others)
+        cluster.others["a"] = others
+        after(2)  # what has just been released shows late
+        with pytest.raises(UsageError, match=says):
+            after(2)
+    _, cluster, after = begin(resumed=True, a=2)
+    cluster.others["a"] = 2
+    after(9)  # it has run there before
+
+
+def test_map_of_a_node_is_that_of_the_hunt_or_of_a_kept_trial(begin, tmp_path):
+    bridge, cluster, after = begin(a=1)
+    after()
+    (actor,) = cluster.actors
+    for number, lanes in ((0, b"first"), (1, b"second"), (2, b"")):
+        submit(bridge, number)
+        after()
+        files = {"run.log": zlib.compress(b"said")}
+        cluster.ready[actor.asked] = News([ended(number, files)], None, [], None, lanes and zlib.compress(lanes))
+        after()
+    assert (tmp_path / layout.MAP).read_text() == "first"
+    kept = [scratch_of(tmp_path, number) for number in range(3)]
+    assert [(folder / "run.log").read_text() for folder in kept] == ["said"] * 3
+    assert [(folder / layout.MAP).exists() for folder in kept] == [False, True, True]
+    assert {(folder / layout.MAP).read_text() for folder in kept[1:]} == {"second"}
+
+
+def test_figures_are_sent_once_a_second(begin, clock):
+    _, _, after = begin(a=1)
+    assert any("nodes" in message for message in after())
+    sent = [sum("nodes" in message for message in after()) for _ in range(3)]
+    assert sent == [1, 1, 1]

@@ -424,7 +424,7 @@ def test_trials_that_run_again_do_not_count_twice_for_the_rate():
     assert progress.last_invalid == result(4, Outcome.INVALID)
 
 
-def test_new_type_is_told_by_trials_and_seconds():
+def test_age_of_the_newest_type_has_trials_and_seconds():
     progress = Progress()
     assert progress.about_kinds() == (None, None, None)
     progress.kinds = SimpleNamespace(newest=None, newest_trial=None, groups=lambda *, running: ("groups", running))
@@ -434,7 +434,7 @@ def test_new_type_is_told_by_trials_and_seconds():
     assert (since_s, trials) == (pytest.approx(30, abs=5), 7)
 
 
-def test_ledger_is_told_of_runs_in_vain_and_of_the_phase():
+def test_ledger_records_failed_runs_and_the_phase():
     progress = Progress()
     assert progress.noted().keys() == {"heartbeat", "phase", "ends_at", "running_rate"}
     progress.failed_steps, progress.failed = 7, [result(1, steps=3), result(2, steps=4)]
