@@ -41,7 +41,6 @@ PEERS = {
     "verifai-mab": "peers:VerifaiBandit",
     "smac": "peers:Smac",
     "turbo": "peers:Turbo",
-    "eight-constants": "eight_constants:EightConstants",
 }
 """Name in tables to what stands for it."""
 

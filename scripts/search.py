@@ -28,6 +28,7 @@ from search_faults import FAULTS, faults_table, write_faults
 from search_kinds import kinds_table, write_kinds
 from search_plot import GIVE_UP, pairs_table, table, write_plot
 from search_pool import trials_on
+from search_sensitivity import CONSTANTS, METHOD, sensitivity_table, write_sensitivity
 from search_wall import wall_table
 from unseen_problems import UNSEEN, unseen_problem
 
@@ -256,6 +257,11 @@ def synthetic_run(name: str, sampler: str, seed: int, lag: str = LAG) -> Run:
     )
 
 
+def cost_of(problem: str, sampler: str, seed: int) -> int:
+    """Return the trials of a hunt on a problem without a simulator, until the first crash or until it was given up."""
+    return synthetic_run(problem, sampler, seed).trials
+
+
 def real_runs(
     name: str,
     samplers: Sequence[str],
@@ -344,6 +350,10 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--store", type=Path, help="a file of JSON to which hunts are added; the table is of all in it")
     parser.add_argument("--kinds", type=int, help="instead, hunts of so many trials that go on, for kinds of crashes")
     parser.add_argument("--faults", type=int, help="instead, so many hunts for planted faults; needs --store")
+    parser.add_argument(
+        "--sensitivity", nargs="?", const=",".join((*CONSTANTS, *METHOD)), metavar="CONSTANTS",
+        help="instead, hunts of guided with half and twice each of these constants (default: all); needs --store",
+    )  # fmt: skip
     parser.add_argument("--wall", action="store_true", help="instead, hunts of the product, for time by the clock")
     parser.add_argument("--again", action="store_true", help="hunts that are stored already, too")
     parser.add_argument("--lag", default=LAG, type=a_lag, help=f"of results, in trials, or {GROWING!r}")
@@ -373,6 +383,13 @@ def main(words: Sequence[str] | None = None) -> int:
         faults = range(options.first_seed, options.first_seed + options.faults)
         write_faults(options.store, [*FAULTS], faults, options.parallel)
         print(faults_table(options.store))
+        return 0
+    if options.sensitivity:
+        if options.store is None:
+            parser.error("--sensitivity needs --store FILE")
+        constants = options.sensitivity.split(",")
+        write_sensitivity(options.store, cost_of, constants, names, seeds, options.parallel)
+        print(sensitivity_table(options.store))
         return 0
     if options.kinds:
         write_kinds(options.store, names, samplers, seeds, options.kinds, options.parallel)

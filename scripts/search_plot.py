@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from development_problems import DEVELOPMENT
 from problems import PROBLEMS, REAL
+from unseen_problems import UNSEEN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +36,7 @@ _MARKS = {
 }
 """Sampler to its colour in the light, in the dark, and its form."""
 _RATES = {name: problem.rate for name, problem in PROBLEMS.items()} | {
-    name: rate for name, (_, rate, _) in DEVELOPMENT.items()
+    name: rate for name, (_, rate, _) in {**DEVELOPMENT, **UNSEEN}.items()
 }
 """Crashes per random trial of the problems without a simulator."""
 
@@ -101,7 +102,7 @@ def rare(found: dict[str, dict[str, float]], sampler: str) -> float:
 def table(runs: Sequence[Run]) -> str:
     """Return it as Markdown."""
     found = costs(runs)
-    known = ("random", "guided-2", "sobol", "cma-es", *_MARKS, "eight-constants")
+    known = ("random", "guided-3", "guided-2", "sobol", "cma-es", *_MARKS, "eight-constants")
     samplers = [name for name in known if any(name in row for row in found.values())]
     samplers.sort(key=lambda name: ["random", "guided"].index(name) if name in ("random", "guided") else 2)
     lines = [f"| problem | one in | {' | '.join(samplers)} |", f"| --- | ---: |{' ---: |' * len(samplers)}"]

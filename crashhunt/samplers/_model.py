@@ -3,8 +3,8 @@
 Computes a Gaussian process (Rasmussen and Williams 2006) over the most critical and the latest trials. The kernel of
 this process has two parts. The first depends only on the arguments. The second counts only between trials with the same
 seed, because the seed determines the traffic. The rest is noise. Length scales and shares are fitted while results
-arrive. Of 64 candidates, most of them neighbours of critical trials, the model proposes the candidate that most likely
-exceeds the best score so far (Kushner 1964).
+arrive. Of many candidates, most of them near critical trials, the model proposes the candidate that most likely exceeds
+the best score so far (Kushner 1964).
 
 Why not a library: proposals must follow from the reported results bit by bit, and take milliseconds.
 
@@ -16,15 +16,14 @@ Cost: at most 96 trials are in the process, so one solution takes 96³ / 3 opera
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from crashhunt.samplers._strategy import Draft, Elites, reflected
+from crashhunt.samplers._strategy import Draft, reflected
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -32,14 +31,13 @@ if TYPE_CHECKING:
     from crashhunt.samplers._strategy import ScoredTrial
 
     Floats = NDArray[np.float64]
+    Excluded = Callable[[Floats, NDArray[np.int64]], NDArray[np.bool_]]
 
 
-__all__ = ["Model", "Process"]
+__all__ = ["TRIALS", "Model", "Process"]
 
 
 # A Gaussian process over arguments and seeds (Rasmussen and Williams 2006, algorithm 2.1).
-
-_CATEGORY_DISTANCE_SQUARED = 0.5  # squared distance between two different values of a choice
 
 
 class Process:
@@ -49,7 +47,7 @@ class Process:
         points: trials x arguments; a choice is the index of its value.
         seeds: seeds of the trials.
         scores: scores of the trials; only their order matters.
-        categorical: which arguments are choices.
+        categorical: which arguments are choices; two values of a choice have the distance 1.
         scales: factors of the arguments, the reciprocals of length scales.
         noise: the share of the variance of scores that is noise, above 0 and below 1.
         seeded: the share of the remaining variance that is explained only by an equal seed.
@@ -72,17 +70,21 @@ class Process:
         self.likelihood = -0.5 * len(points) * math.log(self._amplitude) - float(np.log(np.diag(self._lower)).sum())
         """The logarithm of the likelihood of the scores, up to a constant."""
 
-    def worth(self, points: Floats, seeds: NDArray[np.int64], ambition: float) -> Floats:
+    def worth(
+        self, points: Floats, seeds: NDArray[np.int64], ambition: float, among: NDArray[np.bool_] | None = None
+    ) -> Floats:
         """Return by how many standard deviations the expected score at each point exceeds the target.
 
         Args:
             points: points in the same form as those of the trials.
             seeds: seeds of the points; below 0 for a seed that no trial has.
             ambition: by how much the target exceeds the best score, in standard deviations of all scores.
+            among: of which trials the best score is; None for all.
         """
+        best = float((self._target if among is None else self._target[among]).max())
         half = np.linalg.solve(self._lower, self._kernel(points, seeds).T)
         spread = self._amplitude * np.maximum(1.0 + self._noise - (half**2).sum(axis=0), self._noise)
-        worth: Floats = (half.T @ self._half - float(self._target.max()) - ambition) / np.sqrt(spread)
+        worth: Floats = (half.T @ self._half - best - ambition) / np.sqrt(spread)
         return worth
 
     def _kernel(self, points: Floats, seeds: NDArray[np.int64]) -> Floats:
@@ -92,7 +94,7 @@ class Process:
         squared = np.maximum(squared, 0.0)
         for place in np.flatnonzero(self._categorical):
             differ = points[:, place, None] != self._points[:, place]
-            squared += _CATEGORY_DISTANCE_SQUARED * self._scales[place] ** 2 * differ
+            squared += self._scales[place] ** 2 * differ
         kernel: Floats = np.exp(-0.5 * squared)
         if self._seeded:
             kernel *= 1.0 - self._seeded + self._seeded * (seeds[:, None] == self._seeds)
@@ -108,23 +110,67 @@ def _worths(scores: Floats) -> Floats:
     return worths
 
 
-_BEST, _LAST = 48, 48  # trials in the process: a solution of 96 takes about a millisecond
-_CANDIDATES = 64  # per proposal
-_ANYWHERE, _FITTED = 0.15, 0.25  # shares of candidates; the others are neighbours of one trial
-_PARENTS = 12  # best trials whose neighbours are candidates
-_KEEP_SEED = 0.5  # probability that a neighbour keeps the seed of its parent
-_FINEST = 0.005  # least standard deviation of a step, and of draws around all parents, in widths of an argument
-_WIDEST = 1.0 / math.sqrt(12.0)  # greatest one: that of a uniform draw; steps are log-uniform between both
-_OTHER = 0.3  # probability that a selected categorical argument changes
-_NOISE = (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)  # candidates for the noise share
-_SEEDED = (0.0, 0.2, 0.5, 0.8, 0.95)  # candidates for the share that counts only with the same seed
-_AMBITION = 0.5  # mean of the drawn ambition, in standard deviations
+TRIALS = 96
+"""Trials in the process, trials in each memory, and candidates for a proposal: a solution takes about 0.2 ms."""
+_PARENTS = 12  # most critical trials whose neighbours are candidates: more are less critical, fewer are one peak
+
+# The following numbers are part of the method, and were not varied when a version was chosen.
+
+_ANYWHERE, _AROUND, _NEAR = 1, 2, 3  # odds of candidates: anywhere, around all parents, near one parent
+_KEEP_SEED = 0.5  # probability that a candidate keeps the seed of its parent: a fair coin
+_AMBITION = 1.0  # greatest ambition, in standard deviations of scores; it is drawn from 0 on
+_FIRST_ODDS = -2.0  # logarithm of the odds of each share where the fit begins: a share of 0.12
+_STARTS = 5  # length scales at which the fit begins again, each half of the one before
+_ODDS_STEP = 2.0  # step of that logarithm in the fit
+_FINEST = 0.5 / TRIALS  # half the distance of that many values of an argument, in widths: least step, and least share
+_WIDEST = 1.0 / math.sqrt(12.0)  # standard deviation of a uniform draw, in widths: greatest step
 
 
 class _Parameters(NamedTuple):
-    lengths: NDArray[np.float64]  # logarithms to base 2 of factors of the initial length scales
-    noise: int
-    seeded: int
+    """What is fitted, each in steps from where the fit begins.
+
+    Args:
+        lengths: doublings of the length scales; they begin at the root-mean-square distance of two uniform points.
+        noise: logarithm of the odds of the share of noise.
+        seeded: the same of the share that counts only with the same seed.
+    """
+
+    lengths: Floats
+    noise: float
+    seeded: float
+
+    @property
+    def shares(self) -> tuple[float, float]:
+        """The shares of noise and of what counts only with the same seed."""
+        noise, seeded = (
+            min(max(1.0 / (1.0 + math.exp(-odds)), _FINEST), 1.0 - _FINEST) for odds in (self.noise, self.seeded)
+        )
+        return noise, seeded
+
+    @property
+    def log_prior(self) -> float:
+        """A standard normal distribution of each length, and the prior of Jeffreys (1946) of each share."""
+        shares = sum(0.5 * math.log(share * (1.0 - share)) for share in self.shares)
+        logarithms = math.log(2.0) * self.lengths
+        return shares - 0.5 * float(logarithms @ logarithms)
+
+    def stepped(self, turn: int, by: int) -> _Parameters:
+        """Return other parameters, in turns by another length, noise, all lengths, a new start, and the seed's share.
+
+        The likelihood may have several maxima: long lengths with much noise, and short lengths with little noise. Steps
+        do not lead from the first to the second. A start has little noise, and one length for all arguments.
+        """
+        turn, which = divmod(turn, 5)
+        if which == 0:
+            return self._replace(lengths=self.lengths + by * (np.arange(len(self.lengths)) == turn % len(self.lengths)))
+        if which == 1:
+            return self._replace(noise=self.noise + _ODDS_STEP * by)
+        if which == 2:
+            return self._replace(lengths=self.lengths + by)
+        if which == 3:
+            lengths = np.full(len(self.lengths), -float(turn % _STARTS))
+            return _Parameters(lengths, _FIRST_ODDS + _ODDS_STEP * min(by, 0), _FIRST_ODDS)
+        return self._replace(seeded=self.seeded + _ODDS_STEP * by)
 
 
 class Model:
@@ -132,44 +178,58 @@ class Model:
 
     Args:
         cube: the unit cube whose dimensions are the arguments that vary.
-        like: a model whose fitted parameters are the initial parameters of this model.
     """
 
-    def __init__(self, cube: Cube, like: Model | None = None) -> None:
+    def __init__(self, cube: Cube) -> None:
         self._cube = cube
-        self._best = Elites(_BEST)
-        self._last: deque[ScoredTrial] = deque(maxlen=_LAST)
-        self._count = self._turn = 0
-        unknown = _Parameters(np.zeros(cube.dimensions), 3, 1)
-        self._parameters: _Parameters = unknown if like is None else like._parameters
+        self._told = self._turn = 0
+        self.parameters = _Parameters(np.zeros(cube.dimensions), _FIRST_ODDS, _FIRST_ODDS)
+        self.trials: Sequence[ScoredTrial] = ()
         self._process: Process | None = None
 
-    def remember(self, trials: Iterable[ScoredTrial]) -> None:
-        """Add earlier trials without fitting."""
-        for trial in trials:
-            self._best.add(trial)
-            self._last.append(trial)
-            self._count += 1
+    def learn(self, trials: Sequence[ScoredTrial]) -> None:
+        """Replace the trials, and at growing intervals fit one of the parameters again."""
+        self.remember(trials)
+        self._told += 1
+        if self._is_ready and self._told % (1 + self._told // TRIALS) == 0:
+            self._fit()
+
+    def remember(self, trials: Sequence[ScoredTrial]) -> None:
+        """Replace the trials without fitting."""
+        self.trials = trials
         self._process = None
+        if trials:
+            self._points = np.array([trial.point for trial in trials])
+            self._values = self._cube.values(self._points)
+            self._seeds = np.array([trial.seed for trial in trials])
+            self._scores = np.array([trial.score for trial in trials])
 
-    def tell(self, trial: ScoredTrial) -> None:
-        """Add a trial; at growing intervals, fit one of the parameters again."""
-        self.remember((trial,))
-        if self._is_ready and self._count % (1 + self._count // (_BEST + _LAST)) == 0:
-            self._tune()
+    def propose(
+        self, rng: np.random.Generator, excluded: Excluded | None = None, among: NDArray[np.bool_] | None = None
+    ) -> Draft | None:
+        """Return the best candidate; None if there is none, or while there are too few trials.
 
-    def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
-        """Return the best of many candidates; None while there are too few trials."""
-        if not self._is_ready:
+        Args:
+            rng: source of the candidates.
+            excluded: returns which points and seeds are not proposed; None if all may be.
+            among: which trials are parents, and have the score to exceed; None for all.
+        """
+        order = np.argsort(-self._scores, kind="stable") if self._is_ready else np.empty(0, dtype=np.intp)
+        best = (order if among is None else order[among[order]])[:_PARENTS]
+        if not len(best):
             return None
         if self._process is None:
-            self._process = self._with(self._parameters)
-        best = self._best.best(_PARENTS)
-        points, places, kept = self._candidates(best, rng)
-        seeds = np.where(kept, np.array([trial.seed for trial in best])[places], -1)
-        worth = self._process.worth(self._cube.values(points), seeds, float(rng.exponential(_AMBITION)))
+            self._process = self._with(self.parameters)
+        points, places, kept = self._candidates(self._points[best], rng)
+        parents = best[places]
+        seeds = np.where(kept, self._seeds[parents], -1)
+        worth = self._process.worth(self._cube.values(points), seeds, _AMBITION * float(rng.random()), among)
+        if excluded is not None:
+            worth[excluded(points, seeds)] = -np.inf
         chosen = int(np.argmax(worth))
-        point, parent = points[chosen], best[places[chosen]]
+        if math.isinf(worth[chosen]):
+            return None
+        point, parent = points[chosen], self.trials[parents[chosen]]
         seed = parent.seed if kept[chosen] else None
         if seed is not None and self._cube.arguments(point) == self._cube.arguments(parent.point):
             seed = None  # the same point and seed would repeat the trial
@@ -177,68 +237,47 @@ class Model:
 
     @property
     def _is_ready(self) -> bool:
-        return self._count > self._cube.dimensions  # fewer trials do not even determine a plane
+        return len(self.trials) > self._cube.dimensions  # fewer trials do not even determine a plane
 
     def _with(self, parameters: _Parameters) -> Process:
-        known = {trial.number: trial for trial in self._last} | {trial.number: trial for trial in self._best}
-        trials = [known[number] for number in sorted(known)]
+        noise, seeded = parameters.shares
         return Process(
-            self._cube.values(np.array([trial.point for trial in trials])),
-            np.array([trial.seed for trial in trials]),
-            np.array([trial.score for trial in trials]),
+            self._values,
+            self._seeds,
+            self._scores,
             categorical=self._cube.categorical,
-            scales=2.0**-parameters.lengths / math.sqrt(self._cube.dimensions / 6.0),  # a mean distance of two draws
-            noise=_NOISE[parameters.noise],
-            seeded=_SEEDED[parameters.seeded],
+            scales=2.0**-parameters.lengths / math.sqrt(self._cube.dimensions / 6.0),
+            noise=noise,
+            seeded=seeded,
         )
 
-    def _tune(self) -> None:
-        """Compare one parameter with its two neighbours, and keep the value with the greatest likelihood.
-
-        The natural logarithm of each length scale has a standard normal prior.
-        """
-        tried = [self._parameters, *(self._stepped(by) for by in (-1, 1))]
-        weight = 0.5 * math.log(2.0) ** 2
-        likely = [self._with(one).likelihood - weight * float(one.lengths @ one.lengths) for one in tried]
-        self._parameters = tried[int(np.argmax(likely))]
+    def _fit(self) -> None:
+        """Compare one parameter with its two neighbours, and keep the value with the greatest likelihood."""
+        tried = [self.parameters, *(self.parameters.stepped(self._turn, by) for by in (-1, 1))]
+        self.parameters = max(tried, key=lambda one: self._with(one).likelihood + one.log_prior)
         self._turn += 1
 
-    def _stepped(self, by: int) -> _Parameters:
-        """Return neighbouring parameters: in turns, one length, and one of all lengths, noise and seed share."""
-        lengths, noise, seeded = self._parameters
-        turn, whole = divmod(self._turn, 2)
-        if not whole:
-            lengths = lengths.copy()
-            lengths[turn % len(lengths)] += by
-        elif turn % 3 == 0:
-            lengths = lengths + by
-        elif turn % 3 == 1:
-            noise = min(max(noise + by, 0), len(_NOISE) - 1)
-        else:
-            seeded = min(max(seeded + by, 0), len(_SEEDED) - 1)
-        return _Parameters(lengths, noise, seeded)
-
     def _candidates(
-        self, best: list[ScoredTrial], rng: np.random.Generator
-    ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.bool_]]:
-        """Return candidate points, the index of the parent of each, and whether each keeps its parent's seed."""
-        shape = (_CANDIDATES, self._cube.dimensions)
-        known = np.array([trial.point for trial in best])
-        energy = np.cumsum(1.0 / (2.0 + np.arange(len(best))))
-        places = np.searchsorted(energy / energy[-1], rng.random(_CANDIDATES))
-        places = np.minimum(places, len(best) - 1)
+        self, known: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, NDArray[np.intp], NDArray[np.bool_]]:
+        """Return candidate points, the index of the parent of each, and whether each keeps its parent's seed.
+
+        A sixth is anywhere, a third around all parents, and half near one parent, which is drawn by its rank (Zipf
+        1949).
+        """
+        shape, categorical = (TRIALS, self._cube.dimensions), self._cube.categorical
+        energy = np.cumsum(1.0 / (1.0 + np.arange(len(known))))
+        places = np.searchsorted(energy / energy[-1], rng.random(TRIALS))
+        places = np.minimum(places, len(known) - 1)
         centers, drawn = known[places], rng.random(shape)
-        scale = _WIDEST * (_FINEST / _WIDEST) ** rng.random((_CANDIDATES, 1))
-        points = reflected(centers + scale * rng.standard_normal(shape))
-        points = np.where(self._cube.categorical & (rng.random(shape) >= _OTHER), centers, points)
-        points = np.where(self._cube.categorical & (points != centers), drawn, points)
-        touched = rng.random(shape) < 2.0 ** -rng.integers(0, max(1, shape[1].bit_length()), (_CANDIDATES, 1))
-        touched[np.arange(_CANDIDATES), rng.integers(shape[1], size=_CANDIDATES)] = True
+        scale = _WIDEST * (_FINEST / _WIDEST) ** rng.random((TRIALS, 1))
+        points = np.where(categorical, drawn, reflected(centers + scale * rng.standard_normal(shape)))
+        touched = rng.random(shape) < 2.0 ** -rng.integers(0, max(1, shape[1].bit_length()), (TRIALS, 1))
+        touched[np.arange(TRIALS), rng.integers(shape[1], size=TRIALS)] = True
         points = np.where(touched, points, centers)
-        around = known.mean(axis=0) + np.maximum(known.std(axis=0), _FINEST) * rng.standard_normal(shape)
-        others = known[rng.integers(len(known), size=shape), np.arange(shape[1])]
-        around = np.where(self._cube.categorical, others, reflected(around))
-        how = rng.random(_CANDIDATES)
-        points = np.where((how < _ANYWHERE + _FITTED)[:, None], around, points)
-        points = np.where((how < _ANYWHERE)[:, None], drawn, points)
-        return points, places, (rng.random(_CANDIDATES) < _KEEP_SEED) & (how >= _ANYWHERE)
+        around = centers.mean(axis=0) + np.maximum(centers.std(axis=0), _FINEST) * rng.standard_normal(shape)
+        others = centers[rng.integers(TRIALS, size=shape), np.arange(shape[1])]
+        around = np.where(categorical, others, reflected(around))
+        how = rng.integers(_ANYWHERE + _AROUND + _NEAR, size=(TRIALS, 1))
+        points = np.where(how < _ANYWHERE, drawn, np.where(how < _ANYWHERE + _AROUND, around, points))
+        return points, places, (rng.random(TRIALS) < _KEEP_SEED) & (how[:, 0] >= _ANYWHERE)

@@ -18,165 +18,110 @@ from crashhunt.world import Event
 UNIT = {("ego", f"x{index}"): Range(0.0, 1.0) for index in range(4)}
 
 
-def crash(x, kind="", seed=0):
-    return ScoredTrial(0, np.array([x, x, x, x]), seed, 1.0, kind=kind)
+def crash(x, kind="", seed=100):
+    return ScoredTrial(0, at(x), seed, 1.0, kind=kind)
 
 
 def at(x):
     return np.array([x, x, x, x])
 
 
-def test_without_manner_and_place_arguments_are_all_there_is():
-    known = KnownCrashes(4)
+def is_covered(known, x, seed=-1):
+    return bool(known.cover(at(x)[None], np.array([seed]))[0])
+
+
+def score_of_two_peaks(x):
+    """Criticality falls from 0.5 to 0.7, and rises again to 0.9."""
+    return 0.95 - 3 * abs(x - 0.5) if x < 0.7 else 0.7 - 2 * abs(x - 0.9)
+
+
+def along_a_diagonal(score=score_of_two_peaks):
+    return [ScoredTrial(number, at(x), number, score(x)) for number, x in enumerate(np.linspace(0.5, 1.0, 41))]
+
+
+def known_after(*crashes, trials=None):
+    known = KnownCrashes()
+    for one in crashes:
+        known.add(one, along_a_diagonal() if trials is None else trials)
+    return known
+
+
+def test_nothing_is_excluded_before_the_first_crash():
+    known, trials = KnownCrashes(), along_a_diagonal()
     assert not known
-    assert not known.cover(at(0.5))
-    assert known.add(crash(0.5))
-    assert known
-    assert known.cover(at(0.59))
-    assert not known.cover(at(0.61))
-    trials = [crash(x, seed=1) for x in (0.61, 0.59, 0.1)]
-    assert known.outside(trials) == [trials[0], trials[2]]
+    assert not is_covered(known, 0.5)
+    assert known.outside(trials) == trials
     assert known.outside([]) == []
-    assert not known.add(crash(0.55))  # nothing new
 
 
-def test_crashes_of_one_kind_keep_next_to_nothing_away_until_three_in_a_row_were_nothing_new():
-    known = KnownCrashes(4)
-    assert known.add(crash(0.5, "rear end"))
-    assert not known.cover(at(0.53))
-    assert known.add(crash(0.53, "rear end"))
-    assert known.add(crash(0.56, "rear end"))
-    assert not known.cover(at(0.6))
-    assert known.add(crash(0.59, "side swipe"))  # so it begins anew
-    assert known.add(crash(0.62, "rear end"))
-    assert known.add(crash(0.65, "side swipe"))
-    assert known.add(crash(0.9, "rear end"))  # that is elsewhere
-    assert not known.cover(at(0.7))
-    assert known.add(crash(0.68, "rear end"))
-    assert known.cover(at(0.75))
-    assert not known.cover(at(0.85))
-    assert not known.add(crash(0.75, "rear end"))
-
-
-def test_where_another_kind_comes_there_is_more_to_find():
-    known = KnownCrashes(4)
-    assert known.add(crash(0.5))
-    assert known.add(crash(0.55, "side swipe"))
-    assert not known.cover(at(0.58))
-    assert not known.cover(at(0.53))
-    assert known.cover(at(0.51))
-
-
-def two_peaks(known):
-    """Tell trials along a diagonal: criticality falls from 0.5 to 0.7, and rises again to 0.9."""
-    for number in range(41):
-        x = 0.5 + number / 80
-        known.see(ScoredTrial(number, at(x), number, 0.95 - 3 * abs(x - 0.5) if x < 0.7 else 0.7 - 2 * abs(x - 0.9)))
-
-
-def test_basin_of_a_crash_without_news_is_excluded_and_another_peak_is_not():
-    known = KnownCrashes(4)
-    two_peaks(known)
-    assert not known.cover(at(0.65))
-    known.add(crash(0.5, seed=100))
-    assert known.cover(at(0.65))
-    assert known.cover(at(0.66), 7)
-    assert not known.cover(at(0.75))
-    assert not known.cover(at(0.95))
+def test_basin_of_a_crash_without_a_type_is_excluded_and_another_peak_is_not():
+    known = known_after(crash(0.5))
+    assert known
+    assert is_covered(known, 0.5)
+    assert is_covered(known, 0.65)
+    assert not is_covered(known, 0.75)
+    assert not is_covered(known, 0.95)
     trials = [crash(x, seed=101) for x in (0.65, 0.8)]
     assert known.outside(trials) == trials[1:]
 
 
-def test_basin_of_a_crash_is_excluded_only_when_its_neighbourhood_yields_known_types():
-    known = KnownCrashes(4)
-    two_peaks(known)
-    for x in (0.5, 0.54, 0.58):
-        known.add(crash(x, "rear end", 100))
-        assert not known.cover(at(0.67))
-    known.add(crash(0.62, "rear end", 100))
-    assert known.cover(at(0.67))
-    known.add(crash(0.6, "side swipe", 100))  # it is open again
-    assert not known.cover(at(0.67))
+def test_basin_of_a_crash_is_excluded_after_three_known_types_in_a_row():
+    crashes = [crash(0.5, "rear end"), *[crash(x, "rear end") for x in (0.51, 0.52)]]
+    assert not is_covered(known_after(*crashes), 0.6)
+    fourth = crash(0.515, "rear end")
+    assert is_covered(known_after(*crashes, fourth), 0.6)
+    assert is_covered(known_after(*crashes, fourth), 0.67)
+    assert not is_covered(known_after(*crashes, crash(0.505, "side swipe"), fourth), 0.6)
+    assert not is_covered(known_after(*crashes, crash(0.9, "rear end")), 0.6)  # the fourth is in another basin
+
+
+def test_a_new_type_in_an_excluded_basin_opens_it_again():
+    known = known_after(*[crash(x, "rear end") for x in (0.5, 0.51, 0.52, 0.515)])
+    assert is_covered(known, 0.6)
+    known.add(crash(0.505, "side swipe"), along_a_diagonal())
+    assert not is_covered(known, 0.6)
 
 
 def test_basins_depend_on_the_order_of_criticality_alone():
     covered = []
     for scaled in (lambda score: score, lambda score: 0.45 * score, lambda score: score**2):
-        known = KnownCrashes(4)
-        for number in range(41):
-            x = 0.5 + number / 80
-            score = 0.95 - 3 * abs(x - 0.5) if x < 0.7 else 0.7 - 2 * abs(x - 0.9)
-            known.see(ScoredTrial(number, at(x), number, scaled(score)))
-        known.add(crash(0.5, seed=100))
-        covered.append([known.cover(at(x)) for x in np.linspace(0.5, 1.0, 200)])
+        known = known_after(crash(0.5), trials=along_a_diagonal(lambda x, to=scaled: to(score_of_two_peaks(x))))
+        covered.append([is_covered(known, x) for x in np.linspace(0.5, 1.0, 200)])
     assert 40 < sum(covered[0]) < 160
     assert covered[0] == covered[1] == covered[2]
 
 
-def test_basins_are_made_again_after_16_trials_without_a_crash():
-    known = KnownCrashes(4)
-    known.see(ScoredTrial(0, at(0.5), 0, 0.9))
-    known.add(crash(0.45, seed=100))
-    made = []
-    for number in range(1, 36):
-        before = known._ground
-        known.see(ScoredTrial(number, at(0.5), number, 0.5))
-        made.append(known._ground is not before)
-    assert [number for number, again in enumerate(made, start=1) if again] == [16, 32]
+def test_basins_are_computed_again_when_trials_are_added():
+    known, trials = known_after(crash(0.5)), along_a_diagonal()
+    assert is_covered(known, 0.62)
+    known.update([*trials, ScoredTrial(50, at(0.62), 50, 0.99), ScoredTrial(51, at(0.61), 51, 0.98)])
+    assert is_covered(known, 0.55)
+    untouched = known_after(crash(0.5, "rear end"))
+    before = untouched._ground
+    untouched.update(trials)
+    assert untouched._ground is before  # no basin is excluded, so nothing is computed
 
 
-def test_types_of_the_last_256_crashes_are_known():
-    known = KnownCrashes(4)
-    for number in range(256):
-        known.add(crash(0.5, f"type {number}"))
-    assert not known.is_new(crash(0.5, "type 0"))
-    known.add(crash(0.5, "type 256"))
-    assert known.is_new(crash(0.5, "type 0"))
-    assert not known.is_new(crash(0.5, "type 1"))
+def test_a_crash_is_new_by_its_type_and_without_one_by_its_place():
+    known = known_after(crash(0.5, "rear end"))
+    assert not known.is_new(crash(0.9, "rear end", seed=101))
+    assert known.is_new(crash(0.5, "side swipe", seed=101))
+    known = known_after(crash(0.5))
+    assert not known.is_new(crash(0.6, seed=101))
+    assert known.is_new(crash(0.9, seed=101))
+    assert not known.is_new(crash(0.9, seed=100))  # the same traffic
 
 
-def test_trials_in_a_basin_are_learned_from_when_they_turn_out_to_be_at_another_peak():
-    known = KnownCrashes(4)
-    for number in range(20):
-        assert [one.number for one in known.see(ScoredTrial(number, at(0.5 + number / 100), number, 0.9))] == [number]
-    known.see(ScoredTrial(20, at(0.72), 20, 0.1))
-    known.add(crash(0.5, seed=100))
-    assert known.cover(at(0.55))
-    found = [known.see(ScoredTrial(number, at(0.3 + number / 80), number, number / 80)) for number in range(21, 53)]
-    late = [len(trials) for trials in found if len(trials) > 1]
-    assert late
-    assert len({one.number for trials in found for one in trials}) == sum(map(len, found))  # none of them twice
-
-
-def test_several_kinds_at_the_very_same_arguments_keep_nothing_away_by_the_first_of_them():
-    """As it is with choices and whole numbers, where other traffic leads from the same values to another crash."""
-    known = KnownCrashes(4)
-    for kind in ("rear end", "side swipe", "off road"):
-        assert known.add(crash(0.5, kind))
-        assert known.cover(at(0.5))
-        assert not known.cover(at(0.53))
-
-
-def test_the_oldest_of_many_crashes_is_forgotten():
-    known = KnownCrashes(4)
-    for number in range(33):
-        assert known.add(crash(float(number)))
-    assert not known.cover(at(0.0))
-    assert all(known.cover(at(float(number))) for number in range(1, 33))
-
-
-def test_the_traffic_of_a_crash_is_known_wherever_its_arguments_are():
-    known = KnownCrashes(4)
-    assert known.add(crash(0.5, "rear end", seed=7))
-    assert known.cover(at(0.9), 7)
-    assert not known.cover(at(0.9), 8)
-    assert not known.cover(at(0.9))
+def test_the_traffic_of_a_crash_is_known_wherever_its_arguments_are_until_96_crashes_later():
+    known = known_after(crash(0.5, "rear end", seed=7), trials=[])
+    assert is_covered(known, 0.9, 7)
+    assert not is_covered(known, 0.9, 8)
     trials = [crash(0.9, seed=seed) for seed in (7, 8)]
     assert known.outside(trials) == [trials[1]]
-    for seed in range(8, 8 + 1024):
-        known.add(crash(0.5, "rear end", seed))
-    assert not known.cover(at(0.9), 7)  # the oldest are forgotten
-    assert known.cover(at(0.9), 8)
+    for seed in range(8, 8 + 96):
+        known.add(crash(0.5, f"{seed}", seed), [])
+    assert not is_covered(known, 0.9, 7)
+    assert is_covered(known, 0.9, 8)
 
 
 def kind_of(**evidence):
