@@ -66,14 +66,7 @@ def listener(answer):
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-<<<<<<< Updated upstream
         ("127.0.0.1:1", "--executor ray:127.0.0.1:1: no cluster answers there (Connection refused); start a cluster"),
-=======
-        (
-            "127.0.0.1:1",
-            "--executor ray:127.0.0.1:1: no cluster answers there (Connection refused); start a cluster with",
-        ),
->>>>>>> Stashed changes
         ("nowhere", "--executor ray:nowhere is not an address HOST:PORT; write --executor ray:nowhere:6379"),
         ("a:b", "--executor ray:a:b is not an address HOST:PORT; write --executor ray:a:6379"),
         (".x:1", "--executor ray:.x:1: no machine can have that name; start a cluster with"),
