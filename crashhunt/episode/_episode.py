@@ -434,7 +434,9 @@ class Episode(Forkable, Ending):
         try:
             made = self.agents[agent] = self._make_agent(agent, self.simulator, self.spec.arguments.get(agent, {}))
             place = "reset"
+            _refuse_without(made, "reset", "seed")
             made.reset(agent_seed(self.spec.seed, number))
+            _refuse_without(made, "act", "observation")
         except BaseException as error:
             if type(error) is InternalError and place == "constructor":  # an agent's constructor has a boundary
                 raise
@@ -469,6 +471,16 @@ class Episode(Forkable, Ending):
         if not findings:
             return None
         return merge_findings([finding for finding in findings if finding.outcome in self._crash_on])
+
+
+def _refuse_without(agent: Agent, method: str, argument: str) -> None:
+    """Check that an agent has a method.
+
+    Raises:
+        ValueError: the agent has no such method.
+    """
+    if not callable(getattr(agent, method, None)):
+        raise ValueError(f"it has no method {method}({argument})")
 
 
 def _require_reseeding(simulator: Simulator) -> None:

@@ -264,6 +264,13 @@ class Failing(Observer):
         return result
 
 
+class WithoutMethods:
+    """Has the methods of an agent that it is given."""
+
+    def __init__(self, **methods):
+        vars(self).update(methods)
+
+
 class FailingOracle:
     name = "failing"
 
@@ -372,3 +379,13 @@ def test_who_empties_sys_modules_is_to_blame_for_what_fails_next(tmp_path):
     assert (outcome, steps) == ("agent_error", "4")
     # What fails is the toy, or before it NumPy, where this process has not used yet what NumPy imports later.
     assert message.startswith("the code has emptied sys.modules, upon which this fails: ")
+
+
+@pytest.mark.parametrize(
+    ("methods", "missing"),
+    [({"act": lambda observation: (1.0, 0)}, "reset(seed)"), ({"reset": lambda seed: None}, "act(observation)")],
+)
+def test_agent_without_a_method_does_not_start(tmp_path, methods, missing):
+    result = run(tmp_path, agent=WithoutMethods(**methods))
+    assert (str(result.outcome), result.failure.message) == ("invalid", f"it has no method {missing}")
+    assert result.failure.agent == "ego"
