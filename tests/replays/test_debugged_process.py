@@ -252,7 +252,10 @@ def test_copies_wait_before_each_of_the_last_steps_and_the_user_goes_back_to_tho
     assert backwards.go(20) == "it goes back nowhere from here"
     backwards._first = 10
     assert backwards.go(9) == "it goes back to step 10 at most"
+    flushed = []
+    monkeypatch.setattr(sys, "stdout", SimpleNamespace(flush=lambda: flushed.append(True)))
     assert code_of(backwards.go, 10) == _debugger._BACK_EXIT_CODE
+    assert flushed  # an exit without cleanup would lose what the debugger printed
     assert (tmp_path / "back").read_text() == "10"
 
 
