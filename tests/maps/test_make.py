@@ -81,7 +81,9 @@ def test_a_folder_has_everything_and_its_scenario_can_be_loaded(made_up, tmp_pat
     assert (made_up.people, made_up.bicycles, made_up.scales) == (True, True, (1.0, 1.5))
     assert made_up.probes_at_s == 1.2 * (3 * 20 + 60) / 4  # the usual trip fills the roads
     assert made_up.values["ego_route"] == "r0"
-    assert made_up.said[-1] == "running one trial"
+    assert made_up.said == [
+        "making the network", "drawing trips", f"simulating {RUN_S} s of the plain traffic", "running one trial",
+    ]  # fmt: skip
     # Twice the time of the longest route.
     assert tried == [(["map.net.xml", "map.png", "scenario.toml", "traffic.rou.xml"], 1200)]
     assert (place / "map.net.xml").read_bytes() == MAP.read_bytes()

@@ -116,6 +116,15 @@ def test_shape_has_two_numbers_in_range(first, second):
             parse_shape(text, "--grid")
 
 
+def test_smallest_and_largest_shapes_are_accepted():
+    assert parse_shape("2X40", "--grid") == (2, 40)
+    assert parse_shape("40x2", "--grid") == (40, 2)
+    assert parse_shape("3x2", "--spider") == (3, 2)
+    for text in ("1x2", "2x41", "2x3"):
+        with pytest.raises(UsageError):
+            parse_shape(text, "--spider")
+
+
 @pytest.mark.parametrize("text", ["", "4", "4x", "x4", "4x4x4", "-4x4", "4.5x4", "٤x٤", "0x0"])
 def test_shape_of_other_form_is_refused(text):
     with pytest.raises(UsageError):
