@@ -255,6 +255,7 @@ class _Run:
         self._until = time.monotonic() + gate.duration_s
         self._pairs = PairWatch(gate.margin, 1 - gate.confidence / 100)
         self._seed = self._begin()
+        self._wait_for_hunts()
         self._trees: dict[str, Path] = {}
         if gate.base.commit:
             top = top_of(gate.folder)
@@ -320,11 +321,27 @@ class _Run:
         gate = self._gate
         for number, (name, run) in enumerate(gate.hunts.items()):
             most = gate.most // len(gate.hunts) + (number < gate.most % len(gate.hunts))
-            folder = self._place / name if gate.is_suite else self._place
+            folder = self._folder(name)
             paired = PairedHunts(name, folder / BASE, folder / HEAD, most)
             for side, place in zip((BASE, HEAD), paired.folders, strict=True):
                 self._plan(place, self._request(run, side, most, number))
             yield paired
+
+    def _wait_for_hunts(self) -> None:
+        """Wait until no hunt of an earlier, killed run of this gate runs.
+
+        These hunts run in the work trees of the killed run, which the check-out of new work trees removes. A hunt that
+        loses its current folder fails, and its failure would count as one of the new run.
+        """
+        for name in self._gate.hunts:
+            for side in (BASE, HEAD):
+                hunt = self._folder(name) / side
+                if (hunt / REQUEST).exists():
+                    _wait_until_free(hunt)
+
+    def _folder(self, name: str) -> Path:
+        """Return the folder that contains both hunts of a name."""
+        return self._place / name if self._gate.is_suite else self._place
 
     def _request(self, run: RunRequest, side: str, most: int, number: int) -> RunRequest:
         """Return the request of the hunt of one version; ``number`` is its position among the hunts."""
@@ -361,7 +378,6 @@ class _Run:
                     )  # fmt: skip
                 if not self._gate.trusted:
                     refuse_untrusted_hunt(place)
-                _wait_until_free(place)
             place.mkdir(parents=True, exist_ok=True)
             write_request(place, request)
         except OSError as error:

@@ -376,6 +376,17 @@ def test_gate_waits_for_a_hunt_whose_gate_was_killed(tmp_path, monkeypatch):
         _gate._wait_until_free(tmp_path)
 
 
+def test_work_trees_of_a_killed_gate_stay_until_its_hunts_have_ended(work, tmp_path, monkeypatch):
+    asked = of_commits(work)
+    started(asked, tmp_path / "g")
+    work.asked.clear()
+    waited = []
+    monkeypatch.setattr(_gate, "_wait_until_free", lambda hunt: waited.append((hunt.name, len(work.asked))))
+    started(asked, tmp_path / "g")
+    assert waited == [("base", 0), ("head", 0)]
+    assert [name for *_, name in work.asked] == ["base", "head"]
+
+
 def test_existing_hunts_run_on_only_where_they_are_trusted(tmp_path, monkeypatch):
     asked, checked = gate(tmp_path), []
     started(asked, tmp_path / "g")
@@ -383,7 +394,7 @@ def test_existing_hunts_run_on_only_where_they_are_trusted(tmp_path, monkeypatch
     monkeypatch.setattr(_gate, "_wait_until_free", checked.append)
     started(asked, tmp_path / "g")
     base, head = (tmp_path / f"g/{side}" for side in ("base", "head"))
-    assert checked == [base, base, head, head]
+    assert checked == [base, head, base, head]
     checked.clear()
     started(replace(asked, trusted=True), tmp_path / "g")
     assert checked == [base, head]
