@@ -138,8 +138,19 @@ def _validated(kind: type[T], data: object, place: _Place) -> T:
             raise error(f"unknown key {key!r}", fix=fix, where=where) from None
         if first["type"] in _MISSING_KEY_ERRORS:
             raise error(f"the key {key!r} is missing", fix="add it", where=where) from None
-        message = first["msg"][0].lower() + first["msg"][1:]
-        raise error(f"{key} = {first['input']!r}: {message}", fix="change the value", where=where) from None
+        message, fix = _in_terms_of_toml(first, key)
+        raise error(f"{key} = {first['input']!r}: {message}", fix=fix, where=where) from None
+
+
+def _in_terms_of_toml(found: ErrorDetails, key: str) -> tuple[str, str]:
+    """Return the message and the fix of an error without Python's names of types."""
+    if found["type"] == "tuple_type" and isinstance(found["input"], dict):
+        return "a table where a list of tables is needed", f"write [[{key}]] above each table"
+    if found["type"] == "tuple_type":
+        return "not a list", f"write {key} = […]"
+    if found["type"] in ("dataclass_type", "dict_type", "mapping_type"):
+        return "not a table", f"write [{key}], with the keys below it"
+    return found["msg"][0].lower() + found["msg"][1:], "change the value"
 
 
 def _telling(errors: Sequence[ErrorDetails]) -> ErrorDetails:

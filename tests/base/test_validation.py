@@ -106,3 +106,17 @@ load_scenario("loop"), load_scenario("highway")
 assert "pydantic" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        ({"routes": "a.rou.xml"}, "routes = 'a.rou.xml': not a list; write routes = […]"),
+        ({"routes": {"a": 1}}, "a table where a list of tables is needed; write [[routes]] above each table"),
+        ({"options": 3}, "options = 3: not a table; write [options], with the keys below it"),
+    ],
+)
+def test_errors_have_the_terms_of_toml(data, says):
+    with pytest.raises(ScenarioError) as caught:
+        validate(SumoSetup, {"net": "n.net.xml", **data}, where="here", error=ScenarioError)
+    assert says in str(caught.value)
