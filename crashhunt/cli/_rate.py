@@ -27,8 +27,9 @@ def add_rate(commands: Commands) -> None:
     rate = commands.add_parser(
         "rate",
         help="report how often an agent crashes, with a guarantee",
-        description="Report how often an agent crashes: per trial, per hour and per 1,000 km in its traffic. The "
-        "interval is valid at any time, also for a hunt that is running, was killed, or stopped at its first crash.",
+        description="Report how often an agent crashes in the traffic of a hunt: per trial, per hour and per 1,000 km. "
+        "Each rate has an interval that is valid whenever you look, also for a hunt that is running, was killed, or "
+        "stopped at its first crash.",
     )
     rate.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="directories of hunts or suites")
     rate.add_argument(
@@ -46,8 +47,8 @@ def add_rate(commands: Commands) -> None:
     )
     rate.add_argument(
         "--by", metavar="PART", default="",
-        help="report the rate of each part: kind, fault or disturbance divides the crashes; ARG or ARG:BINS divides "
-        "the trials by the value of the argument ARG, into BINS bins (default: 4)",
+        help="report a rate for each group. The words kind, fault and disturbance group the crashes; ARG or ARG:BINS "
+        "groups the trials by the value of the argument ARG, in BINS bins (default: 4)",
     )  # fmt: skip
     rate.add_argument(
         "--bar", metavar="RATE", default="",

@@ -75,8 +75,8 @@ def add_rerun(commands: Commands) -> None:
     )
     rerun.add_argument("directory", metavar="DIR", type=Path, help="directory of a hunt or a suite")
     rerun.add_argument("--run", metavar="ID", action="append", default=[],
-                       help="in a suite: repeat only this run, such as town/0, or all runs of a hunt, such as town; "
-                       "may be repeated")  # fmt: skip
+                       help="in a suite: run again only this run, such as town/0, or all runs of a hunt, such as town; "
+                       "the option may be given several times")  # fmt: skip
     which = rerun.add_mutually_exclusive_group()
     which.add_argument("--failed", action="store_true", help="run only failed hunts and trials again (the default)")
     which.add_argument("--all", action="store_true", help="run all hunts again from the start")

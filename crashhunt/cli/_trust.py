@@ -38,7 +38,8 @@ def add_trust_command(commands: Commands) -> None:
     )  # fmt: skip
     trust.add_argument(
         "--remove", metavar="ORIGIN", action="append", default=[],
-        help="stop trusting the code with this fingerprint, or the code in this directory; may be repeated",
+        help="stop trusting the code with this fingerprint, or the code in this directory; the option may be given "
+        "several times",
     )  # fmt: skip
     add_json(trust)
     trust.set_defaults(command=_trust)

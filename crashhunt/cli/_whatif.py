@@ -69,7 +69,7 @@ def add_whatif(commands: Commands) -> None:
         metavar="NAME=VALUE",
         action="append",
         default=[],
-        help="an argument of the agent that --agent names; may be repeated",
+        help="an argument of the agent that --agent names; the option may be given several times",
     )
     whatif.add_argument(
         "--futures", action="store_true",

@@ -203,7 +203,7 @@ def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
     if supports(form.space, NamesMetaActions) and name in form.space.meanings:
         return tuple(form.space.meanings).index(name)
     raise InvalidEpisodeError(
-        f"{agent} cannot be made to change to the {side} lane: its actions have no known lane change"
+        f"{agent} cannot be made to change to the {side} lane: none of its actions is known to change the lane"
     )
 
 

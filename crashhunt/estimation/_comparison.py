@@ -89,7 +89,10 @@ class HuntFigures:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Comparison of two hunts by trials with the same number, seed and traffic; without such trials, as a whole.
+    """Comparison of two hunts.
+
+    Trials with the same number, seed and traffic are compared in pairs. If there are no such trials, the crash rates of
+    the two hunts are compared.
 
     Args:
         first: directory of the first hunt.

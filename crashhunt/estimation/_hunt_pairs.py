@@ -37,7 +37,7 @@ _FAILED_STATES = ("no_valid_trial", "error")
 
 @dataclass(frozen=True, slots=True)
 class GateCase:
-    """The result of a case of HEAD's corpus.
+    """The result of running one case of the corpus with the code of the version HEAD.
 
     Args:
         name: name of the case's folder.

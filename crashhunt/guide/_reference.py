@@ -310,7 +310,7 @@ def _keys(module: str, name: str) -> str:
     text = as_markdown(ast.get_docstring(found) if found else "")
     _, heading, keys = text.partition("*Arguments*:\n\n")
     if not heading:
-        raise LookupError(f"{module}.{name} does not describe its keys")
+        raise LookupError(f"{module}.{name} has a docstring that does not describe its keys")
     return keys.partition("\n*")[0].rstrip() + "\n"
 
 

@@ -305,7 +305,7 @@ class LedgerReader:
         try:
             return cast(Facts, {row[0]: json.loads(row[1]) for row in rows if row[0] not in OWN_FACTS})
         except (ValueError, TypeError, RecursionError) as error:
-            raise damaged(self._path, f"a fact about the hunt cannot be read: {error}") from None
+            raise damaged(self._path, f"an entry of the table hunt cannot be read: {error}") from None
 
     def finished(self) -> set[int]:
         """Return the numbers of the finished trials."""

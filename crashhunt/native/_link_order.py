@@ -36,7 +36,7 @@ class LinkOrder:
         self._loads = self._count_calls()
 
     def use(self, use: bool) -> None:
-        """Choose whether links of the next loads have the fixed order, or libsumo's own order."""
+        """Give the links of networks that are loaded from now on the fixed order (True), or libsumo's own (False)."""
         if self._library is not None:
             self._library.crashhunt_link_order_use(use)
 

@@ -146,7 +146,7 @@ class OracleChoice:
         """Return the outcomes that the oracle adds, and their categories.
 
         Raises:
-            CrashhuntError: the oracle cannot be created, as for `make`.
+            CrashhuntError: the oracle cannot be created; `make` lists the reasons.
         """
         made = self.make()
         return (

@@ -107,7 +107,7 @@ class Subject(_Options):
         (), "additional oracles; by default, oracles detect collisions that the simulator reports, overlaps, and "
         "leaving the road",
         help="an additional oracle that detects crashes, with its arguments; crashhunt oracles lists all oracles; "
-        "none switches off the default oracles; may be repeated",
+        "none switches off the default oracles; the option may be given several times",
         flag="--oracle", metavar="NAME[:KEY=VALUE,…]", group="what",
     )  # fmt: skip
 
@@ -342,7 +342,8 @@ class SnapshotChoices(_Options):
 
     snapshot_roots: Sequence[str | Path] = option(
         (), "files and folders to add to the snapshot, in addition to the agents' projects",
-        help="a file or folder that the snapshot contains in addition to the agent's project; may be repeated",
+        help="a file or folder that the snapshot contains in addition to the agent's project; the option "
+        "may be given several times",
         flag="--snapshot-root", group="kept", metavar="PATH",
     )  # fmt: skip
     snapshot_limit_mb: float = option(

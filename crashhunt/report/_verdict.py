@@ -39,10 +39,10 @@ class CrashFacts(Protocol):
     Attributes:
         bundle: the crash or near miss.
         agent: the controlled vehicle.
-        other: the collision partner; empty if there is none.
-        contact: contact of the agent and the collision partner; None if they did not touch.
+        other: the actor that the agent touched or nearly touched; empty if there is none.
+        contact: record of the first contact with this actor; None if the two did not touch.
         nearest: the moment of the greatest criticality; None for a crash.
-        encounter: encounter of the agent and the collision partner; None without a collision partner.
+        encounter: the motion of the agent and this actor, in all steps; None if there is no such actor.
         judgement: result of `judge`; None if `judge` has not run.
     """
 

@@ -128,7 +128,9 @@ def _asking(options: HuntOptions, example: Example) -> HuntOptions:
     known = Example.__annotations__
     for key in example:
         if key not in known:
-            raise UsageError(f"example has no entry {key!r}", fix=one_of(key, known, give="it has"))
+            raise UsageError(
+                f"the example has the unknown key {key!r}", fix=one_of(key, known, give="the known keys are")
+            )
     arguments: dict[str, Value] = {}
     for agent, given in example.get("arguments", {}).items():
         if not isinstance(given, Mapping):

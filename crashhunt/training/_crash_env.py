@@ -277,7 +277,9 @@ def _places(crashes: object) -> list[str | Path]:
 def _record_file(trained_on: object) -> Path | None:
     """Return the path of ``trained_on.json``; None for no file."""
     if not isinstance(trained_on, str | Path) or "\0" in str(trained_on):
-        raise UsageError(f"trained_on is {trained_on!r}", fix="give the folder of the policy")
+        raise UsageError(
+            f"trained_on is {trained_on!r}, which is no path", fix="give the folder in which the policy is saved"
+        )
     if not str(trained_on):
         return None
     path = Path(trained_on)

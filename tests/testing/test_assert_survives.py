@@ -100,7 +100,7 @@ def test_example_replaces_arguments_of_its_names_only():
     assert found.scenario_arguments == {"a": 1, "b": 2}
     assert found.agent == "keep-lane"
     assert _survives._asking(HuntOptions(), {}).arguments == {}
-    with pytest.raises(UsageError, match="example has no entry 'seeds'; did you mean 'seed'"):
+    with pytest.raises(UsageError, match="the example has the unknown key 'seeds'; did you mean 'seed'"):
         _survives._asking(options, {"seeds": 1})
     with pytest.raises(UsageError, match=r"the arguments of 'speed' are 3.0; give the arguments of each agent"):
         _survives._asking(options, {"arguments": {"speed": 3.0}})

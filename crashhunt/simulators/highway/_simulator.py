@@ -227,7 +227,7 @@ class HighwaySimulator:
         return action_with(kind, vehicle, action, self.step_length_s, speed_mps=speed_mps, keeps_lane=keeps_lane)
 
     def resolve_target(self, disturbance: Disturbance) -> str:
-        """Return the identifier of the vehicle at the disturbance's place around its agent; empty if none is there."""
+        """Return the vehicle that a disturbance names by a place, such as ``ahead``; empty if there is none."""
         found = self._disturbances.resolve_target(self._controlled[disturbance.agent], disturbance)
         return "" if found is None else self._actor(found).id
 

@@ -259,7 +259,7 @@ class SumoSimulator:
         return surroundings_of(agent, self._driving.neighboring_lane)
 
     def resolve_target(self, disturbance: Disturbance) -> str:
-        """Return the identifier of the actor at the disturbance's place around its agent; empty if none is there."""
+        """Return the actor that a disturbance names by a place, such as ``ahead``; empty if there is none."""
         return self._disturbances.resolve_target(disturbance, self.scene())
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance | None:
