@@ -202,7 +202,11 @@ _TESTS_ELSEWHERE = {
         "hunts/test_verified_runs.py",
         "hunts/test_whole_hunts.py",
     ),
-    "hunts/_preflight.py": ("hunts/test_preflight.py", "hunts/test_traffic_survey.py"),
+    "hunts/_preflight.py": (
+        "hunts/test_hunt_parts.py",
+        "hunts/test_preflight.py",
+        "hunts/test_traffic_survey.py",
+    ),
     "hunts/_progress.py": (
         "hunts/test_from_the_start.py",
         "hunts/test_hunt_status.py",
@@ -213,8 +217,13 @@ _TESTS_ELSEWHERE = {
         "hunts/test_whole_hunts.py",
     ),
     "hunts/_rates.py": ("hunts/test_rare_hunts.py", "e2e/test_crash_rates.py"),
-    "hunts/_reports.py": ("hunts/test_rare_hunts.py", "hunts/test_states_and_reports.py", "hunts/test_whole_hunts.py"),
-    "hunts/_results.py": ("hunts/test_results.py", "hunts/test_trial_rows.py"),
+    "hunts/_reports.py": (
+        "hunts/test_hunt_parts.py",
+        "hunts/test_rare_hunts.py",
+        "hunts/test_states_and_reports.py",
+        "hunts/test_whole_hunts.py",
+    ),
+    "hunts/_results.py": ("hunts/test_hunt_parts.py", "hunts/test_results.py", "hunts/test_trial_rows.py"),
     "hunts/_state.py": (
         "hunts/test_directory.py",
         "hunts/test_hunt_parts.py",

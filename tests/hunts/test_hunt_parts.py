@@ -17,12 +17,12 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UntrustedError
 from crashhunt.executors import PoolExecutor
-from crashhunt.hunts import _hunt, _state, _verification
+from crashhunt.hunts import HuntReport, _hunt, _preflight, _results, _state, _verification
 from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._state import HuntDirectory, LogReader
 from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReruns, is_settled
 from crashhunt.ledger import Ledger
-from crashhunt.plans import HuntSettings, RunSettings, read_settings
+from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 SETTINGS = HuntSettings(
@@ -608,3 +608,54 @@ def test_crashes_are_confirmed_while_the_hunt_runs():
     assert not confirmation._thread.is_alive()
     assert executor.held_back == 0
     assert runs.asked.empty()
+
+
+def test_hunt_is_hopeless_once_enough_trials_could_not_be_set_up():
+    def hopeless(invalid, survived=0, trials=900, parallel=2):
+        settings = replace(SETTINGS, trials=trials, run=RunSettings(parallel=parallel))
+        return _preflight.is_hopeless(settings, {"invalid": invalid, "survived": survived})
+
+    enough = _preflight._MAX_INVALID_AT_START
+    assert [hopeless(enough - 1), hopeless(enough), hopeless(enough + 1)] == [False, True, True]
+    assert not hopeless(enough, survived=1)
+    assert [hopeless(2, trials=3), hopeless(3, trials=3)] == [False, True]
+    assert [hopeless(2 * enough - 1, parallel=enough), hopeless(2 * enough, parallel=enough)] == [False, True]
+
+
+def test_report_of_a_hunt_has_what_it_was_asked_for(tmp_path):
+    part = SimpleNamespace(to_json=lambda: "part")
+    crash = SimpleNamespace(summary=lambda: "crash", path=tmp_path / "crash")
+    plain = HuntReport(
+        directory=tmp_path, settings=SETTINGS, stopped_because="all_trials", outcomes={"survived": 4, "collision": 1},
+        trial_steps={}, steps_total=70, wall_s=1.23456, crashes=(crash,), reason="", notes=("a note",),
+        events={"hard_braking": (3, 2)}, audit=None, unanswered=1, unconfirmed=2,
+    )  # fmt: skip
+    assert plain.to_json() == {
+        "dir": str(tmp_path), "hunt_seed": 3, "trials_planned": 9, "trials_run": 5,
+        "outcomes": {"survived": 4, "collision": 1}, "stopped_because": "all_trials", "wall_s": 1.235,
+        "steps_total": 70, "events": {"hard_braking": {"count": 3, "trials": 2}}, "crashes_found": 0,
+        "crashes": ["crash"], "notes": ["a note"], "audit": None, "unanswered": 1, "unconfirmed": 2,
+    }  # fmt: skip
+    near = replace(SETTINGS, run=replace(SETTINGS.run, near_misses=2))
+    more = replace(
+        plain, audit=part, probes=part, branches=part, kinds=(), types_by_cause=2, settings=near, near_misses=(crash,),
+        at_fault=(4,), copied=crash, rare=part, rate=part,
+    ).to_json()  # fmt: skip
+    assert {name: more[name] for name in more.keys() - plain.to_json().keys() | {"audit"}} == {
+        "audit": "part", "probes": "part", "branches": "part", "kinds": [], "types_by_cause": 2,
+        "near_misses": ["crash"], "at_fault": [4], "copied": str(crash.path), "rare": "part", "rate": "part",
+    }  # fmt: skip
+
+
+def test_columns_of_a_table_have_the_kinds_of_their_arguments():
+    def spec(kind):
+        return ArgumentSpec(spec="1", kind=kind)
+
+    agents = {"ego": AgentSettings(agent="x", arguments={"speed": spec("int"), "mode": spec(None), "gap": spec(None)})}
+    settings = replace(SETTINGS, agents=agents, scenario_arguments={"rain": spec("bool"), "who": spec("str")})
+    columns = ("number", "outcome", "scenario.rain", "scenario.who", "ego.speed", "ego.mode", "ego.gap", "danger")
+    batch = [{"ego.mode": "fast", "ego.gap": 2}, {"ego.mode": 1, "ego.gap": None}]
+    assert _results._kinds(SimpleNamespace(settings=settings, columns=columns), batch) == {
+        "number": "Int64", "outcome": "String", "scenario.rain": "Boolean", "scenario.who": "String",
+        "ego.speed": "Int64", "ego.mode": "String", "ego.gap": "Float64", "danger": "Float64",
+    }  # fmt: skip
