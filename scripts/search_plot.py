@@ -67,7 +67,7 @@ def costs(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
     The cost is trials without a simulator, where all take as long, and steps of everything with one.
     """
     found: dict[str, dict[str, float]] = {}
-    for problem in (*PROBLEMS, *REAL, *DEVELOPMENT):
+    for problem in (*PROBLEMS, *REAL, *DEVELOPMENT, *UNSEEN):
         of = [run for run in runs if run.problem == problem]
         needed = _needed(problem, [run for run in of if run.sampler == "random"])
         for sampler in dict.fromkeys(run.sampler for run in of):
