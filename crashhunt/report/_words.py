@@ -348,8 +348,8 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
             "later step crashed."
         )
     elif visible is not None and judgement.runs:
-        since = "from the start" if visible == 0 else f"from {ago(visible)}, on"
-        sentences.append(f"{agent} observed {other} {since}.")
+        when = "at the start" if visible == 0 else ago(visible)  # other actors may hide it later
+        sentences.append(f"{agent} first observed {other} {when}.")
     if judgement.why_not:
         sentences.append(f"Whether it could have been avoided is not fully known: {judgement.why_not}.")
     return sentences
@@ -392,8 +392,8 @@ def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
     actor, kind = omission.actor, omission.kind
     seen = ""
     if omission.visible_step is not None and omission.visible_step <= omission.step:
-        seen = ", which it observed from the start" if omission.visible_step == 0 else ""
-        seen = seen or f", which it observed since {ago(omission.visible_step)}"
+        seen = ", which it first observed at the start" if omission.visible_step == 0 else ""
+        seen = seen or f", which it first observed {ago(omission.visible_step)}"
     elif actor and omission.visible_step is not None:
         seen = ", which it did not observe yet"
     if omission.instead == "changed lanes":

@@ -25,15 +25,15 @@ def said(faculty="longitudinal", endings=("none", "none", "none"), changed=(), *
         (
             {},
             (
-                "ego did not brake for left.3 (12.2 m ahead, 20.0 m/s where 19.0 m/s are safe), which it observed "
-                "since step 12, and sped up"
+                "ego did not brake for left.3 (12.2 m ahead, 20.0 m/s where 19.0 m/s are safe), which it first "
+                "observed step 12, and sped up"
             ),
         ),
         (
             {"instead": "braked too little", "visible_step": 0},
             (
                 "ego braked too little for left.3 (12.2 m ahead, 20.0 m/s where 19.0 m/s are safe), which it "
-                "observed from the start"
+                "first observed at the start"
             ),
         ),
         (
