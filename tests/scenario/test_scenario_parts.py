@@ -20,6 +20,7 @@ from crashhunt.scenario import (
     ObservationSetup,
     Scenario,
     _load,
+    _scenario,
     argument_values,
     as_plain_data,
     backend_of,
@@ -452,6 +453,26 @@ def test_untrusted_file_of_sumo_may_only_simulate():
         )
     assert refused("<!DOCTYPE a><routes/>") == "f has a document type, which may change its content"
     assert refused("<routes>").startswith("f cannot be checked: ")
+
+
+@pytest.mark.parametrize(
+    ("option", "harmless"),
+    [("remote-port", False), ("tripinfo-output", False), ("gui-settings-file", False), ("lateral-resolution", True)],
+)
+def test_untrusted_option_of_sumo_may_only_change_the_traffic(town, option, harmless):
+    found = town.with_table(replace(town.table(SumoSetup), options={option: "1"}))
+    assert SUMO.side_effect(found, {}, []) == ("" if harmless else f"it sets SUMO's option {option!r}")
+    asked = replace(town, arguments={"count": ArgumentSetup(default=3, option=option)})
+    assert bool(SUMO.side_effect(asked, {"count": 3}, [])) is not harmless
+
+
+def test_descriptor_of_a_plugin_is_a_backend(monkeypatch):
+    plugin, other = Backend(title="mine"), "no descriptor"
+    monkeypatch.setattr(_scenario, "_plugin_backends", lambda: {"mine": SimpleNamespace(value="m:B")})
+    monkeypatch.setattr(_scenario, "load_attribute", lambda value, *, shown: (plugin, other)[shown != "mine"])
+    find = getattr(backend_of, "__wrapped__", backend_of)
+    assert find("mine") is plugin
+    assert find("nobody") is None
 
 
 def test_line_of_a_definition_is_counted_from_1(tmp_path):
