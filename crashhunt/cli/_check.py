@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import add_json, say
 
@@ -66,8 +67,12 @@ def _check(options: argparse.Namespace, _words: list[str]) -> int:
 
 def _describe(found: Checked) -> str:
     parts = [f"{len(found.trials)} trial{'' if len(found.trials) == 1 else 's'}"] if found.kind == "hunt" else []
-    parts.append(f"{len(found.crashes)} crash{'' if len(found.crashes) == 1 else 'es'}")
-    lines = [f"{found.dir}: {' and '.join(parts)} {'are' if found.kind == 'hunt' else 'is'} intact"]
+    minimized = sum(name.endswith(layout.SMALL) for name in found.crashes) if found.kind == "hunt" else 0
+    crashes = len(found.crashes) - minimized
+    parts.append(f"{crashes} crash{'' if crashes == 1 else 'es'}")
+    parts += [f"{minimized} minimized crash{'' if minimized == 1 else 'es'}"] if minimized else []
+    listed = " and ".join(", ".join(parts).rsplit(", ", 1))
+    lines = [f"{found.dir}: {listed} {'are' if found.kind == 'hunt' else 'is'} intact"]
     if not found.fine:
         bad = [
             f"{len(numbers)} {name}"

@@ -582,7 +582,7 @@ def test_crash_is_described_for_as_long_as_is_asked(opened, monkeypatch, capsys)
 
 def checked(**more):
     usual = {
-        "dir": "h", "kind": "hunt", "trials": [1, 2], "crashes": [1], "damaged_trials": [], "damaged_crashes": [],
+        "dir": "h", "kind": "hunt", "trials": [1, 2], "crashes": ["000001-collision"], "damaged_trials": [], "damaged_crashes": [],
         "findings": (), "fine": True, "to_json": lambda: {"dir": "h"},
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **more})
@@ -593,6 +593,8 @@ def test_check_names_what_is_intact_damaged_and_lost():
     note = SimpleNamespace(damaged=False, where="run.log", what="missing", lost="", fix="")
     assert _check._describe(checked()) == "h: 2 trials and 1 crash are intact"
     assert _check._describe(checked(trials=[1], crashes=[])) == "h: 1 trial and 0 crashes are intact"
+    minimized = checked(crashes=["000001-collision", "000001-collision.small"])  # as many crashes as in status
+    assert _check._describe(minimized) == "h: 2 trials, 1 crash and 1 minimized crash are intact"
     assert _check._describe(checked(kind="crash")) == "h: 1 crash is intact"
     damaged = checked(fine=False, damaged_trials=[3, 4], damaged_crashes=[5], findings=(finding, note))
     assert _check._describe(damaged).splitlines() == [
