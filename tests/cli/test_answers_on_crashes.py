@@ -582,8 +582,8 @@ def test_crash_is_described_for_as_long_as_is_asked(opened, monkeypatch, capsys)
 
 def checked(**more):
     usual = {
-        "dir": "h", "kind": "hunt", "trials": [1, 2], "crashes": ["000001-collision"], "damaged_trials": [], "damaged_crashes": [],
-        "findings": (), "fine": True, "to_json": lambda: {"dir": "h"},
+        "dir": "h", "kind": "hunt", "trials": [1, 2], "crashes": ["000001-collision"], "damaged_trials": [],
+        "damaged_crashes": [], "findings": (), "fine": True, "to_json": lambda: {"dir": "h"},
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **more})
 
