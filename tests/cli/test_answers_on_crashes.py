@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt import cli
-from crashhunt.cli import _check, _guide, _replay, _shrink, _trust, _whatif
+from crashhunt.cli import _check, _guide, _judge, _replay, _shrink, _trust, _whatif
 from crashhunt.errors import BundleError, HuntDirectoryError, UsageError
 from crashhunt.trial import Outcome
 
@@ -112,8 +113,10 @@ def grouped(monkeypatch):
     ))  # fmt: skip
     monkeypatch.setattr("crashhunt.cli._crashes.check_trust", lambda *words: asked["trust"].append(words))
     monkeypatch.setattr("crashhunt.cli._crashes.tell", lambda options, *words: asked["told"].append(words))
-    monkeypatch.setattr("crashhunt.report.findings_of", lambda groups, known: (groups, known))
-    monkeypatch.setattr("crashhunt.report.crashes_summary", lambda findings, compared: f"compared: {compared}")
+    monkeypatch.setattr("crashhunt.report.findings_of", lambda types, known: (types is groups, known))
+    monkeypatch.setattr(
+        "crashhunt.report.crashes_summary", lambda findings, compared: f"{findings[0]}, compared: {compared}"
+    )
     monkeypatch.setattr("crashhunt.report.crash_annotations", lambda findings: ["::error"])
     monkeypatch.setattr("crashhunt.report.write_sarif", lambda findings, path: asked["told"].append(path))
     return groups, asked
@@ -168,13 +171,13 @@ def test_types_of_a_corpus_are_marked(grouped, monkeypatch, capsys, tmp_path):
     words = ("--known", tmp_path / "corpus", "--json")
     assert run("crashes", "a", *words, "--sarif", "s.sarif") == 0
     assert [one["known"] for one in json.loads(capsys.readouterr().out)["groups"]] == ["corpus/case", None]
-    assert asked["told"] == [Path("s.sarif"), ("compared: True", ["::error"])]
+    assert asked["told"] == [Path("s.sarif"), ("True, compared: True", ["::error"])]
     (tmp_path / "corpus").mkdir()  # without a case, which is no error
     assert run("crashes", "a", *words) == 0
     assert [one["known"] for one in json.loads(capsys.readouterr().out)["groups"]] == [None, None]
     asked["told"].clear()
     assert run("crashes", "a", "--annotate") == 0
-    assert asked["told"] == [("compared: False", ["::error"])]
+    assert asked["told"] == [("True, compared: False", ["::error"])]
 
 
 # crashhunt replay
@@ -210,6 +213,7 @@ def test_debugger_stops_in_the_step_in_which_the_agent_failed():
     assert _replay.look_at_all(crash(outcome=Outcome.HANG)).until == 50
     assert _replay.look_at_all(crash(outcome=Outcome.PROCESS_DIED, steps=0)) is None
     assert _replay.look_at_all(crash(), quiet=True).quiet
+    assert not _replay.look_at_all(crash()).quiet
     gui = cli.make_parser().parse_args(["replay", "h", "--gui"])
     with pytest.raises(UsageError, match="ended before its first step, so there is nothing to show; omit --gui"):
         _replay._view_of(gui, crash(outcome=Outcome.PROCESS_DIED, steps=0))
@@ -732,3 +736,71 @@ def test_logs_are_of_the_type_and_the_trial_that_are_named(monkeypatch, capsys):
     assert run("logs", "s", "--errors-only") == 0
     assert asked[-1] == (".", ("error",), None)
     assert capsys.readouterr() == ("", "there is nothing to show\n")
+
+
+# crashhunt dashboard and run
+
+
+def test_dashboard_is_served_as_asked_and_announced(monkeypatch, capsys):
+    asked = []
+
+    def serve(paths, *, announce, **options):
+        asked.append((paths, options))
+        announce(SimpleNamespace(url="http://h:1/", host="h", port=1, token="t"))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("crashhunt.dashboard.serve", serve)
+    assert run("dashboard", "a", "b", "--host", "h", "--port", "1", "--token", "t", "--allow-control") == 0
+    assert capsys.readouterr() == ("http://h:1/\nCtrl-C ends the dashboard.\n", "")
+    assert run("dashboard", "--json") == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"url": "http://h:1/", "host": "h", "port": 1, "token": "t"}
+    assert err == "http://h:1/\nCtrl-C ends the dashboard.\n"
+    run("dashboard", "--no-browser")
+    assert [paths for paths, _ in asked] == [[Path("a"), Path("b")], [Path()], [Path()]]
+    assert asked[0][1] == {"host": "h", "port": 1, "token": "t", "browser": True, "allow_control": True}
+    assert [options["browser"] for _, options in asked] == [True, False, False]
+    assert (asked[1][1]["port"], asked[1][1]["token"], asked[1][1]["allow_control"]) == (8642, "", False)
+
+
+@pytest.mark.parametrize(("ego", "starts"), [(None, True), ("", True), ("any", True), ("car.3", False)])
+def test_long_wait_is_explained_where_traffic_is_surveyed(monkeypatch, capsys, tmp_path, ego, starts):
+    module = importlib.import_module("crashhunt.cli._run")
+    timers = []
+
+    class Timer:
+        def __init__(self, seconds, tell):
+            self.seconds, self.tell, self.started = seconds, tell, False
+            timers.append(self)
+
+        def start(self):
+            self.started = True
+
+    monkeypatch.setattr(module, "threading", SimpleNamespace(Timer=Timer))
+    configured = SimpleNamespace(endings=(".sumocfg",), waiting="SUMO simulates the traffic first")
+    monkeypatch.setattr("crashhunt.scenario.configurations", lambda: [configured])
+    scenario = tmp_path / "town.sumocfg"
+    timer = module._start_wait_notice(SimpleNamespace(ego=ego, scenario=scenario))
+    assert timers == [timer]
+    assert (timer.seconds, timer.started, timer.daemon) == (3.0, starts, True)
+    timer.tell()
+    assert capsys.readouterr().err == ""  # there is no such file
+    scenario.touch()
+    timer.tell()
+    assert capsys.readouterr().err == "SUMO simulates the traffic first\n"
+
+
+def test_one_crash_is_judged_and_not_saved_in_an_exported_file(opened, monkeypatch, capsys):
+    judged = []
+    monkeypatch.setattr(
+        _judge, "_judge_one", lambda options, bundle, stops, trusted, *, write: judged.append(
+            (bundle, [*stops], trusted, write)
+        ) or {"verdict": "avoidable"}
+    )  # fmt: skip
+    bundle = crash()
+    calls = opened(bundle, _judge)
+    assert run("judge", "h", "--crash", "3", "--json") == 0
+    assert judged == [(bundle, [], "trusted", False)]
+    assert calls[0] == (Path("h"), "3")
+    assert calls[1][:2] == (bundle, "archive")
+    assert json.loads(capsys.readouterr().out) == {"judged": [{"verdict": "avoidable"}]}

@@ -129,6 +129,30 @@ def test_case_of_a_corpus_is_copied_whole_and_only_once(case, tmp_path):
     assert [path.name for path in other.iterdir()] == [added.case.path.name]
 
 
+def test_copied_case_is_authenticated_where_it_is(case, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        _cases, "authenticate_bundle", lambda bundle: f"code of {bundle.path.name} in {bundle.hunt.parent.name}"
+    )
+    added = add_case(case.bundle(), tmp_path / "other")
+    assert added.case.bundle().authentication_code == "code of 000000-collision in other"
+
+
+def test_log_of_a_case_has_no_views(case, tmp_path, monkeypatch):
+    written, bundle = [], case.bundle()
+    recording = bundle.recording()
+    (case.path / "crashhunt-case.toml").unlink()  # as in a hunt
+    monkeypatch.setattr(_cases, "without_code", lambda snapshot, folder: snapshot)
+    monkeypatch.setattr(_cases, "_compact", lambda bundle, recording: "compact")
+    monkeypatch.setattr(_cases, "write_log", lambda path, what, *, views: written.append((path.name, what, views)))
+    for most, expected in ((100 * 1024, [recording]), (100, [recording, "compact"])):
+        monkeypatch.setattr(_cases, "_MAX_BYTES_WITH_LOG", most)
+        written.clear()
+        added = add_case(bundle, tmp_path / str(most))
+        assert [(name, views) for name, _, views in written] == [("log.mcap", False)] * len(expected)
+        assert [what == "compact" for _, what, _ in written] == [what == "compact" for what in expected]
+        assert added.new
+
+
 @pytest.mark.parametrize("outcome", [Outcome.SURVIVED, Outcome.FINISHED])
 def test_near_miss_is_not_added(outcome, tmp_path):
     bundle = SimpleNamespace(id="000003-near-miss", result=SimpleNamespace(outcome=outcome))
