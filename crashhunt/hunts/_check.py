@@ -482,13 +482,20 @@ def _copy_rows(found: Checked, settings: HuntSettings, to: Path) -> int:
     with closing(Ledger(to / layout.LEDGER, writable=True)) as ledger:
         count = 0
         source = found.dir / layout.LEDGER
+        replanned: bool | None = None
         if found.trials and has_begun(source):
             with closing(Ledger(source)) as old:
+                try:
+                    replanned = old.facts().get("replanned")
+                except HuntDirectoryError:
+                    replanned = True  # it is not known, and True forbids a p-value
                 ledger.propose(old.intact_turns())
                 for _, row in _copied_rows(found, settings, old):
                     ledger.copy(row)
                     count += 1
-        ledger.enter("interrupted", _detail(found), planned=settings.trials, hunt_seed=settings.seed)
+        ledger.enter(
+            "interrupted", _detail(found), planned=settings.trials, hunt_seed=settings.seed, replanned=replanned
+        )
     return count
 
 

@@ -397,6 +397,34 @@ def test_what_is_whole_is_saved_into_another_directory(hunt, tmp_path):
     assert load_quietly(tmp_path / "s").settings == load(hunt).settings
 
 
+def test_salvaged_hunt_keeps_that_its_number_of_trials_was_changed_or_is_not_known(hunt, tmp_path, monkeypatch):
+    def replanned(to):
+        (checked,) = check(hunt)
+        salvage(checked, tmp_path / to)
+        with closing(Ledger(tmp_path / to / "ledger.sqlite")) as ledger:
+            return ledger.facts().get("replanned")
+
+    assert replanned("never") is None
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(replanned=True)
+    assert replanned("changed") is True
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(replanned=None)
+    (checked,) = check(hunt)
+    facts = Ledger.facts
+
+    def lost(self):
+        if self._path == hunt / "ledger.sqlite":
+            raise HuntDirectoryError("the ledger is damaged")
+        return facts(self)
+
+    monkeypatch.setattr(Ledger, "facts", lost)
+    salvage(checked, tmp_path / "lost")
+    monkeypatch.undo()
+    with closing(Ledger(tmp_path / "lost" / "ledger.sqlite")) as ledger:
+        assert ledger.facts()["replanned"] is True
+
+
 def test_salvage_refuses_a_directory_that_has_something_and_names_what_cannot_be_copied(hunt, tmp_path, monkeypatch):
     (hunt / "crashes" / "000000-collision" / "log.mcap").write_bytes(b"")
     (checked,) = check(hunt)
