@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import signal
 import stat
@@ -46,6 +47,9 @@ def place(tmp_path, monkeypatch):
     files = tmp_path / "temporary files"
     files.mkdir()
     monkeypatch.setenv("TMPDIR", str(files))
+    if temporary._things._count:  # what other tests of this process have not yet removed is in the folder they chose
+        gc.collect()
+        monkeypatch.setattr(temporary, "_things", temporary._TemporaryFiles())
     return files / f"crashhunt-temporary-{os.getuid()}"
 
 

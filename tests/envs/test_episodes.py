@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -153,7 +154,7 @@ def test_fork_of_a_process_has_no_simulation_of_its_own_yet(make, monkeypatch):
     monkeypatch.setattr("crashhunt.envs._sumo_env._process", [])
     make("loop")
     assert SumoEnv("loop").agent == "of another process"
-    monkeypatch.setattr("crashhunt.envs._sumo_env.os.getpid", lambda: -5)  # as in a fork
+    monkeypatch.setattr("crashhunt.envs._sumo_env.os", SimpleNamespace(getpid=lambda: -5))  # as in a fork
     first = SumoEnv("loop")
     assert first.agent == "ego"
     assert SumoEnv("loop").agent == "of another process"

@@ -289,7 +289,9 @@ def test_what_is_too_large_to_travel_is_refused(settings, tmp_path):
     (tmp_path / "code").mkdir()
     with (tmp_path / "code" / "weights.bin").open("wb") as file:
         file.truncate(300 * 10**6)
-    with pytest.raises(UsageError, match=r"have 300 MB, above the 200 MB .* is \S+weights.bin \(300 MB\); make this file smaller"):
+    with pytest.raises(
+        UsageError, match=r"have 300 MB, above the 200 MB .* is \S+weights.bin \(300 MB\); make this file smaller"
+    ):
         RayExecutor(replace(settings, code=(str(tmp_path / "code"),)), argument="local")
 
 
