@@ -287,6 +287,17 @@ def test_rate_that_reads_all_trials_takes_a_twentieth_of_the_time(view):
     assert len(view.reads) == 5
 
 
+def test_rate_needs_settings_and_trials_and_all_trials_where_counts_do_not_suffice(view, monkeypatch):
+    monkeypatch.setattr(view, "_held_out", lambda settings: None)
+    monkeypatch.setattr(_hunt, "counts_suffice", lambda settings, facts, held_out: False)
+    state = SimpleNamespace(state="running")
+    for settings, counts in ((None, 5), (SimpleNamespace(), None), (SimpleNamespace(), 0)):
+        view.settings, view.counts = settings, None if counts is None else SimpleNamespace(trials=counts)
+        assert view.rate(state) is None
+    view.settings, view.counts = SimpleNamespace(), SimpleNamespace(trials=5)
+    assert set(view.rate(state).values()) == {1}
+
+
 def test_results_of_forks_are_summed_up_in_their_share_of_the_time(view):
     def copies(state="running", copies=True):
         view.facts = {"copies": copies, "state": state}

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.simulators.sumo import _disturbances
+from crashhunt.simulators.sumo import _disturbances, _driving
 from crashhunt.world import Actor, Roster, Scene
 
 
@@ -149,3 +149,21 @@ def test_vehicle_in_a_neighbouring_lane_is_the_nearest_there(monkeypatch, left_h
     ):  # fmt: skip
         monkeypatch.setattr(_disturbances, "sumo", Neighbours(lists=lists))
         assert _disturbances._at("ego", who, left_hand=left_hand) == name, (lists, who)
+
+
+@pytest.mark.parametrize(
+    ("allowed", "vehicle_class", "closed"),
+    [
+        ((), "truck", False),
+        (("bus",), "truck", True),
+        (("bus", "truck"), "truck", False),
+        (("bus",), "ignoring", False),
+    ],
+)
+def test_lane_is_closed_to_classes_that_it_does_not_name(monkeypatch, allowed, vehicle_class, closed):
+    """No lane is closed to the class that ignores permissions."""
+    asked = []
+    monkeypatch.setattr(_driving.sumo, "lane_getAllowed", lambda lane: asked.append(lane) or allowed)
+    driving = _driving.Driving({}, 0.1)
+    assert [driving._is_closed("e_0", vehicle_class) for _ in range(2)] == [closed] * 2
+    assert asked == ["e_0"]
