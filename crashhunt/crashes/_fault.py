@@ -51,6 +51,7 @@ _STEP_M = 1.0  # lateral distance from a car's side; a nearer person walks in it
 _OFF_M = 2.5  # lateral distance from a car's axis; a nearer person may be on the road
 _WALKING_SPEED_MPS = 3.0  # m/s; a slower vehicle can stop for any actor
 _CLEARS_S = 3.0
+_INSERTED_S = 1.0  # what happens sooner after the start is due to where vehicles were inserted
 _SOURCES = {"red_light": "Vienna, article 23; StVO § 37", "wrong_way": "Vienna, article 10; StVO § 2"}
 _RED_S = 8.0  # after a red light, a junction is left by then
 
@@ -371,7 +372,8 @@ def fault_of(bundle: Bundle, recording: Recording | None = None, record: Contact
             ),
         )
     event = result.event
-    if event is not None and event.kind in _SOURCES and result.steps * (result.step_length_s or math.inf) >= 1.0:
+    driven_s = result.steps * (result.step_length_s or 0.0)  # results of early versions have no length of a step
+    if event is not None and event.kind in _SOURCES and driven_s >= _INSERTED_S:
         rule, source = event.kind.replace("_", " "), _SOURCES[event.kind]
         return Fault("ego", (FaultFinding(rule=rule, blames="ego", words=event.what, source=source),))
     if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
@@ -384,8 +386,8 @@ def fault_of(bundle: Bundle, recording: Recording | None = None, record: Contact
 
 def fault_in(case: ContactRecord) -> Fault:
     """Return the fault for a collision according to the rules."""
-    if case.time_s - case.began_s < 1.0 or len(case.before) < 2:
-        return Fault("nobody can tell")  # it was put there
+    if case.time_s - case.began_s < _INSERTED_S or len(case.before) < 2:
+        return Fault("nobody can tell")
     if case.is_disputed:
         return Fault("nobody can tell")
     findings = tuple(finding for rule in RULES if (finding := rule(case)) is not None)
