@@ -150,7 +150,7 @@ def begin(tmp_path, monkeypatch, clock):
 
 def submit(bridge, *numbers):
     specs = [TrialSpec(number, number, {}, {}, max_steps=3).to_json() for number in numbers]
-    bridge._roster.waiting += [_bridge.Trial(100 + spec["number"], spec) for spec in specs]
+    bridge._scheduler.waiting += [_bridge.Trial(100 + spec["number"], spec) for spec in specs]
 
 
 def ended(number, files=None):
@@ -219,8 +219,8 @@ def test_a_machine_is_lost_with_all_its_parts(begin):
     told = after()
     assert [message["capacity"] for message in told if "capacity" in message][-1] == 1
     assert len([note for note in notes(told) if note.startswith("node a was lost")]) == 2
-    (left,) = bridge._roster.nodes.values()
-    left = [trial.number for trial in left.running.values()] + [trial.number for trial in bridge._roster.waiting]
+    (left,) = bridge._scheduler.nodes.values()
+    left = [trial.number for trial in left.running.values()] + [trial.number for trial in bridge._scheduler.waiting]
     assert sorted(left) == [*range(10)]
 
 
@@ -336,7 +336,7 @@ def test_the_one_that_ends_every_node_is_distinguished_from_who_was_there(begin)
     result = TrialResult.from_json(culprit)
     assert (result.outcome, result.was_killed_from_outside) == (Outcome.INVALID, True)
     after()
-    (node,) = bridge._roster.nodes.values()
+    (node,) = bridge._scheduler.nodes.values()
     assert [trial.number for trial in node.running.values()] == [1]
 
 
@@ -359,8 +359,8 @@ def test_what_a_node_cannot_run_runs_elsewhere_and_is_not_to_blame(begin):
     cluster.news(cluster.actors[1], error=error)
     cluster.given.clear()
     assert notes(after()) == ["node b takes no part: the disk is full"]
-    (left,) = bridge._roster.nodes.values()
-    assert not any(trial.losses for trial in [*left.running.values(), *bridge._roster.waiting])
+    (left,) = bridge._scheduler.nodes.values()
+    assert not any(trial.losses for trial in [*left.running.values(), *bridge._scheduler.waiting])
     cluster.news(cluster.actors[0], ended(0), ended(2))
     after()
     assert submitted(cluster) == [("a", [1, 3])]
@@ -395,7 +395,7 @@ def test_what_is_given_up_is_given_up_everywhere(begin):
     assert given_up == [("a", "cancel", 1, 106), ("b", "cancel", 1, 106)]
     cluster.news(cluster.actors[0], ended(2))
     assert not [message for message in after() if "result" in message]
-    assert not bridge._roster.waiting
+    assert not bridge._scheduler.waiting
 
 
 def test_what_is_submitted_for_what_has_ended_goes_along_with_the_next_question(begin):

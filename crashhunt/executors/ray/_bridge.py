@@ -97,7 +97,7 @@ class Bridge:
         self._refilled = threading.Condition(self._lock)
         self._missing = 0  # trials that have ended, and for which the hunt has submitted no others yet
         self._tickets = 0  # that were given out
-        self._roster = NodeScheduler()
+        self._scheduler = NodeScheduler()
         self._refused: dict[str, str] = {}  # machine to why
         self._losses: dict[str, int] = {}
         self._free: dict[str, int] = {}  # machine to looks that have shown free CPUs
@@ -117,7 +117,7 @@ class Bridge:
         while not self._closing:
             self.turn()
         with self._lock:
-            nodes = list(self._roster.nodes.values())
+            nodes = list(self._scheduler.nodes.values())
             ready = [node.actor for node in nodes if node.ready]
             self._cluster.close([node.actor for node in nodes], ready, _CLOSE_S)
 
@@ -126,12 +126,12 @@ class Bridge:
         with self._lock:
             self._refresh_nodes()
             self._assign_trials()
-            for node in self._roster.nodes.values():
+            for node in self._scheduler.nodes.values():
                 if node.ready and node.answer is None:
                     given, node.given = node.given, []
                     self._call_node(node, "take", _TAKE_S, given)
             self._send_figures()
-            asked = {node.answer: node for node in self._roster.nodes.values() if node.answer is not None}
+            asked = {node.answer: node for node in self._scheduler.nodes.values() if node.answer is not None}
         if not asked:
             time.sleep(wait_s / 2)
             return
@@ -158,13 +158,13 @@ class Bridge:
 
     def _handle_request(self, message: ToBridge) -> None:
         if "submit" in message:
-            self._roster.waiting += [Trial(ticket, spec) for ticket, spec in message["submit"]]
+            self._scheduler.waiting += [Trial(ticket, spec) for ticket, spec in message["submit"]]
             self._tickets = max([self._tickets, *(ticket + 1 for ticket, _ in message["submit"])])
             self._missing -= len(message["submit"])
         else:
-            self._roster.cancel(message["cancel"])
+            self._scheduler.cancel(message["cancel"])
             self._missing = 0
-            for node in self._roster.nodes.values():
+            for node in self._scheduler.nodes.values():
                 if node.ready:
                     self._cluster.order(node.actor, "cancel", message["cancel"], self._tickets)
         if self._missing <= 0:
@@ -179,7 +179,7 @@ class Bridge:
         If the bridge calls a node soon anyway, the node receives its trials with that call, because each call costs
         time.
         """
-        for node, trials in self._roster.assign().items():
+        for node, trials in self._scheduler.assign().items():
             given = [(trial.ticket, trial.spec) for trial in trials]
             if node.answer is None:
                 node.given += given
@@ -192,13 +192,13 @@ class Bridge:
             return
         self._looked = time.monotonic()
         alive = self._cluster.nodes()
-        for node in list(self._roster.nodes.values()):
+        for node in list(self._scheduler.nodes.values()):
             if node.machine not in alive:
                 self._drop_node(node)
             elif self._is_too_late(node, alive[node.machine]):
                 self._release_actor(node)
         able = {found.id: found for found in alive.values() if found.cpus > 0}
-        taken = sum(node.slots for node in self._roster.nodes.values())
+        taken = sum(node.slots for node in self._scheduler.nodes.values())
         free = {found.id: self._room(found) for found in able.values() if found.id not in self._refused}
         wanted = max(0, self._job["parallel"] - taken) if self._job["parallel"] else None
         for machine, slots in shares(free, wanted).items():
@@ -211,9 +211,9 @@ class Bridge:
                 actor=self._cluster.stand(machine, slots),
                 stood=now,
             )
-            self._roster.nodes[name] = node
+            self._scheduler.nodes[name] = node
             self._call_node(node, "differs", self._job["versions"], self._job["code"])
-        if self._roster.nodes:
+        if self._scheduler.nodes:
             return
         if able and all(name in self._refused for name in able):
             raise UsageError(
@@ -233,7 +233,7 @@ class Bridge:
 
     def _room(self, found: Found) -> int:
         """Return the number of further trials that a machine can run."""
-        parts = self._roster.parts(found.id)
+        parts = self._scheduler.parts(found.id)
         if not parts:
             return found.free
         settled = found.free > 0 and all(node.ready for node in parts)
@@ -251,7 +251,7 @@ class Bridge:
     def _release_actor(self, node: Node) -> None:
         """Cancel an actor that could not be placed; the next actor waits longer."""
         self._patience[node.machine] = 2 * self._patience.get(node.machine, _START_S)
-        self._roster.lose(node)
+        self._scheduler.lose(node)
         self._cluster.kill(node.actor)
         self._began = time.monotonic()  # Ray takes a moment to say that what it had is free
 
@@ -285,7 +285,7 @@ class Bridge:
             self._call_node(node, "begin", job)
         elif said == "ready":
             node.ready, node.since, self._ever_ready, self._alone = True, time.monotonic(), True, False
-            self._send(capacity=self._roster.capacity)
+            self._send(capacity=self._scheduler.capacity)
             self._send_figures(now=True)
         elif said == "lacks":
             self._call_node(node, "deliver", self._cluster.shared(self._parcel.packed))
@@ -296,10 +296,10 @@ class Bridge:
         """Forward the events of a node to the hunt."""
         if news.map:
             self._maps[node.id] = news.map
-        found = [ended for ended in news.ended if self._roster.ended(node, ended.ticket)]
+        found = [ended for ended in news.ended if self._scheduler.ended(node, ended.ticket)]
         if found:
             self._losses.pop(node.machine, None)
-            self._send_figures(now=self._roster.idle)  # before the last result, after which the hunt reads no more
+            self._send_figures(now=self._scheduler.idle)  # before the last result, after which the hunt reads no more
         for ended in found:
             if ended.files:
                 self._keep(node, ended)
@@ -336,7 +336,7 @@ class Bridge:
     def _drop_node(self, node: Node) -> None:
         """Stop using a lost node; its trials run again on other nodes."""
         count = len(node.running)
-        culprits = self._roster.lose(node)
+        culprits = self._scheduler.lose(node)
         self._send_figures(now=True)
         self._cluster.kill(node.actor)
         self._losses[node.machine] = 0 if culprits else self._losses.get(node.machine, 0) + 1
@@ -349,7 +349,7 @@ class Bridge:
         elif node.ready:
             again = f" with {count} trial{'s' * (count != 1)}, to be run again" if count and not culprits else ""
             self._send(note=f"node {node.name} was lost{again}")
-        self._send(capacity=self._roster.capacity, node=node.id, where={})
+        self._send(capacity=self._scheduler.capacity, node=node.id, where={})
         for trial in culprits:
             # Nothing shows at which step each node was lost. So the trial is not known to be the cause, as where a
             # pool's process is killed at another step each time.
@@ -362,16 +362,16 @@ class Bridge:
         self._refused[node.machine] = f"{node.name}: {why}"
         for trial in node.running.values():
             trial.losses -= 1  # it is not to blame
-        self._roster.lose(node)
+        self._scheduler.lose(node)
         self._send_figures(now=True)
         self._cluster.order(node.actor, "close")
         self._cluster.kill(node.actor, after_s=_CLOSE_S)
         self._looked = 0.0
         self._send(
-            note=f"node {node.name} takes no part: {why}", capacity=self._roster.capacity, node=node.id, where={}
+            note=f"node {node.name} takes no part: {why}", capacity=self._scheduler.capacity, node=node.id, where={}
         )
 
     def _send_figures(self, *, now: bool = False) -> None:
         if now or time.monotonic() - self._told > _LOOK_EVERY_S:
             self._told = time.monotonic()
-            self._send(nodes=self._roster.figures())
+            self._send(nodes=self._scheduler.figures())
