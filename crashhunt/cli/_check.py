@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
+from crashhunt.base.text import count_of
 from crashhunt.cli._common import add_json, say
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def _check(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _describe(found: Checked) -> str:
-    parts = [f"{len(found.trials)} trial{'' if len(found.trials) == 1 else 's'}"] if found.kind == "hunt" else []
+    parts = [count_of(len(found.trials), "trial")] if found.kind == "hunt" else []
     minimized = sum(name.endswith(layout.SMALL) for name in found.crashes) if found.kind == "hunt" else 0
     crashes = len(found.crashes) - minimized
     parts.append(f"{crashes} crash{'' if crashes == 1 else 'es'}")

@@ -25,8 +25,7 @@ def add_compare(commands: Commands) -> None:
         help="report which of several hunts crashes less",
         description="Compare the crash rates of hunts, with confidence intervals. For trials with the same seeds, "
         "report whether the agent of a hunt crashes less often than the agent of the first hunt. Before you compare, "
-        "run a hunt "
-        "with each version of the agent, and give both hunts the same --seed and --keep-going.",
+        "run a hunt with each version of the agent, and give both hunts the same --seed and --keep-going.",
     )
     compare.add_argument(
         "directories", metavar="DIR", type=Path, nargs="+", help="directories of at least two hunts, or of suites"

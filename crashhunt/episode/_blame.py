@@ -198,13 +198,9 @@ def internal_error(error: BaseException, trial: int | None = None, steps: int | 
     where = ""
     if frames:
         where = f"{Path(frames[-1].filename).relative_to(layout.PACKAGE.parent)}:{frames[-1].lineno}"
-    when = (
-        ""
-        if steps is None
-        else f" after {count_of(steps, 'step')}"
-        if steps >= 0
-        else " while the episode was being set up"
-    )
+    when = ""
+    if steps is not None:
+        when = f" after {count_of(steps, 'step')}" if steps >= 0 else " while the episode was being set up"
     trial_words = "" if trial is None else f" in trial {trial}{when}"
     message = f"crashhunt itself failed{trial_words}: {in_words(error)}"
     fault = InternalError(message, fix=_REPORT_FIX.format(_ISSUES_URL), where=where)

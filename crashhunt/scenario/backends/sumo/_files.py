@@ -231,11 +231,11 @@ def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) 
         name = waiting.pop(0)
         for nested in _references_of(folder, name):
             if inside and nested.startswith(f"..{os.sep}"):
-                message, fix = (
+                raise ScenarioError(
                     f"names the file {nested!r} outside the scenario's folder",
-                    "move the file into the folder, so that snapshots contain it",
+                    fix="move the file into the folder, so that snapshots contain it",
+                    where=str(folder / name),
                 )
-                raise ScenarioError(message, fix=fix, where=str(folder / name))
             if nested not in found and nested not in names:
                 found[nested] = None
                 waiting.append(nested)
