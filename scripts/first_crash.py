@@ -143,8 +143,8 @@ class Place:
             total += result.stress.steps if result.stress is not None else 0
             total += result.branches.steps if result.branches is not None else 0
             for asks in (probes, branches):
-                if asks is not None and asks.questions.why_not:
-                    raise RuntimeError(asks.questions.why_not)
+                if asks is not None and asks.fork_runner.why_not:
+                    raise RuntimeError(asks.fork_runner.why_not)
             if result.outcome.is_traffic_crash and result.disturbed:
                 plain = self.run(replace(spec, disturbances=()))
                 total += plain.steps

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     Row = tuple[object, ...]
 
 
-__all__ = ["KernelRoster"]
+__all__ = ["KernelObjects"]
 
 
 _POLICY_CODES = {"": 0, "nothing": 1, "controlled": 2, "idm": 3, "linear": 4}
@@ -48,7 +48,7 @@ _READ_DELTA = attrgetter("DELTA")
 assert all(_PARAMETERS[: len(names)] == names for names in NUMBERS_OF.values())
 
 
-class KernelRoster:
+class KernelObjects:
     """The vehicles and objects of a road in the kernel, and their properties that must stay unchanged meanwhile.
 
     Args:

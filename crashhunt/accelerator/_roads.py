@@ -9,7 +9,7 @@ from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
 from crashhunt.accelerator._frames import TrafficFrame
-from crashhunt.accelerator._kernel_objects import KernelRoster
+from crashhunt.accelerator._kernel_objects import KernelObjects
 from crashhunt.accelerator._network import Network
 from crashhunt.accelerator._versions import Own, Watch, is_plain, kinds_of
 
@@ -58,16 +58,16 @@ class Prepared:
         self.alone = False
         self.in_step = False
         self.checked = False
-        self._roster: KernelRoster | None = None
+        self._roster: KernelObjects | None = None
         self._kept: RoadState | None = None
 
-    def roster(self) -> KernelRoster | None:
+    def roster(self) -> KernelObjects | None:
         """Return all vehicles in the kernel, with their current state; None if the kernel does not know them."""
         road = self.road
         if road.record_history:
             return None
         if self._roster is None or not (self.checked or self._roster.is_of(road)):
-            self._roster = KernelRoster(road, self.network)
+            self._roster = KernelObjects(road, self.network)
         traffic = self._roster.traffic
         return self._roster if traffic is not None and traffic.read() else None
 
@@ -100,7 +100,7 @@ class RoadState(NamedTuple):
     """The current state of a road's vehicles in the kernel."""
 
     owner: Prepared
-    roster: KernelRoster
+    roster: KernelObjects
     traffic: Traffic
 
 

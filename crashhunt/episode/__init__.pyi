@@ -15,7 +15,7 @@ from ._failures import (
 )
 from ._fast_path import FastEpisode as FastEpisode
 from ._forced_onsets import OnsetForcer as OnsetForcer
-from ._forks import FirstCopy as FirstCopy, Questions as Questions
+from ._forks import FirstCopy as FirstCopy, ForkRunner as ForkRunner
 from ._observers import (
     Nearness as Nearness,
     Observer as Observer,

@@ -24,7 +24,7 @@ from crashhunt.base.forks import NoAnswer, NoProcessError
 from crashhunt.base.json_types import finite
 from crashhunt.base.resources import FREE, free_memory
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates
-from crashhunt.episode._forks import Questions
+from crashhunt.episode._forks import ForkRunner
 from crashhunt.episode._observers import Observer
 from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import SENSOR_KINDS, Branch, Branches, Disturbance, Outcome, in_turn, steps_of
@@ -95,7 +95,7 @@ class Brancher(Observer):
         tell: Function called with texts for the user.
 
     Attributes:
-        questions: Object that runs the forks, and counts those without a result.
+        fork_runner: Object that runs the forks, and counts those without a result.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Brancher(Observer):
         self._words = tuple(words)
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
-        self.questions = Questions("branches", tell)
+        self.fork_runner = ForkRunner("branches", tell)
         self._branches = Branches()
         self._asleep: deque[_StoredFork] = deque()
         self._disturber: DisturbanceSampler | None = None
@@ -123,7 +123,7 @@ class Brancher(Observer):
         self._branches, self._draws, self._drawn_steps = Branches(), 0, 0
         self._rests_until = 0
         self._strongest_at = 0  # the step from which all disturbances at once are tried again
-        self.questions.begin_trial()
+        self.fork_runner.begin_trial()
         self._owner = os.getpid()
         self._any = False
 
@@ -141,8 +141,8 @@ class Brancher(Observer):
         try:
             self._ask(episode)
         except CrashhuntError as error:
-            self.questions.stop(error.message)
-            self.questions.skip()
+            self.fork_runner.stop(error.message)
+            self.fork_runner.skip()
         finally:
             self._delay(time.monotonic() - began)
 
@@ -151,18 +151,18 @@ class Brancher(Observer):
             self._asleep.popleft().copy.end()
         self._any = True
         near = self._is_near(episode)
-        if self.questions.is_over:
+        if self.fork_runner.is_over:
             if near:
-                self.questions.skip()
+                self.fork_runner.skip()
             return
         if near and free_memory() < FREE:
             self._tell(f"less than {FREE:.0%} of the memory is free: trials branch less than they might")
-            self.questions.skip(f"less than {FREE:.0%} of the memory was free")
+            self.fork_runner.skip(f"less than {FREE:.0%} of the memory was free")
         else:
             sleeper = self._suspend_fork(episode) if near else None
             if sleeper is not None and episode.steps >= self._strongest_at:
                 self._ask_for_everything(episode, sleeper)
-        if not self.questions.is_over:
+        if not self.fork_runner.is_over:
             self._ask_dangerous_moment(episode, episode.steps)
 
     def _suspend_fork(self, episode: Episode) -> _StoredFork | None:
@@ -170,7 +170,7 @@ class Brancher(Observer):
         try:
             self._asleep.append(_StoredFork(episode.steps, episode.suspend_fork(self._run_branch)))
         except NoProcessError as error:
-            self.questions.miss(NoAnswer(f"could not be made: {error.message}", is_from_outside=True))
+            self.fork_runner.miss(NoAnswer(f"could not be made: {error.message}", is_from_outside=True))
             return None
         return self._asleep[-1]
 
@@ -185,12 +185,12 @@ class Brancher(Observer):
             return result  # no branch could run, so there is no result
         if str(result.outcome) in self._crashes:
             return replace(result, branches=replace(self._branches, crashes=()))  # it needed no other
-        asked = self.questions
+        runner = self.fork_runner
         branches = replace(
             self._branches,
-            unanswered=asked.unanswered,
-            why_unanswered=asked.why_unanswered,
-            may_be_asked_again=asked.may_be_answered,
+            unanswered=runner.unanswered,
+            why_unanswered=runner.why_unanswered,
+            may_be_asked_again=runner.may_be_answered,
         )
         return replace(result, branches=branches)
 
@@ -227,14 +227,14 @@ class Brancher(Observer):
         if found is None:
             return
         anyway = self._branch(episode, sleeper, fixed, min(until, found.step + self._second))
-        if anyway is not None or not self.questions.has_answer:
+        if anyway is not None or not self.fork_runner.has_answer:
             return  # it is about to crash anyway, or may be
         first = not self._branches.crashes  # of which one that is likelier is looked for whatever it takes
         self._record_crash(episode, found)
         kept = [one for one in found.took_place if one not in draws.fixed]
         for one in kept:
             fewer = [other for other in kept if other is not one]
-            if not fewer or self.questions.is_over or (not first and self._is_spent(episode)):
+            if not fewer or self.fork_runner.is_over or (not first and self._is_spent(episode)):
                 return
             found = self._branch(episode, sleeper, [*((other,) for other in fewer), *fixed], until)
             if found is not None:
@@ -262,7 +262,7 @@ class Brancher(Observer):
                 self._branches = replace(self._branches, left_out=self._branches.left_out + 1)
             elif not self._is_spent(episode):
                 self._draw(episode, sleeper)
-            if self.questions.is_over:
+            if self.fork_runner.is_over:
                 return
 
     def _draw(self, episode: Episode, sleeper: _StoredFork) -> None:
@@ -294,7 +294,7 @@ class Brancher(Observer):
             copy = self._usable(episode, sleeper)
             return copy.ask(job, _PATIENCE_S), copy.no_answer
 
-        answer = self.questions.ask(attempt, lambda: sleeper.step == episode.steps or sleeper.copy.is_usable)
+        answer = self.fork_runner.run(attempt, lambda: sleeper.step == episode.steps or sleeper.copy.is_usable)
         if answer is None:
             return None
         before, steps = self._branches, cast(int, answer["steps"])

@@ -25,7 +25,7 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.forks import NoAnswer
 from crashhunt.disturbances import SECONDS_PER_COPY, FirstOnsets, disturber_of, parse_rates
-from crashhunt.episode._forks import Questions
+from crashhunt.episode._forks import ForkRunner
 from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import Disturbance, Forced, ForcedCopy, Outcome, in_turn
 
@@ -54,7 +54,7 @@ class OnsetForcer:
         tell: function called with texts for the user.
 
     Attributes:
-        questions: object that runs the forks, and counts those without a result.
+        fork_runner: object that runs the forks, and counts those without a result.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class OnsetForcer:
         self._crashes = frozenset(map(str, crash_on))
         self._patience_s = patience_s
         self._delay = delay
-        self.questions = Questions("rare", tell)
+        self.fork_runner = ForkRunner("rare", tell)
         self._sampler: DisturbanceSampler | None = None
         self._onsets: FirstOnsets | None = None
         self._copies: list[ForcedCopy] = []
@@ -84,21 +84,21 @@ class OnsetForcer:
         if self._onsets is None:
             self._onsets = self._begin(episode)
         for onset in self._onsets.after(episode.steps, partial(_has_target, episode)):
-            if self.questions.unanswered:
-                self.questions.skip(self.questions.why_unanswered)  # the root is incomplete anyway
+            if self.fork_runner.unanswered:
+                self.fork_runner.skip(self.fork_runner.why_unanswered)  # the root is incomplete anyway
                 continue
             began = time.monotonic()
             try:
                 self._follow(episode, onset)
             except CrashhuntError as error:
-                self.questions.stop(error.message)
-                self.questions.skip()
+                self.fork_runner.stop(error.message)
+                self.fork_runner.skip()
             finally:
                 self._delay(time.monotonic() - began)
 
     def result(self, result: TrialResult) -> TrialResult:
         """Return the result of the root trial with the results of its copies, and begin the next trial."""
-        onsets, copies, steps, asked = self._onsets, tuple(self._copies), self._steps, self.questions
+        onsets, copies, steps, runner = self._onsets, tuple(self._copies), self._steps, self.fork_runner
         self._onsets, self._copies, self._steps = None, [], 0
         if onsets is None:
             return result
@@ -107,11 +107,11 @@ class OnsetForcer:
             masses=dict(sorted(onsets.masses.items())),
             copies=copies,
             steps=steps,
-            unanswered=asked.unanswered,
-            why_unanswered=asked.why_unanswered,
-            may_be_asked_again=asked.may_be_answered,
+            unanswered=runner.unanswered,
+            why_unanswered=runner.why_unanswered,
+            may_be_asked_again=runner.may_be_answered,
         )
-        asked.begin_trial()
+        runner.begin_trial()
         return replace(result, forced=forced)
 
     def _begin(self, episode: Episode) -> FirstOnsets:
@@ -138,11 +138,11 @@ class OnsetForcer:
             copy = episode.fork(run, observed=False)
             return copy.answer(patience_s), copy.no_answer
 
-        answer = self.questions.ask(attempt)
+        answer = self.fork_runner.run(attempt)
         if answer is None:
             return
         if lost := answer.get("lost"):
-            self.questions.skip(str(lost), is_from_outside=bool(answer["is_from_outside"]))
+            self.fork_runner.skip(str(lost), is_from_outside=bool(answer["is_from_outside"]))
             return
         for end in cast("list[JsonObject]", answer["ends"]):
             self._note(onset, end)
@@ -169,7 +169,7 @@ class OnsetForcer:
         branched = cast(int, end["branched"])
         self._steps += step - branched
         if outcome in (Outcome.SIMULATOR_ERROR, Outcome.INVALID):
-            self.questions.skip(f"a copy ended by {outcome}")  # perhaps because it is a copy
+            self.fork_runner.skip(f"a copy ended by {outcome}")  # perhaps because it is a copy
             return
         crashed = outcome in self._crashes
         planned = cast("list[JsonObject]", end["planned"])

@@ -1,4 +1,4 @@
-"""Runs forks of an episode (questions): decides which run again, which have no result, and when no more are run."""
+"""Runs forks of an episode: decides which run again, which have no result, and when no more are run."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["FirstCopy", "Questions"]
+__all__ = ["FirstCopy", "ForkRunner"]
 
 
-_MAX_ATTEMPTS: Final = 3  # copies per question, as long as something outside ends them
+_MAX_ATTEMPTS: Final = 3  # copies per fork that is asked for, as long as something outside ends them
 _PAUSES_S: Final = (0.05, 0.5)  # wall time before the second and the third, in which memory may become free
-_MAX_CONSECUTIVE_FAILURES: Final = 3  # questions in turn that no copy answers
+_MAX_CONSECUTIVE_FAILURES: Final = 3  # forks in turn without a result
 _MAX_REASON_LENGTH: Final = 200  # characters; an agent's exception may say anything
 
 
-class Questions:
+class ForkRunner:
     """Runs forks, and counts those without a result.
 
     A fork that was killed from outside, by the kernel because of memory or by an administrator, is replaced by another
@@ -50,7 +50,7 @@ class Questions:
     def __init__(self, what: str, tell: Callable[[str], None] = lambda _: None) -> None:
         self.what = what
         self._tell = tell
-        self._failures = 0  # questions in turn, of this process
+        self._failures = 0  # forks without a result in turn, of this process
         self.why_not = ""
         self.begin_trial()
 
@@ -60,7 +60,7 @@ class Questions:
         self.why_unanswered = ""
         self.may_be_answered = False
         self.has_answer = True
-        self._killed = 0  # questions in turn, of this trial
+        self._killed = 0  # forks without a result in turn, of this trial
         self._paused_because = ""
 
     @property
@@ -68,7 +68,7 @@ class Questions:
         """Return whether no more forks of this trial run."""
         return bool(self.why_not or self._paused_because)
 
-    def ask(
+    def run(
         self,
         attempt: Callable[[], tuple[Plain | None, NoAnswer | None]],
         can_retry: Callable[[], bool] = lambda: True,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal, cast
 
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.episode._forks import Questions
+from crashhunt.episode._forks import ForkRunner
 from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import KINDS, SENSOR_KINDS, Disturbance, Outcome, Stress, steps_of
 
@@ -129,7 +129,7 @@ class Prober:
         tell: function called with texts for the user.
 
     Attributes:
-        questions: object that runs the forks, and counts those without a result.
+        fork_runner: object that runs the forks, and counts those without a result.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class Prober:
         self._budget = budget
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
-        self.questions = Questions("probes", tell)
+        self.fork_runner = ForkRunner("probes", tell)
         self._stress = Stress(1.0)
         self._moment = 0  # of those at which there was something to ask
         self._goes_on = False  # without any disturbance, from the present moment on: that is asked once
@@ -155,9 +155,9 @@ class Prober:
 
     def ask(self, episode: Episode) -> None:
         """For each kind, search for a disturbance that soon crashes the episode and is milder than any found before."""
-        before = self.questions.unanswered
+        before = self.fork_runner.unanswered
         self._ask(episode)
-        asked = self.questions.unanswered == before
+        asked = self.fork_runner.unanswered == before
         stress = self._stress
         self._stress = replace(stress, moments=stress.moments + 1, moments_asked=stress.moments_asked + asked)
 
@@ -165,23 +165,23 @@ class Prober:
         self._goes_on = False
         if self._find_mildest <= 1 / _STRENGTH_LEVELS:
             return
-        if self.questions.is_over:
-            self.questions.skip()
+        if self.fork_runner.is_over:
+            self.fork_runner.skip()
             return
         try:
             asked = self._questions_at(episode)
             turn = self._moment % max(1, len(asked))  # if the budget is too small, each moment skips other questions
             self._moment += 1
             for question in asked[turn:] + asked[:turn]:
-                if self.questions.is_over:
+                if self.fork_runner.is_over:
                     return
                 if self._is_spent(episode):
                     self._stress = replace(self._stress, left_out=self._stress.left_out + 1)
                 elif not self._mildest(episode, question):
                     return
         except CrashhuntError as error:
-            self.questions.stop(error.message)
-            self.questions.skip()
+            self.fork_runner.stop(error.message)
+            self.fork_runner.skip()
 
     @property
     def _find_mildest(self) -> float:
@@ -214,7 +214,7 @@ class Prober:
             }
 
         there = self._in_copy(episode, look).get("there", []) if others else []
-        if others and not self.questions.has_answer:
+        if others and not self.fork_runner.has_answer:
             return []
         absent = {one for one, is_there in zip(others, cast("list[bool]", there), strict=False) if not is_there}
         return [one for one in every if one not in absent]
@@ -222,8 +222,8 @@ class Prober:
     def result(self, result: TrialResult) -> TrialResult:
         """Return the result of the trial with the results of its forks, and begin the next trial."""
         stress, self._stress, self._moment = self._stress, Stress(1.0), 0
-        why, may_be_answered = self.questions.why_unanswered, self.questions.may_be_answered
-        self.questions.begin_trial()
+        why, may_be_answered = self.fork_runner.why_unanswered, self.fork_runner.may_be_answered
+        self.fork_runner.begin_trial()
         if str(result.outcome) in self._crashes:
             stress = replace(stress, margin=0.0, disturbance=None, outcome="", step=0)
         elif stress.moments_asked < stress.moments:
@@ -248,13 +248,13 @@ class Prober:
         while at > low:
             disturbance = kind.disturbance(shares[at], question.who, question.agent, step)
             outcome, ended = self._copy(episode, disturbance)
-            if not self.questions.has_answer:
+            if not self.fork_runner.has_answer:
                 break
             if not outcome:
                 low = at
             elif not self._goes_on and self._copy(episode, None)[0]:
                 return False  # it is about to crash anyway
-            elif not self.questions.has_answer:
+            elif not self.fork_runner.has_answer:
                 break  # it may be about to crash anyway
             else:
                 self._goes_on, high = True, at
@@ -300,4 +300,4 @@ class Prober:
             finally:
                 self._delay(time.monotonic() - began)
 
-        return self.questions.ask(attempt) or {}
+        return self.fork_runner.run(attempt) or {}

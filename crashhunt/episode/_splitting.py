@@ -33,7 +33,7 @@ import numpy as np
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.forks import NoAnswer
-from crashhunt.episode._forks import Questions
+from crashhunt.episode._forks import ForkRunner
 from crashhunt.simulators import SupportsReseeding
 from crashhunt.trial import Forced, ForcedCopy, Outcome, Reseeding
 from crashhunt.world import closing_rate
@@ -112,7 +112,7 @@ class Splitter:
         refuse: function called with the reason if the simulator has no random numbers to change.
 
     Attributes:
-        questions: object that runs the forks, and counts those without a result.
+        fork_runner: object that runs the forks, and counts those without a result.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Splitter:
         self._patience_s = patience_s
         self._delay = delay
         self._refuse = refuse
-        self.questions = Questions("rare", tell)
+        self.fork_runner = ForkRunner("rare", tell)
         self._path: _EpisodePath | None = None
         self._copies: list[ForcedCopy] = []
         self._peak = 0.0
@@ -140,21 +140,21 @@ class Splitter:
         """Make the copies that begin after the completed step; this method is also called before the first step."""
         assert episode.spec.forcing is not None
         if self._path is None:
-            self._path = _EpisodePath(episode, self._crashes, self._patience_s, (), questions=self.questions)
+            self._path = _EpisodePath(episode, self._crashes, self._patience_s, (), fork_runner=self.fork_runner)
             if why_not := _why_no_noise(episode):
-                self.questions.stop(why_not)
+                self.fork_runner.stop(why_not)
                 self._refuse(why_not)
         self._peak = max(self._peak, self._path.measure)
-        if self.questions.why_not and not self.questions.unanswered:
-            self.questions.skip()
-        if self.questions.unanswered:
+        if self.fork_runner.why_not and not self.fork_runner.unanswered:
+            self.fork_runner.skip()
+        if self.fork_runner.unanswered:
             return  # the tree is incomplete anyway
         began = time.monotonic()
         try:
             self._copies += split_path(self._path, episode.spec.forcing.levels or ())
         except CrashhuntError as error:
-            self.questions.stop(error.message)
-            self.questions.skip()
+            self.fork_runner.stop(error.message)
+            self.fork_runner.skip()
         finally:
             if self._path.has_forked:
                 self._path.has_forked = False
@@ -162,7 +162,7 @@ class Splitter:
 
     def result(self, result: TrialResult) -> TrialResult:
         """Return the result of the root trial with the results of its copies, and begin the next trial."""
-        path, copies, peak, asked = self._path, tuple(self._copies), self._peak, self.questions
+        path, copies, peak, runner = self._path, tuple(self._copies), self._peak, self.fork_runner
         self._path, self._copies, self._peak = None, [], 0.0
         if path is None:
             return result
@@ -171,12 +171,12 @@ class Splitter:
             masses={},
             copies=copies,
             steps=sum(copy.step - copy.branched for copy in copies),
-            unanswered=asked.unanswered,
-            why_unanswered=asked.why_unanswered,
-            may_be_asked_again=asked.may_be_answered,
+            unanswered=runner.unanswered,
+            why_unanswered=runner.why_unanswered,
+            may_be_asked_again=runner.may_be_answered,
             peak=peak,
         )
-        asked.begin_trial()
+        runner.begin_trial()
         return replace(result, forced=forced)
 
 
@@ -195,8 +195,8 @@ class _EpisodePath:
         reseedings: step and seed of each of these forks.
         reached: number of levels that the path has reached.
         weight: share of the path in the weight of the tree.
-        questions: object that counts copies without a result, for the root path; None for a copy, which fails if one of
-            its own copies fails.
+        fork_runner: object that counts copies without a result, for the root path; None for a copy, which fails if one
+            of its own copies fails.
 
     Attributes:
         has_forked: whether the path has been copied.
@@ -211,12 +211,12 @@ class _EpisodePath:
         reseedings: tuple[tuple[int, int], ...] = (),
         reached: int = 0,
         weight: float = 1.0,
-        questions: Questions | None = None,
+        fork_runner: ForkRunner | None = None,
     ) -> None:
         self.episode, self.reached, self.weight = episode, reached, weight
         self.has_forked = False
         self._crashes, self._patience_s, self._key, self._reseedings = crashes, patience_s, key, reseedings
-        self._questions = questions
+        self._fork_runner = fork_runner
         self._branched = episode.steps
         self._forks = 0
 
@@ -263,8 +263,8 @@ class _EpisodePath:
             copy = self.episode.fork(run, observed=False)
             return copy.answer(self._patience_s * COPIES_PER_LEVEL**self._levels_left), copy.no_answer
 
-        if self._questions is not None:
-            answer = self._questions.ask(attempt)
+        if self._fork_runner is not None:
+            answer = self._fork_runner.run(attempt)
             if answer is None:
                 return []
         else:
@@ -273,9 +273,9 @@ class _EpisodePath:
                 raise _LostError(no_answer or NoAnswer("did not answer"))
         if lost := answer.get("lost"):
             reason = NoAnswer(str(lost), is_from_outside=bool(answer["is_from_outside"]))
-            if self._questions is None:
+            if self._fork_runner is None:
                 raise _LostError(reason)
-            self._questions.skip(f"a copy {reason.why}", is_from_outside=reason.is_from_outside)
+            self._fork_runner.skip(f"a copy {reason.why}", is_from_outside=reason.is_from_outside)
             return []
         return [ForcedCopy.from_json(end) for end in cast("list[JsonObject]", answer["ends"])]
 

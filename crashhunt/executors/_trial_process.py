@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
     from crashhunt.agents import Agent
     from crashhunt.base.codec import JsonObject
-    from crashhunt.episode import Questions, Reset, WorkerSettings
+    from crashhunt.episode import ForkRunner, Reset, WorkerSettings
     from crashhunt.executors._postmortem import FaultReport, Report
     from crashhunt.simulators import Simulator
     from crashhunt.trial import TrialResult, Value
@@ -108,7 +108,7 @@ class TrialProcess:
         self._home = Path.cwd()
         self._notices: list[str] = []
         self._reference: ReferenceDriver | None = None
-        self._questions: tuple[Questions, ...] = ()  # of copies of the trial
+        self._fork_runners: tuple[ForkRunner, ...] = ()  # of copies of the trial
         # Line by line, so that what a dying process printed last is in the file.
         sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
         sys.stderr = io.TextIOWrapper(os.fdopen(2, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
@@ -204,7 +204,7 @@ class TrialProcess:
                 reset=reset,
                 prober=prober,
                 brancher=brancher,
-                first_copy=FirstCopy(self._cannot_copy) if job["tries_copy"] and self._questions else None,
+                first_copy=FirstCopy(self._cannot_copy) if job["tries_copy"] and self._fork_runners else None,
                 forcer=forcer,
             )
         except RecorderError:
@@ -214,9 +214,9 @@ class TrialProcess:
             if os.getpid() != self._pid:  # this is a fork that an agent made, and it has ended
                 _leave(0)
         block_signals()  # whose handlers are those of agents, and the episode is over
-        for asked in self._questions:
-            if asked.why_not:
-                self._notices.append(f"{asked.what}{_EXCLUDED_FROM_HERE_WORDS}{asked.why_not}")
+        for runner in self._fork_runners:
+            if runner.why_not:
+                self._notices.append(f"{runner.what}{_EXCLUDED_FROM_HERE_WORDS}{runner.why_not}")
         wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
         report = self._report(replace(result, wall_s=wall_s, setup_s=setup_s), simulator, job)
         box.report(encode_report(report, bytes.fromhex(job["key"]), result.digest, dumps=_dumps))
@@ -289,14 +289,14 @@ class TrialProcess:
             forcer = Splitter(
                 settings.crash_on, settings.timeout_s, self._delay, self._notices.append, self._cannot_copy
             )
-        self._questions = tuple(each.questions for each in (prober, brancher, forcer) if each is not None)
+        self._fork_runners = tuple(each.fork_runner for each in (prober, brancher, forcer) if each is not None)
         return prober, brancher, forcer
 
     def _cannot_copy(self, why_not: str) -> None:
-        for asked in self._questions:
-            asked.stop(why_not)
-            self._notices.append(f"{asked.what}{EXCLUDED_WORDS}{why_not}")
-        self._questions = ()
+        for runner in self._fork_runners:
+            runner.stop(why_not)
+            self._notices.append(f"{runner.what}{EXCLUDED_WORDS}{why_not}")
+        self._fork_runners = ()
 
     def _delay(self, wall_s: float) -> None:
         """Add the time spent in forks to the trial's time limit."""

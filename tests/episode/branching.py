@@ -56,7 +56,7 @@ def branches(name, stage, speed, seed, steps):
         "starts": [[str(one.outcome), one.steps, draws.log_likelihood_of(one)] for one in starts],
         "waited": min(waited) > 0,
         "left": len(children_of(os.getpid())),
-        "why_not": brancher.questions.why_not,
+        "why_not": brancher.fork_runner.why_not,
     }
     if name == "toy":
         again, itself = place.run(brancher), place.run(brancher, KeepLaneWithSpeed(20.0))
@@ -93,7 +93,7 @@ def ends(stage):
         brancher = Brancher(RATES, CRASHES, lambda _: None)
         result = place.run(brancher, Sleeps(how))
         found[name] = [
-            str(result.outcome), brancher.questions.why_not, len(children_of(os.getpid())), result.branches.to_json()
+            str(result.outcome), brancher.fork_runner.why_not, len(children_of(os.getpid())), result.branches.to_json()
         ]  # fmt: skip
     module.free_memory, told = lambda: 0.2, []
     result = place.run(Brancher(RATES, CRASHES, lambda _: None, told.append), steps=40)

@@ -252,7 +252,7 @@ def probes(stage):
         "never": run(drives, late).stress,
         "by itself": run(lambda *_: KeepLaneWithSpeed(20.0), prober).stress.to_json(),
     }  # fmt: skip
-    found["thread"] = run(starts_thread, prober).stress.to_json(), prober.questions.why_not
+    found["thread"] = run(starts_thread, prober).stress.to_json(), prober.fork_runner.why_not
     return found
 
 

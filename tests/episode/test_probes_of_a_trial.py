@@ -289,7 +289,7 @@ def test_killed_copy_is_asked_again_and_the_answers_are_as_without_the_kill(kill
     asker.ask(road)
     assert stress_of(asker) == stress_of(undisturbed)
     assert set(told) == {"probes: a copy of a trial was killed by SIGKILL, and another is asked"}
-    assert asker.questions.why_not == ""
+    assert asker.fork_runner.why_not == ""
 
 
 def test_question_whose_copies_are_all_killed_leaves_the_margin_open(no_pauses):
@@ -336,7 +336,7 @@ def test_kills_suspend_the_questions_of_one_trial_only(no_pauses):
     assert road.forks == asked
     stress = stress_of(asker)
     assert (stress.extent, stress.may_be_asked_again) == ("asked 0 of 2", True)
-    assert asker.questions.why_not == ""
+    assert asker.fork_runner.why_not == ""
     asker.ask(road)
     assert stress_of(asker).extent == "asked 1 of 1"
 
@@ -345,17 +345,17 @@ def test_copies_that_fail_by_themselves_are_asked_once_and_three_in_turn_end_the
     told = []
     asker = Prober(2.0, CRASHES, lambda _: None, tell=told.append)
     for moment in range(3):
-        assert asker.questions.why_not == ""
+        assert asker.fork_runner.why_not == ""
         road = Road({"brake": 0.5}, answers=False)
         asker.ask(road)
         assert road.forks == 1, "it was asked again, or more was asked though it is not known who is there"
         assert stress_of(asker).extent == "asked 0 of 1", moment
-    assert asker.questions.why_not == "3 copies in turn failed; the last raised KeyError: 3"
+    assert asker.fork_runner.why_not == "3 copies in turn failed; the last raised KeyError: 3"
     assert told == ["probes: a copy raised KeyError: 3; what it was asked has no answer"] * 3
     road = Road({"brake": 0.5})
     asker.ask(road)
     stress = stress_of(asker)
-    assert (road.forks, stress.margin, stress.why_unasked) == (0, None, asker.questions.why_not)
+    assert (road.forks, stress.margin, stress.why_unasked) == (0, None, asker.fork_runner.why_not)
     assert not stress.may_be_asked_again
 
 
@@ -363,7 +363,7 @@ def test_an_answer_between_failures_keeps_the_asking_going():
     asker, _ = prober()
     for answers in (False, False, True, False, False):
         asker.ask(Road({}, answers=answers))
-    assert asker.questions.why_not == ""
+    assert asker.fork_runner.why_not == ""
     assert stress_of(asker).extent == "asked 1 of 5"
 
 
@@ -374,7 +374,7 @@ def test_what_has_no_copy_is_reported_and_its_time_counts():
 
     asker, waited = prober()
     asker.ask(Refused({}))
-    assert asker.questions.why_not == "a process with several threads cannot be forked"
+    assert asker.fork_runner.why_not == "a process with several threads cannot be forked"
     assert len(waited) == 1
     stress = stress_of(asker)
     assert (stress.margin, stress.extent, stress.why_unasked) == (
@@ -397,4 +397,4 @@ def test_system_that_starts_no_process_for_a_while_does_not_end_the_asking(no_pa
 
     asker, _ = prober()
     asker.ask(Full({"brake": 0.5}))
-    assert (asker.questions.why_not, stress_of(asker).margin) == ("", 0.5)
+    assert (asker.fork_runner.why_not, stress_of(asker).margin) == ("", 0.5)

@@ -55,7 +55,7 @@ def process(tmp_path, monkeypatch):
             scenario=scenario, oracles=(), crash_on=(Outcome.COLLISION,), scratch=tmp_path, timeout_s=9.0, **given
         )
         found = TrialProcess.__new__(TrialProcess)
-        found._settings, found._notices, found._reference, found._questions = settings, ["a notice"], None, ()
+        found._settings, found._notices, found._reference, found._fork_runners = settings, ["a notice"], None, ()
         found._box, found._pid, found._has_begun, found._shared = None, 0, False, None
         found._simulator = found._parts = None
         found._home = tmp_path
@@ -113,7 +113,7 @@ def test_copies_of_a_trial_are_those_that_the_settings_ask_for(process, monkeypa
     def maker(name):
         def make(*given):
             made.append((name, given))
-            return SimpleNamespace(questions=SimpleNamespace(what=name, stop=lambda why: made.append((name, why))))
+            return SimpleNamespace(fork_runner=SimpleNamespace(what=name, stop=lambda why: made.append((name, why))))
 
         return make
 
@@ -124,7 +124,7 @@ def test_copies_of_a_trial_are_those_that_the_settings_ask_for(process, monkeypa
         made.clear()
         found = process(**given)
         pairs = found._copies()
-        assert [one.what for one in found._questions] == [name for name, _ in made]
+        assert [one.what for one in found._fork_runners] == [name for name, _ in made]
         return found, [name for name, _ in made], [one is not None for one in pairs], [words for _, words in made]
 
     crash_on = (Outcome.COLLISION,)
@@ -148,7 +148,7 @@ def test_copies_of_a_trial_are_those_that_the_settings_ask_for(process, monkeypa
     found._cannot_copy("it has threads")
     assert found._notices[-1] == "Splitter are left out: it has threads"
     assert made[-1] == ("Splitter", "it has threads")
-    assert found._questions == ()
+    assert found._fork_runners == ()
 
 
 def test_time_in_copies_is_added_to_the_limit(process, monkeypatch):
@@ -317,7 +317,7 @@ def test_trial_runs_in_its_folder_and_reports(process, monkeypatch, tmp_path):
         _trial_process, "encode_report", lambda report, key, digest, dumps: (report["result"], key, digest)
     )
     asked = SimpleNamespace(what="probes", why_not="a thread", stop=lambda why: None)
-    found._copies = lambda: setattr(found, "_questions", (asked,)) or ("prober", "brancher", "forcer")
+    found._copies = lambda: setattr(found, "_fork_runners", (asked,)) or ("prober", "brancher", "forcer")
     job = {"spec": SPEC.to_json(), "folder": str(tmp_path), "reserved": 64, "key": "0a", "wants_map": False,
            "tries_copy": True}  # fmt: skip
     assert found._run(job, None) == 0
@@ -342,7 +342,7 @@ def test_trial_runs_in_its_folder_and_reports(process, monkeypatch, tmp_path):
     for more in ({"tries_copy": False}, {}):
         called.clear()
         if not more:
-            found._copies = lambda: setattr(found, "_questions", ()) or (None, None, None)
+            found._copies = lambda: setattr(found, "_fork_runners", ()) or (None, None, None)
         found._run(job | more, "reset")
         assert "separate" not in called
         assert ran[-1][1]["first_copy"] is None
