@@ -135,9 +135,9 @@ def fork_lines(state: HuntState) -> list[str]:
     """Return the present results of the forks of a hunt's trials, one line each; empty if it has no forks."""
     lines = []
     if (probes := state.probes) is not None:
-        least = "no stress margin yet"
+        least = "no robustness margin yet"
         if probes["least"] is not None:
-            least = f"least stress margin {probes['least']:.2f} (trial {probes['trial']})"
+            least = f"least robustness margin {probes['least']:.2f} (trial {probes['trial']})"
         crashed = f"{probes['crashed_trials']} of {probes['trials'] + probes['not_fully_asked']} trials"
         said = f"{least}; probes {probes['probes']}, made to crash {crashed}{_confirmed(probes)}"
         lines.append(said + _not_fully_asked(probes))

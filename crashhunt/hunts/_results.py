@@ -73,7 +73,7 @@ DISTURBANCES = ("disturbances", "log_likelihood")
 """Further ones, of hunts with disturbances: how many took place, and how likely all of it was."""
 
 STRESS = ("stress_margin", "stress_asked", "stress_margin_upper_bound")
-"""Further columns of hunts with probes: the stress margin, 0 to 1, the number of moments that were asked, and the
+"""Further columns of hunts with probes: the robustness margin, 0 to 1, the number of moments that were asked, and the
 upper bound of the margin if that was not all of them."""
 
 BRANCHES = ("branches", "branch_crashes", "branches_asked")

@@ -340,7 +340,7 @@ def _describe_stress(result: TrialResult) -> str:
     assert stress is not None
     what = stress.disturbance.words if stress.disturbance is not None else ""
     margin = f"{stress.least:.2f}" if stress.margin is not None else f"at most {stress.least:.2f} ({stress.extent})"
-    parts = (f"least stress margin: {margin}", f"trial {result.spec.number}", what, format_arguments(result))
+    parts = (f"least robustness margin: {margin}", f"trial {result.spec.number}", what, format_arguments(result))
     return ", ".join(filter(None, parts))
 
 

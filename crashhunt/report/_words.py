@@ -564,20 +564,20 @@ def describe_probes(report: HuntReport) -> list[str]:
     if found is None or not (found.margins or found.not_fully_asked):
         return []
     steps = f"{found.steps} steps, in addition to {report.trial_steps} steps of trials"
-    enough = f"; {found.skipped} questions were skipped, because copies had used their share" if found.skipped else ""
-    lines = ["Stress margin: no trial was fully probed."]
+    enough = _skipped(found.skipped)
+    lines = ["Robustness margin: no trial was fully probed."]
     if found.margins:
         safe = sum(margin == 1.0 for margin in found.margins)
         least, median = min(found.margins), statistics.median(found.margins)
         said = f"{safe} of them crashed under no plausible disturbance"
         many = _count_words(len(found.margins), "trial")
-        lines = [f"Stress margin of {many}: least {least:.2f}, median {median:.2f}; {said}."]
+        lines = [f"Robustness margin of {many}: least {least:.2f}, median {median:.2f}; {said}."]
     lines += _not_fully_asked(found.not_fully_asked, found.why_unasked)
-    lines.append(f"  {_count_words(found.probes, 'probe')} of copies took {steps}{enough}")
+    lines.append(f"  {_count_words(found.probes, 'probe')} took {steps}{enough}")
     if found.run_again:
         lines.append(
-            f"  of the {found.run_again} mildest disturbances that made a trial crash, {len(found.crashes)} reproduce "
-            f"the crash from the start{_not_finished(found.not_finished)}:"
+            f"  crashes by the mildest disturbance that reproduce from the start: {len(found.crashes)} of "
+            f"{found.run_again}{_not_finished(found.not_finished)}:"
         )
     for bundle, by in zip(found.crashes, found.by, strict=True):
         lines.append(f"  {bundle.path}: {bundle.result.summary}, {by.words}")
@@ -589,24 +589,28 @@ def describe_branches(report: HuntReport) -> list[str]:
     found = report.branches
     if found is None or not found.trials:
         return []
-    enough = f"; {found.skipped} were skipped, because copies had used their share" if found.skipped else ""
+    enough = _skipped(found.skipped)
     moments = f"{_count_words(found.moments, 'moment')} of {_count_words(found.trials, 'trial')}"
     crashed = f"{found.crashed} crashed, of {_count_words(found.crashed_trials, 'trial')}"
     lines = [
-        f"Branches: {found.branches} runs of copies with other disturbances, from {moments}; {crashed}.",
+        f"Branches: {found.branches} forks with other disturbances, from {moments}; {crashed}.",
         f"  they took {found.steps} steps, in addition to {report.trial_steps} steps of trials{enough}",
         *_not_fully_asked(found.not_fully_asked, found.why_unanswered),
     ]
     if found.run_again:
         unfinished = _not_finished(found.not_finished)
         lines.append(
-            f"  of the {found.run_again} likeliest crashes, {len(found.crashes)} reproduce from the start{unfinished}:"
+            f"  likeliest crashes that reproduce from the start: {len(found.crashes)} of {found.run_again}{unfinished}:"
         )
     for bundle in found.crashes:
         likely = bundle.result.log_likelihood
         said = f", log-likelihood {likely:.2f}" if likely is not None else ""
         lines.append(f"  {bundle.path}: {bundle.result.summary}{said}")
     return lines
+
+
+def _skipped(count: int) -> str:
+    return f"; {count} more were skipped, because the step budget of their trials was used up" if count else ""
 
 
 def _not_fully_asked(count: int, why: str) -> list[str]:

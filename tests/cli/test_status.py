@@ -59,12 +59,12 @@ def test_nodes_are_listed_up_to_twenty():
         ({"core": "on"}, "h: compiled core on"),
         (
             {"probes": PROBES},
-            "h: least stress margin 0.25 (trial 4); probes 30, made to crash 3 of 10 trials, not fully asked 1 trial",
+            "h: least robustness margin 0.25 (trial 4); probes 30, made to crash 3 of 10 trials, not fully asked 1 trial",
         ),
         (
             {"probes": PROBES | {"least": None, "trial": None, "not_fully_asked": 2, "run_again": 3, "confirmed": 1}},
             (
-                "h: no stress margin yet; probes 30, made to crash 3 of 11 trials, confirmed 1 of 3, "
+                "h: no robustness margin yet; probes 30, made to crash 3 of 11 trials, confirmed 1 of 3, "
                 "not fully asked 2 trials"
             ),
         ),

@@ -39,7 +39,7 @@ def test_a_hunt_branches_where_trials_come_near_and_confirms_what_it_finds_from_
     assert crash["disturbed"]
     assert (shell.folder / crash["path"]).parent == shell.folder / "h" / "branches"
     again = found["run_again"]
-    assert f"of the {again} likeliest crashes, {again} reproduce from the start:" in done.err
+    assert f"likeliest crashes that reproduce from the start: {again} of {again}:" in done.err
     rows = list(csv.DictReader(io.StringIO(shell.crashhunt("trials", "h", "--format", "csv").out)))
     assert sum(int(row["branches"]) for row in rows) == found["branches"]
     assert sum(int(row["branch_crashes"]) for row in rows) == found["crashed"]

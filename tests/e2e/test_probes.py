@@ -41,8 +41,8 @@ def test_a_hunt_reports_how_little_it_would_take_and_confirms_it_from_the_start(
     crash = found["crashes"][0]
     assert crash["confirmed"]
     assert (shell.folder / crash["path"]).parent == shell.folder / "h" / "probes"
-    assert "Stress margin of 3 trials: least 0." in done.err
-    assert "of the 3 mildest disturbances that made a trial crash, 3 reproduce the crash from the start" in done.err
+    assert "Robustness margin of 3 trials: least 0." in done.err
+    assert "crashes by the mildest disturbance that reproduce from the start: 3 of 3" in done.err
     assert done.err.count(", leader brakes with ") == 3
     rows = list(csv.DictReader(io.StringIO(shell.crashhunt("trials", "h", "--format", "csv").out)))
     assert min(float(row["stress_margin"]) for row in rows) == found["least"]
@@ -58,7 +58,7 @@ def test_a_hunt_reports_how_little_it_would_take_and_confirms_it_from_the_start(
     }  # fmt: skip
     assert "branches" not in state
     told = " ".join(shell.crashhunt("status", "h").out.split())
-    assert f"least stress margin {found['least']:.2f} (trial {least['number']}); probes {found['probes']}" in told
+    assert f"least robustness margin {found['least']:.2f} (trial {least['number']}); probes {found['probes']}" in told
     assert "made to crash 3 of 3 trials, confirmed 3 of 3" in told
     assert shell.crashhunt("check", "h").code == 0
     (shell.folder / "h" / "probes" / "000001-collision" / "log.mcap").unlink()

@@ -23,12 +23,12 @@ def probed(*margins, open_ones=0, run_again=0, not_finished=0):
 
 def test_nothing_plausible_made_them_crash_is_said_of_fully_asked_trials_only():
     assert describe_probes(probed(0.25, 1.0, 1.0, open_ones=2)) == [
-        "Stress margin of 3 trials: least 0.25, median 1.00; 2 of them crashed under no plausible disturbance.",
+        "Robustness margin of 3 trials: least 0.25, median 1.00; 2 of them crashed under no plausible disturbance.",
         "  2 trials were not fully probed: a copy was killed by SIGKILL",
-        "  62 probes of copies took 2751 steps, in addition to 900 steps of trials",
+        "  62 probes took 2751 steps, in addition to 900 steps of trials",
     ]
     assert describe_probes(probed(open_ones=1))[:2] == [
-        "Stress margin: no trial was fully probed.",
+        "Robustness margin: no trial was fully probed.",
         "  1 trial was not fully probed: a copy was killed by SIGKILL",
     ]
     assert describe_probes(probed()) == []
@@ -38,14 +38,12 @@ def test_nothing_plausible_made_them_crash_is_said_of_fully_asked_trials_only():
 
 def test_what_could_not_be_run_from_the_start_is_distinguished_from_what_did_not_crash():
     line = describe_probes(probed(0.25, run_again=3, not_finished=1))[-1]
-    assert line == (
-        "  of the 3 mildest disturbances that made a trial crash, 0 reproduce the crash from the start, "
-        "and 1 did not finish:"
-    )
+    assert line == ("  crashes by the mildest disturbance that reproduce from the start: 0 of 3, and 1 did not finish:")
     branched = BranchReport(8, 133, 163, 8163, 28, 13, 5, 1, WHY, 5, 2, ())
     lines = describe_branches(SimpleNamespace(branches=branched, trial_steps=2400))
+    assert lines[1].endswith("; 28 more were skipped, because the step budget of their trials was used up")
     assert lines[2] == "  1 trial was not fully probed: a copy was killed by SIGKILL"
-    assert lines[3] == "  of the 5 likeliest crashes, 0 reproduce from the start, and 2 did not finish:"
+    assert lines[3] == "  likeliest crashes that reproduce from the start: 0 of 5, and 2 did not finish:"
     assert branched.to_json()["not_fully_asked"] == 1
 
 

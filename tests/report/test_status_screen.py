@@ -85,7 +85,7 @@ def test_the_least_stress_margin_is_shown_where_there_is_room():
         console = Console(width=100, height=height, force_terminal=True, color_system=None)
         with console.capture() as captured:
             console.print(Watcher(console, TITLE)._screen(replace(found, stressed=stressed)))
-        line = "least stress margin: 0.38, trial 123, the actor ahead of ego brakes with 2.25 m/s² for 3 s"
+        line = "least robustness margin: 0.38, trial 123, the actor ahead of ego brakes with 2.25 m/s² for 3 s"
         assert (line in captured.get()) is shown
 
 
@@ -105,7 +105,7 @@ def test_margin_that_is_not_fully_asked_is_shown_as_such():
     console = Console(width=100, height=12, force_terminal=True, color_system=None)
     with console.capture() as captured:
         console.print(Watcher(console, TITLE)._screen(shown))
-    assert "least stress margin: at most 0.38 (asked 1 of 9), trial 123" in captured.get()
+    assert "least robustness margin: at most 0.38 (asked 1 of 9), trial 123" in captured.get()
     assert "2 trials were not fully probed: copies of them died" in captured.get()
 
 
