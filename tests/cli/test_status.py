@@ -59,7 +59,8 @@ def test_nodes_are_listed_up_to_twenty():
         ({"core": "on"}, "h: compiled core on"),
         (
             {"probes": PROBES},
-            "h: least robustness margin 0.25 (trial 4); probes 30, made to crash 3 of 10 trials, not fully asked 1 trial",
+            "h: least robustness margin 0.25 (trial 4); probes 30, made to crash 3 of 10 trials, "
+            "not fully asked 1 trial",
         ),
         (
             {"probes": PROBES | {"least": None, "trial": None, "not_fully_asked": 2, "run_again": 3, "confirmed": 1}},
