@@ -117,9 +117,27 @@ def _facts(state: HuntState) -> list[str]:
 
     crashes = _crashes(state)
     lines = [f"{state.crashes} {'crash' if state.crashes == 1 else 'crashes'}: {crashes}"] if crashes else []
-    lines += [describe_running(state.rate)] if state.rate is not None else []
+    lines += [describe_running(state.rate) + _not_counted(state)] if state.rate is not None else []
     lines += fork_lines(state)
     return [*lines, *([f"compiled core {state.core}"] if state.core is not None else [])]
+
+
+def _not_counted(state: HuntState) -> str:
+    """Return why the rate is of fewer trials than have finished; empty if it is of all valid trials.
+
+    The trials of a rate are the first ones without a gap: which trials finish early depends on how long they take, and
+    so on whether they crash.
+    """
+    rate = state.rate
+    if rate is None or rate["method"] == "rare" or rate["per"] != "trial" or rate["bar"] is not None:
+        return ""
+    if rate["certain"] is None or rate["origin"] or rate.get("trained_on"):
+        return ""  # trials are excluded for other reasons
+    count = state.trials_run - state.outcomes.get("invalid", 0) - rate["trials"]
+    if count <= 0:
+        return ""
+    trials, are = ("1 trial", "is") if count == 1 else (f"{count} trials", "are")
+    return f"; {trials} after a trial that has not ended {are} excluded"
 
 
 def _state(state: HuntState) -> str:

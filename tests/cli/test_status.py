@@ -59,8 +59,10 @@ def test_nodes_are_listed_up_to_twenty():
         ({"core": "on"}, "h: compiled core on"),
         (
             {"probes": PROBES},
-            "h: least robustness margin 0.25 (trial 4); probes 30, made to crash 3 of 10 trials, "
-            "not fully asked 1 trial",
+            (
+                "h: least robustness margin 0.25 (trial 4); probes 30, made to crash 3 of 10 trials, "
+                "not fully asked 1 trial"
+            ),
         ),
         (
             {"probes": PROBES | {"least": None, "trial": None, "not_fully_asked": 2, "run_again": 3, "confirmed": 1}},
@@ -78,6 +80,30 @@ def test_nodes_are_listed_up_to_twenty():
 def test_further_facts_have_a_line_each(facts, line):
     lines = written(HuntState(dir="h", state="running", **facts))
     assert lines[3:] == [line]
+
+
+@pytest.mark.parametrize(
+    ("rate", "counted", "remark"),
+    [
+        ({}, 151, "; 4 trials after a trial that has not ended are excluded"),
+        ({}, 154, "; 1 trial after a trial that has not ended is excluded"),
+        ({}, 155, ""),
+        ({"per": "hour"}, 151, ""),  # its trials are those of whole units
+        ({"bar": 0.3, "verdict": "above"}, 151, ""),  # its trials are those up to the decision
+        ({"origin": "guided"}, 151, ""),  # its trials are the random ones
+        ({"trained_on": 4}, 151, ""),
+    ],
+)
+def test_rate_of_fewer_trials_than_have_finished_has_the_reason(rate, counted, remark):
+    rate = {
+        "method": "plain", "per": "trial", "bar": None, "certain": {"low": 0.2, "high": 0.5}, "origin": None,
+        "crashes": 62, "trials": counted, "confidence": 95.0,
+    } | rate  # fmt: skip
+    outcomes = {"collision": 63, "survived": 92, "invalid": 1}
+    state = HuntState(dir="h", state="interrupted", trials_run=156, outcomes=outcomes, rate=rate)
+    (line,) = (line for line in written(state, width=400) if line.startswith("h: crash rate"))
+    said = line.partition(" %)")[2]
+    assert said == remark or (not remark and "not ended" not in said)
 
 
 def test_newest_type_has_an_age_while_the_hunt_runs():
