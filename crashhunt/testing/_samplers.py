@@ -21,7 +21,7 @@ __all__ = ["SamplerContract"]
 Make = Callable[[Space], Sampler]
 
 _TRIALS, _LAG = 40, 4
-_SLOW = {5: 10, 11: 9, 12: 3}  # trials that hang for a while, and for how many trials
+_SLOW = {5: 10, 11: 9}  # trials that hang for a while, and for how many trials
 _OUTCOMES = (Outcome.SURVIVED, Outcome.COLLISION, Outcome.INVALID, Outcome.FINISHED)
 
 

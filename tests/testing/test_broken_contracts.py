@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from contract_runs import failing
 
 from crashhunt.disturbances import Drawn
 from crashhunt.oracles import Finding, Overlap, ReportedCollision
@@ -24,22 +25,6 @@ from crashhunt.testing._disturbances import DisturbanceContract
 from crashhunt.testing._last_avoidable_step import EscapeCheck, RecordedThenBrakes
 from crashhunt.testing._oracles import _LANES
 from crashhunt.world import Event
-
-
-def failing(suite, fixtures):
-    """Return the tests of a contract suite that fail with what a function returns as their fixtures."""
-    found = set()
-    for name in dir(suite):
-        if not name.startswith("test_"):
-            continue
-        method = getattr(suite(), name)
-        code = method.__func__.__code__
-        wanted = code.co_varnames[1 : code.co_argcount]
-        try:
-            method(**{key: value for key, value in fixtures().items() if key in wanted})
-        except (AssertionError, pytest.fail.Exception):
-            found.add(name)
-    return found
 
 
 class Model:
