@@ -7,6 +7,7 @@ import hashlib
 import inspect
 import logging
 import re
+from abc import ABC
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -278,7 +279,8 @@ _ORIGINALS = {
     for owner in _BASES
     for name in (*_METHODS, *_SPECIAL, "index_to_speed")
 }
-_HIGHWAY_ENV_MODULES = frozenset(module.__name__ for module in MODULES) | {"abc", "builtins"}
+# By identity, because a class that a user makes with ``type(name, bases, members)`` has the module name `abc`.
+_CLASSES_WATCHED = frozenset(id(kind) for module in MODULES for _, kind in _classes(module)) | {id(ABC), id(object)}
 
 originals: dict[str, Callable[..., Any]] = {}
 """The replaced methods of highway-env by ``Class.name``; empty until the accelerator is first switched on."""
@@ -297,7 +299,7 @@ class Own:
         self._kind, self._base = kind, base
         self._mro = kind.__mro__
         # The members that a user can change later; `Watch` covers highway-env's own classes.
-        parts = [part for part in self._mro if part.__module__ not in _HIGHWAY_ENV_MODULES]
+        parts = [part for part in self._mro if id(part) not in _CLASSES_WATCHED]
         self._sizes = [len(vars(part)) for part in parts]
         self._snapshot = snapshot_of([(part, vars(part)) for part in parts]) if parts else None
         values = {*values, *(name for name in dir(base) if is_plain(inspect.getattr_static(base, name)))}
