@@ -1,13 +1,16 @@
 """Samplers of others, and a plain mutation, in the form of ours, to be measured beside them.
 
-Optuna as its own documentation drives it; ``--sampler optuna:NAME`` gives it a random trial in five besides. VerifAI is
-installed by whoever measures: ``pip install verifai``, best into an environment of its own, as it brings Scenic, and an
-attrs of 2022. So are SMAC (``pip install smac``) and BoTorch (``pip install botorch``).
+Optuna as its own documentation drives it; ``--sampler optuna:NAME`` gives it a random trial in five besides.
+
+The packages of some peers are not among the dependencies of crashhunt. Install these into another virtual environment:
+``pip install verifai`` (which needs Scenic, and attrs of 2022), ``pip install smac``, ``pip install botorch``.
+``scripts/search`` skips peers whose package is not installed.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import tempfile
 from bisect import insort
 from pathlib import Path
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PEERS",
+    "SLOW",
     "OptunaCmaEs",
     "OptunaTpe",
     "PlainMutation",
@@ -31,6 +35,7 @@ __all__ = [
     "Turbo",
     "VerifaiBandit",
     "VerifaiCrossEntropy",
+    "missing_packages",
 ]
 
 PEERS = {
@@ -43,6 +48,22 @@ PEERS = {
     "turbo": "peers:Turbo",
 }
 """Name in tables to what stands for it."""
+SLOW = ("smac", "turbo")
+"""Peers that take 0.1 s or more for a proposal, so that they run only if they are named."""
+_PACKAGES = {
+    "optuna-tpe": ("optuna",),
+    "optuna-cma-es": ("optuna", "cmaes"),
+    "verifai-ce": ("verifai",),
+    "verifai-mab": ("verifai",),
+    "smac": ("smac",),
+    "turbo": ("botorch",),
+}
+"""Name in tables to the packages that it needs."""
+
+
+def missing_packages(sampler: str) -> list[str]:
+    """Return the packages that a sampler needs and that are not installed."""
+    return [package for package in _PACKAGES.get(sampler, ()) if importlib.util.find_spec(package) is None]
 
 
 class _Optuna:
@@ -148,8 +169,16 @@ class VerifaiBandit(_Verifai):
     make = "multiArmedBanditSamplerFor"
 
 
+def _never_called(config: object, seed: int = 0) -> float:
+    """Have the arguments that SMAC expects from a function to minimize; SMAC does not call it in this use."""
+    raise NotImplementedError
+
+
 class Smac:
-    """SMAC3 (Lindauer et al. 2022) with its facade for hyperparameters, a random forest, asked and told in turns."""
+    """SMAC3 (Lindauer et al. 2022) with its facade for hyperparameters: a random forest, and expected improvement.
+
+    SMAC gives proposals and receives results through its own methods `ask` and `tell`. Results may arrive late.
+    """
 
     learns = True
     wants_hunt = True
@@ -159,6 +188,7 @@ class Smac:
         from ConfigSpace import Categorical, ConfigurationSpace, Float
 
         self._space = {f"x{place}": (key, known) for place, (key, known) in enumerate(sorted(space.items()))}
+        self._folder = tempfile.TemporaryDirectory(prefix="crashhunt-smac-")
         seed = hunt.seed % 2**31
         configurations = ConfigurationSpace(seed=seed)
         configurations.add([
@@ -166,12 +196,12 @@ class Smac:
             for name, (_, known) in self._space.items()
         ])  # fmt: skip
         scenario = smac.Scenario(
-            configurations, deterministic=True, n_trials=100_000, seed=seed, output_directory=Path(tempfile.mkdtemp())
+            configurations, deterministic=True, n_trials=100_000, seed=seed, output_directory=Path(self._folder.name)
         )
         facade = smac.HyperparameterOptimizationFacade
         # The number of initial draws depends on the trials that are planned: as for 500 of them.
         initial = facade.get_initial_design(scenario, n_configs=min(10 * len(space), 50))
-        self._smac = facade(scenario, lambda *_: 0.0, initial_design=initial, logging_level=False)
+        self._smac = facade(scenario, _never_called, initial_design=initial, logging_level=False)
         self._asked: dict[int, Any] = {}
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
@@ -192,7 +222,10 @@ class Smac:
 
 
 class Turbo:
-    """TuRBO-1 (Eriksson et al. 2019) as the tutorial of BoTorch runs it, in batches of four, for numbers only.
+    """TuRBO-1 (Eriksson et al. 2019) as the tutorial of BoTorch runs it, in batches of four.
+
+    Source: https://botorch.org/docs/tutorials/turbo_1 (Thompson sampling). For this algorithm, the value of a choice is
+    a number from 0 to 1.
 
     A Gaussian process with a Matérn kernel of 5/2, Thompson draws in a trust region around the best trial, and a new
     start where the region has shrunk to its minimum. The process is fitted for every fourth proposal, so that a
@@ -203,8 +236,8 @@ class Turbo:
     batch = 4
 
     def __init__(self, space: Space, *, points: int = 10) -> None:
+        importlib.import_module("torch").set_num_threads(1)
         self._cube = Cube(space)
-        self._last: dict[int, Any] = {}
         self._begin()
 
     def _begin(self) -> None:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from development_problems import DEVELOPMENT, development_problem
-from peers import PEERS
+from peers import PEERS, SLOW, missing_packages
 from problems import PROBLEMS, REAL
 from search_faults import FAULTS, faults_table, write_faults
 from search_kinds import kinds_table, write_kinds
@@ -233,8 +233,8 @@ def _with_margin(result: TrialResult) -> TrialResult:
     return result if result.stress is None else replace(result, danger=1.0 - result.stress.least)
 
 
-def synthetic_run(name: str, sampler: str, seed: int, lag: str = LAG) -> Run:
-    """One hunt on a problem without a simulator."""
+def synthetic_run(name: str, sampler: str, seed: int, lag: str = LAG, limit: float = math.inf) -> Run:
+    """One hunt on a problem without a simulator, of at most a number of trials."""
     if name in DEVELOPMENT:
         problem = development_problem(name, seed)
     else:
@@ -245,7 +245,8 @@ def synthetic_run(name: str, sampler: str, seed: int, lag: str = LAG) -> Run:
             argument: ArgumentSpec(spec=spec, kind=kind) for argument, (spec, kind) in problem.arguments.items()
         })},
     )  # fmt: skip
-    found = hunted(settings, FastStepper(problem), math.ceil(GIVE_UP / problem.rate), name, lag=lag)
+    most = math.ceil(min(GIVE_UP / problem.rate, limit))
+    found = hunted(settings, FastStepper(problem), most, name, lag=lag)
     return Run(
         problem=name,
         sampler=sampler,
@@ -293,11 +294,12 @@ def all_runs(
     workers: int,
     known: Collection[Hunt] = (),
     lag: str = LAG,
+    limit: float = math.inf,
 ) -> Iterator[Run]:
     """Every sampler on every problem without a simulator, but for what is known."""
     with ProcessPoolExecutor(workers) as pool:
         jobs = [
-            pool.submit(synthetic_run, name, sampler, seed, lag)
+            pool.submit(synthetic_run, name, sampler, seed, lag, limit)
             for name in names for sampler in samplers for seed in seeds if (name, sampler, seed) not in known
         ]  # fmt: skip
         for job in jobs:
@@ -334,16 +336,33 @@ def stored(path: Path) -> dict[Hunt, Run]:
     return runs
 
 
+def _installed(samplers: Sequence[str]) -> list[str]:
+    """Return the samplers whose packages are installed, and print the others in one line."""
+    missing = {sampler: packages for sampler in samplers if (packages := missing_packages(sampler))}
+    if missing:
+        needs = ", ".join(f"{sampler} (pip install {' '.join(packages)})" for sampler, packages in missing.items())
+        print(f"skipped, because a package is not installed: {needs}", file=sys.stderr)
+    return [sampler for sampler in samplers if sampler not in missing]
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Run and print."""
     parser = argparse.ArgumentParser("scripts/search", description=__doc__)
-    parser.add_argument("--samplers", default=",".join((*OURS, *PEERS)))
+    parser.add_argument(
+        "--samplers",
+        default=",".join((*OURS, *(peer for peer in PEERS if peer not in SLOW))),
+        help=f"also {', '.join(SLOW)}; samplers whose package is not installed are skipped",
+    )
     parser.add_argument(
         "--problems",
         default=",".join(PROBLEMS),
         help="some of these, and of " + ", ".join((*REAL, *DEVELOPMENT, *UNSEEN)),
     )
     parser.add_argument("--repetitions", type=int, default=30)
+    parser.add_argument(
+        "--limit", type=int, metavar="TRIALS", default=math.inf,
+        help="of a hunt on a problem without a simulator, for slow samplers; compare only hunts with the same limit",
+    )  # fmt: skip
     parser.add_argument("--parallel", type=int, default=2)
     parser.add_argument("--quick", action="store_true", help="a few hunts, in seconds: shows only that nothing broke")
     parser.add_argument("--plot", type=Path, help="an SVG to write, of all hunts")
@@ -373,7 +392,7 @@ def main(words: Sequence[str] | None = None) -> int:
     for module, name, value in options.set:
         setattr(module, name, value)
     seeds = range(options.first_seed, options.first_seed + options.repetitions)
-    samplers, names = options.samplers.split(","), options.problems.split(",")
+    samplers, names = _installed(options.samplers.split(",")), options.problems.split(",")
     unknown = [name for name in names if name not in (*PROBLEMS, *REAL, *DEVELOPMENT, *UNSEEN)]
     if unknown:
         parser.error(f"--problems: {', '.join(unknown)} is no problem; see --help")
@@ -400,8 +419,17 @@ def main(words: Sequence[str] | None = None) -> int:
         return 0
     runs = stored(options.store) if options.store is not None and options.store.exists() else {}
     known = () if options.again else (*runs,)
+    ran: list[Run] = []
     for found in (
-        all_runs(samplers, seeds, [name for name in names if name not in REAL], options.parallel, known, options.lag),
+        all_runs(
+            samplers,
+            seeds,
+            [name for name in names if name not in REAL],
+            options.parallel,
+            known,
+            options.lag,
+            options.limit,
+        ),
         *(
             real_runs(name, samplers, seeds, options.parallel, known, options.lag, options.probe)
             for name in names
@@ -410,12 +438,17 @@ def main(words: Sequence[str] | None = None) -> int:
     ):
         for run in found:
             runs[run.problem, run.sampler, run.seed] = run
+            ran.append(run)
             if options.store is not None:
                 store(options.store, [*runs.values()])
     print(table([*runs.values()]))
     if options.pairs is not None:
         base, _, other = options.pairs.partition(",")
         print(f"\n{pairs_table([*runs.values()], base, other)}")
+    for sampler in dict.fromkeys(run.sampler for run in ran):
+        of = [run for run in ran if run.sampler == sampler]
+        spent, trials = sum(run.cpu_s for run in of), sum(run.trials for run in of)
+        print(f"CPU time of {sampler}: {spent:.1f} s for {trials} trials, {1000 * spent / trials:.2f} ms each")
     if options.plot is not None:
         write_plot([*runs.values()], options.plot)
     return 0
