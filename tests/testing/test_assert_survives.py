@@ -192,3 +192,21 @@ def test_trial_of_an_example_has_its_values_and_no_others(toy, monkeypatch, foun
     assert (full.only, full.disturbances) == (("left.1",), (erring,))
     assert (empty.seed, empty.arguments, empty.scenario_arguments) == (0, {}, {})
     assert (empty.only, empty.disturbances) == (None, ())
+
+
+def test_call_without_options_has_the_values_of_its_signature(hunt):
+    hunt.crashes = [SimpleNamespace(id="large", result=result(seed=1))]
+    hunt.small = None
+    with pytest.raises(AssertionError, match="max_steps=500, example="):
+        assert_survives("keep-lane", "toy")
+    ((words, options),) = hunt.asked
+    assert words[1:] == (0, 20, 500)
+    assert options["seed"] == 0
+    assert [options for _, options in hunt.shrunk] == [{"budget": 100, "parallel": 0, "form": "traffic"}]
+
+
+def test_failure_is_shown_in_the_test_and_not_inside_crashhunt(hunt):
+    hunt.crashes = [SimpleNamespace(id="large", result=result(seed=1))]
+    with pytest.raises(AssertionError) as caught:
+        assert_survives("keep-lane", "toy")
+    assert caught.traceback.filter(caught)[-1].path.name == "test_assert_survives.py"

@@ -6,7 +6,8 @@ import copy
 import itertools
 import math
 import random
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,7 +21,15 @@ from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.simulators import SpeedAndLaneChange
 from crashhunt.simulators.toy import ToySimulator
 from crashhunt.space import Choice, Range
-from crashhunt.testing import AgentContract, OracleContract, SamplerContract, SimulatorContract, drive
+from crashhunt.testing import (
+    AgentContract,
+    OracleContract,
+    SamplerContract,
+    SimulatorContract,
+    _last_avoidable_step,
+    check_escape,
+    drive,
+)
 from crashhunt.testing._disturbances import DisturbanceContract
 from crashhunt.testing._last_avoidable_step import EscapeCheck, RecordedThenBrakes
 from crashhunt.testing._oracles import _LANES
@@ -594,3 +603,115 @@ def test_driver_repeats_the_log_and_brakes_after_its_step(monkeypatch):
     meta = RecordedThenBrakes("log.mcap", "ego", 0, SimpleNamespace(meanings=("FASTER", "IDLE", "SLOWER")))
     meta.reset(1)
     assert meta.act(None) == 2
+
+
+def test_overruled_driver_may_act_after_the_end_of_its_log(monkeypatch):
+    log = SimpleNamespace(actions=lambda agent: ["first"])
+    monkeypatch.setattr("crashhunt.testing._last_avoidable_step.read_log", lambda path: log)
+    agent = RecordedThenBrakes("log.mcap", "ego", _last_avoidable_step._NEVER, None)
+    assert [agent.act(None) for _ in range(3)] == ["first"] * 3
+    assert agent._after > 10**6
+
+
+@dataclass(frozen=True)
+class Worker:
+    scenario: object
+    scratch: Path = Path()
+
+
+@dataclass(frozen=True)
+class Spec:
+    arguments: dict
+    max_steps: int = 30
+    seed: int = 5
+
+
+def crash(agent, other):
+    """A result with a collision of an agent and another actor; without one for None."""
+    found = agent and SimpleNamespace(agent=agent, other=other)
+    return SimpleNamespace(collision=found, escape=None)
+
+
+class Runs:
+    """An executor that returns what a function makes of a trial, at the second request."""
+
+    def __init__(self, worker):
+        self.worker, self.requests, self.closed = worker, 0, 0
+        self.made.append(self)
+
+    def submit(self, spec):
+        self.spec = spec
+
+    def completed(self, timeout_s):
+        self.requests += 1
+        assert self.requests < 9
+        return [self.ends(self.spec)] if self.requests > 1 else []
+
+    def close(self):
+        self.closed += 1
+
+
+@pytest.fixture
+def escapes(monkeypatch):
+    """Replace replays: a trial ends as `ends` says."""
+    made, asked = [], []
+    scenario = SimpleNamespace(agents={"ego": 1, "second": 2}, with_agents=lambda agents: ("with", agents))
+    rerun = SimpleNamespace(
+        worker=Worker(scenario), spec=Spec({"ego": {"log": "a"}, "second": {"log": "b"}}),
+        recorded=SimpleNamespace(steps=30, prologue=SimpleNamespace(step_length_s=0.25)),
+        bundle=SimpleNamespace(id="c", driver="ego", result=crash("ego", "truck")),
+    )  # fmt: skip
+
+    def prepare(bundle, options):
+        asked.append((bundle, options.code))
+        return rerun
+
+    kind = type("Made", (Runs,), {"made": made})
+    monkeypatch.setattr(_last_avoidable_step, "prepare", prepare)
+    monkeypatch.setattr(_last_avoidable_step, "FreshProcessExecutor", kind)
+    monkeypatch.setattr(_last_avoidable_step, "partner", lambda result: result.collision and result.collision.other)
+    return SimpleNamespace(made=made, kind=kind, bundle=rerun.bundle, asked=asked)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "found"),
+    [
+        (crash(None, None), crash("ego", "truck"), (True, False)),
+        (crash("ego", "truck"), crash("ego", "truck"), (False, False)),
+        (crash("ego", "wall"), crash("second", "truck"), (True, True)),
+        (crash("second", "truck"), crash(None, None), (True, True)),
+    ],
+)
+def test_last_avoidable_step_is_checked_by_braking_after_it_and_later(escapes, before, after, found):
+    escapes.kind.ends = staticmethod(lambda spec: before if spec.arguments["ego"]["after"] == 7 else after)
+    escapes.bundle.result.escape = SimpleNamespace(step=7, too_late=8)
+    check = check_escape(escapes.bundle)
+    assert check == EscapeCheck("c", 7, 8, *found)
+    assert escapes.asked == [(escapes.bundle, "log")]
+    assert [run.spec.arguments["ego"] for run in escapes.made] == [{"log": "a", "after": 7}, {"log": "a", "after": 8}]
+    for run in escapes.made:
+        assert run.spec.arguments["second"] == {"log": "b", "after": _last_avoidable_step._NEVER}
+        assert run.spec.max_steps == 30 + round(_last_avoidable_step._AFTERWARDS_S / 0.25)
+        assert run.spec.seed == 5
+        name = "crashhunt.testing._last_avoidable_step:RecordedThenBrakes"
+        assert run.worker.scenario == ("with", {"ego": name, "second": name})
+        assert run.closed == 1
+        assert not run.worker.scratch.exists()
+
+
+@pytest.mark.parametrize(("step", "too_late", "runs"), [(None, 8, [8]), (7, None, [7]), (None, None, [])])
+def test_step_that_is_not_known_is_not_checked(escapes, step, too_late, runs):
+    escapes.kind.ends = staticmethod(lambda spec: crash("ego", "truck"))
+    escapes.bundle.result.escape = SimpleNamespace(step=step, too_late=too_late)
+    check = check_escape(escapes.bundle)
+    assert [run.spec.arguments["ego"]["after"] for run in escapes.made] == runs
+    assert (check.step, check.too_late) == (step, too_late)
+    assert (check.avoided, check.avoided_later) == (
+        None if step is None else False,
+        None if too_late is None else False,
+    )
+
+
+def test_crash_without_a_calculated_step_is_not_run(escapes):
+    assert check_escape(escapes.bundle) == EscapeCheck("c")
+    assert escapes.made == escapes.asked == []
