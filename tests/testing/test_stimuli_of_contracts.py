@@ -1048,7 +1048,7 @@ class Several(Rounded):
 @pytest.mark.parametrize(
     ("model", "fails"), [(Rounded, set()), (Several, {"test_the_likelihood_is_that_of_the_draws"})]
 )
-def test_disturbance_contract_finds_a_rare_surplus_and_no_rounding(model, fails):
+def test_disturbance_contract_accepts_rounding_and_finds_a_rare_excess(model, fails):
     assert failing(DisturbanceContract, lambda: {"make": model}) == fails
 
 
