@@ -26,7 +26,7 @@ from peers import PEERS, SLOW, missing_packages
 from problems import PROBLEMS, REAL
 from search_faults import FAULTS, faults_table, write_faults
 from search_kinds import kinds_table, write_kinds
-from search_plot import GIVE_UP, pairs_table, table, write_plot
+from search_plot import GIVE_UP, delay_table, pairs_table, table, write_plot
 from search_pool import trials_on
 from search_sensitivity import CONSTANTS, METHOD, sensitivity_table, write_sensitivity
 from search_wall import wall_table
@@ -381,6 +381,10 @@ def main(words: Sequence[str] | None = None) -> int:
         help="robustness probes in trials on a simulator; samplers receive 1 - margin as the danger",
     )  # fmt: skip
     parser.add_argument("--pairs", metavar="A,B", help="in addition, the cost of B as a share of that of A, same seeds")
+    parser.add_argument(
+        "--delay", type=Path, metavar="FILE",
+        help=f"in addition, the cost as a share of that of stored hunts with lag {LAG}, and that of the delay alone",
+    )  # fmt: skip
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument(
         "--set", action="append", default=[], type=a_constant, metavar="MODULE.NAME=VALUE",
@@ -445,6 +449,15 @@ def main(words: Sequence[str] | None = None) -> int:
     if options.pairs is not None:
         base, _, other = options.pairs.partition(",")
         print(f"\n{pairs_table([*runs.values()], base, other)}")
+    if options.delay is not None:
+        if options.lag == GROWING:
+            parser.error("--delay needs a fixed --lag")
+        for sampler in samplers:
+            early, late = (
+                [run for run in found if run.sampler == sampler]
+                for found in (stored(options.delay).values(), runs.values())
+            )
+            print(f"\n{sampler}:\n{delay_table(early, late, int(options.lag) - int(LAG))}")
     for sampler in dict.fromkeys(run.sampler for run in ran):
         of = [run for run in ran if run.sampler == sampler]
         spent, trials = sum(run.cpu_s for run in of), sum(run.trials for run in of)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from search import Run
 
-__all__ = ["costs", "interval", "one_in", "pairs_table", "rare", "table", "write_plot"]
+__all__ = ["costs", "delay_table", "interval", "one_in", "pairs_table", "rare", "table", "write_plot"]
 
 GIVE_UP = 3.0  # times what random draws need
 _LEFT, _WIDTH, _ROW, _TOP = 190, 860, 24, 74
@@ -39,6 +39,8 @@ _RATES = {name: problem.rate for name, problem in PROBLEMS.items()} | {
     name: rate for name, (_, rate, _) in {**DEVELOPMENT, **UNSEEN}.items()
 }
 """Crashes per random trial of the problems without a simulator."""
+_MISLEADING = ("deceptive",)
+"""Problems whose criticality says something, but leads to a place without a crash."""
 
 
 def _paid(problem: str, runs: Sequence[Run]) -> list[int]:
@@ -137,6 +139,54 @@ def pairs_table(runs: Sequence[Run], base: str, other: str) -> str:
         whole = np.exp(np.mean(np.log(drawn), axis=0))
         lines.append(f"| *all {len(ratios)}* | | | | {_share(statistics.geometric_mean(ratios), whole)} |")
     return "\n".join(lines)
+
+
+def delay_table(early: Sequence[Run], late: Sequence[Run], more: int) -> str:
+    """Return the cost of hunts with a greater lag, and of the delay alone, as shares of the cost with a smaller lag.
+
+    An imaginary sampler makes as many random draws in addition as results arrive later, and needs as many further
+    trials as with the smaller lag. One column counts all of these draws, and the other ends a hunt when a draw crashes.
+
+    Args:
+        early: hunts of one sampler with the smaller lag.
+        late: its hunts with the greater lag; those with the same problem and seed count.
+        more: by how many trials the lag is greater.
+    """
+    rng = np.random.default_rng(0)
+    lines = [
+        "| problem | hunts | early | late | ratio | delay alone | delay, draws may crash |",
+        "| --- | ---: | ---: | ---: | --- | --- | --- |",
+    ]
+    of_late = {(run.problem, run.seed): run.trials for run in late}
+    found, learnable = [], []
+    for problem in dict.fromkeys(run.problem for run in early if run.problem in _RATES):
+        pairs = [
+            (run.trials, of_late[problem, run.seed])
+            for run in sorted(early, key=lambda run: run.seed)
+            if run.problem == problem and (problem, run.seed) in of_late
+        ]
+        if len(pairs) < 2:
+            continue
+        one, two = np.array(pairs, dtype=float).T
+        again = rng.integers(len(pairs), size=(4000, len(pairs)))
+        # The first of each is the mean of all hunts, the others are of the bootstrap.
+        before, after = (np.append(costs.mean(), costs[again].mean(1)) for costs in (one, two))
+        rate = _RATES[problem]
+        survive = (1.0 - rate) ** more
+        delayed = before + more, (1.0 - survive) / rate + survive * before
+        found.append([ratio / before for ratio in (after, *delayed)])
+        learnable.append(problem in PROBLEMS and PROBLEMS[problem].hint and problem not in _MISLEADING)
+        cells = [problem, f"{len(pairs)}", f"{before[0]:.0f}", f"{after[0]:.0f}", *_shares(found[-1])]
+        lines.append(f"| {' | '.join(cells)} |")
+    for name, chosen in (("all", [True] * len(found)), ("criticality leads to the crash", learnable)):
+        if any(chosen):
+            logarithms = np.log(np.array(found)[chosen]).mean(axis=0)
+            lines.append(f"| *{name}: {sum(chosen)}* | | | | {' | '.join(_shares(np.exp(logarithms)))} |")
+    return "\n".join(lines)
+
+
+def _shares(ratios: Sequence[np.ndarray[tuple[int], np.dtype[np.float64]]]) -> list[str]:
+    return [_share(float(ratio[0]), ratio[1:]) for ratio in ratios]
 
 
 def _share(ratio: float, drawn: np.ndarray[tuple[int], np.dtype[np.float64]]) -> str:

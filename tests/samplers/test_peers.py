@@ -38,3 +38,20 @@ def test_slow_peers_and_those_with_packages_are_peers(study):
 def test_a_hunt_ends_at_the_limit(study):
     runs = [study.synthetic_run("needle", "random", seed, limit=7) for seed in range(3)]
     assert [(run.trials, run.found) for run in runs] == [(7, False)] * 3  # one trial in 5000 crashes
+
+
+def test_cost_of_the_delay_counts_as_many_random_draws_as_results_arrive_later(study):
+    def runs(trials):
+        return [
+            study.Run(problem=name, sampler="guided", seed=seed, trials=trials, found=True)
+            for name in ("smooth", "blind") for seed in range(3)
+        ]  # fmt: skip
+
+    smooth, blind, every, learnable = study.delay_table(runs(50), runs(60), 28).splitlines()[2:]
+    assert smooth == (
+        # 28 of 500 crash early: (1 - 0.998^28) * 500 + 0.998^28 * 50 = 74.5
+        "| smooth | 3 | 50 | 60 | 1.20 (1.20-1.20) | 1.56 (1.56-1.56) | 1.49 (1.49-1.49) |"
+    )
+    assert blind.startswith("| blind | 3 | 50 | 60 | 1.20 (1.20-1.20) | 1.56 (1.56-1.56) |")
+    assert every.startswith("| *all: 2* | | | | 1.20 ")
+    assert learnable.startswith("| *criticality leads to the crash: 1* | | | | 1.20 ")
