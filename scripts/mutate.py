@@ -191,6 +191,7 @@ _TESTS_ELSEWHERE = {
     "hunts/_crashes.py": ("hunts/test_kinds.py", "hunts/test_tally.py", "hunts/test_whole_hunts.py"),
     "hunts/_fork_results.py": ("hunts/test_from_the_start.py", "hunts/test_whole_hunts.py", "e2e/test_branches.py"),
     "hunts/_hunt.py": (
+        "hunts/test_hunt_loop.py",
         "hunts/test_hunt_parts.py",
         "hunts/test_rare_hunts.py",
         "hunts/test_states_and_reports.py",
@@ -209,6 +210,7 @@ _TESTS_ELSEWHERE = {
     ),
     "hunts/_progress.py": (
         "hunts/test_from_the_start.py",
+        "hunts/test_hunt_loop.py",
         "hunts/test_hunt_status.py",
         "hunts/test_phases.py",
         "hunts/test_searching.py",

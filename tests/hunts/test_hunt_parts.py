@@ -19,10 +19,13 @@ from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError,
 from crashhunt.executors import PoolExecutor
 from crashhunt.hunts import HuntReport, _hunt, _preflight, _results, _state, _verification
 from crashhunt.hunts._hunt import Hunt
+from crashhunt.hunts._reports import BranchReport, Difference, ProbeReport, RareReport, kind_data
 from crashhunt.hunts._state import HuntDirectory, LogReader
 from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReruns, is_settled
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
+from crashhunt.rates import TRIALS_PER_ROOT, RareEstimate
+from crashhunt.rates._rare import Estimated
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 SETTINGS = HuntSettings(
@@ -659,3 +662,94 @@ def test_columns_of_a_table_have_the_kinds_of_their_arguments():
         "number": "Int64", "outcome": "String", "scenario.rain": "Boolean", "scenario.who": "String",
         "ego.speed": "Int64", "ego.mode": "String", "ego.gap": "Float64", "danger": "Float64",
     }  # fmt: skip
+
+
+def test_report_of_copies_has_each_count_under_its_name(tmp_path):
+    crash = SimpleNamespace(summary=lambda: "crash")
+    branches = BranchReport(
+        trials=1, moments=2, branches=3, steps=4, skipped=5, crashed=6, crashed_trials=7, not_fully_asked=8,
+        why_unanswered="killed", run_again=9, not_finished=10, crashes=(crash, crash),
+    )  # fmt: skip
+    assert branches.to_json() == {
+        "trials": 1, "moments": 2, "branches": 3, "steps": 4, "left_out": 5, "crashed": 6, "crashed_trials": 7,
+        "not_fully_asked": 8, "run_again": 9, "not_finished": 10, "confirmed": 2, "crashes": ["crash", "crash"],
+    }  # fmt: skip
+    probes = ProbeReport(
+        margins=(0.5, 0.25, 1.0), not_fully_asked=1, why_unasked="killed", probes=2, steps=3, skipped=4, run_again=5,
+        not_finished=6, crashes=(crash,), by=(),
+    )  # fmt: skip
+    assert probes.to_json() == {
+        "trials": 3, "not_fully_asked": 1, "least": 0.25, "median": 0.5, "probes": 2, "steps": 3, "left_out": 4,
+        "run_again": 5, "not_finished": 6, "confirmed": 1, "crashes": ["crash"],
+    }  # fmt: skip
+    none = replace(probes, margins=()).to_json()
+    assert (none["trials"], none["least"], none["median"]) == (0, None, None)
+    rare = RareReport(SimpleNamespace(to_json=lambda: {"estimate": 0.1}), verified=3, not_finished=1, crashes=(crash,))
+    assert rare.to_json() == {
+        "estimate": 0.1, "run_again": 3, "not_finished": 1, "confirmed": 1, "crashes": ["crash"],
+    }  # fmt: skip
+    group = SimpleNamespace(
+        signature="rear-end", count=4, first=SimpleNamespace(id="a"), shortest=SimpleNamespace(id="b")
+    )
+    assert kind_data(group) == {"words": "rear-end", "count": 4, "first": "a", "shortest": "b"}
+
+
+@pytest.mark.parametrize(
+    ("step", "agent", "says"),
+    [
+        (None, "", "trial 7 is another one in a fresh process: the digest was a and is b"),
+        (0, "ego", "trial 7 is another one in a fresh process: at step 0, the digest of ego was a and is b"),
+    ],
+)
+def test_difference_of_an_audit_is_a_sentence(step, agent, says):
+    found = Difference(trial=7, step=step, agent=agent, field="the digest", recorded="a", replayed="b")
+    assert str(found) == says
+
+
+RARE = RareEstimate(
+    roots=60, estimate=0.0123, undisturbed=0.0023, disturbed=0.01, estimated=Estimated(0.005, 0.02, 41.6, 0.1, 9),
+    estimated_disturbed=Estimated(0.004, 0.019, 40.0, 0.1, 9), why_not="", why_not_disturbed="", more_roots=None,
+    certain=(0.001, 0.08), excluded=0, parts={f"cell{number}": 0.001 * number for number in range(1, 7)},
+    undisturbed_crashes=5, plain=239, plain_crashes=4, steps=9000, plain_steps=700, plain_equivalent_steps=1.2e6,
+    confidence=0.95,
+)  # fmt: skip
+
+
+def lines_of(verified=0, crashes=(), more=(), **changes):
+    return RareReport(replace(RARE, **changes), verified, 0, crashes, more).lines
+
+
+CERTAIN = "  certain: at least 0.001, at most 0.08 (95%; 4 of 239 plain trials crashed)"
+OMITS = "  the estimate omits failures that no copy has met; the certain bounds include them"
+
+
+def test_estimate_of_rare_mode_is_explained_line_by_line():
+    cells = "; ".join(f"cell{number} 0.00{number} ({number}0%)" for number in range(1, 6))
+    assert lines_of(verified=3, crashes=("a", "b"), more=("  levels: 3",)) == [
+        "rare: 0.012 per trial (0.005 to 0.02, estimated from 60 roots; effective sample size 42)",
+        f"  undisturbed 5 of 299 trials; {cells}",
+        "  5 of 6 parts shown; run --json has all of them",
+        "  with a disturbance: 0.01 per trial (0.004 to 0.019)",
+        "  9000 steps, 700 of them in plain trials; plain trials alone need about 1.2e+06 steps",
+        "  of the 3 weightiest crashes, 2 came again from the start",
+        "  levels: 3", CERTAIN, OMITS,
+    ]  # fmt: skip
+    few = lines_of(parts={f"cell{number}": 0.002 for number in range(5)}, undisturbed_crashes=0, certain=None)
+    assert [line[:30] for line in few[1:]] == [
+        "  undisturbed 0 of 299 trials;", "  9000 steps, 700 of them in p", OMITS[:30],
+    ]  # fmt: skip
+
+
+def test_estimate_of_rare_mode_without_an_interval_gives_the_reason():
+    found = lines_of(estimated=None, why_not="few crashes", more_roots=20, plain_equivalent_steps=None)
+    assert found[0] == "rare: 0.012 per trial"
+    more = f"about {20 * TRIALS_PER_ROOT} more trials are needed"
+    assert found[1] == f"  no interval (60 roots with their copies): few crashes; {more}"
+    assert not any("steps" in line for line in found)
+    found = lines_of(estimate=0.0, estimated=None, why_not="no crash", disturbed=0.0, estimated_disturbed=None)
+    assert found[0] == "rare: no crash yet"
+    assert found[1] == "  no interval (60 roots with their copies): no crash"
+    assert found[2] == "  undisturbed 5 of 299 trials"  # nothing is divided by an estimate of zero
+    nothing = {"estimate": None, "estimated": None, "more": ("more",)}
+    assert lines_of(**nothing, why_not="", roots=60) == ["rare: no estimate: no root has ended", "more"]
+    assert lines_of(**nothing, why_not="few", roots=0) == ["rare: no estimate: few", "more", CERTAIN]

@@ -18,7 +18,18 @@ from crashhunt.hunts._rates import Forcings, RareWatch, SplittingWatch
 from crashhunt.hunts._reports import RareReport
 from crashhunt.ledger import Ledger
 from crashhunt.rates import BLOCK, TRIALS_PER_ROOT, _splitting as splitting, is_root
-from crashhunt.trial import CRASHES, Disturbance, Forced, ForcedCopy, Forcing, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import (
+    CRASHES,
+    KILLED,
+    Disturbance,
+    Failure,
+    Forced,
+    ForcedCopy,
+    Forcing,
+    Outcome,
+    TrialResult,
+    TrialSpec,
+)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
@@ -225,6 +236,237 @@ def test_plain_trials_that_contradict_the_copies_withhold_the_interval():
     found = rule.estimate()
     assert found.estimated is None
     assert "plain trials crash more often than the copies explain" in found.why_not
+
+
+def tree(number, peak=0.5, crash="", **more):
+    """A result of rare mode with splitting."""
+    spec = TrialSpec(number, number, {}, {}, 50, forcing=Forcing(1.0, levels=(0.2, 0.4)))
+    forced = Forced(1.0, {}, (ForcedCopy("0", 3, 1.0, 2, crash, 9),), 90, peak=peak, **more)
+    return TrialResult(spec, Outcome.SURVIVED, 50, forced=forced)
+
+
+PILOT_TRIALS = splitting.PILOT_ROOTS * TRIALS_PER_ROOT
+
+
+def test_splitting_waits_for_its_pilots_and_then_for_the_trees_that_test_the_levels():
+    needed = rare_module.SplittingForcings.needed
+    asked = (0, 1, PILOT_TRIALS - 1, PILOT_TRIALS, 2 * PILOT_TRIALS - 1, 2 * PILOT_TRIALS, 9 * PILOT_TRIALS)
+    assert [needed(number) for number in asked] == [
+        0, 0, 0, PILOT_TRIALS, PILOT_TRIALS, 2 * PILOT_TRIALS, 2 * PILOT_TRIALS,
+    ]  # fmt: skip
+
+
+def test_levels_of_splitting_are_chosen_from_the_peaks_of_all_pilots(monkeypatch):
+    chosen = []
+    monkeypatch.setattr(rare_module, "choose_levels", lambda peaks: chosen.append(list(peaks)) or (0.25, 0.5))
+    rows = Rows({n: tree(n, peak=float(n)) for n in range(0, 2 * PILOT_TRIALS, TRIALS_PER_ROOT)})
+    del rows[5]
+    rows[10] = tree(10, unanswered=1, why_unanswered="a copy was killed")
+    rows[15] = plain(15)
+    forcings = rare_module.SplittingForcings(settings(), rows)
+    assert forcings.of(1) is None
+    assert forcings.of(PILOT_TRIALS - TRIALS_PER_ROOT) == Forcing(1.0, levels=())
+    assert chosen == []
+    for number in (PILOT_TRIALS, PILOT_TRIALS + TRIALS_PER_ROOT):
+        assert forcings.of(number) == Forcing(1.0, levels=(0.25, 0.5))
+    every = range(0, PILOT_TRIALS, TRIALS_PER_ROOT)
+    assert chosen == [[float(n) for n in every if n not in (5, 10, 15)]]
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Splitting with two pilot roots, and as many trees that test its levels."""
+    for module in (rare_module, splitting):
+        monkeypatch.setattr(module, "PILOT_ROOTS", 2)
+    found = SimpleNamespace(peaks=[], trees=[], levels=(0.25, 0.5), unfit=[], why="")
+
+    def levels(peaks):
+        found.peaks.append(list(peaks))
+        return found.levels
+
+    def shares(trees, count):
+        found.trees.append(([forced.peak for forced, _ in trees], [crashed for _, crashed in trees], count))
+        return [0.1, 0.2, 0.3]
+
+    def unfit(shares):
+        found.unfit.append(list(shares))
+        return found.why
+
+    monkeypatch.setattr(rare_module, "choose_levels", levels)
+    monkeypatch.setattr(rare_module, "crash_shares", shares)
+    monkeypatch.setattr(rare_module, "why_unfit", unfit)
+    return found
+
+
+def groups(count):
+    rows = Rows()
+    for place in range(count):
+        number = place * TRIALS_PER_ROOT
+        rows[number] = tree(number, peak=float(place), crash="collision" if place == 4 else "")
+        rows |= {other: plain(other) for other in range(number + 1, number + TRIALS_PER_ROOT)}
+    return rows
+
+
+def test_pilots_of_splitting_count_as_plain_trials_only(short):
+    rows = groups(6)
+    rows[1], rows[21] = plain(1, Outcome.COLLISION), plain(21, Outcome.COLLISION)
+    rows[15] = replace(rows[15], outcome=Outcome.COLLISION)
+    watch = SplittingWatch(settings(), rows)
+    watch.read(2 * TRIALS_PER_ROOT - 1)
+    assert (watch.levels, watch.roots, watch.lines) == ((), 0, [])
+    watch.read(2 * TRIALS_PER_ROOT)
+    assert watch.levels == (0.25, 0.5)
+    assert short.peaks == [[0.0, 1.0]]
+    found = watch.estimate()
+    assert (found.plain, found.plain_crashes) == (10, 1)  # both roots too
+    assert found.why_not == found.why_not_disturbed == "2 of 4 pilot roots have ended"
+    watch.read(4 * TRIALS_PER_ROOT)
+    assert short.trees == [([2.0, 3.0], [False, True], 2)]
+    assert short.unfit == [[0.1, 0.2, 0.3]]
+    assert watch.shares == (0.1, 0.2, 0.3)
+    assert (watch.estimate().plain, watch.roots) == (18, 0)
+    assert watch.lines == [
+        "  levels (closing speed by gap): 0.25, 0.5 per s; P(crash) in 2 pilot roots: 0.1, from each level 0.2, 0.3"
+    ]
+    watch.read(6 * TRIALS_PER_ROOT)
+    assert watch.roots == 2
+    assert [one.spec.number for one in watch.weightiest] == [20]
+    assert not watch.is_over
+    assert watch.running(now=True)["crashes"] == 2
+
+
+def test_invalid_pilots_leave_the_reason_that_they_are_invalid(short):
+    rows = groups(2)
+    rows[6] = plain(6, Outcome.INVALID)
+    watch = SplittingWatch(settings(), rows)
+    watch.read()
+    assert watch.estimate().why_not.startswith("1 of 10 plain trials are invalid")
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_splitting_that_is_of_no_use_ends_with_the_reason(short, late):
+    if late:
+        short.why = "unfit"
+    else:
+        short.levels = ()
+        short.why = "no levels"
+    watch = SplittingWatch(settings(), groups(8))
+    watch.read()
+    assert watch.is_over
+    assert watch.refusal == short.why
+    assert watch._read == (4 if late else 2) * TRIALS_PER_ROOT
+    assert short.unfit == ([[0.1, 0.2, 0.3]] if late else [[0.0]])
+    found = watch.estimate()
+    assert found.why_not == found.why_not_disturbed == short.why
+
+
+def test_weightiest_crashes_are_kept_in_order():
+    def weighted(number, weight):
+        copy = ForcedCopy("brake=6.0", 3, weight, 2, "collision", 9)
+        low = ForcedCopy("brake=6.0", 3, 9.0, 2, "", 9)  # without a crash, its weight does not count
+        first = root(number)
+        return replace(first, forced=replace(first.forced, copies=(copy, low, replace(copy, weight=weight / 4))))
+
+    weights = [0.001, 0.005, 0.002, 0.007, 0.003, 0.004, 0.006]
+    watch = RareWatch(settings(), rows_of([weighted(n, weight) for n, weight in enumerate(weights)]), SAMPLER)
+    watch.read()
+    kept = [one.spec.number // TRIALS_PER_ROOT for one in watch.weightiest]
+    assert kept == [3, 6, 1, 5, 4]
+    assert [rare_module.greatest_weight(one) for one in watch.weightiest] == [0.007, 0.006, 0.005, 0.004, 0.003]
+    assert list(rare_module.crashed_copies(plain(1))) == []
+
+
+def test_object_of_rare_mode_fits_its_kind(monkeypatch):
+    def of(**options):
+        return SimpleNamespace(**vars(settings()) | {"rare": True, "splitting": False} | options)
+
+    for make in (rare_module.forcings_of, rare_module.rare_watch):
+        assert make(of(rare=False), Rows(), SAMPLER) is None
+    assert type(rare_module.forcings_of(of(), Rows(), SAMPLER)) is Forcings
+    assert type(rare_module.forcings_of(of(splitting=True), Rows(), None)) is rare_module.SplittingForcings
+    assert type(rare_module.rare_watch(of(), Rows(), SAMPLER)) is RareWatch
+    assert type(rare_module.rare_watch(of(splitting=True), Rows(), None)) is SplittingWatch
+
+
+# The trials that count for a rate.
+
+RULED = SimpleNamespace(
+    sampler="random", seeds=0, trials=40, max_steps=50, seed=7, agents={"ego": 1, "second": 2}, rare=False,
+    crash_on=CRASHES, run=SimpleNamespace(until_rate=""),
+)  # fmt: skip
+
+
+def of(**options):
+    return SimpleNamespace(**vars(RULED) | options)
+
+
+def records(*seeds, empty=False):
+    return SimpleNamespace(records=[SimpleNamespace(hunt_seeds=seeds)] if seeds else [], has="has", is_empty=empty)
+
+
+def test_rule_of_counting_follows_the_hunt():
+    rule = rare_module.counting_rule(RULED, {})
+    assert (rule.max_steps, rule.agents, rule.plain_origin, rule.traffics, rule.planned) == (50, 2, "", 0, 40)
+    assert rule.is_held_out is None
+    assert rare_module.counting_rule(of(agents={}), {}).agents == 1
+    guided = of(sampler="guided")
+    assert rare_module.counting_rule(guided, {"plain_origin": "random"}).plain_origin == "random"
+    assert rare_module.counting_rule(guided, {}).plain_origin == ""
+    assert rare_module.counting_rule(guided, {"independent": True, "plain_origin": "random"}).plain_origin == ""
+    traffics = rare_module.counting_rule(of(seeds=3), {"independent": False, "plain_origin": "random"})
+    assert (traffics.plain_origin, traffics.traffics) == ("", 3)
+    assert rare_module.counting_rule(RULED, {}, records()).is_held_out is None
+    assert rare_module.counting_rule(RULED, {}, records(1)).is_held_out == "has"
+
+
+def test_rate_needs_traffic_that_no_agent_was_trained_on():
+    refuse = rare_module.refuse_training_traffic
+    rare, until = of(rare=True), of(run=SimpleNamespace(until_rate="0.1/trial"))
+    with pytest.raises(UsageError, match=r"--rare: an agent was trained on traffics of --seed 7; give another --seed"):
+        refuse(rare, records(3, 7))
+    with pytest.raises(UsageError, match="--until-rate: an agent was trained on all traffics of --seed 7"):
+        refuse(until, records(3, empty=True))
+    for accepted in ((rare, records(3)), (rare, records()), (until, records(7)), (RULED, records(7, empty=True))):
+        refuse(*accepted)
+
+
+@pytest.mark.parametrize(
+    ("options", "facts", "says"),
+    [
+        ({}, {}, ""),
+        ({"rare": True}, {}, "in rare mode, one of five trials"),
+        ({"sampler": "guided"}, {}, "the sampler guided does not draw trials independently"),
+        ({"sampler": "guided"}, {"independent": True}, ""),
+        ({"sampler": "guided"}, {"plain_origin": "random"}, ""),
+        ({}, {"independent": False}, "the sampler random does not draw trials independently"),
+        ({"seeds": 40}, {}, ""),
+        ({"seeds": 41}, {}, "TRIALS must be at least --seeds"),
+        ({"seeds": 3, "sampler": "sobol"}, {"independent": True}, "the sampler sobol does not draw"),
+    ],
+)
+def test_hunt_without_a_rate_gives_the_reason(options, facts, says):
+    found = rare_module.why_no_interval(of(**options), facts)
+    assert found.find(says) >= 0
+    assert bool(found) is bool(says)
+
+
+def test_rate_counts_the_trials_of_earlier_runs(tmp_path):
+    killed = Failure(KILLED, "out of memory")
+    with closing(Ledger(tmp_path / "l.sqlite", writable=True)) as ledger:
+        for number, outcome in enumerate([Outcome.SURVIVED, Outcome.COLLISION, Outcome.INVALID, Outcome.FINISHED]):
+            ledger.record(plain(number, outcome), snapshot="")
+        ledger.record(replace(plain(4, Outcome.INVALID), failure=killed), snapshot="")
+        ledger.record(plain(5, Outcome.COLLISION), snapshot="")
+        watch = rare_module.rate_watch(RULED, ledger, records())
+        found = watch.running(now=True)
+        assert (found["per"], found["trials"], found["crashes"]) == ("trial", 3, 1)  # up to the killed trial
+        ledger.note(independent=False)
+        assert rare_module.rate_watch(RULED, ledger, records()) is None
+        assert rare_module.bar_watch(RULED, ledger, records()) is None
+        until = of(run=SimpleNamespace(until_rate="0.5/trial"))
+        bar = rare_module.bar_watch(until, ledger, records())
+        assert (bar.bar, bar.per) == (0.5, "trial")
+        assert bar.running(now=True)["crashes"] == 1
 
 
 def estimate_of(report):

@@ -1,0 +1,359 @@
+"""The loop of a hunt, whose executor makes up results: what it submits, records in the ledger and reports."""
+
+from __future__ import annotations
+
+import math
+import time
+from contextlib import closing
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+import crashhunt
+from crashhunt.hunts import _hunt as hunt_module
+from crashhunt.hunts._hunt import Hunt
+from crashhunt.hunts._next_trials import GREATEST_LAG
+from crashhunt.ledger import Ledger
+from crashhunt.trial import Failure, Outcome, TrialResult
+
+TOY = """
+title = "A toy"
+schema = 1
+simulator = "toy"
+[arguments.gap_m]
+default = 12.0
+[agents.ego]
+agent = "crashhunt.agents:KeepLaneWithSpeed"
+[agents.ego.arguments.speed]
+default = 8.0
+range = "6:14"
+"""
+
+
+def survives(spec):
+    return TrialResult(spec, Outcome.SURVIVED, steps=10 + spec.number, digest=f"{spec.number:032x}", danger=0.5)
+
+
+def is_invalid(spec):
+    return TrialResult(spec, Outcome.INVALID, steps=0, failure=Failure("ScenarioError", "no road"))
+
+
+class Inline:
+    """An executor with two workers, which returns one result at each call."""
+
+    capacity, first = 2, 0
+
+    def __init__(self, settings, *, parallel, recycle_after, ends):
+        self.settings, self.parallel, self.recycle_after, self.ends = settings, parallel, recycle_after, ends
+        self.waiting, self.submitted, self.most, self.cancelled, self.closed, self.said = [], [], 0, [], 0, ["a note"]
+
+    def submit(self, spec):
+        self.submitted.append(spec)
+        self.waiting.append(spec)
+        self.most = max(self.most, len(self.waiting))
+
+    def completed(self, timeout_s):
+        assert timeout_s == hunt_module._TICK_S
+        if self.waiting:
+            yield self.ends(self.waiting.pop(self.first))
+
+    def cancel(self, *, above=-1):
+        self.cancelled.append(above)
+        self.waiting = [spec for spec in self.waiting if spec.number <= above]
+
+    def where(self):
+        return {spec.number: "header" for spec in self.waiting}
+
+    def notes(self):
+        said, self.said = self.said, []
+        return said
+
+    def close(self):
+        self.closed += 1
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Returns a function that runs a hunt of the given length on made-up results."""
+    (tmp_path / "toy.toml").write_text(TOY)
+    monkeypatch.chdir(tmp_path)
+
+    def hunt(trials, ends=survives, *, parallel=2, **options):
+        def make(name, settings, *, parallel, recycle_after):
+            found.executor = Inline(settings, parallel=parallel, recycle_after=recycle_after, ends=ends)
+            return found.executor
+
+        found = SimpleNamespace(seen=[], path=tmp_path / "h", executor=None)
+        monkeypatch.setattr(hunt_module, "make_executor", make)
+        given = {"scenario": "toy.toml", "seed": 4, "snapshot_code": False, "watch": found.seen.append} | options
+        found.report = crashhunt.run(found.path, parallel, trials, 60, **given)
+        with closing(Ledger(found.path / "ledger.sqlite")) as ledger:
+            found.facts, found.events = ledger.facts(), [event[1:] for event in ledger.events()]
+            found.numbers = [data["spec"]["number"] for data in ledger.plain_results()]
+        return found
+
+    return hunt
+
+
+def test_loop_submits_as_many_trials_as_workers_need_and_ends_with_the_last(run):
+    found = run(9)
+    executor, report = found.executor, found.report
+    assert [spec.number for spec in executor.submitted] == found.numbers == list(range(9))
+    assert executor.most == 4  # two run, and each worker has its next
+    assert (executor.parallel, executor.settings.scratch.name[:8]) == (2, ".scratch")
+    assert executor.cancelled == [-1]
+    assert executor.closed == 2
+    assert (report.stopped_because, report.outcomes) == ("all_trials", {"survived": 9})
+    assert (report.trial_steps, report.steps_total) == (sum(range(10, 19)), sum(range(10, 19)))
+    assert report.notes == ("a note",)
+    assert found.events == [("running", ""), ("remark", "a note"), ("all_trials", "")]
+    assert report.crashes == report.near_misses == ()
+    assert (report.unanswered, report.unconfirmed, report.reason) == (0, 0, "")
+    assert (report.audit, report.kinds, report.probes, report.branches, report.rare, report.rate) == (None,) * 6
+    last = found.seen[-1]
+    assert (last.phase, last.done, last.planned, last.outcomes) == ("done", 9, 9, {"survived": 9})
+    assert last.workers == {}
+    assert last.rate_per_s == pytest.approx(9 / last.elapsed_s)
+    assert found.seen[0].workers == dict.fromkeys((1, 2, 3), "header")
+    assert all(status.disturbed is None and status.kinds is None for status in found.seen)
+    assert last.time_left_s == math.inf
+    assert (last.crashes, last.branched, last.stressed) == (0, 0, None)
+
+
+def test_fewer_trials_than_workers_need_fewer_workers(run):
+    found = run(2, parallel=8)
+    assert found.executor.parallel == 2
+    assert run(2, parallel=8).executor.submitted == []  # all of them have ended
+
+
+@pytest.mark.parametrize(
+    ("sampler", "deterministic", "lag", "version"),
+    [
+        ("random", True, (None, None), None),
+        ("random", False, (None, None), None),
+        ("mutation", True, (GREATEST_LAG, True), "version"),
+        ("mutation", False, (None, None), "version"),
+    ],
+)
+def test_ledger_has_the_lag_and_the_version_of_a_sampler_that_learns(run, sampler, deterministic, lag, version):
+    facts = run(3, sampler=sampler, deterministic=deterministic).facts
+    assert (facts.get("lag"), facts.get("lag_grows")) == lag
+    assert isinstance(facts.get("sampler_version"), int) is (version is not None)
+    assert facts["independent"] is (sampler == "random")
+    again = run(4, sampler=sampler, deterministic=deterministic).facts
+    assert [again.get(name) for name in ("lag", "sampler_version")] == [
+        facts.get(name) for name in ("lag", "sampler_version")
+    ]
+
+
+def test_ledger_has_the_settings_of_the_hunt_and_of_this_run(run, monkeypatch):
+    entered = []
+    enter = Ledger.enter
+
+    def note(ledger, state, detail="", **facts):
+        entered.append((state, facts))
+        enter(ledger, state, detail, **facts)
+
+    monkeypatch.setattr(Ledger, "enter", note)
+    facts = run(3).facts
+    (state, first), (last, _) = entered
+    assert (state, last) == ("running", "all_trials")
+    assert first["owner"]["pid"] > 0
+    assert "owner" not in facts
+    assert first["began"] == pytest.approx(time.time(), abs=60)
+    assert first["heartbeat"] == pytest.approx(time.time(), abs=60)
+    assert (first["done_before"], first["planned"], first["replanned"], first["until"]) == (0, 3, None, None)
+    assert (first["hunt_seed"], first["crash_on"][0]) == (4, "collision")
+    assert (first["disturb"], first["copies"], first["until_rate"], first["audits_left"]) == (None,) * 4
+    assert (first["core"], first["phase"], first["ends_at"]) == (None, None, None)
+    assert facts["running_rate"]["trials"] == 3
+    assert "phase" not in facts
+
+    entered.clear()
+    found = run(3, duration="60s")
+    assert entered[0][1]["until"] == pytest.approx(time.time() + 60, abs=30)
+    assert (entered[0][1]["done_before"], entered[0][1]["replanned"]) == (3, None)
+    assert found.report.stopped_because == "all_trials"
+    entered.clear()
+    run(5)
+    assert (entered[0][1]["done_before"], entered[0][1]["replanned"]) == (3, True)
+    entered.clear()
+    assert run(5).facts["replanned"] is True  # it stays
+
+
+def test_hunt_without_a_valid_trial_ends_early_with_its_reason(run):
+    found = run(900, is_invalid)
+    assert found.report.stopped_because == "no_valid_trial"
+    assert found.report.outcomes == {"invalid": 10}
+    assert "no road" in found.report.reason
+    assert found.events[-1] == ("no_valid_trial", found.report.reason)
+    assert found.executor.closed
+
+
+def test_hunt_whose_few_trials_are_all_invalid_has_no_valid_trial_either(run):
+    assert run(3, is_invalid).report.stopped_because == "no_valid_trial"
+
+    def one(spec):
+        return survives(spec) if spec.number == 1 else is_invalid(spec)
+
+    found = run(4, one, overwrite=True)
+    assert (found.report.stopped_because, found.report.reason) == ("all_trials", "")
+
+
+def test_hunt_with_a_time_limit_ends_when_it_is_over(run, monkeypatch):
+    clock = SimpleNamespace(add=0.0)
+    monotonic = time.monotonic
+    monkeypatch.setattr(time, "monotonic", lambda: monotonic() + clock.add)
+
+    def slow(spec):
+        clock.add += 10.0
+        return survives(spec)
+
+    found = run(0, slow, duration="45s")
+    assert found.report.stopped_because == "time"
+    assert found.numbers == list(range(8))  # what runs when the time is over still counts
+    assert found.facts["planned"] == 0
+    assert found.report.wall_s == pytest.approx(80, abs=9)
+
+
+def test_heartbeat_notes_the_progress_about_once_a_second(run, monkeypatch):
+    noted, clock = [], SimpleNamespace(add=0.0)
+    note, monotonic = Ledger.note, time.monotonic
+    monkeypatch.setattr(time, "monotonic", lambda: monotonic() + clock.add)
+
+    def listen(ledger, **facts):
+        noted.append((clock.add, facts))
+        note(ledger, **facts)
+
+    def slow(spec):
+        clock.add += 100.0 if spec.number in (3, 6) else 0.0
+        return survives(spec)
+
+    monkeypatch.setattr(Ledger, "note", listen)
+    run(9, slow)
+    beats = [
+        now for now, facts in noted if set(facts) >= {"heartbeat", "phase", "running_rate"} and "state" not in facts
+    ]
+    assert beats == [0.0, 0.0, 100.0, 200.0]  # at the start, and in the loop
+    assert noted[-1][1]["owner"] is None
+
+
+def test_hunt_that_was_stopped_is_interrupted_and_says_what_is_left(run, monkeypatch):
+    stops = []
+
+    def stop(spec):
+        if spec.number == 3:
+            stops.append(2)
+        return survives(spec)
+
+    init = Hunt.__init__
+
+    def watch(hunt, *words, **options):
+        init(hunt, *words, **options)
+        monkeypatch.setattr(hunt_module, "stop_requests", lambda: Stops(stops))
+
+    monkeypatch.setattr(Hunt, "__init__", watch)
+    found = run(9, stop)
+    assert found.report.stopped_because == "interrupted"
+    assert found.numbers == [0, 1, 2, 3]
+    assert found.facts["state"] == "interrupted"
+    stops.clear()
+    assert run(9).numbers == list(range(9))
+
+
+class Stops:
+    """In place of the requests to stop."""
+
+    def __init__(self, stops):
+        self.stops = stops
+
+    def __enter__(self):
+        return self.stops
+
+    def __exit__(self, *_):
+        pass
+
+
+def test_hunt_until_a_rate_ends_with_its_verdict(run):
+    found = run(0, until_rate="0.5/trial", most=60)
+    assert found.report.stopped_because == "rate"
+    assert found.report.rate.verdict == "below"
+    assert found.facts["until_rate"]["verdict"] == "below"
+    decided = found.facts["until_rate"]["decided_at"]
+    assert decided is not None
+    assert decided <= max(found.numbers) <= decided + 4
+    again = run(0, until_rate="0.5/trial", most=60)
+    assert again.executor is None
+    assert again.report.stopped_because == "rate"
+    assert again.facts["until_rate"] == found.facts["until_rate"]
+
+
+@pytest.fixture
+def bundles(monkeypatch):
+    """Replace bundles: each is confirmed, and has the result of its trial."""
+    written = []
+
+    def write(folder, result, trial, *, hunt_seed, snapshot, lanes):
+        written.append(result.spec.number)
+        return SimpleNamespace(result=result, id=f"{result.spec.number:06d}", confirmed=True, path=folder)
+
+    monkeypatch.setattr(hunt_module, "write_bundle", write)
+    monkeypatch.setattr(hunt_module.TrialReruns, "confirm", lambda again, crashes: list(crashes))
+    return written
+
+
+def crashes_from(*numbers):
+    def ends(spec):
+        found = survives(spec)
+        return replace(found, outcome=Outcome.COLLISION, danger=None) if spec.number in numbers else found
+
+    return ends
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_first_crash_ends_a_hunt(run, bundles, deterministic):
+    found = run(30, crashes_from(3, 5), deterministic=deterministic)
+    assert found.report.stopped_because == "crash"
+    assert [bundle.result.spec.number for bundle in found.report.crashes] == bundles == [3]
+    assert found.numbers == [0, 1, 2, 3]
+    assert found.report.outcomes == {"survived": 3, "collision": 1}
+    assert found.report.tally.found == found.seen[-1].crashes == 1
+    assert {status.phase for status in found.seen} == {"hunting", "saving", "done"}
+    assert found.executor.cancelled == [3 if deterministic else -1, -1]
+    assert found.facts["state"] == "crash"
+    assert (found.report.unanswered, found.report.unconfirmed) == (0, 0)
+
+
+def test_deterministic_hunt_waits_for_trials_below_its_crash(run, bundles, monkeypatch):
+    monkeypatch.setattr(Inline, "first", -1)  # the last submitted trial ends first
+    found = run(30, crashes_from(*range(30)), deterministic=True)
+    assert found.report.stopped_because == "crash"
+    assert bundles == [0]
+    assert found.numbers == [0]
+    assert found.executor.cancelled == [3, 2, 1, 0, -1]
+    monkeypatch.setattr(Inline, "first", 0)
+    other = run(30, crashes_from(*range(30)), deterministic=False, overwrite=True)
+    assert other.executor.cancelled == [-1, -1]
+
+
+def test_hunt_that_keeps_going_reports_its_shortest_crash_first(run, bundles, monkeypatch):
+    monkeypatch.setattr(hunt_module, "prune_bundles", lambda ledger, kinds, crashes, keep, *, final=True: crashes)
+    kinds = SimpleNamespace(
+        until=None, added=[], types_by_cause=None, at_fault=(2, 4), newest=None, newest_trial=None,
+        groups=lambda **_: (), refresh=lambda crashes: None, next_to_judge=lambda: None, count_to_judge=lambda: 0,
+    )  # fmt: skip
+    kinds.add = lambda bundle, ended: kinds.added.append((bundle.result.spec.number, ended))
+    monkeypatch.setattr("crashhunt.hunts._progress.Kinds", lambda *_, **__: kinds)
+
+    def ends(spec):
+        return replace(crashes_from(2, 4, 6)(spec), steps={2: 9, 4: 5, 6: 5}.get(spec.number, 20))
+
+    found = run(8, ends, keep_going=True)
+    assert found.report.stopped_because == "all_trials"
+    assert [bundle.result.spec.number for bundle in found.report.crashes] == [4, 6, 2]
+    assert kinds.added == [(2, 3), (4, 5), (6, 7)]
+    assert found.report.at_fault == (2, 4)
+    assert found.report.kinds == ()
+    assert found.report.outcomes == {"survived": 5, "collision": 3}
+    assert found.executor.cancelled == [-1]
