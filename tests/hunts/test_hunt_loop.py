@@ -239,7 +239,7 @@ def test_heartbeat_notes_the_progress_about_once_a_second(run, monkeypatch):
     assert noted[-1][1]["owner"] is None
 
 
-def test_hunt_that_was_stopped_is_interrupted_and_says_what_is_left(run, monkeypatch):
+def test_stopped_hunt_is_interrupted_and_resumes(run, monkeypatch):
     stops = []
 
     def stop(spec):
