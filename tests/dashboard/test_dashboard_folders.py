@@ -520,7 +520,7 @@ def test_browser_needs_a_window(monkeypatch):
     assert _server._has_screen() is True
 
 
-def test_server_says_nothing_of_itself_and_believes_no_proxy():
+def test_server_sends_no_header_of_its_own_and_ignores_those_of_proxies():
     """Of the headers of a proxy, a client could make up its address."""
     config = _serving.make_server("app", print).config
     expected = {

@@ -111,7 +111,7 @@ def test_host_is_a_name_of_this_machine(host, local, other, monkeypatch):
     assert status(guard_of("My.Name"), host="my.name") == 200
 
 
-def test_names_of_a_machine_are_told_to_others_only(monkeypatch):
+def test_names_of_a_machine_count_where_others_may_call_it(monkeypatch):
     monkeypatch.setattr(_security.socket, "gethostname", lambda: "Box")
     monkeypatch.setattr(_security.socket, "getfqdn", lambda: "Box.example")
     assert names_of("127.0.0.1") == {"localhost", "127.0.0.1"}

@@ -101,7 +101,7 @@ def test_sample_is_halved_when_it_has_one_too_many(monkeypatch, outcome):
     assert sample.generation == 2
 
 
-def test_damaged_and_missing_trials_are_left_out_and_ten_are_reported():
+def test_sample_omits_damaged_and_missing_trials_and_reports_ten():
     sample = Sample(CRASH_ON)
     sample.add(ledger_of({n: Outcome.SURVIVED for n in range(30) if n != 29}, damaged=range(3, 20)), [
         (n, "survived") for n in range(31)
