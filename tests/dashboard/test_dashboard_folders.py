@@ -348,6 +348,20 @@ def test_rate_is_computed_again_when_the_counts_have_changed(view, monkeypatch):
     assert view.rate(state) == {"why_not": "x" * 2_000}
 
 
+def test_rate_of_all_trials_is_that_of_the_ledger_and_of_the_traffics_that_count(view, monkeypatch):
+    given = []
+
+    def rate(*words):
+        given.append((*words[:3], [result.spec.number for result in words[3]], *words[4:]))
+        raise HuntDirectoryError("odd")
+
+    monkeypatch.setattr(_hunt, "rate_of_trials", rate)
+    monkeypatch.setattr(_hunt, "counts_suffice", lambda *_: False)
+    monkeypatch.setattr(HuntView, "_held_out", lambda self, settings: "held out")
+    assert view.rate(view.refresh()) == {"why_not": "odd"}
+    assert given == [(view.path, view.settings, view.facts, [0, 1], "held out")]
+
+
 def test_snapshots_are_examined_again_when_their_folder_has_changed(view, monkeypatch):
     examined = []
     monkeypatch.setattr(_hunt, "unreadable_below", lambda path, root: examined.append((path, root)) or "odd")
