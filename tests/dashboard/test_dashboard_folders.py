@@ -352,7 +352,7 @@ def test_rate_of_all_trials_is_that_of_the_ledger_and_of_the_traffics_that_count
     given = []
 
     def rate(*words):
-        given.append((*words[:3], [result.spec.number for result in words[3]], *words[4:]))
+        given.append((*words[:3], [result["spec"]["number"] for result in words[3]], *words[4:]))
         raise HuntDirectoryError("odd")
 
     monkeypatch.setattr(_hunt, "rate_of_trials", rate)
