@@ -678,7 +678,12 @@ def _spec(
     for argument in (known, declared):
         # The constructor's own default too: it may be another one by the time of a replay.
         if argument is not None and argument.default is not None:
-            constant = parse_spec(str(Constant(argument.default)), kind, where=name)
+            try:
+                constant = parse_spec(str(Constant(argument.default)), kind, where=name)
+            except ArgumentError:
+                if argument is known:
+                    raise
+                return None  # a default of another type than the annotation, such as `gap: float | str = "auto"`
             # A text such as "a|b" would be read as a choice; so its owner keeps it as a default.
             return ArgumentSpec(spec=str(constant), kind=kind) if isinstance(constant, Constant) else None
     return None

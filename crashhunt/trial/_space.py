@@ -11,6 +11,7 @@ A specification is a short text, such as ``5:40`` in ``--arg speed=5:40``::
 
 from __future__ import annotations
 
+import functools
 import inspect
 import math
 import types
@@ -456,8 +457,7 @@ def signature_of(factory: Callable[..., object]) -> Signature:
         parameters = inspect.signature(factory).parameters.values()
     except (TypeError, ValueError):
         return Signature({}, open=True, given=())
-    target = factory.__init__ if isinstance(factory, type) else factory  # type: ignore[misc]
-    names = getattr(target, "__globals__", {})
+    names = _names_seen_by(factory)
     arguments: dict[str, Argument] = {}
     given: list[str] = []
     required: list[str] = []
@@ -474,6 +474,21 @@ def signature_of(factory: Callable[..., object]) -> Signature:
             if parameter.default is parameter.empty:
                 required.append(parameter.name)
     return Signature(arguments, open=is_open, given=tuple(given), required=tuple(required))
+
+
+def _names_seen_by(factory: Callable[..., object]) -> dict[str, object]:
+    """Return the global names of the function whose parameters `inspect` shows, in which annotations are evaluated."""
+    target: Any = factory
+    while True:
+        if isinstance(target, functools.partial):
+            target = target.func
+        elif hasattr(target, "__wrapped__"):
+            target = target.__wrapped__
+        elif isinstance(target, type):
+            target = target.__init__  # type: ignore[misc]
+        else:
+            names: dict[str, object] = getattr(target, "__globals__", {})
+            return names
 
 
 def _takes_nothing(factory: Callable[..., object]) -> bool:
@@ -493,21 +508,40 @@ def _annotation(parameter: inspect.Parameter, names: dict[str, object]) -> objec
 
 
 def _argument(parameter: inspect.Parameter, hint: object) -> Argument:
-    default = parameter.default if isinstance(parameter.default, bool | int | float | str) else None
-    declared = None
-    if typing.get_origin(hint) is typing.Annotated:
-        hint, *extras = typing.get_args(hint)
-        declared = next((extra for extra in extras if isinstance(extra, Argument)), None)
-    if typing.get_origin(hint) in (types.UnionType, typing.Union):
-        hint = next((part for part in typing.get_args(hint) if part in _KINDS), None)
-    kind = _KINDS.get(hint) or (kind_of(default) if default is not None else None)
+    declared = _declaration_in(hint)
+    own = parameter.default
+    kinds = _kinds_of(hint) or ({kind_of(own)} if isinstance(own, bool | int | float | str) else set())
+    # Text cannot represent the member of an enumeration or an infinite number, so the factory keeps such a default.
+    default = own if type(own) in (bool, int, str) or (type(own) is float and math.isfinite(own)) else None
+    argument = Argument(parameter.name, _joint_kind(kinds), default)
     if declared is None:
-        return Argument(parameter.name, kind, default)
-    return Argument(
-        name=parameter.name,
-        kind=kind,
-        default=default,
-        distribution=declared.distribution,
-        unit=declared.unit,
-        help=declared.help,
-    )
+        return argument
+    return replace(argument, distribution=declared.distribution, unit=declared.unit, help=declared.help)
+
+
+def _declaration_in(hint: object) -> Argument | None:
+    """Return the `Argument` in an annotation, also in that of an optional parameter; None if there is none."""
+    parts = typing.get_args(hint)
+    if typing.get_origin(hint) is typing.Annotated:
+        return next((part for part in parts[1:] if isinstance(part, Argument)), None)
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        return next((found for found in map(_declaration_in, parts) if found is not None), None)
+    return None
+
+
+def _kinds_of(hint: object) -> set[Kind]:
+    """Return the types of values that an annotation allows and that can be written as text."""
+    if typing.get_origin(hint) is typing.Annotated:
+        return _kinds_of(typing.get_args(hint)[0])
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        return {kind for part in typing.get_args(hint) for kind in _kinds_of(part)}
+    if typing.get_origin(hint) is Literal:
+        return {kind_of(value) for value in typing.get_args(hint) if isinstance(value, bool | int | str)}
+    return {kind for known, kind in _KINDS.items() if hint is known}
+
+
+def _joint_kind(kinds: set[Kind]) -> Kind | None:
+    """Return the type of an argument that allows several types; None if each text determines its type."""
+    if "float" in kinds:  # an integer is also a float
+        return "float" if kinds <= {"float", "int", "str"} else None
+    return next(iter(kinds)) if len(kinds) == 1 else None

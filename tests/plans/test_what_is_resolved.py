@@ -58,7 +58,7 @@ range = "8:14"
 """
 AGENT = """
 class Agent:
-    def __init__(self, speed: float = 7.0, mode: str = "a|b", needed=None, step_length_s=0.1):
+    def __init__(self, speed: float = 7.0, mode: str = "a|b", needed=None, gap: float | str = "wide", step_length_s=1):
         pass
     def reset(self, seed): ...
     def act(self, observation): ...
@@ -144,7 +144,7 @@ def test_arguments_are_those_of_scenario_agent_and_request_in_this_order(folder)
         return arguments, {name: (spec.spec, spec.kind) for name, spec in settings.scenario_arguments.items()}
 
     own, its = specs(asked())
-    assert own == {"speed": ("8.0:14.0", "float")}  # "a|b" would be a choice, and None is no value
+    assert own == {"speed": ("8.0:14.0", "float")}  # "a|b" would be a choice, None is no value, "wide" no float
     assert its == {"gap_m": ("5.0:20.0", "float"), "needed": ("1", "int")}
     own, its = specs(asked(arguments={"speed": "3", "mode": "b"}, scenario_arguments={"gap_m": "7:9"}))
     assert own == {"mode": ("b", "str"), "speed": ("3.0", "float")}
@@ -303,7 +303,9 @@ def test_of_a_record_the_code_is_asked_only_where_it_does_not_know():
 
 
 def test_code_states_what_an_agent_takes(folder):
-    assert takes_of("drives:Agent") == Takes(("speed", "mode", "needed"), defaults={"speed": 7.0, "mode": "a|b"})
+    assert takes_of("drives:Agent") == Takes(
+        ("speed", "mode", "needed", "gap"), defaults={"speed": 7.0, "mode": "a|b", "gap": "wide"}
+    )
     assert takes_of("drives:Open") == Takes((), open=True)
     assert takes_of("drives:Nothing") == Takes(open=True)  # whoever runs it says why
     other = folder / "other"

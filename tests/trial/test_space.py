@@ -1,7 +1,11 @@
 from __future__ import annotations
 
+import enum
+import functools
 import json
-from typing import Annotated
+import math
+import types
+from typing import Annotated, Literal
 
 import numpy as np
 import pytest
@@ -260,6 +264,48 @@ def test_arguments_of_a_factory_are_read_off_its_signature():
     assert set(found.given) == {"step_length_s", "observation_space"}
     assert (signature_of(Takes).open, signature_of(Takes).arguments) == (True, {})
     assert (signature_of(Nothing).open, signature_of(Nothing).arguments) == (False, {})
+
+
+class Level(enum.IntEnum):
+    LOW = 1
+
+
+Gap = Annotated[float, Argument("gap", distribution=Range(5.0, 9.0))]
+
+
+def several_types(
+    number: int | float = 10,  # noqa: PYI041 - users write it
+    name_or_index: int | str = 3,
+    optional: Gap | None = None,
+    mode: Literal["1", "2"] | None = None,
+    far: float = math.inf,
+    level: Level = Level.LOW,
+    angle: float = np.float64(0.5),
+): ...
+
+
+def test_types_of_an_argument_are_those_of_all_parts_of_its_annotation():
+    found = signature_of(several_types).arguments
+    assert {name: argument.kind for name, argument in found.items()} == {
+        "number": "float", "name_or_index": None, "optional": "float", "mode": "str", "far": "float", "level": "int",
+        "angle": "float",
+    }  # fmt: skip
+    assert found["optional"].distribution == Range(5.0, 9.0)
+
+
+def test_default_that_text_cannot_represent_stays_with_the_factory():
+    defaults = {name: argument.default for name, argument in signature_of(several_types).arguments.items()}
+    assert defaults == {**dict.fromkeys(defaults), "number": 10, "name_or_index": 3}
+
+
+def test_annotations_of_a_wrapped_function_are_those_of_its_own_module():
+    @functools.wraps(several_types)
+    def foreign(**options): ...
+
+    wrapper = types.FunctionType(foreign.__code__, {})
+    wrapper.__wrapped__ = several_types
+    for factory in (wrapper, functools.partial(several_types, number=3), functools.partial(wrapper)):
+        assert signature_of(factory).arguments["optional"].distribution == Range(5.0, 9.0)
 
 
 def test_signature_is_rebuilt_from_its_data():
