@@ -108,7 +108,8 @@ class Preflight:
         kind = "" if failure.kind in ("ValueError", "invalid") else f"{failure.kind}: "
         given = result.spec.arguments.get(failure.agent, {})
         names = ", ".join(f"--arg {name}={value}" for name, value in given.items() if isinstance(value, str))
-        places = re.findall(r'^  File "([^"]+)", line (\d+)', trace, re.MULTILINE)
+        frames = re.findall(r'^  File "([^"]+)", line (\d+)', trace, re.MULTILINE)
+        places = [frame for frame in frames if not frame[0].startswith(f"{layout.PACKAGE}/")]
         fix = f"correct {names or 'the agent'}"
         if "pip install" in message:
             fix = "install the package"

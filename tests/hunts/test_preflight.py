@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
+from crashhunt.base import layout
 from crashhunt.errors import ArgumentError
 from crashhunt.hunts import Preflight
 from crashhunt.plans import Request, plan
@@ -30,6 +33,15 @@ def test_what_fails_in_every_trial_in_the_same_way_is_refused():
         preflight.filter_setup_failures(result(3, kind="KeyError"))
     assert caught.value.where == "my.py:7"
     assert caught.value.exit_code == 2
+
+
+def test_constructor_that_needs_more_than_it_is_given_is_not_blamed_on_a_line_of_crashhunt():
+    failure = result(0, "missing 1 required positional argument: 'a'", kind="TypeError")
+    called = f'Traceback:\n  File "{layout.PACKAGE}/episode/_run.py", line 272, in agent\n'
+    failed = replace(failure, failure=replace(failure.failure, traceback=called))
+    with pytest.raises(ArgumentError, match="missing 1 required") as caught:
+        Preflight(settings_of(speed="15"), 1).filter_setup_failures(failed)
+    assert caught.value.where == "agent ego"
 
 
 def test_a_hunt_of_one_trial_is_refused_after_one():
