@@ -105,7 +105,7 @@ class Pair:
         both: pairs in which both hunts crashed; with ``--seeds``, traffic seeds in which both crashed equally often.
         p_value: *p* value of McNemar's or Fisher's exact test; None if the number of trials was not fixed in advance.
         caution: a warning that limits the meaning of the answer; empty if there is none.
-        test: basis of the verdict: ``pairs``, the evidence of discordant pairs; ``intervals``, the certain intervals of
+        test: basis of the verdict: ``pairs``, the evidence of pairs; ``intervals``, the certain intervals of
             both hunts; empty if there is none.
         why_unpaired: reason why there are no pairs; empty if there are pairs.
         counts: numbers of crashes and of valid trials, of the first hunt and of the second.
@@ -385,7 +385,7 @@ def _by_pairs(
     log_evidence = test.log_evidence
     answer = "undecided"
     if log_evidence >= -math.log(_ALPHA):
-        answer = "first" if test.only_second > test.only_first else "second"
+        answer = "first" if test.second_crashes_more else "second"
     p_value = None
     if _is_fixed_ahead(one) and _is_fixed_ahead(two):
         from scipy.stats import binomtest
@@ -466,7 +466,7 @@ def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, Pair
     rules = _rule(first), _rule(second)
     with_arguments = not _same_draws(first, second)
     sequence = PairSequence(rules, lambda one, other: one.tags == other.tags)
-    test = PairTest(rules[0].trials_per_unit if rules[0].traffics else 1)
+    test = PairTest(sequence.rounds)
     for side in (0, 1):
         for trial in _trials(hunts[side], with_arguments=with_arguments):
             for pair in sequence.add(side, trial):

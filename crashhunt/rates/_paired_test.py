@@ -15,6 +15,8 @@ non-negative martingale that begins at 1 / 2. By Ville's inequality, the probabi
 is at most alpha / 2. Each factor grows with d for every Z. The differences that are not rejected are therefore an
 interval, and bisection finds its end. The lower end is the upper end of -Z.
 
+The evidence of a difference is that of discordant pairs. With several trials in a pair, it is E(0) of Z plus E(0) of -Z.
+
 Sources: those of `_anytime_interval`, which computes the evidence of discordant pairs. The bets on Z are those of
 Waudby-Smith and Ramdas (2024), with a mixture over fixed shares.
 
@@ -72,6 +74,9 @@ class PairSequence:
         rules: counting rules for the trials of the first agent and of the second agent.
         is_same: function that returns whether two trials of the same number have the same seed and traffic; by default,
             all have.
+
+    Attributes:
+        rounds: number of trials in each pair.
     """
 
     def __init__(
@@ -84,7 +89,7 @@ class PairSequence:
         self._complete: dict[int, Pair] = {}
         self._next = 0  # trial, or traffic
         self._traffics = rules[0].traffics
-        self._rounds = min(rule.trials_per_unit for rule in rules)
+        self.rounds = min(rule.trials_per_unit for rule in rules) if self._traffics else 1
         self.valid = self.invalid = self.not_random = self.not_same = 0  # pairs of trials
 
     def add(self, side: int, trial: TrialFacts) -> Iterator[Pair]:
@@ -107,7 +112,7 @@ class PairSequence:
         return (number % self._traffics if self._traffics else number) < self._next
 
     def _is_wanted(self, number: int) -> bool:
-        return not self._traffics or number < self._traffics * self._rounds
+        return not self._traffics or number < self._traffics * self.rounds
 
     def _numbers(self, place: int) -> list[int]:
         """Return the numbers of the trials of a pair; empty if the hunt has no such traffic seed."""
@@ -115,7 +120,7 @@ class PairSequence:
             return [place]
         if place >= self._traffics:
             return []
-        return [place + turn * self._traffics for turn in range(self._rounds)]
+        return [place + turn * self._traffics for turn in range(self.rounds)]
 
     def _counted(self, numbers: list[int]) -> Pair:
         found = []
@@ -214,7 +219,16 @@ class PairTest:
     @property
     def log_evidence(self) -> float:
         """The logarithm of the evidence that the two agents do not crash equally often."""
-        return discordance_evidence(self.only_first, self.only_second)
+        if self._rounds == 1:
+            return discordance_evidence(self.only_first, self.only_second)
+        # With several trials, an agent that crashes in more pairs may crash less often, so the sign is no fair coin.
+        ends = [self._log_evidence_below(0.0, sign) for sign in (1, -1)]
+        return max(ends) + math.log1p(math.exp(-abs(ends[0] - ends[1])))
+
+    @property
+    def second_crashes_more(self) -> bool:
+        """Whether the second agent crashed more often in the pairs."""
+        return self.crashes[1] > self.crashes[0]
 
     def difference(self, alpha: float = 0.05) -> Interval | None:
         """Return the interval of the difference in crashes per trial, second minus first agent; None without a pair.
@@ -294,7 +308,7 @@ class PairWatch:
         """Return the verdict on the pairs that were added; the first verdict is final."""
         test = self.test
         if self.verdict == "undecided" and test.log_evidence >= -math.log(self.alpha):
-            is_worse = test.only_second > test.only_first
+            is_worse = test.second_crashes_more
             if is_worse or may_end:
                 self.verdict = "worse" if is_worse else "better"
         elif self.verdict == "undecided" and may_end and self.margin and test.is_within(self.margin, self.alpha):

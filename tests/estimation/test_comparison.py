@@ -96,18 +96,27 @@ def test_same_seeds_are_pairs_only_in_the_same_traffic(tmp_path):
 
 
 def test_traffics_are_the_pairs_of_hunts_that_share_traffics(tmp_path):
-    found = crashhunt.compare(hunt(tmp_path / "a", 20, seeds=8), hunt(tmp_path / "b", 2, seeds=8))
+    several = {"trials": 120, "seeds": 24}
+    found = crashhunt.compare(hunt(tmp_path / "a", 60, **several), hunt(tmp_path / "b", 6, **several))
     assert all(figures.interval is not None for figures in found.hunts)
     (pair,) = found.pairs
-    # Of 8 traffics with 5 trials each the first crashes 2 or 3 times in each, the second once in two.
-    assert (pair.units, pair.trials, pair.only_first, pair.only_second) == (8, 40, 8, 0)
+    # Of 24 traffics with 5 trials each the first crashes 2 or 3 times in each, the second once in six.
+    assert (pair.units, pair.trials, pair.only_first, pair.only_second) == (24, 120, 24, 0)
     assert pair.p_value is None
     assert pair.answer == "second"
-    assert "of 8 traffics with 40 trials each way, " in pair.verdict
-    assert pair.difference.low < -18 / 40 < pair.difference.high
+    assert "of 24 traffics with 120 trials each way, " in pair.verdict
+    assert pair.difference.low < -54 / 120 < pair.difference.high < 0
     (pair,) = crashhunt.compare(tmp_path / "a", hunt(tmp_path / "alone", 2)).pairs
     assert (pair.trials, pair.p_value) == (0, None)
-    assert "have 8 traffics and one per trial (--seeds)" in pair.verdict
+    assert "have 24 traffics and one per trial (--seeds)" in pair.verdict
+
+
+def test_differences_of_traffics_are_those_of_the_trials_that_both_hunts_have(tmp_path):
+    first, second = hunt(tmp_path / "a", 60, trials=120, seeds=24), hunt(tmp_path / "b", 0, trials=48, seeds=24)
+    for one, other, sign in ((first, second, -1), (second, first, 1)):
+        (pair,) = crashhunt.compare(one, other).pairs
+        assert (pair.units, pair.trials) == (24, 48)
+        assert pair.difference.low < sign * 0.99 < pair.difference.high
 
 
 def test_a_hunt_that_was_extended_has_no_p_value(tmp_path):

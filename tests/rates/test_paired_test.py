@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -79,6 +81,26 @@ def test_margin_is_decided_once_the_interval_lies_within_it(counts):
     low, high = test.difference()
     for margin in (max(-low, high) * 1.001, max(-low, high) * 0.999):
         assert test.is_within(margin) == (low > -margin and high < margin)
+
+
+def with_rounds(counts, rounds):
+    test = PairTest(rounds)
+    for (first, second), times in counts.items():
+        for _ in range(times):
+            test.add(tuple((trial(n, crashed=n < first), trial(n, crashed=n < second)) for n in range(rounds)))
+    return test
+
+
+def test_agent_that_crashes_in_more_traffics_but_less_often_is_not_the_worse_one():
+    test = with_rounds({(1, 0): 60, (0, 10): 10, (0, 0): 30}, 10)
+    assert (test.crashes, test.only_first, test.only_second) == ((60, 100), 60, 10)
+    assert test.second_crashes_more
+    assert test.log_evidence < math.log(20)
+    assert not test.excludes(0.0)
+    equal = with_rounds({(1, 0): 2000, (0, 2): 1000, (0, 0): 3000}, 2)  # the expected counts of equal crash rates
+    assert equal.log_evidence < 0
+    assert with_rounds({(1, 0): 50, (0, 0): 50}, 2).log_evidence > math.log(20)
+    assert with_rounds({}, 2).log_evidence == pytest.approx(0.0)
 
 
 def ever_outside(rng, only_first, only_second, pairs):
