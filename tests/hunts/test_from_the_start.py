@@ -2,17 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import pytest
 
 from crashhunt.base.errors import SimulatorError
 from crashhunt.disturbances import disturber_of, parse_rates
-from crashhunt.hunts._fork_results import ForkCrashes
+from crashhunt.hunts import _fork_results
+from crashhunt.hunts._fork_results import (
+    ForkCrashes,
+    keep_near_misses,
+    likeliest,
+    mildest,
+    verify_branches,
+    verify_fork_results,
+    verify_probes,
+    verify_rare,
+)
 from crashhunt.hunts._progress import PhaseClock, Progress
 from crashhunt.hunts._verification import Found, VerificationRuns
-from crashhunt.trial import Branch, Branches, Disturbance, Outcome, Stress, TrialResult, TrialSpec
+from crashhunt.trial import (
+    KILLED,
+    Branch,
+    Branches,
+    Disturbance,
+    Failure,
+    Forced,
+    ForcedCopy,
+    Forcing,
+    Outcome,
+    Stress,
+    TrialResult,
+    TrialSpec,
+)
 
 FOUND = Found(TrialSpec(3, 1, {"ego": {}}, {}, 9), "collision", 5)
 
@@ -150,3 +173,302 @@ def test_what_is_kept_is_not_run_again_and_stays(tmp_path):
     copies = VerificationRuns(again, None, {"probes": {3: bundle}})
     assert copies.crashes([FOUND], "probes", "probes") == ((bundle,), 0)
     assert [path.name for path in (tmp_path / "probes").iterdir()] == ["000003-collision"]
+
+
+# The sums of all trials, and what is run from the start at the end of a hunt.
+
+
+class Ends:
+    """In place of the runs from the start: what crashes again has a bundle, and one run does not finish."""
+
+    def __init__(self, ledger, *, kept=None, stopped=False, unfinished=0, fails=(), disturber=None, **settings):
+        self.kept, self.is_stopped, self.unfinished, self.fails = kept or {}, stopped, unfinished, fails
+        self.again = SimpleNamespace(ledger=ledger, settings=SimpleNamespace(**settings))
+        self.asked, self.disturber = [], disturber
+
+    def crashes(self, found, folder, name):
+        self.asked.append(([one.spec.number for one in found], folder, name))
+        self.found = found
+        if self.is_stopped:
+            return (), 0
+        crashed = [one for one in found if one.spec.number not in self.fails]
+        return tuple(
+            SimpleNamespace(result=TrialResult(one.spec, Outcome.COLLISION)) for one in crashed
+        ), self.unfinished
+
+
+class Rows:
+    """A ledger in memory."""
+
+    def __init__(self, *results):
+        self.rows, self.noted = {one.spec.number: one for one in results}, []
+
+    def plain_results(self):
+        return [self.rows[number].to_json() for number in sorted(self.rows)]
+
+    def result(self, number):
+        return self.rows.get(number)
+
+    def most_dangerous(self, count):
+        return list(self.rows)[:count]
+
+    def note(self, **facts):
+        self.noted.append(facts)
+
+
+def at(step, strength=4.0):
+    return Disturbance(step, "ahead", "brake", strength, 2.0, "ego")
+
+
+def trial(number, **more):
+    return TrialResult(TrialSpec(number, number, {"ego": {}}, {}, 9), Outcome.SURVIVED, steps=9, digest="d", **more)
+
+
+def branched(number, *likelihoods, **more):
+    found = tuple(Branch((at(2, 1.0 + place),), 1, "collision", 5, one) for place, one in enumerate(likelihoods))
+    return trial(number, branches=Branches(crashes=found, **more))
+
+
+def test_branches_are_summed_and_the_likeliest_of_each_trial_runs_from_the_start():
+    ledger = Rows(
+        branched(0, moments=1, asked=2, steps=3, left_out=4),
+        branched(1, -9.0, -2.0, moments=10, asked=20, steps=30, left_out=40),
+        branched(2, None, moments=100, asked=200, steps=300, left_out=400, unanswered=1, why_unanswered="killed"),
+        branched(3, -1.0, unanswered=2, why_unanswered="another reason"),
+        trial(4),
+    )
+    copies = Ends(ledger, branch=True, unfinished=1, fails=(1,))
+    report = verify_branches(copies)
+    assert copies.asked == [([3, 1, 2], "branches", "branches")]
+    assert [one.spec.disturbances for one in copies.found] == [(at(2, 1.0),), (at(2, 2.0),), (at(2, 1.0),)]
+    assert {(one.outcome, one.step, one.spec.origin) for one in copies.found} == {("collision", 5, "branch")}
+    assert (report.trials, report.moments, report.branches) == (4, 111, 222)
+    assert (report.steps, report.skipped, report.crashed, report.crashed_trials) == (333, 444, 4, 3)
+    assert (report.not_fully_asked, report.why_unanswered) == (2, "killed")
+    assert (report.run_again, report.not_finished) == (3, 1)
+    assert [bundle.result.spec.number for bundle in report.crashes] == [3, 2]
+    assert verify_branches(Ends(ledger, branch=False)) is None
+    stopped = verify_branches(Ends(ledger, branch=True, stopped=True))
+    assert (stopped.run_again, stopped.crashes, stopped.crashed) == (0, (), 4)
+
+
+def test_ten_likeliest_branches_run_and_those_that_are_kept_come_first():
+    ledger = Rows(*(branched(number, -float(number)) for number in range(12)))
+    copies = Ends(ledger, branch=True, kept={"branches": {11: "bundle"}})
+    verify_branches(copies)
+    assert copies.asked[0][0] == [11, *range(9)]
+
+
+def test_likeliest_branch_of_a_trial_is_a_whole_trial():
+    assert likeliest(trial(1)) is likeliest(branched(1)) is None
+    found = likeliest(branched(1, None, -3.0, -7.0))
+    assert found.spec == replace(trial(1).spec, disturbances=(at(2, 2.0),), origin="branch")
+
+
+def probed(number, margin, least=None, **more):
+    planned = {"disturbance": at(4), "outcome": "collision", "step": 6} if least is not None else {}
+    return trial(number, stress=Stress(margin, **planned, **more))
+
+
+def test_probes_are_summed_and_the_mildest_run_from_the_start():
+    ledger = Rows(
+        probed(0, 1.0, probes=1, steps=2, left_out=3),
+        probed(1, 0.5, 0.5, probes=10, steps=20, left_out=30),
+        probed(2, None, probes=100, steps=200, left_out=300, why_unasked="killed"),
+        probed(3, 0.25, 0.25),
+        probed(4, None, why_unasked="another reason"),
+        probed(5, 0.75, 0.75),
+        probed(6, 0.875, 0.875),
+        trial(7),
+    )
+    copies = Ends(ledger, probe="4s", unfinished=2, fails=(1,))
+    report = verify_probes(copies)
+    assert copies.asked == [([3, 1, 5], "probes", "probes")]
+    assert {(one.outcome, one.step, one.spec.origin) for one in copies.found} == {("collision", 6, "probe")}
+    assert {one.spec.disturbances for one in copies.found} == {(at(4),)}
+    assert report.margins == (1.0, 0.5, 0.25, 0.75, 0.875)
+    assert (report.not_fully_asked, report.why_unasked) == (2, "killed")
+    assert (report.probes, report.steps, report.skipped) == (111, 222, 333)
+    assert (report.run_again, report.not_finished) == (3, 2)
+    assert [bundle.result.spec.number for bundle in report.crashes] == [3, 5]
+    assert report.by == (at(4), at(4))
+    assert verify_probes(Ends(ledger, probe="")) is None
+    assert verify_probes(Ends(ledger, probe="4s", stopped=True)).run_again == 0
+    kept = Ends(ledger, probe="4s", kept={"probes": {6: "bundle"}})
+    verify_probes(kept)
+    assert kept.asked[0][0] == [6, 3, 1]
+
+
+def test_disturbance_of_a_probe_has_its_actual_values():
+    stress = probed(1, 0.5, 0.5).stress
+    drawn = Disturbance(4, "ahead", "stop", 1.0, 2.0, "ego")
+    other = Disturbance(4, "ahead", "brake", 1.0, 2.0, "second")
+    late = Disturbance(5, "ahead", "brake", 1.0, 2.0, "ego")
+    actual = Disturbance(4, "ahead", "brake", 3.5, 2.0, "ego", "car")
+    took_place = (drawn, other, late, actual)
+    ran = replace(trial(1), disturbances=took_place, spec=replace(trial(1).spec, disturbances=took_place))
+    assert _fork_results._as_it_took_place(stress, ran) == actual
+    assert _fork_results._as_it_took_place(stress, trial(1)) == at(4)
+    both = mildest(replace(ran, stress=stress))
+    assert at(4) in both.spec.disturbances
+    assert len(both.spec.disturbances) == 5
+    assert [one.step for one in both.spec.disturbances] == sorted(one.step for one in both.spec.disturbances)
+    assert mildest(trial(1)) is mildest(probed(1, 0.5)) is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "confirmed"),
+    [
+        ({"probe": "4s", "branch": True}, {"probes": (1, 1), "branches": (0, 1)}),
+        ({"probe": "4s", "branch": False}, {"probes": (1, 1)}),
+        ({"probe": "", "branch": True}, {"branches": (0, 1)}),
+        ({"probe": "", "branch": False}, None),
+    ],
+)
+def test_confirmed_crashes_of_forks_are_noted(settings, confirmed):
+    ledger = Rows(branched(1, -2.0), probed(2, 0.5, 0.5), probed(3, 0.75, 0.75))
+    copies = Ends(ledger, unfinished=1, fails=(3,), **settings)
+    probes, branches = verify_fork_results(copies)
+    assert (probes is None, branches is None) == (not settings["probe"], not settings["branch"])
+    assert ledger.noted == ([{"confirmed": confirmed}] if confirmed else [])
+
+
+@pytest.fixture
+def weighty(monkeypatch):
+    """Rare mode of a hunt whose roots 5 and 10 have copies that crashed."""
+
+    def forced(number, *weights):
+        copies = tuple(
+            ForcedCopy("brake=6.0", 3, weight, 2, "collision" if weight < 9 else "", 7, disturbances=(at(2, weight),))
+            for weight in weights
+        )
+        spec = TrialSpec(number, number, {"ego": {}}, {}, 9, forcing=Forcing(0.01))
+        return TrialResult(spec, Outcome.SURVIVED, forced=Forced(0.9, {}, copies, 90))
+
+    @dataclass(frozen=True)
+    class Estimate:
+        estimate: float | None = 0.1
+        estimated: object = "interval"
+        estimated_disturbed: object = "interval"
+        why_not: str = ""
+        why_not_disturbed: str = ""
+        more_roots: int | None = 3
+
+    rule = SimpleNamespace(
+        weightiest=[forced(5, 0.5, 2.0, 9.5), forced(10, 1.5)], read=lambda: reads.append(1), lines=["more"],
+        estimate=Estimate,
+    )  # fmt: skip
+    reads = []
+    monkeypatch.setattr(
+        _fork_results, "rare_watch", lambda settings, ledger, disturber: rule if settings.rare else None
+    )
+    return reads
+
+
+def test_weightiest_copies_of_rare_mode_run_from_the_start(weighty):
+    copies = Ends(Rows(), rare=True, unfinished=0)
+    report = verify_rare(copies)
+    assert weighty == [1]
+    assert copies.asked == [([5, 10], "branches", "rare crashes")]
+    assert [(one.spec.disturbances, one.outcome, one.step) for one in copies.found] == [
+        ((at(2, 2.0),), "collision", 7), ((at(2, 1.5),), "collision", 7),
+    ]  # fmt: skip
+    assert {(one.spec.forcing, one.spec.origin) for one in copies.found} == {(None, "rare")}
+    assert (report.verified, report.not_finished, len(report.crashes), report.more) == (2, 0, 2, ("more",))
+    assert report.estimate.estimate == 0.1
+    assert verify_rare(Ends(Rows(), rare=False)) is None
+
+
+@pytest.mark.parametrize(
+    ("options", "differences", "why"),
+    [
+        ({}, 0, ""),
+        ({}, 3, "3 trials of the audit were not the same again"),
+        ({"fails": (5,)}, 0, "1 of 2 crashes did not come again from the start"),
+        ({"fails": (5,)}, 3, "1 of 2 crashes did not come again from the start"),
+        ({"fails": (5,), "unfinished": 1}, 0, ""),
+        ({"stopped": True}, 0, ""),
+    ],
+)
+def test_estimate_of_rare_mode_is_withheld_where_runs_contradict_it(weighty, options, differences, why):
+    report = verify_rare(Ends(Rows(), rare=True, **options), differences=differences)
+    found = report.estimate
+    assert (found.why_not, found.why_not_disturbed) == (why, why)
+    empty = [
+        found.estimate is None,
+        found.estimated is None,
+        found.estimated_disturbed is None,
+        found.more_roots is None,
+    ]
+    assert empty == [bool(why)] * 4
+    assert report.verified == (0 if options.get("stopped") else 2)
+
+
+@pytest.fixture
+def near(tmp_path, monkeypatch):
+    """Near misses of a hunt of trials 0 to 5, of which bundles of 1 and 9 are there."""
+    kept = [SimpleNamespace(result=trial(number), path=tmp_path / f"{number}") for number in (1, 9)]
+    removed, written = [], []
+    monkeypatch.setattr(_fork_results, "list_near_misses", lambda directory: list(kept))
+    monkeypatch.setattr(_fork_results, "remove_at_once", removed.append)
+
+    def make(run, keep=3, stops=()):
+        phases = []
+        clock = SimpleNamespace(begin=lambda *given: phases.append(given), advance=lambda: phases.append("one"))
+        again = SimpleNamespace(
+            place=SimpleNamespace(path=tmp_path), ledger=Rows(*map(trial, range(6))), notes=[], failed=[],
+            settings=SimpleNamespace(run=SimpleNamespace(near_misses=keep)), stops=stops, run=run, phases=clock,
+        )  # fmt: skip
+        return SimpleNamespace(again=again, phases=phases, removed=removed, written=written, kept=kept)
+
+    return make
+
+
+def test_most_critical_trials_run_again_and_are_kept(near, tmp_path):
+    def run(specs, folder):
+        assert ([spec.number for spec in specs], folder) == ([0, 2, 3], "near-misses")
+        kill = Failure(KILLED, "killed 3 times", exit_code=-9)
+        ends = (trial(0), replace(trial(2), digest="e"), replace(trial(3), outcome=Outcome.INVALID, failure=kill))
+        for end in ends:
+            yield SimpleNamespace(
+                result=end, write=lambda given, *, confirmed: found.written.append((given.spec.number, confirmed))
+            )
+
+    found = near(run, keep=4)
+    assert keep_near_misses(found.again) == tuple(found.kept)
+    assert found.removed == [tmp_path / "9"]
+    assert found.written == [(0, True)]
+    assert found.phases == [("near misses", 3), "one", "one", "one"]
+    assert [one.spec.number for one in found.again.failed] == [2]
+    assert found.again.notes == [
+        "trial 2, a near miss, is another one in a fresh process: it has no bundle",
+        "trial 3, a near miss, was killed 3 times: it has no bundle until the same command is run again",
+    ]
+
+
+def test_near_misses_stay_where_none_are_asked_for_or_the_hunt_is_stopped(near):
+    def never(specs, folder):
+        pytest.fail("it runs")
+
+    for options in ({"keep": 0}, {"stops": (2,)}):
+        found = near(never, **options)
+        assert keep_near_misses(found.again) == ()
+        assert found.removed == []
+
+
+def test_near_misses_that_are_there_do_not_run_again(near):
+    found = near(lambda specs, folder: iter([] if not specs else pytest.fail("it runs")), keep=2)
+    found.kept[:] = [SimpleNamespace(result=trial(number), path=number) for number in (0, 1)]
+    assert keep_near_misses(found.again) == tuple(found.kept)
+    assert (found.removed, found.phases) == ([], [])
+    found.kept[0].result = replace(trial(0), digest="other")
+
+    def fails(specs, folder):
+        assert [spec.number for spec in specs] == [0]
+        yield from ()
+        raise SimulatorError("no room")
+
+    found.again.run = fails
+    keep_near_misses(found.again)
+    assert found.removed == [0]
+    assert found.again.notes == ["near misses could not be run again: no room"]
