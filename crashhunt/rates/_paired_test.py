@@ -15,7 +15,8 @@ non-negative martingale that begins at 1 / 2. By Ville's inequality, the probabi
 is at most alpha / 2. Each factor grows with d for every Z. The differences that are not rejected are therefore an
 interval, and bisection finds its end. The lower end is the upper end of -Z.
 
-The evidence of a difference is that of discordant pairs. With several trials in a pair, it is E(0) of Z plus E(0) of -Z.
+The evidence of a difference is that of discordant pairs. With several trials in a pair, it is E(0) of Z plus that of
+-Z.
 
 Sources: those of `_anytime_interval`, which computes the evidence of discordant pairs. The bets on Z are those of
 Waudby-Smith and Ramdas (2024), with a mixture over fixed shares.
