@@ -232,6 +232,7 @@ _TESTS_ELSEWHERE = {
         "hunts/test_logs.py",
         "hunts/test_phases.py",
         "hunts/test_states_and_reports.py",
+        "hunts/test_states_of_facts.py",
     ),
     "hunts/_verification.py": (
         "hunts/test_from_the_start.py",
