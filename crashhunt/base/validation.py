@@ -14,7 +14,7 @@ from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from crashhunt.base.text import did_you_mean
+from crashhunt.base.text import any_of, did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -30,6 +30,8 @@ T = TypeVar("T")
 
 _UNKNOWN_KEY_ERRORS = ("unexpected_keyword_argument", "extra_forbidden")
 _MISSING_KEY_ERRORS = ("missing", "missing_argument")
+_WANTED = "Input should be "  # of pydantic
+_A_STRING = f"{_WANTED}a valid string"
 
 
 def validate(
@@ -129,8 +131,9 @@ def _validated(kind: type[T], data: object, place: _Place) -> T:
     try:
         return cast(T, _adapter(cast(Any, kind)).validate_python(data))
     except ValidationError as problem:
-        first = _telling(problem.errors(include_url=False))
-        path = tuple(str(part) for part in first["loc"])
+        errors = problem.errors(include_url=False)
+        first = _telling(errors)
+        path = _keys_to(first, data)
         key = ".".join((place.under, *path) if place.under else path)
         if first["type"] in _UNKNOWN_KEY_ERRORS:
             known = list(place.keys()) if place.keys and len(path) == 1 else _known_keys(kind, path[:-1])
@@ -138,19 +141,41 @@ def _validated(kind: type[T], data: object, place: _Place) -> T:
             raise error(f"unknown key {key!r}", fix=fix, where=where) from None
         if first["type"] in _MISSING_KEY_ERRORS:
             raise error(f"the key {key!r} is missing", fix="add it", where=where) from None
-        message, fix = _in_terms_of_toml(first, key)
+        of_members = [found for found in errors if _keys_to(found, data) == path]
+        message, fix = _in_terms_of_toml(first, key, of_members)
         raise error(f"{key} = {first['input']!r}: {message}", fix=fix, where=where) from None
 
 
-def _in_terms_of_toml(found: ErrorDetails, key: str) -> tuple[str, str]:
-    """Return the message and the fix of an error without Python's names of types."""
+def _keys_to(found: ErrorDetails, data: object) -> tuple[str, ...]:
+    """Return the keys that lead to an error, without the names that pydantic gives to the members of a union."""
+    path: list[str] = []
+    here: Any = data
+    for part in found["loc"]:
+        if (isinstance(here, Mapping) and part in here) or (isinstance(here, list | tuple) and isinstance(part, int)):
+            here = here[part]
+            path.append(str(part))
+    return (*path, str(found["loc"][-1])) if found["type"] in _MISSING_KEY_ERRORS else tuple(path)
+
+
+def _in_terms_of_toml(found: ErrorDetails, key: str, of_members: Sequence[ErrorDetails]) -> tuple[str, str]:
+    """Return the message and the fix of an error without Python's names of types.
+
+    Args:
+        found: the error.
+        key: the key whose value is wrong.
+        of_members: the errors of the same value; each member of a union has its own.
+    """
     if found["type"] == "tuple_type" and isinstance(found["input"], dict):
         return "a table where a list of tables is needed", f"write [[{key}]] above each table"
     if found["type"] == "tuple_type":
         return "not a list", f"write {key} = […]"
     if found["type"] in ("dataclass_type", "dict_type", "mapping_type"):
         return "not a table", f"write [{key}], with the keys below it"
-    return found["msg"][0].lower() + found["msg"][1:], "change the value"
+    messages = [_A_STRING if other["type"] == "path_type" else other["msg"] for other in (found, *of_members)]
+    wanted = dict.fromkeys(message.removeprefix(_WANTED) for message in messages)
+    if all(message.startswith(_WANTED) for message in messages):
+        return f"input should be {any_of(wanted)}", "change the value"
+    return messages[0][0].lower() + messages[0][1:], "change the value"
 
 
 def _telling(errors: Sequence[ErrorDetails]) -> ErrorDetails:

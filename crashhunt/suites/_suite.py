@@ -94,6 +94,11 @@ class Suite:
             seen.add(entry.id.lower())
             if entry.runs < 1:
                 raise UsageError(f"hunts.{entry.id}.runs = {entry.runs}", fix="give at least 1")
+            if entry.seed is not None and entry.seed < 0:
+                raise UsageError(f"hunts.{entry.id}.seed = {entry.seed}", fix="give at least 0")
+            for path in (entry.scenario, *entry.snapshot_roots):
+                if "\0" in str(path):
+                    raise UsageError(f"hunts.{entry.id}: {str(path)!r} is not a path", fix="remove the null byte")
             if entry.agent and entry.agents:
                 raise UsageError(f"hunts.{entry.id} has both agent and agents", fix="give one of them")
 

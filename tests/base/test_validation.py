@@ -13,12 +13,13 @@ from dataclasses import asdict
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from crashhunt.base.errors import ScenarioError
+from crashhunt.base.errors import ScenarioError, UsageError
 from crashhunt.base.validation import validate
 from crashhunt.plans import HuntSettings, Request, plan
 from crashhunt.scenario import Scenario, backend_of, shipped_folder
 from crashhunt.scenario.backends.highway import HighwaySetup
 from crashhunt.scenario.backends.sumo import SumoSetup
+from crashhunt.suites import SuiteEntry
 
 
 def as_read(settings) -> dict:
@@ -120,3 +121,21 @@ def test_errors_have_the_terms_of_toml(data, says):
     with pytest.raises(ScenarioError) as caught:
         validate(SumoSetup, {"net": "n.net.xml", **data}, where="here", error=ScenarioError)
     assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        ({"scenario": 3}, "scenario = 3: input should be a valid string; change the value"),
+        ({"snapshot_roots": ["a", 3]}, "snapshot_roots.1 = 3: input should be a valid string;"),
+        (
+            {"arguments": {"speed": [5, 6]}},
+            "arguments.speed = [5, 6]: input should be a valid string, a valid integer, a valid number or a valid bool",
+        ),
+        ({"agents": {"str": 3}}, "agents.str = 3: input should be a valid string;"),
+    ],
+)
+def test_errors_name_the_key_and_all_types_that_a_value_may_have(data, says):
+    with pytest.raises(UsageError) as caught:
+        validate(SuiteEntry, data, where="here", error=UsageError)
+    assert str(caught.value).startswith(f"here: {says}")

@@ -213,6 +213,7 @@ def test_the_request_of_settings_results_in_the_same_settings():
     [
         ({"id": "a", "runs": 0}, "hunts.a.runs = 0"), ({"id": "../a"}, "is not a valid folder name"),
         ({"id": "a", "agent": "m:A", "agents": {"ego": "m:A"}}, "has both agent and agents"),
+        ({"id": "a", "seed": -1}, "hunts.a.seed = -1"), ({"id": "a", "scenario": "a\0b"}, "null byte"),
     ],
 )  # fmt: skip
 def test_a_hunt_that_no_folder_could_have_is_refused(entry, says):
