@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sqlite3
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import digest_of_row
+from crashhunt.base.resources import limit_behind
 from crashhunt.trial import check_plain
 
 if TYPE_CHECKING:
@@ -334,6 +336,10 @@ def damaged(path: Path, message: str) -> HuntDirectoryError:
 def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
     """Convert an error of SQLite to an error of crashhunt."""
     where, text = str(path), " ".join(str(error).split())  # which may quote what is damaged
+    # SQLite reports a file that would exceed ``ulimit -f`` as an I/O error.
+    if "disk I/O" in text and (limit := limit_behind(OSError(errno.EFBIG, text))):
+        what, _, fix = limit.partition(": ")
+        return HuntDirectoryError(f"cannot be written ({text}), because {what}", fix=fix, where=where)
     if "full" in text or "disk I/O" in text:
         return HuntDirectoryError(
             f"the disk is full ({text})", fix="free some space and run the same command again", where=where

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 import sqlite3
 import threading
@@ -502,6 +503,15 @@ def test_error_of_sqlite_has_a_cause_and_a_fix(path, text, says, fix):
     assert says in str(found)
     assert fix in found.fix
     assert found.where == str(path)
+
+
+def test_limit_on_the_size_of_files_is_not_taken_for_a_full_disk(path, monkeypatch):
+    monkeypatch.setattr(
+        resource, "getrlimit", lambda which: (1 << 20, 1 << 20) if which == resource.RLIMIT_FSIZE else ()
+    )
+    found = _schema.explained(path, sqlite3.OperationalError("disk I/O error"))
+    assert "cannot be written (disk I/O error), because the limit on the size of a file is 1 MiB" in found.message
+    assert found.fix == "raise it with ulimit -f"
 
 
 def test_file_that_cannot_be_opened_is_a_folder_or_forbidden_or_has_no_folder(path, monkeypatch):
