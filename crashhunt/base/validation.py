@@ -150,6 +150,7 @@ def _keys_to(found: ErrorDetails, data: object) -> tuple[str, ...]:
     """Return the keys that lead to an error, without the names that pydantic gives to the members of a union."""
     path: list[str] = []
     here: Any = data
+    part: Any
     for part in found["loc"]:
         if (isinstance(here, Mapping) and part in here) or (isinstance(here, list | tuple) and isinstance(part, int)):
             here = here[part]
