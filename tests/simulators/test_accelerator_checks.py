@@ -363,9 +363,9 @@ def test_vehicles_are_compared_with_the_kernels_once_where_no_foreign_code_runs(
     place = small_road(*[IDMVehicle] * 3)
     owner = _roads.look(place).owner
     compared = []
-    is_of = _kernel_objects.KernelRoster.is_of
+    is_of = _kernel_objects.KernelObjects.is_of
     monkeypatch.setattr(
-        _kernel_objects.KernelRoster, "is_of", lambda self, road: compared.append(1) or is_of(self, road)
+        _kernel_objects.KernelObjects, "is_of", lambda self, road: compared.append(1) or is_of(self, road)
     )
     assert owner.drives_all()
     assert owner.checked

@@ -73,7 +73,7 @@ def built():
     """How often lanes, positions and vehicles are put into new objects of the accelerator."""
     counts = Counter()
     with pytest.MonkeyPatch.context() as patch:
-        for kind in (_frames.TrafficFrame, _network.Network, _kernel_objects.KernelRoster):
+        for kind in (_frames.TrafficFrame, _network.Network, _kernel_objects.KernelObjects):
             make = kind.__init__
             patch.setattr(
                 kind, "__init__", lambda *given, make=make: (counts.update([type(given[0]).__name__]), make(*given))[1]
