@@ -254,7 +254,7 @@ def test_place_around_an_agent_is_along_its_lanes(x, lane, who):
     assert made.resolve_target(agent, planned("brake", who or "ahead")) is (other if who else None)
 
 
-def test_place_has_the_nearest_vehicle_and_no_lane_beside_the_road():
+def test_place_has_the_nearest_vehicle_on_a_lane_that_exists():
     road = straight(lanes=2)
     agent = put(road, 100.0, 0, kind=ControlledVehicle)
     put(road, 140.0, 1)
