@@ -440,6 +440,12 @@ def fields_of(kind: type) -> tuple[str, ...]:
 def _locator(who: Driver) -> str:
     if isinstance(who, str):
         return who
+    if not callable(who):
+        kind = type(who).__qualname__
+        raise UsageError(
+            f"the agent is an object of class {kind}, but each trial creates its own agent",
+            fix=f"give the class {kind} itself, or a function that returns the agent",
+        )
     module, name = getattr(who, "__module__", ""), getattr(who, "__qualname__", "")
     if module in ("", "__main__") or not name or "<" in name:
         raise UsageError(

@@ -253,6 +253,8 @@ def test_no_trials_are_fine_with_a_time_and_drivers_have_to_be_importable(folder
     for who in (Local, elsewhere, lambda: None):
         with pytest.raises(UsageError, match="is not in a module that workers can import"):
             request_of(HuntOptions(agent=who), trials=1, max_steps=1)
+    with pytest.raises(UsageError, match=r"the agent is an object of class Agent, .*; give the class Agent itself"):
+        request_of(HuntOptions(agent=drives.Agent()), trials=1, max_steps=1)
 
 
 def test_whose_an_argument_is():
