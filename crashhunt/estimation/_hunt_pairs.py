@@ -206,11 +206,17 @@ class PairedHunts:
         sequence = self._sequence = self._sequence or self._pair_sequence()
         if sequence is None:
             return
-        if self._held_out.is_empty:
-            self.trained_on = self.most
-            return
+        has_records = False
         for pair in self._read(sequence):
             if watch.verdict != "undecided" or sequence.position > self.most:
+                return
+            if not has_records:
+                # A hunt creates its ledger before its snapshot, which has the training records of its agents. The
+                # snapshot exists before the first trial, so read the records only after both trials of a pair.
+                base = read_settings(self.folders[0] / layout.HUNT)
+                self._held_out, has_records = held_out_traffics(base, self.folders), True
+            if self._held_out.is_empty:
+                self.trained_on = self.most
                 return
             if not all(self._held_out.has(int(one.tags[0])) for one, _ in pair):
                 self.trained_on += 1
@@ -273,7 +279,6 @@ class PairedHunts:
         if why := why_unpaired(base, head):
             raise HuntDirectoryError(f"the hunts of BASE and HEAD cannot be compared: {why}", where=self.name)
         self._crash_on = tuple(map(str, base.crash_on))
-        self._held_out = held_out_traffics(base, self.folders)
         return PairSequence((counting_rule(base, {}), counting_rule(head, {})), _is_same)
 
     def _read(self, sequence: PairSequence) -> Iterator[Pair]:

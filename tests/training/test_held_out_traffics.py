@@ -17,10 +17,10 @@ from hypothesis import given, strategies as st
 import crashhunt
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError, UsageError
-from crashhunt.estimation import GateReport, measure_rates
+from crashhunt.estimation import GateReport, PairedHunts, measure_rates
 from crashhunt.hunts import hunt_state
 from crashhunt.ledger import Ledger
-from crashhunt.rates import CountingRule, RateCounter, TrialFacts, UnitSequence, make_rate
+from crashhunt.rates import CountingRule, PairWatch, RateCounter, TrialFacts, UnitSequence, make_rate
 from crashhunt.report import comparison_page, describe_comparison, describe_gate, describe_running, gate_summary
 from crashhunt.training import (
     CrashEnv,
@@ -283,6 +283,29 @@ def test_verdict_of_a_gate_reports_training_traffic():
         assert "12 pairs do not count: an agent was trained on traffics of this part" in text
         assert text.count("0 crashes in 12 trials (12 trials on training traffic are excluded), at most") == 2
     assert found.to_json()["head"]["left_out"] == {"trained_on": 12}
+
+
+def test_pairs_of_a_gate_have_the_record_of_a_snapshot_that_was_taken_after_the_ledger(place, tmp_path):
+    for side in ("before", "after"):  # as a gate may see hunts that begin
+        (tmp_path / side).mkdir()
+        shutil.copy(place / side / "hunt.toml", tmp_path / side)
+        Ledger(tmp_path / side / "ledger.sqlite", writable=True).close()
+    pairs, watch = PairedHunts("toy", tmp_path / "before", tmp_path / "after", TRIALS), PairWatch(0.02)
+    pairs.take(watch)
+    assert (pairs.counts.pairs, pairs.trained_on, pairs.is_complete) == (0, 0, False)
+    for side in ("before", "after"):
+        shutil.copytree(place / side, tmp_path / side, dirs_exist_ok=True)
+    pairs.take(watch)
+    held_out = sum(is_test_traffic(seed, 0.5) for seed in seeds_of(place / "before"))
+    assert (pairs.counts.pairs, pairs.trained_on) == (held_out, TRIALS - held_out)
+    assert (watch.test.pairs, pairs.is_complete) == (held_out, True)
+
+
+@pytest.mark.usefixtures("without_test_part")
+def test_no_pair_of_a_gate_counts_where_nothing_is_held_out(place):
+    pairs, watch = PairedHunts("toy", place / "before", place / "after", TRIALS), PairWatch(0.02)
+    pairs.take(watch)
+    assert (watch.test.pairs, pairs.trained_on, pairs.is_complete) == (0, TRIALS, True)
 
 
 @pytest.mark.nightly  # by day, compare counts the same pairs
