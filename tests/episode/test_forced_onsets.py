@@ -23,7 +23,7 @@ def ask(tmp_path):
     def ask_it(what):
         done = subprocess.run(
             [sys.executable, Path(__file__).with_name("forcing.py"), what, tmp_path],
-            env={**os.environ, **worker_environment()}, capture_output=True, text=True, check=False, timeout=100,
+            env={**os.environ, **worker_environment()}, capture_output=True, text=True, check=False, timeout=500,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout.splitlines()[-1])
