@@ -571,7 +571,10 @@ def test_whatever_is_killed_whenever_nothing_is_lost_and_nothing_left(toy, made_
         )  # fmt: skip
 
     def ended(process: subprocess.Popen) -> int:
-        _, said = process.communicate(timeout=300)
+        try:
+            _, said = process.communicate(timeout=300)
+        finally:
+            process.kill()  # one that takes longer would hunt on in a folder that is removed
         assert b"Traceback" not in said, said
         return process.returncode
 
