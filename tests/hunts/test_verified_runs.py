@@ -14,6 +14,7 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.executors import NodeFigures
 from crashhunt.hunts import _next_trials, _progress, _verification
 from crashhunt.hunts._next_trials import find_unanswered
 from crashhunt.hunts._progress import PhaseClock, Progress, RemainingTime, StrategyTally
@@ -22,7 +23,18 @@ from crashhunt.ledger import Ledger
 from crashhunt.plans import RunSettings
 from crashhunt.recording import Divergence
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.trial import KILLED, Collision, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import (
+    KILLED,
+    Branch,
+    Branches,
+    Collision,
+    Disturbance,
+    Failure,
+    Outcome,
+    Stress,
+    TrialResult,
+    TrialSpec,
+)
 
 HIT = Collision("ego", "collider", "ego", "b", ("overlap",), "overlap", 1.0, 2.0)
 
@@ -498,3 +510,79 @@ def test_phase_is_shown_ten_times_a_second_at_most(monkeypatch):
     clock.now = 52.0
     phases.advance()
     assert (shown[-1].done, shown[-1].seconds_left) == (2, pytest.approx(4.0))
+
+
+def test_each_trial_that_ends_tells_how_many_are_left(monkeypatch):
+    clock = SimpleNamespace(now=50.0)
+    monkeypatch.setattr(_progress.time, "monotonic", lambda: clock.now)
+    ended, progress = [], Progress(parallel=3)
+    progress.remaining = SimpleNamespace(ended=lambda *given: ended.append(given))
+    progress.outcomes.update({"survived": 4})
+    for number in range(3):
+        progress.count(result(number), crashed=False, planned=6)
+    assert ended == [(50.0, 1, 3), (50.0, 0, 3), (50.0, 0, 3)]
+
+
+def test_trials_that_crashed_or_failed_are_no_near_misses_but_their_forks_count():
+    progress = Progress()
+    branch = Branch((), 1, "collision", 5, -2.0)
+    forks = {"branches": Branches(crashes=(branch, branch))}
+    progress.count(result(1, danger=0.9, collision=HIT, **forks), crashed=False, planned=9)
+    progress.count(result(2, danger=0.9, failure=Failure("ValueError", "no")), crashed=False, planned=9)
+    assert (progress.nearest, progress.branched) == (None, 2)
+    assert progress.searching.status().grown_trials is None
+    progress.count(result(3, danger=0.5, **forks), crashed=False, planned=9)
+    progress.count(result(4, danger=0.5), crashed=False, planned=9)  # of two that are equal, the first
+    assert (progress.nearest.spec.number, progress.branched) == (3, 4)
+    assert progress.searching.status().grown_trials == 1
+    progress.count(result(5, danger=0.75), crashed=False, planned=9)
+    assert progress.nearest.spec.number == 5
+    assert progress.searching.status().grown_trials == 0
+
+
+def test_robustness_of_a_hunt_is_that_of_the_first_trial_with_the_least_margin():
+    progress = Progress()
+    for number, margin in ((1, 1.0), (2, 0.5), (3, 0.5), (4, 0.75)):
+        stress = Stress(margin, disturbance=Disturbance(2, "ahead", "brake", 4.0, 2.0, "ego"))
+        progress.count(result(number, stress=stress), crashed=False, planned=9)
+        assert (progress.stressed and progress.stressed.spec.number) == (None if number == 1 else 2)
+
+
+def test_crash_that_is_not_saved_yet_counts_with_its_disturbances():
+    progress = Progress()
+    erring = (Disturbance(2, "ahead", "brake", 4.0, 2.0, "ego"),)
+    progress.tally.found, progress.tally.disturbed = 4, 2
+    progress.count(crash(5, disturbances=erring), crashed=True, planned=9)
+    assert (progress.crash_count, progress.disturbed) == (5, 3)
+    progress.found = {5: crash(5)}
+    assert (progress.crash_count, progress.disturbed) == (5, 2)
+    progress.crashes = [Bundle(crash(4)), Bundle(crash(5))]
+    assert (progress.unsaved, progress.crash_count) == (None, 4)
+
+
+def test_machines_of_a_hunt_are_noted_if_there_are_several():
+    progress = Progress()
+    progress.look_at(SimpleNamespace(nodes=lambda: [NodeFigures("a", 2, 3, 0.5)]))
+    assert progress.nodes == (NodeFigures("a", 2, 3, 0.5),)
+    assert progress.noted()["nodes"] == [{"name": "a", "parallel": 2, "trials": 3, "rate_per_s": 0.5}]
+    progress.look_at(SimpleNamespace())
+    assert progress.nodes is None
+    progress.kinds = SimpleNamespace(groups=list, newest=5.0, types_by_cause=None)
+    assert "types_by_cause" not in progress.noted()
+    progress.kinds.types_by_cause = 0
+    assert progress.noted()["types_by_cause"] == 0
+    progress.counted = SimpleNamespace(running=lambda *, now: now)
+    assert [progress.noted(now=now)["running_rate"] for now in (False, True)] == [False, True]
+    assert progress.noted()["running_rate"] is False
+    progress.phase = _progress.PhaseStatus(name="probes", done=1, total=2, seconds_left=3.0)
+    assert progress.noted()["phase"] == {"name": "probes", "done": 1, "total": 2, "seconds_left": 3.0}
+
+
+def test_status_without_forks_has_no_counts_of_them():
+    status = _progress.HuntStatus("hunting", 10, 4, {}, 2.0, 2.0, None, {}, 0)
+    assert (status.branched, status.not_fully_asked, status.time_left_s) == (0, 0, math.inf)
+    assert replace(status, done=12).seconds_left == 0.0
+    assert replace(status, planned=0).share_done == 0.0
+    assert replace(status, elapsed_s=0.0, time_left_s=0.0, planned=0).share_done == 1.0
+    assert replace(status, elapsed_s=0.25, time_left_s=0.5).share_done == 0.4
+    assert replace(status, elapsed_s=0.25, time_left_s=0.25).share_done == 0.5
