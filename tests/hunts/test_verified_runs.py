@@ -512,7 +512,7 @@ def test_phase_is_shown_ten_times_a_second_at_most(monkeypatch):
     assert (shown[-1].done, shown[-1].seconds_left) == (2, pytest.approx(4.0))
 
 
-def test_each_trial_that_ends_tells_how_many_are_left(monkeypatch):
+def test_each_finished_trial_updates_the_time_left(monkeypatch):
     clock = SimpleNamespace(now=50.0)
     monkeypatch.setattr(_progress.time, "monotonic", lambda: clock.now)
     ended, progress = [], Progress(parallel=3)
