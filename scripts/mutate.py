@@ -262,6 +262,7 @@ _TESTS_ELSEWHERE = {
         "simulators/test_gym.py",
     ),
     "simulators/_kinematics_observation.py": (
+        "simulators/test_kinematics.py",
         "simulators/test_left_hand.py",
         "simulators/test_sumo.py",
         "simulators/test_highway.py",
@@ -282,7 +283,12 @@ _TESTS_ELSEWHERE = {
     ),
     "simulators/sumo/_fast_step.py": ("native/test_usual_steps.py",),
     "simulators/sumo/_traffic_survey.py": ("hunts/test_traffic_survey.py", "simulators/test_sumo_reports.py"),
-    "simulators/toy.py": ("episode/test_disturbed.py", "episode/test_episode*.py", "testing/test_broken_contracts.py"),
+    "simulators/toy.py": (
+        "simulators/test_toy.py",
+        "episode/test_disturbed.py",
+        "episode/test_episode*.py",
+        "testing/test_broken_contracts.py",
+    ),
     "snapshots": ("snapshots/test_*.py", "e2e/test_snapshot.py"),
     "suites": ("suites/test_*.py", "e2e/test_suite.py", "e2e/test_gate.py"),
     "testing/_backends.py": ("scenario/test_backends.py",),
