@@ -556,3 +556,10 @@ def test_environment_in_this_process_has_no_copies(environments):
             env.branch(*given)
     with pytest.raises(UsageError, match="seed is -1; give 0 or more"):
         env.branch(1, seed=-1)
+
+
+def test_end_of_the_users_program_is_looked_for_every_second():
+    waits = []
+    pipe = SimpleNamespace(poll=lambda seconds: waits.append(seconds) or False)
+    assert _process._serve(pipe, lambda: len(waits) == 3, "episodes") == "episodes"
+    assert waits == [1.0] * 3

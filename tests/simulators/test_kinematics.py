@@ -104,27 +104,26 @@ def test_core_observes_only_the_usual_columns(setup, usual):
     scene = scene_of((0.0, 0.0, 0.0, 1.0, 4.0, "passenger"))
     asked, given = [], np.arange(made.shape[0] * made.shape[1], dtype="<f4")
 
-    def observe(*words):
-        asked.append(words)
-        return given.tobytes()
-
-    scene.columns, scene.core = scene.columns or "columns", SimpleNamespace(observe=observe)
-    for change, calls in (((lambda: None), usual), ((lambda: made.hidden.add(("a0", "x"))), False)):
-        change()
+    def shown():
         asked.clear()
-        scene.columns = "columns" if usual else None
-        if not usual:
-            continue
-        if calls:
-            shown = made.observe(scene, 0, distance=1.0, from_left=2.0, lateral_speed=3.0, lanes=1)
-            assert asked == [("columns", 0, 2, 1.0, 2.0, 3.0)]
-            assert shown.ravel().tolist() == given.tolist()
+        return made.observe(scene, 0, distance=1.0, from_left=2.0, lateral_speed=3.0, lanes=1)
+
+    plain = shown()
+    scene.core = SimpleNamespace(observe=lambda *words: asked.append(words) or answer)
+    scene.columns = "columns"
+    answer = given.tobytes()
+    assert (shown() == (given.reshape(made.shape) if usual else plain)).all()
+    assert asked == ([("columns", 0, 2, 1.0, 2.0, 3.0)] if usual else [])
+    answer = None  # the core leaves it to Python
+    assert (shown() == plain).all()
+    made.hidden.add(("a0", "x"))
+    assert (shown() == plain).all()
+    assert asked == []
 
 
 def test_space_has_bounds_that_no_simulation_reaches():
-    high = dict(
-        zip(COLUMNS, Kinematics(ObservationSetup(vehicles=2, features=COLUMNS)).space.high[1].tolist(), strict=True)
-    )
+    space = Kinematics(ObservationSetup(vehicles=2, features=COLUMNS)).space
+    high = dict(zip(COLUMNS, space.high[1].tolist(), strict=True))
     assert high == {"presence": 1.0, "x": 1e6, "y": 1e6, "vx": 1e3, "vy": 1e3, "heading": pytest.approx(math.pi),
                     "cos_h": 1.0, "sin_h": 1.0, "kind": 5.0}  # fmt: skip
     assert space.shape == (2, 9)
