@@ -148,12 +148,26 @@ def _real_folder(folder: str) -> Path:
 def _take_module(name: str, imported: ImportedModules, found: Sources) -> None:
     """Add a package, or a module that is a single file, to the sources."""
     file, folders = imported.places.get(name, (None, ()))
+    archive = _archive_of(file or next(iter(folders), ""))
+    if archive is not None:  # an entry of ``sys.path``, as it is in the snapshot
+        place = f"{layout.CODE}/@{archive.parent.name}/{archive.name}"
+        found.files[place] = str(archive)
+        if place not in found.paths:
+            found.paths.append(place)
+        return
     for folder in map(Path, folders):
         for path in _walk(folder):
             found.files[f"{layout.CODE}/{name}/{path}"] = f"{folder}/{path}"
         return
     if file is not None:
         found.files[f"{layout.CODE}/{Path(file).name}"] = file
+
+
+def _archive_of(file: str) -> Path | None:
+    """Return the zip file from which Python imported a module; None for a module in a folder."""
+    if not file or os.path.exists(file):  # noqa: PTH110 - of hundreds of modules
+        return None
+    return next((path for path in Path(file).parents if path.is_file()), None)
 
 
 def _is_page(place: str) -> bool:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import zipfile
 
 import pytest
 
@@ -66,3 +67,18 @@ def test_installed_package_with_libraries_next_to_it_is_not_copied(tmp_path, mon
         monkeypatch.delitem(sys.modules, name)
     assert "code/plain_world/__init__.py" in kept
     assert not [place for place in kept if place.startswith("code/boxed_world")]
+
+
+def test_zip_file_that_holds_a_module_is_copied_and_imported_from(tmp_path, monkeypatch):
+    archive = tmp_path / "drivers.zip"
+    with zipfile.ZipFile(archive, "w") as packed:
+        for name in ("zipped_driver/__init__.py", "zipped_module.py"):
+            packed.writestr(name, "")
+    monkeypatch.syspath_prepend(archive)
+    found = find_sources(ImportedModules.here([], ["zipped_driver", "zipped_module"]))
+    for name in ("zipped_driver", "zipped_module"):
+        monkeypatch.delitem(sys.modules, name)
+    place = f"code/@{tmp_path.name}/drivers.zip"
+    assert found.files[place] == str(archive)
+    assert found.paths == ["code", place]
+    assert not [kept for kept in found.files if "zipped" in kept]
