@@ -9,10 +9,11 @@ Cost: a ledger is read once for all measures, at about 30,000 trials per second.
 
 from __future__ import annotations
 
+import math
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
@@ -34,12 +35,13 @@ if TYPE_CHECKING:
     from crashhunt.plans import HuntSettings
     from crashhunt.rates import CountingRule, CrashRate, Interval, Per, TrialFacts, Unit
     from crashhunt.training import HeldOutTraffics
-    from crashhunt.trial import Distribution
+    from crashhunt.trial import Distribution, Value
 
 __all__ = ["counts_suffice", "measure_rates", "rate_of_counts", "rate_of_trials"]
 
 _DEFAULT_BINS = 4
 _MAX_BINS = 50
+_LABEL_DIGITS, _MAX_DIGITS = 4, 17  # of the ends of a bin: as few as tell all bins apart
 _CRASH_PROPERTIES = ("kind", "fault", "disturbance")
 _UNDISTURBED, _DISTURBED, _UNKNOWN = "undisturbed", "disturbed", "not known"
 
@@ -290,18 +292,51 @@ def _by_argument(by: str, settings: HuntSettings) -> _Division:
 
 def _bins(distribution: Distribution, count: int) -> tuple[tuple[str, ...], Callable[[object], int]]:
     """Return the labels of bins of equal probability, and a function that finds the bin of a value."""
-    if not isinstance(distribution, Range) or _few_values(distribution, count):
+    if not isinstance(distribution, Range) or _few_values(distribution, count) or distribution.low == distribution.high:
         options = distribution.options if isinstance(distribution, Choice) else distribution.grid(count)
         labels = tuple(str(option) for option in options)
         return labels, lambda value: options.index(value)
-    edges = [distribution.quantile(place / count) for place in range(count + 1)]
-    labels = tuple(f"{low:.4g} to {high:.4g}" for low, high in pairwise(edges))
-    return labels, lambda value: min(int(distribution.share_of(value) * count), count - 1)
+
+    def place(value: Any) -> int:
+        return min(int(distribution.share_of(value) * count), count - 1)
+
+    if _is_stepped(distribution):
+        return _labels(_ends_of_steps(distribution, count, place)), place
+    edges = [distribution.quantile(part / count) for part in range(count + 1)]
+    return _labels([*pairwise(edges)]), place
+
+
+def _ends_of_steps(distribution: Range, count: int, place: Callable[[Value], int]) -> list[tuple[Value, Value]]:
+    """Return the first and the last value of each bin of a distribution with separate values."""
+
+    def value_at(index: int) -> Value:
+        return distribution.quantile((index + 0.5) / distribution.steps)
+
+    firsts = [0]
+    for part in range(1, count):
+        first = math.ceil(part * distribution.steps / count - 0.5)
+        firsts.append(first if place(value_at(first)) == part else first + 1)  # a share at an edge may be rounded down
+    return [(value_at(first), value_at(after - 1)) for first, after in pairwise([*firsts, distribution.steps])]
+
+
+def _labels(ends: Sequence[tuple[Value, Value]]) -> tuple[str, ...]:
+    """Return a different text for each bin, given the ends of the bins."""
+    labels: list[str] = []
+    for digits in range(_LABEL_DIGITS, _MAX_DIGITS + 1):
+        texts = [[str(end) if isinstance(end, int) else f"{end:.{digits}g}" for end in both] for both in ends]
+        labels = [low if low == high else f"{low} to {high}" for low, high in texts]
+        is_exact = all((low == high) == (first == last) for (low, high), (first, last) in zip(texts, ends, strict=True))
+        if is_exact and len(set(labels)) == len(labels):
+            break
+    return tuple(labels)
 
 
 def _few_values(distribution: Range, count: int) -> bool:
-    stepped = distribution.step is not None or (distribution.integer and not distribution.log)
-    return stepped and distribution.steps <= count
+    return _is_stepped(distribution) and distribution.steps <= count
+
+
+def _is_stepped(distribution: Range) -> bool:
+    return distribution.step is not None or (distribution.integer and not distribution.log)
 
 
 def _parts(
