@@ -5,17 +5,22 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from columns import FEWER_COLUMNS
 
 from crashhunt.base.integrity import digest_of_data
+from crashhunt.base.temporary import this_process
 from crashhunt.crashes import export_crash, find_bundle
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import check
-from crashhunt.ledger import Ledger
+from crashhunt.hunts import check, salvage
+from crashhunt.hunts._check import intact_snapshots
+from crashhunt.hunts._state import ledger_owner
+from crashhunt.ledger import Ledger, Turn
 from crashhunt.trial import Outcome
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
@@ -250,3 +255,186 @@ def test_an_exported_crash_is_looked_at(hunt, tmp_path):
     found = found_in(file)
     assert not found.fine
     assert found.findings[0].lost == "the crash"
+
+
+def finding_of(found):
+    (finding,) = found.findings
+    return finding.where, finding.what, finding.lost, finding.damaged
+
+
+def test_ledger_without_digests_or_seal_is_no_damage(hunt):
+    file = str(hunt / "ledger.sqlite")
+    ledger = Ledger(hunt / "ledger.sqlite", writable=True)
+    ledger.note(state="running", owner=ledger_owner())
+    assert found_in(hunt).findings == []  # its writer is at work
+    ledger.note(owner=None)
+    where, what, lost, damaged = finding_of(found_in(hunt))
+    assert (where, lost, damaged) == (file, "", False)
+    assert what.startswith("its writer was killed")
+    ledger.close()
+    assert found_in(hunt).findings == []
+    execute(
+        hunt, "DELETE FROM hunt WHERE key IN ('seal', 'reader')", "DROP TABLE proposals", *FEWER_COLUMNS,
+        *(f"ALTER TABLE {table} DROP COLUMN digest" for table in ("trials", "replaced", "events", "hunt")),
+        "DROP INDEX IF EXISTS trials_with_events", "PRAGMA user_version = 1",
+    )  # fmt: skip
+    found = found_in(hunt)
+    where, what, lost, damaged = finding_of(found)
+    assert (found.protected, found.fine, found.trials) == (False, True, {0, 1, 2, 3})
+    assert (where, lost, damaged) == (file, "", False)
+    assert "its rows have no digests" in what
+
+
+def test_running_hunt_has_no_leftovers_and_misses_no_bundle(hunt):
+    (hunt / "crashes" / ".000001-collision.tmp").mkdir()
+    shutil.rmtree(hunt / "crashes" / CRASH)
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(state="running", owner=ledger_owner())
+    assert found_in(hunt).findings == []
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(owner=None)
+    assert len(found_in(hunt).findings) == 2
+
+
+def test_file_that_another_process_writes_is_no_leftover(hunt):
+    token = this_process().token
+    mine = hunt / "crashes" / f".000001-collision.{token}"
+    mine.mkdir()
+    assert found_in(hunt).findings == []
+    scratch = hunt / f".scratch-{token}"  # of a hunt, which does not run
+    scratch.mkdir()
+    assert finding_of(found_in(hunt))[0] == str(scratch)
+
+
+@pytest.mark.parametrize(("planned", "lost"), [(4, "trials 0, 1, 2, 3"), (9, "trials 0, 1, 2, 3, 4 and 3 more")])
+def test_damaged_trials_are_named_up_to_five(hunt, planned, lost):
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        was = ledger.result(1)
+        for number in range(4, planned - 1):
+            ledger.record(replace(was, spec=replace(was.spec, number=number)), snapshot="")
+    execute(hunt, "UPDATE trials SET seed = seed + 1")
+    found = found_in(hunt)
+    assert lost in {finding.lost for finding in found.findings}
+    assert found.damaged_trials == set(range(max(4, planned - 1)))  # whether they were planned or not
+    (hunt / "hunt.toml").unlink()
+    assert found_in(hunt).damaged_trials == found.damaged_trials
+
+
+def test_output_of_a_trial_that_has_changed_is_reported(hunt):
+    folder = hunt / "trials" / "000001"
+    folder.mkdir(parents=True)
+    (folder / "params.json").write_text(json.dumps({"files": {"run.log": {"size": 3, "blake2b": "0" * 32}}}))
+    where, what, lost, damaged = finding_of(found_in(hunt))
+    assert (where, lost, damaged) == (str(folder), "what the trial printed", True)
+    assert what.startswith("run.log ")
+
+
+def test_bundle_without_digests_is_no_damage(hunt):
+    file = hunt / "crashes" / CRASH / "crash.json"
+    data = json.loads(file.read_text())
+    early = {name: value for name, value in data.items() if name not in ("escape", "files", "integrity")}
+    file.write_text(json.dumps(early | {"schema": 1}))
+    found = found_in(hunt)
+    where, what, lost, damaged = finding_of(found)
+    assert (where, lost, damaged) == (str(file), "", False)
+    assert "without digests" in what
+    assert found.crashes == [CRASH, "000002-collision"]
+
+
+def test_file_that_was_added_to_a_snapshot_is_no_damage_and_many_changes_are_counted(hunt):
+    (snapshot,) = (hunt / "snapshots").iterdir()
+    (snapshot / "scenario" / "notes.txt").write_text("mine")
+    where, what, lost, damaged = finding_of(found_in(hunt))
+    assert (where, lost, damaged) == (str(snapshot), "", False)
+    assert what == "scenario/notes.txt was added; it is no module, so it never runs"
+    assert [one.path for one in intact_snapshots(hunt)] == [snapshot]
+    for number in range(7):
+        (snapshot / "scenario" / f"m{number}.py").touch()
+        found = [finding.what for finding in found_in(hunt).findings if finding.damaged]
+        assert found[:5] == [f"scenario/m{place}.py was not there" for place in range(min(5, number + 1))]
+        assert found[5:] == ([f"and {number - 4} more of its files"] if number > 4 else [])
+    assert list(intact_snapshots(hunt)) == []
+
+
+def test_minimized_crash_is_none_of_the_ledger(hunt):
+    small = hunt / "crashes" / f"{CRASH}.small"
+    shutil.copytree(hunt / "crashes" / CRASH, small)
+    signed(small / "crash.json", hunt_seed=9)
+    found = found_in(hunt)
+    assert found.findings == []
+    assert found.crashes == [CRASH, small.name, "000002-collision"]
+
+
+def test_export_without_a_crash_is_reported(hunt, tmp_path, monkeypatch):
+    shutil.rmtree(hunt / "crashes")
+
+    @contextmanager
+    def opened(path):
+        yield SimpleNamespace(directory=hunt)
+
+    monkeypatch.setattr("crashhunt.crashes.open_archive", opened)
+    file = tmp_path / "crash.zip"
+    file.touch()
+    where, what, lost, damaged = finding_of(found_in(file))
+    assert (where, what, lost, damaged) == (str(file), "there is no crash in it", "the crash", True)
+
+
+def test_hunt_without_settings_and_ledger_is_looked_at_by_its_files(hunt):
+    (hunt / "hunt.toml").unlink()
+    (hunt / "ledger.sqlite").unlink()
+    (hunt / "request.json").write_text("{}")
+    found = found_in(hunt)
+    assert [finding.what for finding in found.findings] == ["is missing"]
+    assert found.crashes == [CRASH, "000002-collision"]
+
+
+def test_only_a_hunt_can_be_salvaged(hunt, tmp_path):
+    with pytest.raises(HuntDirectoryError, match=r"has no part of a hunt that can be recovered; give the directory"):
+        salvage(found_in(hunt / "crashes" / CRASH), tmp_path / "to")
+    (hunt / "trials" / "000001").mkdir(parents=True)
+    (hunt / "trials" / "000001" / "run.log").write_text("printed")
+    (hunt / "request.json").write_text("{}")
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        ledger.propose([Turn((), ledger.result(1).spec)])
+    assert salvage(found_in(hunt), tmp_path / "to") == {"trials": 4, "crashes": 2}
+    assert (tmp_path / "to" / "trials" / "000001" / "run.log").read_text() == "printed"
+    assert (tmp_path / "to" / "request.json").read_text() == "{}"
+    with closing(Ledger(tmp_path / "to" / "ledger.sqlite")) as ledger:
+        assert [turn.spec.number for turn in ledger.turns()] == [1]
+        assert ledger.facts()["detail"] == f"what was whole of {hunt}"
+        assert (ledger.facts()["planned"], ledger.facts()["hunt_seed"]) == (4, 1)
+    text = (tmp_path / "to" / "hunt.toml").read_text()
+    assert f"check {hunt} --salvage {tmp_path / 'to'}" in text
+    # A second call does nothing, unless a hunt has resumed there or something is gone.
+    assert salvage(found_in(hunt), tmp_path / "to") == {"trials": 4, "crashes": 2}
+    with closing(Ledger(tmp_path / "to" / "ledger.sqlite", writable=True)) as ledger:
+        ledger.enter("all_trials")
+    with pytest.raises(HuntDirectoryError, match="the directory exists already"):
+        salvage(found_in(hunt), tmp_path / "to")
+
+
+@pytest.mark.parametrize("gone", ["hunt.toml", f"crashes/{CRASH}", "a trial"])
+def test_copy_that_lacks_something_is_no_copy(hunt, tmp_path, gone):
+    to = tmp_path / "to"
+    salvage(found_in(hunt), to)
+    if gone == "a trial":
+        with closing(Ledger(to / "ledger.sqlite", writable=True)) as ledger:
+            ledger.replace([3])
+    elif (to / gone).is_dir():
+        shutil.rmtree(to / gone)
+    else:
+        (to / gone).unlink()
+    with pytest.raises(HuntDirectoryError, match="the directory exists already"):
+        salvage(found_in(hunt), to)
+
+
+def test_salvage_takes_the_settings_of_a_snapshot_and_no_crash_without_its_bundle(hunt, tmp_path):
+    (hunt / "hunt.toml").write_text("nothing")
+    cut(hunt / "crashes" / CRASH / "log.mcap")
+    (tmp_path / "empty").mkdir()
+    assert salvage(found_in(hunt), tmp_path / "empty") == {"trials": 3, "crashes": 1}
+    with closing(Ledger(tmp_path / "empty" / "ledger.sqlite")) as ledger:
+        assert ledger.finished() == {1, 2, 3}
+    shutil.rmtree(hunt / "snapshots")
+    with pytest.raises(HuntDirectoryError):
+        salvage(found_in(hunt), tmp_path / "other")
