@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 from crashhunt.base import layout
 from crashhunt.base.errors import UntrustedError, UsageError
 from crashhunt.base.files import cannot_write
-from crashhunt.base.text import did_you_mean, one_of, visible
+from crashhunt.base.text import did_you_mean, one_line, one_of, visible
 from crashhunt.plans import hunt_options
 
 if TYPE_CHECKING:
@@ -287,7 +287,7 @@ def ask_to_trust(refusal: UntrustedError, *, as_json: bool) -> bool:
     """Ask whether the user trusts the code from now on; return False without a terminal."""
     if as_json or not (sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()):
         return False
-    print(visible(f"{refusal.where}: {refusal.message}"), file=sys.stderr)
+    print(one_line(f"{refusal.where}: {refusal.message}"), file=sys.stderr)  # an archive names its maker as it likes
     print("Trust this code from now on and run it? [y/N] ", end="", file=sys.stderr, flush=True)
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 

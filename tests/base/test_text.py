@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import sys
 import unicodedata
+from io import StringIO
 from types import SimpleNamespace
 
 import pytest
@@ -61,8 +63,6 @@ def test_an_agent_cannot_speak_to_the_terminal(toy):
 
 
 def test_the_screen_shows_what_is_there():
-    from io import StringIO
-
     from rich.console import Console
 
     from crashhunt.cli._status import show_states
@@ -78,23 +78,41 @@ def test_the_screen_shows_what_is_there():
     assert Watcher(console, HOSTILE)
 
 
-def test_who_made_it_is_asked_in_one_line(tmp_path, capsys, monkeypatch):
-    from crashhunt.cli import _replay, main
-    from crashhunt.crashes import Archive
+def untrusted(folder):
+    """The refusal of a crash in an archive, whose index says what it likes about who made it."""
+    from crashhunt.crashes import refuse_untrusted
 
-    archive = Archive(tmp_path, HOSTILE, f"{HOSTILE}\nTrust it: yes", made_here=False)
+    bundle = SimpleNamespace(hunt=folder, path=folder, snapshot="none", authentication_code="")
+    return refuse_untrusted(bundle, where=str(folder / HOSTILE), made_by=f"{HOSTILE}\nTrust it: yes")
+
+
+def test_refusal_reports_in_one_line_who_made_an_archive(tmp_path, capsys, monkeypatch):
+    from crashhunt.cli import _replay, main
 
     def refuse(*_: object) -> None:
-        raise _replay._refuse(archive, bundle, tmp_path / HOSTILE)
+        raise untrusted(tmp_path)
 
-    bundle = SimpleNamespace(hunt=tmp_path)
-    monkeypatch.setattr("crashhunt.plans.read_settings", lambda _: SimpleNamespace(agents={}))
     monkeypatch.setattr(_replay, "opened_crash", refuse)
     with pytest.raises(SystemExit):
         main(["replay", "x.zip"])
     said = capsys.readouterr().err
     assert said.count("\n") == 1
+    assert "Trust it: yes made it, and this would run its code" in said
     assert not obeyed(said)
+
+
+def test_question_of_trust_has_one_line_for_who_made_an_archive(tmp_path, monkeypatch):
+    from crashhunt.cli import _common
+
+    terminal = StringIO()
+    terminal.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: True, readline=lambda: "n\n"))
+    assert not _common.ask_to_trust(untrusted(tmp_path), as_json=False)
+    described, question = terminal.getvalue().splitlines()
+    assert "Trust it: yes made it, and this would run its code" in described
+    assert question == "Trust this code from now on and run it? [y/N] "
+    assert not obeyed(described)
 
 
 def test_trials_are_a_share_of_the_planned_ones_only_where_they_are_fewer():
