@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import warnings
+from collections.abc import Mapping
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,7 @@ from crashhunt.simulators._pettingzoo import OneLearner, is_parallel, takes_turn
 from crashhunt.world import Contact, Roster, Scene
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 __all__ = ["GymSimulator"]
 
 _NO_ACTORS = Roster(())
+_RESET_PARTS = ("observation", "info")
+_STEP_PARTS = ("observation", "reward", "terminated", "truncated", "info")
 _CRASH_KIND_KEY = "crash_kind"
 _MAX_KIND_CHARACTERS = 80
 _CONSTRUCTOR, _RESET, _STEP, _REWARD, _INFO, _CLOSE = (
@@ -91,7 +94,7 @@ class GymSimulator:
         try:
             self._adopt(self._make((options or {}).get("arguments", {})))
             with _RESET:
-                observation, info = self._env.reset(seed=seed)
+                observation, info = _parts("reset", self._env.reset(seed=seed), _RESET_PARTS)
         except ForeignError as error:
             raise InvalidEpisodeError(f"the environment could not be set up: {in_words(error.error)}") from error.error
         self.agents = [self._agent]
@@ -112,7 +115,7 @@ class GymSimulator:
         """Run one step of the environment."""
         action = native(self.actions[self._agent], actions[self._agent])
         with _STEP:
-            observation, reward, ended, cut, info = self._env.step(action)
+            observation, reward, ended, cut, info = _parts("step", self._env.step(action), _STEP_PARTS)
         with _REWARD:  # these may be objects of any class
             reward, terminated, truncated = float(reward), bool(ended), bool(cut)
         self._steps += 1
@@ -255,6 +258,20 @@ class GymSimulator:
                 ),
             )
         self._scene = Scene(self._steps * self.step_length_s, _NO_ACTORS, [], [], [], contacts)
+
+
+def _parts(method: str, returned: Any, wanted: tuple[str, ...]) -> Sequence[Any]:
+    """Return what a method of an environment has returned, after a check that it is what Gymnasium defines.
+
+    Raises:
+        TypeError: the environment has the interface of the old gym, or its info is not a dictionary.
+    """
+    if not isinstance(returned, tuple | list) or len(returned) != len(wanted):
+        what = f"{len(returned)} values" if isinstance(returned, tuple | list) else f"one {type(returned).__name__}"
+        raise TypeError(f"{method}() returned {what}, but {method}() of Gymnasium returns {', '.join(wanted)}")
+    if method == "step" and not isinstance(returned[-1], Mapping):
+        raise TypeError(f"step() returned info = {returned[-1]!r:.80}, which is not a dictionary")
+    return returned
 
 
 class _Rule:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from crashhunt.base.boundaries import ForeignError
 from crashhunt.episode import Nearness
 from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.oracles import ReportedCollision
@@ -177,6 +178,34 @@ def test_a_dotted_option_is_an_entry_of_a_table_and_the_rest_of_it_stays(tmp_pat
     assert config == {"friction": {"of": 0.1, "type": "dry"}}
     with pytest.raises(InvalidEpisodeError, match="friction is"):
         simulator.reset(seed=1, options={"arguments": {"wet": -1.0}})
+
+
+class OldTray(Tray):
+    """Has the interface of the gym before Gymnasium."""
+
+    returned = (np.zeros(2), 0.0, False, {})
+
+    def reset(self, *, seed=None, options=None):
+        given = super().reset(seed=seed)
+        return given if self.size > 1 else np.zeros(2)
+
+    def step(self, action):
+        return self.returned if self.size > 2 else (np.zeros(2), 0.0, False, False, None)
+
+
+@pytest.mark.parametrize(
+    ("size", "says"),
+    [
+        (3.0, "step() returned 4 values, but step() of Gymnasium returns observation, reward, terminated, truncated"),
+        (2.0, "step() returned info = None, which is not a dictionary"),
+        (1.0, "reset() returned one ndarray, but reset() of Gymnasium returns observation, info"),
+    ],
+)
+def test_error_of_an_old_gym_environment_states_what_gymnasium_returns(tmp_path, size, says):
+    simulator = simulator_of(tmp_path, f"{__name__}:OldTray", size=size)
+    with pytest.raises((ForeignError, InvalidEpisodeError)) as caught:
+        fall(simulator, steps=1)
+    assert says in str(getattr(caught.value, "error", caught.value))
 
 
 def test_a_flattened_action_has_the_type_of_its_space_or_is_refused(tmp_path):

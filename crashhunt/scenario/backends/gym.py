@@ -72,8 +72,8 @@ def _check(scenario: Scenario, where: str) -> None:
         message = f"agents = {sorted(scenario.agents)!r} are several agents, but a Gymnasium environment has one"
         raise ScenarioError(message, fix="keep one agent", where=where)
     if scenario.observation is not None:
-        message = "observation = '' cannot be used with a Gymnasium environment, which defines its own observations"
-        raise ScenarioError(message, fix="remove the key observation", where=where)
+        message = "the table [observation] cannot be used with a Gymnasium environment, which defines its observations"
+        raise ScenarioError(message, fix="remove the table", where=where)
 
     danger = scenario.table(GymSetup).danger
     if danger and not re.fullmatch(r"-?info\..+", danger):
