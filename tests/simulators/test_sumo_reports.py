@@ -587,6 +587,7 @@ def test_survey_ends_600_s_after_the_first_road_vehicle(survey):
     assert found["entries"] == [("v", 13.0, "passenger", False)]
     assert (found["begin_s"], found["end_s"], found["steps"]) == (10.0, 615.0, 605)
     assert (found["gridlock"], found["cut_short"], found["out_of_time"]) == (None, False, False)
+    survey.expected = 0
     survey.run()
     assert survey.calls == [("start", ["sumo", 7, {"scale": 1.0}]), ("load", [7, {"scale": 1.0}])]
 
