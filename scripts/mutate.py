@@ -260,6 +260,7 @@ _TESTS_ELSEWHERE = {
         "simulators/test_actions.py",
         "simulators/test_any_space.py",
         "simulators/test_gym.py",
+        "simulators/test_gym_parts.py",
     ),
     "simulators/_kinematics_observation.py": (
         "simulators/test_kinematics.py",
