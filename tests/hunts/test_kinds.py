@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from contextlib import closing
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
@@ -21,8 +23,9 @@ from crashhunt.crashes import (
     join_causes,
 )
 from crashhunt.hunts import _crashes
-from crashhunt.hunts._crashes import Judged, Kinds
+from crashhunt.hunts._crashes import Judged, Kinds, dropped_crashes, find_crashes, prune_bundles
 from crashhunt.hunts._reports import kind_data
+from crashhunt.ledger import Ledger
 from crashhunt.plans import RunSettings
 from crashhunt.trial import Collision, Failure, Outcome, TrialResult, TrialSpec
 
@@ -328,3 +331,132 @@ def test_software_faults_need_no_runs_for_their_cause():
 def test_impossible_options_are_refused(options, words):
     with pytest.raises(UsageError, match=words):
         RunSettings(**options).checked()
+
+
+# Bundles that are deleted, and crashes that are shown.
+
+
+@dataclass
+class Saved:
+    """In place of a bundle."""
+
+    id: str
+    path: object
+    steps: int = 5
+
+    @property
+    def result(self):
+        number = int(self.id.partition("-")[0])
+        return SimpleNamespace(spec=SimpleNamespace(number=number), steps=self.steps)
+
+
+def test_deleted_bundles_are_noted_before_they_are_removed(tmp_path, monkeypatch):
+    calls, asked = [], []
+    crashes = [Saved(f"{number:06d}-collision", tmp_path / str(number)) for number in range(4)]
+    kinds = SimpleNamespace(
+        drop_excess=lambda keep, *, final: asked.append((keep, final)) or [crashes[2], crashes[0]],
+        dropped={"a": [2, 0]}, dropped_at_fault=[2],
+    )  # fmt: skip
+    monkeypatch.setattr(_crashes, "remove_at_once", lambda path: calls.append(path.name))
+    ledger = SimpleNamespace(note=lambda **facts: calls.append(facts))
+    assert prune_bundles(ledger, kinds, crashes, 3) == [crashes[1], crashes[3]]
+    assert calls == [{"dropped": {"a": [2, 0]}, "dropped_at_fault": [2]}, "2", "0"]
+    assert asked == [(3, False)]
+    calls.clear()
+    kinds.drop_excess = lambda keep, *, final: asked.append((keep, final)) or []
+    assert prune_bundles(ledger, kinds, crashes, 3, final=True) is crashes
+    assert asked[-1] == (3, True)
+    assert prune_bundles(ledger, kinds, crashes, 0) is prune_bundles(ledger, None, crashes, 3) is crashes
+    assert (calls, len(asked)) == ([], 2)
+
+
+def test_deleted_bundles_of_several_hunts_are_added_up(tmp_path):
+    for name, dropped in (("a", {"x": [1, 2], "y": [3]}), ("b", {"x": [4]}), ("c", None)):
+        (tmp_path / name).mkdir()
+        with closing(Ledger(tmp_path / name / "ledger.sqlite", writable=True)) as ledger:
+            ledger.note(dropped=dropped)
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "ledger.sqlite").write_bytes(b"no database" * 99)
+    hunts = [tmp_path / name for name in ("a", "nowhere", "d", "b", "c")]
+    assert dropped_crashes(hunts) == {"x": 3, "y": 1}
+
+
+@pytest.fixture
+def saved(tmp_path, monkeypatch):
+    """A hunt with bundles of five crashes; trial 4 is the shortest, and 3 and 9 are of a type of their own."""
+    steps, read = {1: 50, 2: 40, 3: 90, 4: 10, 9: 90}, []
+    for number in steps:
+        (tmp_path / "crashes" / f"{number:06d}-collision").mkdir(parents=True)
+
+    def bundle(folder):
+        read.append(folder.name)
+        return Saved(folder.name, folder, steps[int(folder.name.partition("-")[0])])
+
+    folders = sorted((tmp_path / "crashes").iterdir())
+    monkeypatch.setattr(_crashes, "read_bundle", bundle)
+    monkeypatch.setattr(_crashes, "list_bundles", lambda directory: list(map(bundle, folders)))
+
+    def grouped(bundles, dropped, *, faults):
+        assert faults is False
+        groups = {}
+        for one in bundles:
+            groups.setdefault("own" if one.steps == 90 else "rear-end", []).append(one)
+        found = []
+        for name, ones in groups.items():
+            shortest, count = min(ones, key=lambda one: one.steps), len(ones) + dropped.get(name, 0)
+            found.append(SimpleNamespace(signature=name, count=count, shortest=shortest))
+        return SimpleNamespace(groups=found)
+
+    monkeypatch.setattr(_crashes, "group_crashes", grouped)
+    return SimpleNamespace(path=tmp_path, read=read, steps=steps)
+
+
+def numbers(found):
+    return [bundle.result.spec.number for bundle in found.shown]
+
+
+def test_crashes_without_a_ledger_are_those_with_a_bundle(saved):
+    found = find_crashes(saved.path, 3)
+    assert (found.tally.found, found.saved, found.untyped) == (5, 5, 0)
+    assert list(found.types.items()) == [("rear-end", 3), ("own", 2)]
+    assert found.shortest == {"rear-end": "000004-collision", "own": "000003-collision"}
+    assert numbers(found) == [4, 2, 3]  # one of each type, then the shortest
+    assert numbers(find_crashes(saved.path, 1)) == [4]
+    assert numbers(find_crashes(saved.path, 9)) == [4, 2, 1, 3, 9]
+    assert numbers(find_crashes(saved.path, 0)) == []
+
+
+def test_crashes_of_a_hunt_are_those_of_its_ledger(saved):
+    kinds = [
+        {"words": "rear-end", "count": 5, "first": "000001-collision", "shortest": "000004-collision"},
+        {"words": "own", "count": 3, "first": "000003-collision", "shortest": "000009-collision"},
+    ]
+    with closing(Ledger(saved.path / "ledger.sqlite", writable=True)) as ledger:
+        for number, steps in {**saved.steps, 5: 70, 6: 80}.items():
+            spec = TrialSpec(number, 1, {}, {}, 99)
+            ledger.record(TrialResult(spec, Outcome.COLLISION, steps=steps), snapshot="")
+        ledger.record(TrialResult(TrialSpec(7, 1, {}, {}, 99), Outcome.SURVIVED, steps=1), snapshot="")
+        ledger.note(crash_on=["collision"], dropped={"rear-end": [5, 6], "gone": [8]}, kinds=kinds)
+        ledger.note(kinds_version=_crashes.SIGNATURE_VERSION)
+    found = find_crashes(saved.path, 2)
+    assert (found.tally.found, found.saved, found.untyped) == (8, 5, 0)  # a bundle is written before its row
+    assert found.types == {"rear-end": 5, "own": 3}
+    assert numbers(found) == [4, 9]
+    assert sorted(saved.read) == ["000004-collision", "000009-collision"]
+    assert numbers(find_crashes(saved.path, 4)) == [4, 2, 1, 9]
+    with closing(Ledger(saved.path / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(kinds=[kinds[0]])  # not all of them: the logs are read
+    found = find_crashes(saved.path, 2)
+    assert (found.types, found.untyped) == ({"rear-end": 5, "own": 2, "gone": 1}, 0)
+    assert found.shortest["own"] == "000003-collision"
+    with closing(Ledger(saved.path / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(kinds=kinds, kinds_version=_crashes.SIGNATURE_VERSION + 1)
+    assert find_crashes(saved.path, 2).types == {"rear-end": 5, "own": 2, "gone": 1}
+
+
+def test_outcomes_that_count_are_noted_or_in_the_settings(tmp_path):
+    assert _crashes.outcomes_of_crashes(tmp_path, {"crash_on": ["hang"]}) == ["hang"]
+    assert _crashes.outcomes_of_crashes(tmp_path, {"crash_on": []}) == []
+    assert _crashes.outcomes_of_crashes(tmp_path, {}) is None
+    assert _crashes._number("000012-collision") == 12
+    assert _crashes._number("mine") == -1
