@@ -7,8 +7,20 @@ import json
 from dataclasses import replace
 
 from crashhunt.hunts import FACTS, TrialRow
-from crashhunt.hunts._results import BRANCHES, STRESS
-from crashhunt.trial import EVENTS, Branches, Collision, Escape, Failure, Outcome, Stress, TrialResult, TrialSpec
+from crashhunt.hunts._results import BRANCHES, DISTURBANCES, ORIGINS, STRESS
+from crashhunt.trial import (
+    EVENTS,
+    Branch,
+    Branches,
+    Collision,
+    Disturbance,
+    Escape,
+    Failure,
+    Outcome,
+    Stress,
+    TrialResult,
+    TrialSpec,
+)
 from crashhunt.world import ClosestApproach, Event
 
 SPEC = TrialSpec(3, 7, {"ego": {"speed": 11.5}}, {"gap_m": 4}, max_steps=100, parent=1, origin="climb")
@@ -91,3 +103,44 @@ def test_margin_that_is_not_fully_asked_is_empty_and_what_was_asked_stands_next_
     assert TrialRow(before).cells(STRESS) == {
         "stress_margin": 0.5, "stress_asked": None, "stress_margin_upper_bound": None,
     }  # fmt: skip
+
+
+def test_columns_of_a_table_keep_their_order():
+    assert FACTS[:11] == (
+        "number", "seed", "outcome", "steps", "sim_time_s", "danger", "time_to_collision_s", "gap_m",
+        "required_deceleration", "wall_s", "digest",
+    )  # fmt: skip
+    assert FACTS[11:] == tuple(map(str, EVENTS))
+    assert (*DISTURBANCES, *STRESS, *BRANCHES, *ORIGINS) == (
+        "disturbances", "log_likelihood", "stress_margin", "stress_asked", "stress_margin_upper_bound", "branches",
+        "branch_crashes", "branches_asked", "parent", "origin",
+    )  # fmt: skip
+
+
+def test_row_of_a_trial_with_disturbances_counts_them():
+    erring = (Disturbance(2, "ahead", "brake", 4.0, 2.0, "ego"),) * 2
+    row = TrialRow(replace(RESULT, disturbances=erring, log_likelihood=-3.5).to_json())
+    assert row.cells(DISTURBANCES) == {"disturbances": 2, "log_likelihood": -3.5}
+    crashes = (Branch((), 1, "collision", 5, -2.0),) * 3
+    assert (
+        TrialRow(replace(RESULT, branches=Branches(crashes=crashes)).to_json()).cells(BRANCHES)["branch_crashes"] == 3
+    )
+    early = TrialRow({"spec": {"number": 3, "seed": 7}, "outcome": "survived", "steps": 9, "branches": {"asked": 4}})
+    assert early.cells((*DISTURBANCES, *BRANCHES[:2])) == {
+        "disturbances": 0, "log_likelihood": None, "branches": 4, "branch_crashes": 0,
+    }  # fmt: skip
+    assert early.origin == ""
+    assert TrialRow(RESULT.to_json()).origin == "climb"
+
+
+def test_row_knows_whether_all_forks_of_its_trial_have_a_result():
+    def fully(stress, branches):
+        return TrialRow(replace(RESULT, stress=stress, branches=branches).to_json()).is_fully_asked
+
+    half, whole = Stress(None, moments=9, moments_asked=1), Stress(0.5)
+    some, every = Branches(asked=1, unanswered=1), Branches(asked=2)
+    assert fully(None, None) is fully(whole, every) is True
+    assert [fully(*one) for one in ((half, None), (None, some), (half, every), (whole, some))] == [False] * 4
+    assert TrialRow(replace(RESULT, stress=half).to_json()).stress_margin is None
+    assert TrialRow(replace(RESULT, stress=whole).to_json()).stress_margin == 0.5
+    assert TrialRow(RESULT.to_json()).stress_margin is None
