@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from crashhunt.base import layout
-from crashhunt.errors import ArgumentError
+from crashhunt.errors import ArgumentError, UsageError
+from crashhunt.executors import EXCLUDED_WORDS
 from crashhunt.hunts import Preflight
+from crashhunt.hunts._preflight import WorkerNotices, why_invalid
 from crashhunt.plans import Request, plan
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
@@ -76,3 +79,96 @@ def test_as_soon_as_one_is_otherwise_all_are_accounted_for(other):
 def test_where_an_argument_varies_another_value_may_do():
     preflight = Preflight(settings_of(speed="5:15"), 20)
     assert preflight.filter_setup_failures(result(0)) == [result(0)]
+
+
+class Says:
+    """An executor with notices."""
+
+    def __init__(self, *notes):
+        self.said = list(notes)
+
+    def notes(self):
+        found, self.said = self.said, []
+        return found
+
+
+def asking(**options):
+    agents = {name: SimpleNamespace(agent=agent) for name, agent in (("ego", "my:A"), ("b", "my:B"), ("c", "my:A"))}
+    return SimpleNamespace(**{"probe": "", "branch": False, "rare": False, "agents": agents} | options)
+
+
+@pytest.mark.parametrize("what", ["probes", "branches", "rare"])
+def test_hunt_whose_trials_cannot_be_forked_is_refused_before_its_first_result(what):
+    note = f"{what}{EXCLUDED_WORDS}it has threads"
+    heard = WorkerNotices(asking(probe="4s", branch=True), {})
+    with pytest.raises(UsageError) as caught:
+        heard.take(Says("slow", note))
+    assert caught.value.message == "--probe and --branch: trials with my:A, my:B cannot be copied: it has threads"
+    assert caught.value.fix == "correct my:A, my:B, or omit --probe and --branch"
+    with pytest.raises(UsageError, match=r"^--rare: trials with"):
+        WorkerNotices(asking(rare=True), {"survived": 0}).hear(Says(note))
+    later = WorkerNotices(asking(rare=True), {"survived": 1})  # then the hunt continues without forks
+    assert later.take(Says(note)) == [note]
+
+
+def test_notices_are_returned_once_and_in_order():
+    heard = WorkerNotices(asking(), {})
+    heard.hear(Says("a", f"logs{EXCLUDED_WORDS}there is no room"))
+    assert heard.take(Says("b", "probes are slow")) == [
+        "a", f"logs{EXCLUDED_WORDS}there is no room", "b", "probes are slow",
+    ]  # fmt: skip
+    assert heard.take(Says()) == []
+
+
+def test_first_result_is_counted_after_the_notices_were_read():
+    heard = []
+    preflight = Preflight(settings_of(speed="15"), 20, listen=lambda: heard.append(1))
+    assert preflight.filter_setup_failures(result(0)) == []
+    assert heard == []
+    for number in (1, 2):
+        preflight.filter_setup_failures(result(number, outcome=Outcome.SURVIVED))
+    assert heard == [1]
+    assert preflight.filter_setup_failures(result(3)) == [result(3)]  # nothing is held back any more
+    varied = Preflight(settings_of(speed="15:16"), 1)
+    assert varied.filter_setup_failures(result(0)) == [result(0)]
+
+
+def test_refusal_names_arguments_that_are_texts_and_what_to_install():
+    def refused(message, arguments, kind="ValueError"):
+        failed = result(0, message, kind=kind)
+        failed = replace(failed, spec=replace(failed.spec, arguments={"ego": arguments}))
+        with pytest.raises(ArgumentError) as caught:
+            Preflight(settings_of(speed="15"), 1).filter_setup_failures(failed)
+        return caught.value
+
+    assert refused("no", {"speed": 15.0, "policy": "p.zip", "mode": "fast"}).fix == (
+        "correct --arg policy=p.zip, --arg mode=fast"
+    )
+    assert refused("no", {"speed": 15.0}).fix == "correct the agent"
+    assert refused("it needs torch: pip install torch", {}).fix == "install the package"
+    assert refused("no", {}, kind="KeyError").where == "/s/code/my.py:7"
+    assert refused("no", {}).where == "agent ego"
+    assert refused("no", {}, kind="invalid").message.endswith("does not start: no")
+
+
+def test_reason_of_an_invalid_trial_is_that_of_the_simulator_or_its_last_line():
+    told = []
+
+    def explained(summary, output, scenario):
+        told.append((summary, output, scenario))
+        return answer
+
+    scenario = SimpleNamespace(backend=SimpleNamespace(explained=explained))
+    answer = ValueError("no edge")
+    failure = Failure("SimulatorError", "it failed", last_output="Error: no edge\n \nWarning: slow\n")
+    failed = TrialResult(TrialSpec(1, 1, {}, {}, 9), Outcome.INVALID, failure=failure)
+    assert why_invalid(failed, scenario) == "no edge"
+    assert told == [(failed.summary, failure.last_output, scenario)]
+    answer = None
+    assert why_invalid(failed, scenario) == f"{failed.summary}\n  last output: Error: no edge"
+    plain = SimpleNamespace(backend=SimpleNamespace(explained=None))
+    assert why_invalid(failed, plain) == f"{failed.summary}\n  last output: Error: no edge"
+    silent = replace(failed, failure=replace(failure, last_output="Warning: slow"))
+    assert why_invalid(silent, plain) == silent.summary
+    assert why_invalid(replace(failed, failure=None), scenario) == replace(failed, failure=None).summary
+    assert len(told) == 2
