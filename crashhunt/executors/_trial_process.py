@@ -10,14 +10,17 @@ import os
 import signal
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, NoReturn, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, RecorderError
+from crashhunt.base.exceptions import is_users
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.shared_state import SharedState
 from crashhunt.base.signals import block_signals
@@ -52,7 +55,7 @@ from crashhunt.simulators import (
 from crashhunt.trial import Outcome, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from crashhunt.agents import Agent
     from crashhunt.base.codec import JsonObject
@@ -66,6 +69,7 @@ __all__ = ["EXCLUDED_WORDS", "Job", "TrialProcess", "loaded"]
 EXCLUDED_WORDS = " are left out: "
 """Text of a notice between "probes" or "branches" and the reason why they are disabled."""
 _EXCLUDED_FROM_HERE_WORDS = " are left out from here on: "
+_INSTALLED = frozenset(("site-packages", "dist-packages"))  # names of folders; a version identifies what they contain
 
 # Bound here, before any agent is imported that could replace them.
 _dumps, _leave, _open, _dup2, _close = json.dumps, os._exit, os.open, os.dup2, os.close
@@ -107,6 +111,8 @@ class TrialProcess:
         self._shared: SharedState | None = None
         self._home = Path.cwd()
         self._notices: list[str] = []
+        self._modules = frozenset(sys.modules)
+        self._modules = frozenset(sys.modules)
         self._reference: ReferenceDriver | None = None
         self._fork_runners: tuple[ForkRunner, ...] = ()  # of copies of the trial
         # Line by line, so that what a dying process printed last is in the file.
@@ -256,6 +262,8 @@ class TrialProcess:
         del data["spec"]  # which the supervisor knows
         report: Report = {"result": data, "notices": self._notices}
         report["notices"] += simulator.notices if supports(simulator, ReportsNotices) else ()
+        report["notices"] += notices_of_late_imports(self._modules, settings.code)
+        report["notices"] += notices_of_late_imports(self._modules, settings.code)
         kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
         kept = kept or settings.is_audited(result)
         wants_map = (kept or job["wants_map"]) and result.outcome is not Outcome.INVALID
@@ -318,6 +326,32 @@ class TrialProcess:
             made = overruled_agent(made, simulator, spec.overruled)
             self._reference = made if isinstance(made, ReferenceDriver) else None
         return made
+
+
+def notices_of_late_imports(before: frozenset[str], code: Sequence[str]) -> list[str]:
+    """Return a notice for each module that a trial has imported from a user's folder and not from the snapshot.
+
+    A snapshot contains the modules that are imported with an agent. If an agent imports a module only while it drives,
+    a replay would run today's code of this module.
+
+    Args:
+        before: names of the modules that were imported before the trial.
+        code: folders of the snapshot; empty if the hunt has no snapshot, so there are no notices.
+    """
+    found = []
+    with suppress(Exception):  # the code of a trial may have put anything into `sys.modules`
+        for name in sorted(sys.modules.keys() - before) if code else ():
+            file = getattr(sys.modules[name], "__file__", None)
+            if "." in name or not isinstance(file, str) or not is_users(file):
+                continue
+            path = Path(file).resolve()
+            if _INSTALLED.isdisjoint(path.parts) and not any(path.is_relative_to(folder) for folder in code):
+                folder = path.parent.parent if path.stem == "__init__" else path.parent
+                found.append(
+                    f"the module {name!r} is not in the snapshot, because it is imported only during a trial: replays "
+                    f"run its code of today; add --snapshot-root {quote(str(folder))}"
+                )
+    return found
 
 
 def loaded(settings: WorkerSettings, report: Callable[[str], None] = lambda _: None) -> Parts:

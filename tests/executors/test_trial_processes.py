@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -14,7 +15,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import _trial_process
-from crashhunt.executors._trial_process import TrialProcess
+from crashhunt.executors._trial_process import TrialProcess, notices_of_late_imports
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.simulators import FullBraking
 from crashhunt.trial import Collision, Failure, Outcome, TrialResult, TrialSpec
@@ -58,6 +59,7 @@ def process(tmp_path, monkeypatch):
         found._settings, found._notices, found._reference, found._fork_runners = settings, ["a notice"], None, ()
         found._box, found._pid, found._has_begun, found._shared = None, 0, False, None
         found._simulator = found._parts = None
+        found._modules = frozenset(sys.modules)
         found._home = tmp_path
         return found
 
@@ -382,3 +384,16 @@ def test_output_of_a_trial_is_in_its_folder(process, monkeypatch, tmp_path):
     assert (folder / layout.RUN_LOG).read_text() == "before"
     assert (folder / layout.STACK).stat().st_mode & 0o777 == 0o644
     assert handled == [found._stack, (signal.SIGUSR1, found._stack)]
+
+
+def test_module_that_only_a_trial_imports_from_outside_of_the_snapshot_is_reported(tmp_path, monkeypatch):
+    code, mine, installed = tmp_path / "code", tmp_path / "my code", tmp_path / "site-packages"
+    before = frozenset(sys.modules)
+    places = {"kept": code / "kept.py", "late": mine / "late.py", "big": mine / "big" / "__init__.py"}
+    for name, file in {**places, "lib": installed / "lib.py", "big.part": mine / "big" / "part.py"}.items():
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(__file__=str(file)))
+    monkeypatch.setitem(sys.modules, "built_in", SimpleNamespace())
+    found = notices_of_late_imports(before, (str(code),))
+    assert [notice.split("'")[1] for notice in found] == ["big", "late"]
+    assert all(notice.endswith(f"add --snapshot-root '{mine}'") for notice in found)
+    assert notices_of_late_imports(before, ()) == []  # without a snapshot
