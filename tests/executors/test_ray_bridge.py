@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 import zlib
+from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
@@ -180,6 +181,27 @@ def test_a_node_gets_ready_and_runs_what_is_submitted(begin):
     assert [list(message["where"]) for message in told if "where" in message] == [["0"]]
     cluster.news(cluster.actors[0], ended(1))
     assert not [message for message in after() if "result" in message], "it has come back already"
+
+
+def test_nodes_are_looked_for_once_a_second(begin, clock):
+    _, cluster, after = begin(a=1)
+    looks, nodes = [], cluster.nodes
+    cluster.nodes = lambda: looks.append(clock.now) or nodes()
+    after(3)
+    assert len(looks) == 3
+    assert [later - earlier for earlier, later in pairwise(looks)] == pytest.approx([1.01, 1.01])
+
+
+def test_turn_without_nodes_waits_half_as_long_as_for_an_answer(begin, clock):
+    bridge, cluster, _ = begin()
+    slept = []
+    clock.sleep = slept.append
+    bridge.turn(0.5)
+    assert slept == [0.25]
+    cluster.cpus["a"] = 1
+    clock.now += 1.01
+    bridge.turn(0)
+    assert slept == [0.25]
 
 
 def test_what_is_kept_is_written_before_the_hunt_hears_of_it(begin, tmp_path):

@@ -71,6 +71,19 @@ def test_vehicle_is_drawn_from_those_amid_traffic():
     assert drawn(*every, ("ego", 990)).agent == "crashhunt.ego"
 
 
+def test_vehicles_of_all_times_are_drawn_where_that_gives_more_of_them():
+    def drawn(*given, **more):
+        return draw_among(departures(*given), **more)
+
+    unnamed = [("a|b", 0), ("c", 320), ("d", 330), ("e|f", 900)]  # names with a bar cannot be drawn
+    found = drawn(*unnamed, few=3)
+    assert (found.arguments["vehicle"].range, found.setup.depart_s) == ("c|d", 330.0)
+    assert "entering at 320-330 s" in found.note
+    assert drawn(*unnamed, ("g", 950), few=3).setup.depart_s == 950.0
+    assert drawn(("a", 0), ("x|y", 320), ("d", 600)).agent == "a"  # one is enough
+    assert drawn(("a", 0), ("x|y", 320), ("d", 600), few=2).arguments["vehicle"].range == "a|d"
+
+
 def test_of_many_vehicles_some_are_drawn_evenly():
     found = draw_among(departures(*((f"v{number}", 200 + number / 10) for number in range(1000))))
     names = found.arguments["vehicle"].range.split("|")
