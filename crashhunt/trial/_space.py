@@ -24,7 +24,7 @@ from crashhunt.base.errors import ArgumentError
 from crashhunt.base.text import one_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     import numpy as np
 
@@ -510,7 +510,7 @@ def _annotation(parameter: inspect.Parameter, names: dict[str, object]) -> objec
 def _argument(parameter: inspect.Parameter, hint: object) -> Argument:
     declared = _declaration_in(hint)
     own = parameter.default
-    kinds = _kinds_of(hint) or ({kind_of(own)} if isinstance(own, bool | int | float | str) else set())
+    kinds = list(_kinds_of(hint)) or ([kind_of(own)] if isinstance(own, bool | int | float | str) else [])
     # Text cannot represent the member of an enumeration or an infinite number, so the factory keeps such a default.
     default = own if type(own) in (bool, int, str) or (type(own) is float and math.isfinite(own)) else None
     argument = Argument(parameter.name, _joint_kind(kinds), default)
@@ -529,19 +529,20 @@ def _declaration_in(hint: object) -> Argument | None:
     return None
 
 
-def _kinds_of(hint: object) -> set[Kind]:
-    """Return the types of values that an annotation allows and that can be written as text."""
+def _kinds_of(hint: object) -> dict[Kind, None]:
+    """Return the types of values, in order, that an annotation allows and that can be written as text."""
     if typing.get_origin(hint) is typing.Annotated:
         return _kinds_of(typing.get_args(hint)[0])
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
-        return {kind for part in typing.get_args(hint) for kind in _kinds_of(part)}
+        return {kind: None for part in typing.get_args(hint) for kind in _kinds_of(part)}
     if typing.get_origin(hint) is Literal:
-        return {kind_of(value) for value in typing.get_args(hint) if isinstance(value, bool | int | str)}
-    return {kind for known, kind in _KINDS.items() if hint is known}
+        return {kind_of(value): None for value in typing.get_args(hint) if isinstance(value, bool | int | str)}
+    return {kind: None for known, kind in _KINDS.items() if hint is known}
 
 
-def _joint_kind(kinds: set[Kind]) -> Kind | None:
+def _joint_kind(kinds: Sequence[Kind]) -> Kind | None:
     """Return the type of an argument that allows several types; None if each text determines its type."""
-    if "float" in kinds:  # an integer is also a float
-        return "float" if kinds <= {"float", "int", "str"} else None
-    return next(iter(kinds)) if len(kinds) == 1 else None
+    if len(kinds) > 1 and ("float" not in kinds or not {*kinds} <= {"float", "int", "str"} or kinds[0] == "str"):
+        return None
+    # An integer is also a float. Of `float | str`, numbers are the rule, and a range such as 5:40 has no whole numbers.
+    return "float" if "float" in kinds else next(iter(kinds), None)

@@ -276,6 +276,8 @@ Gap = Annotated[float, Argument("gap", distribution=Range(5.0, 9.0))]
 def several_types(
     number: int | float = 10,  # noqa: PYI041 - users write it
     name_or_index: int | str = 3,
+    gap: float | str = "wide",
+    mode_or_gap: str | float = "wide",
     optional: Gap | None = None,
     mode: Literal["1", "2"] | None = None,
     far: float = math.inf,
@@ -287,7 +289,8 @@ def several_types(
 def test_types_of_an_argument_are_those_of_all_parts_of_its_annotation():
     found = signature_of(several_types).arguments
     assert {name: argument.kind for name, argument in found.items()} == {
-        "number": "float", "name_or_index": None, "optional": "float", "mode": "str", "far": "float", "level": "int",
+        "number": "float", "name_or_index": None, "gap": "float", "mode_or_gap": None,
+        "optional": "float", "mode": "str", "far": "float", "level": "int",
         "angle": "float",
     }  # fmt: skip
     assert found["optional"].distribution == Range(5.0, 9.0)
@@ -295,7 +298,13 @@ def test_types_of_an_argument_are_those_of_all_parts_of_its_annotation():
 
 def test_default_that_text_cannot_represent_stays_with_the_factory():
     defaults = {name: argument.default for name, argument in signature_of(several_types).arguments.items()}
-    assert defaults == {**dict.fromkeys(defaults), "number": 10, "name_or_index": 3}
+    assert defaults == {
+        **dict.fromkeys(defaults),
+        "number": 10,
+        "name_or_index": 3,
+        "gap": "wide",
+        "mode_or_gap": "wide",
+    }
 
 
 def test_annotations_of_a_wrapped_function_are_those_of_its_own_module():
