@@ -18,7 +18,7 @@ from crashhunt.base.boundaries import Boundary, ForeignError, Party
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.base.exceptions import in_words, place_of
 from crashhunt.base.plugins import load_object
-from crashhunt.base.text import encodable, one_of
+from crashhunt.base.text import did_you_mean, encodable, one_of
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.gym import GymSetup
 from crashhunt.simulators._gym_crash_types import crash_cell
@@ -120,6 +120,8 @@ class GymSimulator:
             reward, terminated, truncated = float(reward), bool(ended), bool(cut)
         self._steps += 1
         with _INFO:  # the crash rule may be a function of the user's
+            if self._steps == 1 and (key := self._setup.crash.info) and key not in info:
+                self._report_misspelt_key(key, info)
             what = self._rule(observation, reward, terminated, truncated, info)
             if what and not self._crashed:
                 self.crash_cell = "" if self._rule.has_named else crash_cell(info)
@@ -170,6 +172,14 @@ class GymSimulator:
         if notice not in self.notices:
             self.notices[notice] = None
             logging.getLogger("crashhunt").warning("%s, for the first time at step %d", notice, self._steps)
+
+    def _report_misspelt_key(self, key: str, info: Info) -> None:
+        """Report a key of the crash rule that ``info`` lacks, if a similar key exists.
+
+        Many environments add the key only in the step of a crash, so a missing key alone is no mistake.
+        """
+        if hint := did_you_mean(key, map(str, info)):
+            self._notice(f"gym.crash.info = {key!r} is not a key of the first step's info: {hint}")
 
     def _find(self) -> Callable[..., object]:
         name = self._setup.id

@@ -134,6 +134,23 @@ def test_without_a_rule_it_finishes_and_its_own_bound_on_steps_does_not_count(tm
     assert simulator.agents == []
 
 
+def test_scenario_without_a_crash_rule_has_a_note():
+    for crash, count in (({}, 1), ({"kind": f"{__name__}:kind_of"}, 1), ({"info": "fell"}, 0)):
+        found = list(BACKEND.notes(scenario_of("Tray-v0", crash=crash)))
+        assert (
+            found == ["gym.crash has no rule, so only failures of the agent and of the environment are crashes"] * count
+        )
+
+
+@pytest.mark.parametrize(("key", "hint"), [("felt", "did you mean 'fell'?"), ("fell", ""), ("red light", "")])
+def test_misspelt_key_of_the_crash_rule_is_reported_once(tmp_path, key, hint):
+    simulator = simulator_of(tmp_path, "Tray-v0", crash={"info": key})
+    fall(simulator, steps=2)
+    fall(simulator, steps=2)
+    expected = f"gym.crash.info = {key!r} is not a key of the first step's info: {hint}"
+    assert list(simulator.notices) == [expected] * bool(hint)
+
+
 def test_observations_are_recorded_flat_and_shown_as_they_are(tmp_path):
     simulator = simulator_of(tmp_path, "Tray-v0")
     observations, _ = simulator.reset(seed=4)

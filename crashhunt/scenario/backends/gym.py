@@ -6,14 +6,14 @@ The descriptor does not import Gymnasium.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.scenario._scenario import Backend
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from crashhunt.scenario._scenario import Scenario
     from crashhunt.trial import Value
@@ -81,6 +81,11 @@ def _check(scenario: Scenario, where: str) -> None:
         raise ScenarioError(f"gym.danger = {danger!r} is not of the form info.KEY or -info.KEY", fix=fix, where=where)
 
 
+def _notes(scenario: Scenario) -> Iterator[str]:
+    if replace(scenario.table(GymSetup).crash, kind="") == CrashRule():
+        yield "gym.crash has no rule, so only failures of the agent and of the environment are crashes"
+
+
 def _modules(scenario: Scenario) -> Iterable[str]:
     setup = scenario.table(GymSetup)
     return setup.id, setup.crash.function, setup.crash.kind, setup.others
@@ -100,6 +105,7 @@ BACKEND = Backend(
     shows_itself=True,
     check=_check,
     modules=_modules,
+    notes=_notes,
     versions=("gymnasium",),
     reported_events=(),
     disturbances=(),
