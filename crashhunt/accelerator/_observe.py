@@ -365,8 +365,10 @@ def _as_tuple(value: object) -> object:
 
 
 def _are_known(features: object) -> bool:
-    """Return whether all features are known and unique; a data frame repeats the column of a repeated feature."""
-    return type(features) is list and _KNOWN_FEATURES.issuperset(features) and len(set(features)) == len(features)
+    """Return whether there are features, all known and unique; a data frame repeats the column of an equal feature."""
+    if type(features) is not list or not features or not _KNOWN_FEATURES.issuperset(features):
+        return False
+    return len(set(features)) == len(features)
 
 
 def _arrives(thing: RoadObject, network: Network) -> bool:

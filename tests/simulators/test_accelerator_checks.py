@@ -452,6 +452,37 @@ def test_kernel_is_bound_with_the_first_rounding_that_is_numpys(monkeypatch):
         assert [given[-3:] for given in bound] == ways[: ways.index(wanted) + 1]
 
 
+def test_functions_are_compared_on_many_numbers_of_all_magnitudes():
+    asked, right = {}, _kernel.kernel()
+    module = SimpleNamespace(
+        compute=lambda name, *numbers: asked.setdefault(name, []).append(numbers) or right.compute(name, *numbers)
+    )
+    assert _kernel._differs(module) == ""
+    counts = {name: len(found) for name, found in asked.items()}
+    assert counts == {
+        "sin": 600, "cos": 600, "tan": 600, "arctan": 600, "arcsin": 600, "arctan2": 600, "power": 3000, "dot": 600,
+        "remainder": 600, "dot3": 600, "product": 1200, "square": 1200,
+    }  # fmt: skip
+    for name, found in asked.items():
+        columns = np.array(found).T
+        if name == "power":
+            columns, exponents = columns[:1], columns[1]
+            assert (exponents.min(), exponents.max()) == (pytest.approx(0.0, abs=0.1), pytest.approx(6.0, abs=0.1))
+            assert {0.5, 2.0, 4.0} <= set(exponents.tolist())
+        if name == "remainder":
+            assert set(columns[1]) == {2 * np.pi}
+            columns = columns[:1]
+        for column in columns:
+            sizes = np.abs(column)
+            assert sizes.min() < 1e-8
+            assert sizes.max() > 500.0 or name == "arcsin"
+            assert 0.4 < np.mean(column > 0) < 0.6 or name == "power"
+        for one in range(len(columns)):
+            for other in range(one):
+                assert abs(np.corrcoef(np.log(np.abs(columns[one])), np.log(np.abs(columns[other])))[0, 1]) < 0.2, name
+    assert np.abs(np.array(asked["arcsin"])).max() == 1.0
+
+
 def test_vehicle_of_the_dynamic_model_moves_without_a_search_for_its_lane():
     place = small_road(BicycleVehicle)
     vehicle = place.vehicles[0]

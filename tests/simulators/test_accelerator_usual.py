@@ -6,6 +6,7 @@ import re
 import sys
 from collections import Counter
 from contextlib import contextmanager
+from functools import partial
 from itertools import product
 
 import gymnasium
@@ -18,6 +19,7 @@ from crashhunt.simulators.highway import HighwaySimulator
 import numpy as np
 import pytest
 from compiled import needs_kernel
+from highway_env.envs.common import observation
 from highway_env.envs.common.observation import observation_factory
 from highway_env.envs.exit_env import ExitEnv
 from highway_env.envs.highway_env import HighwayEnvFast
@@ -168,6 +170,59 @@ def test_observations_have_the_bits_of_highway_env_whatever_they_are_set_to():
         assert one == other
     assert sum(len(entry) == 3 for entry in slow) <= 2  # errors
     assert len({str(entry[-2]) for entry in slow}) > 10
+
+
+ODD = [
+    {"vehicles_count": 1}, {"vehicles_count": np.int64(4)}, {"vehicles_count": 4.0}, {"features": ("presence", "x")},
+    {"features": ["x", "x"]}, {"features": []}, {"features_range": {"x": [5, 5]}}, {"order": "unsorted"},
+    {"features_range": {"x": [0, np.inf]}}, {"features_range": {"x": [np.float32(0), 9]}},
+    {"features_range": {"x": [9]}}, {"features_range": {"x": (20, -20), "y": [0, 1, 2], "none": [0, 0]}},
+    {"features_range": {"cos_h": [0, 2]}, "features": ["cos_h", "sin_h"]},
+]  # fmt: skip
+
+
+def odd_speeds(vehicle):
+    """Tables of target speeds, of which highway-env can use some."""
+    before = vehicle.target_speeds
+    for table in (before, before.astype(np.float32), before.astype(int), np.array([20.0]), np.array([20.0, np.nan]),
+                  np.array([[20.0, 30.0]]), [20.0, 30.0], np.array(["20", "30"])):  # fmt: skip
+        vehicle.target_speeds = table
+        yield str(table)
+    vehicle.target_speeds = before
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_odd_settings_have_what_they_have_in_highway_env():
+    def outcome(look):
+        try:
+            seen = look()
+        except Exception as error:
+            return repr(error)
+        return seen.dtype, seen.shape, seen.tobytes()
+
+    def found():
+        env = HighwayEnvFast({**SMALL, "vehicles_count": 3})
+        env.reset(seed=4)
+        every = []
+        for setting in ODD:
+            seeing = observation_factory(env, {"type": "Kinematics"})
+            vars(seeing).update(setting)
+            seeing.observer_vehicle = env.vehicle
+            every.append((str(setting), outcome(seeing.observe), str(seeing.features_range)))
+        for reach in (np.float32(150), np.float64(30.0)):
+            env.PERCEPTION_DISTANCE = reach
+            every.append((str(reach), outcome(env.observation_type.observe)))
+        times = partial(observation.compute_ttc_grid, env, 0.5, 4)
+        every += [(table, outcome(times)) for table in odd_speeds(env.vehicle)]
+        away = MDPVehicle(env.road, env.vehicle.position + np.array([9.0, 0.0]), 0.0, 20.0)
+        for vehicle in (away, env.vehicle, env.road.vehicles[2]):
+            every += [outcome(lambda v=vehicle, h=h: observation.compute_ttc_grid(env, 1.0, h, v)) for h in (3, 2.5)]
+        return every
+
+    slow = found()
+    assert switch_on() == ""
+    for one, other in zip(slow, found(), strict=True):
+        assert one == other
 
 
 LEFT_TO_THE_KERNEL = {
