@@ -243,12 +243,12 @@ def test_connected_lanes_are_the_next_and_the_last_ones_with_their_offsets():
     assert lanes.connected_lanes(0) == [(0, 0.0), (2, 60.0), (3, -network.get_lane(("d", "a", 0)).length)]
 
 
-@pytest.mark.parametrize("s", [-5.1, -5.0, 0.0, 64.9, 65.0, 65.1])
-@pytest.mark.parametrize("r", [-3.1, -3.0, 0.0, 3.0, 3.1])
-def test_position_counts_as_on_a_lane_as_in_highway_env(s, r):
+def test_position_counts_as_on_a_lane_as_in_highway_env():
     network = bent_network()
-    lane = network.get_lane(("a", "b", 0))
-    assert _network.Network(network).is_on(0, s, r) == lane.on_lane(np.array([s, r]), s, r, margin=1)
+    lane, lanes = network.get_lane(("a", "b", 0)), _network.Network(network)
+    for s in (-5.1, -5.0, 0.0, 64.9, 65.0, 65.1):
+        for r in (-3.1, -3.0, 0.0, 3.0, 3.1):
+            assert lanes.is_on(0, s, r) == lane.on_lane(np.array([s, r]), s, r, margin=1), (s, r)
 
 
 NUMBERS = {

