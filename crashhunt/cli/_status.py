@@ -13,8 +13,10 @@ from crashhunt.cli._exit_codes import BAD_INPUT, DONE
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Iterator, Sequence
 
-    from rich.console import Console, Group
+    from rich.console import Console, ConsoleOptions, Group
+    from rich.table import Table
 
     from crashhunt.cli._common import Commands
     from crashhunt.hunts import BranchSums, HuntState, ProbeSums
@@ -22,6 +24,10 @@ if TYPE_CHECKING:
 __all__ = ["add_status", "show_states", "states_console", "states_table"]
 
 _COLUMNS_WITHOUT_TERMINAL = 120
+_NUMBERS = ("trials", "pace", "left", "crashes", "errors")  # columns
+_OMITTED_FIRST = ("pace", "errors", "left", "outcomes")  # columns that a narrow terminal does not show
+_MIN_NAME_COLUMNS = 12  # of the name of a hunt, which is folded
+_WIDEST = 10_000
 _MAX_LISTED_NODES = 20  # of a hunt, one a line
 _STATE_COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "green", "interrupted": "yellow"}
 
@@ -77,38 +83,81 @@ def states_console(*, stderr: bool = False) -> Console:
 
 def states_table(states: list[HuntState]) -> Group:
     """Return hunts as a table for a terminal, followed by the other facts of each hunt, one line each."""
-    from rich import box
     from rich.console import Group
+    from rich.text import Text
+
+    lines = [Text(one_line(f"{state.dir}: {line}"), overflow="fold") for state in states for line in _facts(state)]
+    return Group(_FittingTable(states), *lines)
+
+
+class _FittingTable:
+    """A table of hunts that omits columns for which the terminal is too narrow, because a cut number is a wrong one.
+
+    Args:
+        states: states of the hunts.
+    """
+
+    def __init__(self, states: Sequence[HuntState]) -> None:
+        self._states = states
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
+        from rich.measure import Measurement
+
+        table, wide = _table(self._states), options.update(max_width=_WIDEST)
+        for count in range(1, len(_OMITTED_FIRST) + 1):
+            folded = max(0, _longest_name(self._states) - _MIN_NAME_COLUMNS)
+            if Measurement.get(console, wide, table).minimum - folded <= options.max_width:
+                break
+            table = _table(self._states, _OMITTED_FIRST[:count])
+        yield table
+
+
+def _longest_name(states: Sequence[HuntState]) -> int:
+    return max((len(one_line(state.dir)) for state in states), default=0)
+
+
+def _table(states: Sequence[HuntState], omitted: Sequence[str] = ()) -> Table:
+    from rich import box
     from rich.table import Table
     from rich.text import Text
 
     from crashhunt.report import format_pace, format_seconds
 
+    rows = [
+        {
+            "trials": out_of(state.trials_run, state.trials_planned, "/"),
+            "pace": format_pace(state.rate_per_s) if state.rate_per_s else "-",
+            "left": format_seconds(state.seconds_left) if state.seconds_left is not None else "-",
+            "crashes": str(state.crashes),
+            "errors": str(state.errors),
+            "outcomes": ", ".join(f"{name} {count}" for name, count in state.outcomes.items()),
+        }
+        for state in states
+    ]
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("hunt", overflow="fold")
-    table.add_column("state")
-    for name in ("trials", "pace", "left", "crashes", "errors"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("outcomes", overflow="fold", min_width=13)
-    for state in states:
-        said = ", ".join(f"{name} {count}" for name, count in state.outcomes.items())
+    table.add_column("hunt", overflow="fold", min_width=min(_longest_name(states), _MIN_NAME_COLUMNS))
+    table.add_column(
+        "state", min_width=max((len(word) for state in states for word in _state(state).split()), default=0)
+    )
+    for name in _NUMBERS:
+        if name not in omitted:
+            width = max(len(row[name]) for row in rows) if rows else 0
+            table.add_column(name, justify="right", no_wrap=True, min_width=max(width, len(name)))
+    if "outcomes" not in omitted:
+        table.add_column("outcomes", overflow="fold", min_width=13)
+    for state, row in zip(states, rows, strict=True):
         table.add_row(
             Text(one_line(state.dir)),
             Text(_state(state), style=_STATE_COLORS.get(state.state, ""), no_wrap=state.phase is None),
-            out_of(state.trials_run, state.trials_planned, "/"),
-            format_pace(state.rate_per_s) if state.rate_per_s else "-",
-            format_seconds(state.seconds_left) if state.seconds_left is not None else "-",
-            str(state.crashes),
-            str(state.errors),
-            Text(said),
+            *(Text(cell) for name, cell in row.items() if name not in omitted),
         )
         for node in (state.nodes or [])[:_MAX_LISTED_NODES]:
             name = one_line(f"  {node['name']} ({node['parallel']} at a time)")
-            table.add_row(Text(name), "", str(node["trials"]), format_pace(node["rate_per_s"]))
+            pace = [] if "pace" in omitted else [format_pace(node["rate_per_s"])]
+            table.add_row(Text(name), "", str(node["trials"]), *pace)
         if len(state.nodes or []) > _MAX_LISTED_NODES:
             table.add_row(f"  and {len(state.nodes or []) - _MAX_LISTED_NODES} more")
-    lines = [Text(one_line(f"{state.dir}: {line}"), overflow="fold") for state in states for line in _facts(state)]
-    return Group(table, *lines)
+    return table
 
 
 def _facts(state: HuntState) -> list[str]:

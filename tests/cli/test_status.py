@@ -154,3 +154,26 @@ def test_watched_states_are_read_until_all_hunts_have_ended(monkeypatch):
 def test_table_without_terminal_has_120_columns():
     assert _status.states_console().width == 120
     assert _status.states_console(stderr=True).stderr is True
+
+
+@pytest.mark.parametrize(
+    ("columns", "kept"),
+    [
+        (120, {"pace", "left", "errors", "outcomes"}),
+        (80, {"left", "errors", "outcomes"}),
+        (66, {"left", "outcomes"}),
+        (60, {"outcomes"}),
+        (40, set()),
+    ],
+)
+def test_narrow_terminal_shows_fewer_columns_and_no_cut_number(columns, kept):
+    state = HuntState(
+        dir="hunts/one", state="crashed", trials_run=40, trials_planned=40, rate_per_s=0.17, crashes=28,
+        seconds_left=90, outcomes={"collision": 28, "finished": 12},
+    )  # fmt: skip
+    header, _, *rows = written(state, width=columns)
+    assert set(header.split()) == {"hunt", "state", "trials", "crashes", *kept}
+    assert {"hunts/one", "crashed", "40/40", "28"} <= set(rows[0].split())
+    assert ("collision 28" in rows[0]) == ("outcomes" in kept)
+    assert ("5.9 s/trial" in rows[0]) == ("pace" in kept)
+    assert all(len(row) <= columns for row in rows)
