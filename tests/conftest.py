@@ -18,6 +18,7 @@ import tempfile
 import threading
 from dataclasses import dataclass
 from importlib.machinery import SourceFileLoader
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,7 @@ import json_schemas
 import pytest
 from commands import CRASHHUNT, Begun, Commands
 
+from crashhunt.base import reaper
 from crashhunt.base.integrity import describe_files, digest_of_data
 from crashhunt.native import HOW_TO_REBUILD, _core, outdated_modules
 from crashhunt.snapshots import _take
@@ -316,38 +318,49 @@ def plain_highway_env() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def _modules_of_its_own() -> Iterator[None]:
-    """What a test has imported from its own folder is no other test's, nor found by others."""
-    modules, path = set(sys.modules), [*sys.path]
+def _apart(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Keep a test apart from the others; one fixture, because thousands of tests have it.
+
+    What a test has imported from its own folder is no other test's, nor found by others. Test modules, and with them
+    the whole repository, are not in the snapshots of hunts in this process. What a test itself hunts and replays starts
+    as little as what its commands do.
+    """
+    modules, last, path = len(sys.modules), next(reversed(sys.modules)), [*sys.path]
+    not_installed, started = _take._not_installed, reaper.subprocess
+    _take._not_installed = _not_installed_nor_ours
+    if request.path.parent.name != "base":
+        reaper.subprocess = _WARM_SUBPROCESS  # type: ignore[assignment]
     yield
+    _take._not_installed, reaper.subprocess = not_installed, started
     sys.path[:] = path
-    for name in sys.modules.keys() - modules:
+    for name in _imported_since(modules, last):
         if (getattr(sys.modules[name], "__file__", None) or "").startswith(tempfile.gettempdir() + os.sep):
             del sys.modules[name]
 
 
-@pytest.fixture(autouse=True)
-def _no_tests_in_snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep test modules, and with them the whole repository, out of the snapshots of hunts in this process."""
-    found = _take._not_installed
-    monkeypatch.setattr(_take, "_not_installed", lambda places: {name for name in found(places) if not _is_ours(name)})
+def _imported_since(modules: int, last: str) -> list[str]:
+    """Return what may have been imported since there were so many modules, of which this was the last.
+
+    There are thousands of modules, and comparing them all would take half of the time of a simple test.
+    """
+    names, more = reversed(sys.modules), len(sys.modules) - modules
+    new = [*islice(names, max(more, 0))]
+    return new if more >= 0 and next(names) == last else [*sys.modules]
+
+
+_not_installed = _take._not_installed
+_WARM_SUBPROCESS = SimpleNamespace(
+    Popen=lambda *words, **options: _commands().warm.popen(*words, **options),
+    TimeoutExpired=subprocess.TimeoutExpired,
+)
+
+
+def _not_installed_nor_ours(places: Any) -> set[str]:
+    return {name for name in _not_installed(places) if not _is_ours(name)}
 
 
 def _is_ours(name: str) -> bool:
     return (getattr(sys.modules.get(name), "__file__", None) or "").startswith(_REPOSITORY)
-
-
-@pytest.fixture(autouse=True)
-def _warm(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test itself hunts and replays starts as little as what its commands do."""
-    if request.path.parent.name != "base":
-        monkeypatch.setattr(
-            "crashhunt.base.reaper.subprocess",
-            SimpleNamespace(
-                Popen=lambda *words, **options: _commands().warm.popen(*words, **options),
-                TimeoutExpired=subprocess.TimeoutExpired,
-            ),
-        )
 
 
 def mostly_nightly(cases: Iterable[Any], always: Container[Any]) -> list[Any]:
