@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
-from conftest import add_toy
+from conftest import _commands, add_toy
 from dashboard_hunts import hunted
 from served import served
+
+from crashhunt.dashboard import _control
 
 OURS = {"Host": "localhost", "X-Crashhunt": "1"}
 
@@ -65,11 +72,36 @@ def test_unknown_jobs_and_what_cannot_be_stopped_are_refused(hunt):
         assert dashboard.get(jobs)["jobs"] == []
 
 
+class Forked:
+    """A command of the page in a fork, as far as the page's jobs use a `subprocess.Popen`."""
+
+    def __init__(self, words, environment, **streams):
+        assert words[:3] == [sys.executable, "-m", "crashhunt"]
+        assert streams == {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        out, write = os.pipe()
+        self._begun = _commands().begin(words[3:], Path.cwd(), environment, terminal=write, streams=(1, 2))
+        os.close(write)
+        self.stdout = os.fdopen(out, "rb")
+
+    def wait(self):
+        self._begun.communicate()
+        return self._begun.returncode
+
+    def send_signal(self, number):
+        self._begun.send_signal(number)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     "names", [{"replay"}, pytest.param({"replay", "judge", "shrink"}, marks=pytest.mark.nightly)], ids=len
 )
-def test_commands_are_started_from_the_page_and_run(toy, page, names):
+def test_commands_are_started_from_the_page_and_run(toy, page, names, monkeypatch):
+    if len(names) == 1:  # at night they are processes as they are for users
+        started = SimpleNamespace(
+            Popen=lambda words, **streams: Forked(words, toy.environment, **streams),
+            DEVNULL=subprocess.DEVNULL, PIPE=subprocess.PIPE, STDOUT=subprocess.STDOUT,
+        )  # fmt: skip
+        monkeypatch.setattr(_control, "subprocess", started)
     words = ("--scenario", "toy", "--arg", "speed=8:20", "--seed", "4")
     toy.crashhunt("run", "one", "1", "1", "99", *words)
     with served(toy.folder / "one", control=True) as dashboard:

@@ -165,7 +165,7 @@ def test_confirmation_is_seen_while_it_runs_and_resumed_after_an_interrupt(toy):
         assert process.poll() is None, process.communicate()
         if (toy.folder / "h" / "ledger.sqlite").exists():
             states.append(hunt_state(toy.folder / "h"))
-        time.sleep(0.1)
+        time.sleep(0.4)
     state = states[-1]
     assert (state.state, state.trials_run, state.phase["name"], state.phase["total"]) == ("running", 5, "confirming", 5)
     assert "confirming" in toy.crashhunt("status", "h").out
