@@ -24,7 +24,7 @@ from highway_env.vehicle.objects import Landmark, Obstacle
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.scenario.backends.highway import HighwaySetup
-from crashhunt.simulators.highway import _config, _disturbances, _scene, _scripted, _simulator
+from crashhunt.simulators.highway import _config, _disturbances, _scene, _scripted, _simulator, _surroundings
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances
 from crashhunt.simulators.highway._scene import Hidden, HighwayEvents, VehicleFilter
 from crashhunt.simulators.highway._surroundings import surroundings_of
@@ -327,6 +327,22 @@ def test_paths_cross_within_their_reach(one, two, route, crossed):
     agent.route = [("w", "c", 0), ("c", route, 0)]
     assert _disturbances.crosses(road.network, agent, other) is crossed
     assert _disturbances.crosses(road.network, other, agent) is crossed
+
+
+def test_path_of_a_vehicle_has_a_point_every_2_m_for_80_m():
+    road = straight()
+    vehicle = put(road, 101.0, 1)
+    roads, points = _disturbances._way(road.network, vehicle)
+    assert roads == {("0", "1")}
+    assert points[:, 0].tolist() == [101.0, *range(101, 181, 2)]
+    assert set(points[:, 1]) == {4.0}
+    road = crossing()
+    turning = on(road, "w", "c", 97.0)
+    turning.route = [("w", "c", 0), ("c", "n", 0)]
+    roads, points = _disturbances._way(road.network, turning)
+    assert roads == {("w", "c"), ("c", "n")}
+    assert points[:5].tolist() == [[-3.0, 0.0], [-3.0, 0.0], [-1.0, 0.0], [0.0, 0.0], [0.0, 2.0]]
+    assert points[-1].tolist() == [0.0, 48.0]  # the end of the road
 
 
 def test_crossing_vehicle_is_the_nearest_on_a_road_with_rules():
@@ -677,6 +693,14 @@ def test_surroundings_have_the_limits_of_the_vehicle():
     assert around([], speed=-3.0).speed_mps == 0.0
     assert around([], lane=0, limits=(-5.0, 3.0)).sides[1].exists is False
     assert 1 not in around([], lane=0).sides
+
+
+@pytest.mark.parametrize(
+    ("speeds", "step"), [([20.0, 23.0], 3.0), ([20.0, 23.0, 30.0], 3.0), ([20.0], 5.0), ([], 5.0), (None, 5.0)]
+)
+def test_acceleration_is_that_to_the_next_target_speed(speeds, step):
+    vehicle = SimpleNamespace(KP_A=0.5, **({} if speeds is None else {"target_speeds": np.array(speeds)}))
+    assert _surroundings._greatest_acceleration(vehicle) == pytest.approx(0.5 * step)
 
 
 def test_vehicles_around_are_the_nearest_of_each_lane():
