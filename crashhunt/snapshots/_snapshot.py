@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 from contextlib import suppress
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, TypedDict
 
@@ -22,6 +22,7 @@ from crashhunt.base.integrity import (
     describe_files,
     digest_of_data,
     is_authentic,
+    parse_object,
     read_object,
     typed,
 )
@@ -92,28 +93,16 @@ class Snapshot:
         """
         file = self.path / layout.MANIFEST
         try:
-            found = read_object(file, Manifest)
-            typed(found, {"schema": int, "paths": list[str], "files": FILES})
-            if not 1 <= found["schema"] <= SCHEMA:
-                raise BundleError(
-                    f"schema version {found['schema']} is not supported (supported: 1 to {SCHEMA})",
-                    fix="use the version of crashhunt that wrote the trial",
-                    where=str(file),
-                )
-            if found["schema"] >= _FIRST_VERSION_WITH_DIGESTS or "integrity" in found:
-                typed(found, {"integrity": str, "described": FILES})
-                said = found.pop("integrity")
-                if digest_of_data(found) != said:
-                    raise ValueError("the file has changed since it was written")
-            found.setdefault("argument_files", {})
-            typed(found, {"argument_files": dict[str, str]})
-            _check_names(found)
+            return _parse_manifest(file.read_bytes())
+        except _UnsupportedError as error:
+            raise BundleError(
+                str(error), fix="use the version of crashhunt that wrote the trial", where=str(file)
+            ) from None
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise BundleError(
                 f"the snapshot has no manifest: {reason}", fix=_DAMAGE_FIX, where=str(self.path)
             ) from None
-        return found
 
     @property
     def has_code(self) -> bool:
@@ -197,7 +186,7 @@ class Snapshot:
         manifest = self.manifest
         found = []
         for name, entry in {**manifest["files"], **manifest.get("described", {})}.items():
-            wrong = changed_file(self.path / name, entry)
+            wrong = changed_file(f"{self.path}/{name}", entry)  # hundreds of files, and a Path takes as long again
             if wrong:
                 found.append(f"{name} {wrong}")
         digest = digest_of_described(manifest["files"], plain_data=[manifest["paths"], manifest["argument_files"]])
@@ -220,10 +209,12 @@ class Snapshot:
 
     def discard_compiled(self) -> None:
         """Delete compiled files, which Python would run instead of the source files next to them."""
-        for path in (self.path / layout.CODE).rglob("__pycache__/*.pyc"):
-            if path.relative_to(self.path).as_posix() not in self.manifest["files"]:
-                with suppress(OSError):  # `faults` then reports the file as added
-                    path.unlink()
+        for parent, _, files in os.walk(self.path / layout.CODE):
+            if os.path.basename(parent) == "__pycache__":  # noqa: PTH119 - hundreds of folders
+                for path in (Path(parent, name) for name in files if name.endswith(".pyc")):
+                    if path.relative_to(self.path).as_posix() not in self.manifest["files"]:
+                        with suppress(OSError):  # `faults` then reports the file as added
+                            path.unlink()
 
     def _may_run(self, name: str) -> bool:
         return (self.path / name).is_symlink() or any(name.endswith(suffix) for suffix in _IMPORTABLE_SUFFIXES)
@@ -255,6 +246,31 @@ class Snapshot:
                 fix="get an undamaged copy of the hunt's directory; or run crashhunt replay --force --trust",
                 where=str(self.path),
             )
+
+
+class _UnsupportedError(Exception):
+    """The manifest is of another version."""
+
+
+@lru_cache(maxsize=4)
+def _parse_manifest(text: bytes) -> Manifest:
+    """Return the contents of a manifest, which callers must not change.
+
+    A command makes many `Snapshot` objects of one snapshot, and each checks hundreds of entries.
+    """
+    found = parse_object(text, Manifest)
+    typed(found, {"schema": int, "paths": list[str], "files": FILES})
+    if not 1 <= found["schema"] <= SCHEMA:
+        raise _UnsupportedError(f"schema version {found['schema']} is not supported (supported: 1 to {SCHEMA})")
+    if found["schema"] >= _FIRST_VERSION_WITH_DIGESTS or "integrity" in found:
+        typed(found, {"integrity": str, "described": FILES})
+        said = found.pop("integrity")
+        if digest_of_data(found) != said:
+            raise ValueError("the file has changed since it was written")
+    found.setdefault("argument_files", {})
+    typed(found, {"argument_files": dict[str, str]})
+    _check_names(found)
+    return found
 
 
 def code_of_manifest(manifest: Manifest) -> str:

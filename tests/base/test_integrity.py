@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import socket
+
 import pytest
 
 from crashhunt.base.integrity import (
@@ -58,6 +61,22 @@ def test_files_are_described_with_those_in_folders_and_any_change_is_seen(tmp_pa
     assert changed_file(file, entry)
     file.unlink()
     assert "missing" in changed_file(file, entry)
+
+
+def test_only_a_regular_file_is_the_recorded_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "file"
+    file.write_bytes(b"12345")
+    entry = describe_files(tmp_path)["file"]
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to(file)
+    os.mkfifo(tmp_path / "pipe")
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind("socket")  # the whole path may be too long
+        for name in ("folder", "link", "pipe", "socket", "file/inside", "nothing", "no\0name"):
+            assert changed_file(f"{tmp_path}/{name}", entry) == "is missing", name
+    assert "cannot be read" in changed_file(tmp_path / ("x" * 300), entry)
+    assert changed_file(file, entry) == ""
 
 
 def test_the_digest_of_data_does_not_depend_on_the_order_of_keys():
