@@ -144,6 +144,7 @@ def prepare(kind: type[Serializable]) -> None:
             if issubclass(found, Serializable) and is_dataclass(found):
                 prepare(found)
             inside.append(get_args(hint))
+    essentials(kind)
 
 
 @cache
@@ -379,10 +380,15 @@ def essentials(*kinds: Any) -> frozenset[str]:
     found: set[str] = set()
     for kind in kinds:
         if is_dataclass(kind):
-            found |= {item.name for item in fields(kind) if "essential" in item.metadata}
-            found |= essentials(*_hints_of(cast(Any, kind)).values())
+            found |= _essentials_of(cast(Any, kind))
         found |= essentials(*get_args(kind))
     return frozenset(found)
+
+
+@cache
+def _essentials_of(kind: Any) -> frozenset[str]:
+    own = {item.name for item in fields(kind) if "essential" in item.metadata}
+    return essentials(*_hints_of(kind).values()) | own
 
 
 def not_understood(needed: Iterable[str], *kinds: object) -> list[str]:

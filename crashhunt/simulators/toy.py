@@ -87,6 +87,9 @@ class ToySimulator:
         self._look(())
         return {agent: self._observe(agent) for agent in self.agents}, {}
 
+    def ready_process(self) -> None:
+        """Do nothing: the toy loads nothing later, and its `reset` does not sample from the action spaces."""
+
     why_no_reseeding = ""
 
     def reseed(self, seed: int) -> None:

@@ -108,10 +108,14 @@ def test_data_that_cannot_be_read_is_refused_with_the_key(data, message):
 def test_prepared_class_and_those_inside_it_convert_without_further_preparation():
     from crashhunt.base import codec
 
+    def misses():
+        return [cached.cache_info().misses for cached in (codec._write_function, codec._readers, codec._essentials_of)]
+
     prepare(Whole)
-    before = codec._write_function.cache_info().misses, codec._readers.cache_info().misses
+    before = misses()
     assert Whole.from_json(FULL.to_json()) == FULL
-    assert (codec._write_function.cache_info().misses, codec._readers.cache_info().misses) == before
+    assert not_understood(["later"], Whole) == ["later"]
+    assert misses() == before
 
 
 def test_types_of_plain_data_are_those_of_the_annotations():
