@@ -7,11 +7,14 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import pytest
 import warm
 from conftest import _commands
+
+from crashhunt.episode._failures import _contents_of
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals to stopped processes are of Linux")
 
@@ -68,3 +71,32 @@ def test_server_that_is_gone_is_no_broken_pipe_of_crashhunt(start_keeper):
     kept.wait()
     with lost.control, pytest.raises(RuntimeError, match="the process that the tests fork has ended"):
         start_keeper(lost)
+
+
+CHANGES = {
+    "nothing": lambda place, kind: [vars(place), place.function(), kind.method, kind()],
+    "a function": lambda place, kind: setattr(place, "function", len),
+    "another object": lambda place, kind: setattr(place, "number", 4),
+    "a function less": lambda place, kind: delattr(place, "function"),
+    "a function more": lambda place, kind: setattr(place, "another", len),
+    "a method": lambda place, kind: setattr(kind, "method", len),
+    "there and back": lambda place, kind: (setattr(kind, "method", len), setattr(kind, "method", kind.old)),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_fork_records_a_module_again_that_has_changed_since(change, monkeypatch):
+    place = types.ModuleType("place")
+    exec("number = 3\nfunction = lambda: 1\nclass Kind:\n    def method(self): pass\n    old = method\n", vars(place))
+    recorded = []
+
+    def record(name, module):
+        recorded.append(name)
+        return _contents_of(name, module)
+
+    known = warm._Contents(place, _contents_of("place", place))
+    monkeypatch.setitem(warm._contents, id(vars(place)), known)
+    CHANGES[change](place, place.Kind)
+    assert warm._contents_of(record, "place", place) == _contents_of("place", place)
+    assert recorded == ([] if change == "nothing" else ["place"])
+    assert set(known.found[1]) == {place.Kind}

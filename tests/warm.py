@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import _imp
 import atexit
+import ctypes
 import dataclasses
 import fcntl
+import functools
 import gc
 import importlib
 import importlib.util
@@ -56,6 +58,8 @@ _read: dict[tuple[str, str], str | None] = {}  # what a file says of something t
 _made: dict[str, tuple[types.CodeType, bytes]] = {}  # what a module of crashhunt is made from
 # What is there when one of these has been imported: modules, their code, and what their files say.
 _imported: dict[str, dict[str, tuple[types.ModuleType, types.CodeType, dict[str, bytes]]]] = {}
+# What crashhunt records of each module before a trial, by the address of the module's dictionary.
+_contents: dict[int, _Contents] = {}
 _BEGIN_WITH = ("crashhunt.executors._fork_server", "crashhunt.executors._fresh")
 # What these import as soon as they have read what is to be done.
 _ALL = ("crashhunt.scenario._load", "crashhunt.crashes._last_avoidable_step", "crashhunt.recording._foxglove")
@@ -382,6 +386,65 @@ def prepare_ours() -> None:
     importlib.import_module("crashhunt.base.plugins").registered("agents")
 
 
+class _Contents:
+    """What `crashhunt.episode` has recorded of a module, for forks in which the module is still the same.
+
+    A fork that looks at every function of every module writes to the counter of references of each, and the kernel
+    copies thousands of pages: a tenth of what a replay costs.
+
+    Args:
+        module: the module.
+        found: what crashhunt recorded.
+    """
+
+    def __init__(self, module: types.ModuleType, found: tuple[dict[str, object], dict[type, object]]) -> None:
+        self.found = found
+        self.own = id(vars(module))
+        addresses = [self.own, *(id(gc.get_referents(vars(kind))[0]) for kind in found[1])]
+        self.versions = {address: _version_of(address) for address in addresses}
+
+    @property
+    def is_same(self) -> bool:
+        """Whether neither the module nor one of its classes has got another attribute since."""
+        return all(_version_of(address) == version for address, version in self.versions.items())
+
+
+def _version_of(address: int) -> int:
+    """The version of a dictionary, which Python changes with every change of what it has."""
+    return ctypes.c_uint64.from_address(address + 24).value
+
+
+def _has_versions() -> bool:
+    example = {"a": 1}
+    found = [_version_of(id(example))]
+    for change in (lambda: example.get("a"), lambda: example.update(a=2), lambda: example.pop("a")):
+        change()
+        found.append(_version_of(id(example)))
+    return found[0] == found[1] and len(set(found)) == 3 and example == {}
+
+
+def _remember_contents() -> None:
+    """Have crashhunt record what is the same in every fork once."""
+    if sys.implementation.name != "cpython" or not _has_versions():
+        return
+    _contents.clear()
+    for kept in _imported.values():
+        failures, *_ = kept["crashhunt.episode._failures"]
+        record = failures._contents_of
+        ours = {name: module for name, (module, *_) in kept.items()}
+        for name, module in {**sys.modules, **ours}.items():
+            if type(module) is types.ModuleType:
+                _contents[id(vars(module))] = _Contents(module, record(name, module))
+        failures._contents_of = functools.partial(_contents_of, record)
+    gc.collect()
+    gc.freeze()
+
+
+def _contents_of(record: Callable[..., Any], name: str, module: types.ModuleType) -> Any:
+    known = _contents.get(id(vars(module)))
+    return known.found if known is not None and known.is_same else record(name, module)
+
+
 def _is_ours(name: str) -> bool:
     return name.partition(".")[0] == "crashhunt"
 
@@ -427,6 +490,7 @@ def _with_simulator(simulator: str) -> socket.socket:
                 lambda: (
                     _import(_OF_SIMULATORS[simulator]),
                     _import_ours(simulator),
+                    _remember_contents(),
                     _serve(Clients(theirs), simulator),
                 )
             )
@@ -512,11 +576,15 @@ def _put_back(begins_with: str) -> None:
         file, *_ = (stems[name] + end for end in files)
         _imp._fix_co_filename(code, file)  # type: ignore[attr-defined]
         _given.add(next(iter(files.values())))
+        contents = _contents.get(id(vars(module)))
+        is_same = contents is not None and contents.is_same
         module.__loader__ = loader = _Known(name, file)
         module.__spec__ = spec = importlib.util.spec_from_file_location(name, file, loader=loader)
         module.__file__ = file
         if hasattr(module, "__path__"):
             module.__path__ = spec.submodule_search_locations
+        if contents is not None and is_same:  # none of these is a function
+            contents.versions[contents.own] = _version_of(contents.own)
         sys.modules[name] = module
 
 
@@ -538,4 +606,5 @@ if __name__ == "__main__":
         "xml.etree.ElementTree",
         "xml.sax",
     )
+    _remember_contents()
     _serve(Clients(socket.socket(fileno=int(sys.argv[1])), sys.argv[2]))

@@ -169,7 +169,7 @@ class _Originals:
 
     packages: frozenset[str]
     functions: dict[str, dict[str, object]]
-    classes: dict[type, dict[str, object]]
+    classes: dict[str, dict[type, dict[str, object]]]
     used: dict[str, dict[str, object]]
     recursion_limit: int
     limits: dict[str, int]
@@ -186,27 +186,28 @@ def record_originals() -> None:
     """
     packages = _packages_of_simulators()
     functions: dict[str, dict[str, object]] = {}
-    classes: dict[type, dict[str, object]] = {}
+    classes: dict[str, dict[type, dict[str, object]]] = {}
     for name, module in list(sys.modules.items()):
-        if not isinstance(module, ModuleType) or (
-            name not in _WATCHED_MODULES and name.partition(".")[0] not in packages
-        ):
-            continue
-        functions[name] = held = _callables(module)
-        for value in held.values():
-            if isinstance(value, type) and value.__module__ == name and value not in classes:
-                classes[value] = _callables(value)
+        if isinstance(module, ModuleType) and (name in _WATCHED_MODULES or name.partition(".")[0] in packages):
+            functions[name], classes[name] = _contents_of(name, module)
     limits = {name: resource.getrlimit(number)[0] for name, number in _LIMITS.items()}
     _originals[:] = [
         _Originals(
             packages=packages,
             functions=functions,
             classes=classes,
-            used={name: _callables(sys.modules[name]) for name in _USED_FUNCTIONS if name in sys.modules},
+            used={name: _contents_of(name, sys.modules[name])[0] for name in _USED_FUNCTIONS if name in sys.modules},
             recursion_limit=sys.getrecursionlimit(),
             limits=limits,
         )
     ]
+
+
+def _contents_of(name: str, module: ModuleType) -> tuple[dict[str, object], dict[type, dict[str, object]]]:
+    """Return the functions and classes of a module, and the functions of each class that it defines."""
+    held = _callables(module)
+    own = (value for value in held.values() if isinstance(value, type) and value.__module__ == name)
+    return held, {kind: _callables(kind) for kind in own}
 
 
 def _callables(thing: ModuleType | type) -> dict[str, object]:
@@ -234,9 +235,15 @@ def is_tampered() -> bool:
             return True
     return any(
         vars(kind).get(key) is not value and _is_users_or_nothing(vars(kind).get(key))
-        for kind, held in before.classes.items()
+        for kind, held in _recorded_classes(before)
         for key, value in held.items()
     )
+
+
+def _recorded_classes(originals: _Originals) -> Iterator[tuple[type, dict[str, object]]]:
+    """Yield each recorded class with its recorded functions."""
+    for classes in originals.classes.values():
+        yield from classes.items()
 
 
 def _is_users_or_nothing(value: object) -> bool:
@@ -435,7 +442,7 @@ def _replaced_function(frames: list[FrameType], others: set[str]) -> str:
     for module_name, held in _originals[0].functions.items():
         now = vars(sys.modules[module_name]) if module_name in sys.modules else {}
         replaced |= {one: f"{module_name}.{one}" for one in used & held.keys() if is_foreign(now.get(one), held[one])}
-    for kind, held in _originals[0].classes.items():
+    for kind, held in _recorded_classes(_originals[0]):
         place, present = f"{kind.__module__}.{kind.__qualname__}", vars(kind)
         replaced |= {one: f"{place}.{one}" for one in used & held.keys() if is_foreign(present.get(one), held[one])}
     for frame in frames:  # the innermost function that refers to one is the one that failed
