@@ -26,7 +26,7 @@ seen = []
 report = crashhunt.run("h", 2, 20, 99, scenario="toy", arguments={"speed": "12:14"}, seed=1, watch=seen.append)
 print(report.stopped_because, len(seen) > 0, seen[-1].phase)
 found = crashhunt.load("h")
-print(crashhunt.replay(found.crashes[0]).verdict, crashhunt.replay("h", changes={"speed": 4}).verdict)
+print(crashhunt.replay(found.crashes[0]).verdict)
 """
 
 
@@ -36,7 +36,7 @@ def test_a_script_needs_no_guard(toy):
         [sys.executable, "script.py"], cwd=toy.folder, capture_output=True, text=True, timeout=300, check=False
     )
     assert done.stderr == ""
-    assert done.stdout.split() == ["top", "level", "crash", "True", "done", "reproduced", "fixed"]
+    assert done.stdout.split() == ["top", "level", "crash", "True", "done", "reproduced"]
 
 
 @pytest.fixture
@@ -67,6 +67,7 @@ def test_results_are_typed_objects_and_arrays(hunt):
     agent = found.agent(number)
     agent.reset(0)
     assert agent.act(recording.observations("ego")[0])[0] == pytest.approx(table["ego.speed"][number])
+    assert crashhunt.replay("h", changes={"speed": 4}).verdict == "fixed"
     with pytest.raises(UsageError, match="trial 99 has not ended"):
         found.trial(99)
     with pytest.raises(UsageError, match="no controlled vehicle 'x'"):

@@ -65,8 +65,8 @@ def test_a_hunt_stops_on_what_an_oracle_of_ones_own_sees(own):
 
 def test_crash_on_decides_where_it_states_something(own):
     words = ["--oracle", "own:Fast:above=8", "--keep-going"]
-    assert "too_fast" not in run(own, *words, "--crash-on", "collision", name="only", trials="6")["outcomes"]
-    assert set(run(own, *words, "--crash-on", "too_fast", name="both", trials="6")["outcomes"]) >= {"too_fast"}
+    assert "too_fast" not in run(own, *words, "--crash-on", "collision", name="only", trials="2")["outcomes"]
+    assert set(run(own, *words, "--crash-on", "too_fast", name="both", trials="2")["outcomes"]) >= {"too_fast"}
     done = own.crashhunt("run", "h", "1", "1", "9", "--scenario", "toy", "--crash-on", "too_fast", expect=2)
     assert "--crash-on 'too_fast' is not an outcome that can count as a crash" in done.err
 

@@ -140,6 +140,9 @@ def test_disturbed_and_undisturbed_crashes_are_reported_apart(toy):
 # --- run --until-rate
 
 
+FEW = ("--keep", "1")  # every crash with a bundle is confirmed
+
+
 def until(toy, folder, workers, trials, rate, *words, expect):
     options = ("--until-rate", rate, "--json", *words)
     return toy.crashhunt("run", folder, workers, trials, *HUNT, *options, expect=expect).json
@@ -147,18 +150,18 @@ def until(toy, folder, workers, trials, rate, *words, expect):
 
 def test_hunt_ends_once_the_rate_is_certainly_below_or_above(toy):
     calm = ("--arg", "speed=2", "--set", "gap_m=40")
-    done = toy.crashhunt("run", "calm", "2", "0", "20", "--scenario", "toy", *calm, "--until-rate", "0.1/trial")
-    assert "certainly below the bar of 0.10 per trial" in done.out
-    (rate,) = rates(toy, "calm", "--bar", "0.1/trial")
+    done = toy.crashhunt("run", "calm", "2", "0", "20", "--scenario", "toy", *calm, "--until-rate", "0.3/trial")
+    assert "certainly below the bar of 0.30 per trial" in done.out
+    (rate,) = rates(toy, "calm", "--bar", "0.3/trial")
     assert (rate["crashes"], rate["estimate"], rate["verdict"]) == (0, 0.0, "below")
-    assert rate["units"] * 0.1 < 3.6
-    found = until(toy, "wild", "2", "0", "0.001/trial", expect=1)
+    assert rate["units"] * 0.3 < 3.6
+    found = until(toy, "wild", "2", "0", "0.001/trial", *FEW, expect=1)
     assert (found["stopped_because"], found["rate"]["verdict"]) == ("rate", "above")
     assert found["rate"]["certain"]["low"] >= 0.001
 
 
 def test_hunt_that_cannot_decide_ends_at_most_and_exits_with_3(toy):
-    found = until(toy, "h", "2", "0", "0.3/trial", "--most", "6", expect=3)
+    found = until(toy, "h", "2", "0", "0.3/trial", *FEW, "--most", "6", expect=3)
     assert (found["stopped_because"], found["trials_run"], found["rate"]["verdict"]) == ("all_trials", 6, "undecided")
 
 
@@ -174,13 +177,12 @@ def test_workers_decide_at_the_same_trial(toy):
 
 @pytest.mark.nightly  # by day, test_gate.py resumes to a verdict, and rates/ decide in any order
 def test_resumed_hunt_decides_as_one_that_was_never_interrupted(toy):
-    few = ("--keep", "1")  # every crash with a bundle is confirmed
-    whole = until(toy, "whole", "2", "0", "0.005/trial", *few, expect=1)["rate"]
-    first = until(toy, "parts", "2", "0", "0.005/trial", *few, "--most", "1", expect=3)["rate"]
+    whole = until(toy, "whole", "2", "0", "0.005/trial", *FEW, expect=1)["rate"]
+    first = until(toy, "parts", "2", "0", "0.005/trial", *FEW, "--most", "1", expect=3)["rate"]
     assert first["units"] == 1 < whole["units"]
-    assert until(toy, "parts", "1", "0", "0.005/trial", *few, expect=1)["rate"] == {**whole, "dir": "parts"}
+    assert until(toy, "parts", "1", "0", "0.005/trial", *FEW, expect=1)["rate"] == {**whole, "dir": "parts"}
     trials = len(results(toy.folder / "parts"))
-    assert until(toy, "parts", "1", "0", "0.005/trial", *few, expect=1)["rate"] == {**whole, "dir": "parts"}
+    assert until(toy, "parts", "1", "0", "0.005/trial", *FEW, expect=1)["rate"] == {**whole, "dir": "parts"}
     assert len(results(toy.folder / "parts")) == trials  # decided before, so nothing runs
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from conftest import Shell, mostly_nightly
+from test_show import hunted
 
 from crashhunt.base.sandbox import landlock_version
 from crashhunt.crashes import find_bundle, open_archive
@@ -23,26 +24,22 @@ STRANGER = ReplayOptions(code="log", force=True, trusted=False)
 OPTIONS, ROUTES = "scenario/scenario.toml", "scenario/traffic.rou.xml"
 
 
-def exported(folder: Path, *options: str) -> Path:
-    """A crash of the shipped scenario, exported."""
-    shell = Shell(folder)
-    words = ("--arg", "speed=19", "--set", "vehicles=35", "--seed", "1", "--timeout", "140", *options)
+@pytest.fixture(scope="module")
+def crash(tmp_path_factory):
+    """A crash of the shipped scenario without its code, hundreds of files that recorded actions have no need of."""
+    shell = Shell(tmp_path_factory.mktemp("exported"))
+    words = ("--arg", "speed=19", "--set", "vehicles=35", "--seed", "1", "--timeout", "140", "--no-snapshot")
     done = shell.crashhunt("run", "h", "1", "9", "600", *words, "--json", expect=None)
     assert done.json["crashes"], done.err
     shell.crashhunt("export", "h", "crash.zip")
     return shell.folder / "crash.zip"
 
 
-@pytest.fixture(scope="module")
-def crash(tmp_path_factory):
-    """A crash without its code, hundreds of files that recorded actions have no need of."""
-    return exported(tmp_path_factory.mktemp("exported"), "--no-snapshot")
-
-
-@pytest.fixture(scope="module")
-def with_code(tmp_path_factory):
-    """The same with it."""
-    return exported(tmp_path_factory.mktemp("exported"))
+@pytest.fixture
+def with_code(shell, made_once):
+    """A crash of the shipped scenario with its code; `test_show` hunts for it as well."""
+    made_once(hunted, shell).crashhunt("export", "h", "crash.zip")
+    return shell.folder / "crash.zip"
 
 
 def changed(source: Path, target: Path, *edits: tuple[str, str, str]) -> Path:
