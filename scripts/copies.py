@@ -10,6 +10,7 @@ import resource
 import shutil
 import signal
 import sys
+import tempfile
 import time
 from collections import Counter, defaultdict
 from pathlib import Path
@@ -111,6 +112,7 @@ class Slot:
         self._written = 0
         self._pid = 0
         self._deadline = 0.0
+        self._temporary = ""
         # Some tests read the workflows of GitHub.
         shutil.copytree(
             ROOT, tree, ignore=lambda _, names: [name for name in names if name[0] == "." and name != ".github"]
@@ -127,6 +129,10 @@ class Slot:
     def start(self, arguments: list[str], *, seconds: float, watcher: Watcher | None = None) -> None:
         """Run pytest in a process of its own, for so much time of the processor and at most ten times as long."""
         self._deadline = time.monotonic() + 10 * seconds
+        # The child ends without Python's exit functions, so that this process removes its temporary files.
+        memory = Path("/dev/shm")
+        in_memory = memory.is_dir() and os.access(memory, os.W_OK)
+        self._temporary = tempfile.mkdtemp(prefix="crashhunt-mutate-", dir=memory if in_memory else None)
         self._pid = os.fork()
         if self._pid == 0:
             code = 70
@@ -145,6 +151,7 @@ class Slot:
             return None
         self._sweep()
         self._pid = 0
+        shutil.rmtree(self._temporary, ignore_errors=True)
         if os.WIFSIGNALED(status):
             return "timeout" if os.WTERMSIG(status) == signal.SIGXCPU else "failed"
         return "passed" if os.WEXITSTATUS(status) == 0 else "failed"
@@ -162,6 +169,7 @@ class Slot:
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(self._pid, 0)
             self._pid = 0
+            shutil.rmtree(self._temporary, ignore_errors=True)
 
     def said(self) -> str:
         """Return what pytest has printed."""
@@ -182,7 +190,8 @@ class Slot:
         for number in (1, 2):
             os.dup2(output, number)
         sys.path.insert(0, str(self.tree))
-        os.environ["PYTHONPATH"] = str(self.tree)  # for what the tests start
+        os.environ |= {"PYTHONPATH": str(self.tree), "TMPDIR": self._temporary}  # for what the tests start, too
+        tempfile.tempdir = None
         import hypothesis
         import pytest
 

@@ -498,7 +498,8 @@ def test_ledger_of_later_without_a_word_on_readers_is_refused(path):
         ("malformed\n database", "the ledger is damaged: malformed database", "crashhunt check"),
     ],
 )
-def test_error_of_sqlite_has_a_cause_and_a_fix(path, text, says, fix):
+def test_error_of_sqlite_has_a_cause_and_a_fix(path, monkeypatch, text, says, fix):
+    monkeypatch.setattr(resource, "getrlimit", lambda which: (resource.RLIM_INFINITY,) * 2)
     found = _schema.explained(path, sqlite3.OperationalError(text))
     assert says in str(found)
     assert fix in found.fix
