@@ -200,8 +200,8 @@ def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     for more, says in (
         ("--from-log", "recorded actions cannot be repeated"),
         ("--scenario=loop-two-agents", "2 controlled"),
-        ("--frames=f", "a film applies to the scenario of the crash"),
-        ("--until=3", "--until applies to the scenario of the crash"),
+        ("--frames=f", "a film cannot be combined with --scenario, because it needs the scenario of the crash"),
+        ("--until=3", "--until cannot be combined with --scenario, because it needs the scenario"),
     ):
         refused = shell.crashhunt("replay", "h", "--scenario", "motorway", more, expect=2)
         assert says in refused.err

@@ -287,7 +287,7 @@ def test_a_token_is_shown_to_a_cluster_that_asks_for_it(toy):
             toy.crashhunt(words[0], "shown", *words[1:])
             token.write_text("9876543210" * 4)
             err = toy.crashhunt(words[0], "wrong", *words[1:], expect=2).err
-            assert f"the Ray cluster at 127.0.0.1:{port} expects another token; put the one" in err
+            assert f"the Ray cluster at 127.0.0.1:{port} expects another token; put the token with which" in err
             token.unlink()
             err = toy.crashhunt(words[0], "none", *words[1:], expect=2).err
             assert f"the Ray cluster at 127.0.0.1:{port} needs a token; set RAY_AUTH_MODE=token, and put" in err
