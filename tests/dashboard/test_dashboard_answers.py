@@ -6,6 +6,7 @@ import asyncio
 import json
 import math
 import time
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -262,6 +263,8 @@ def test_control_stops_hunts_and_starts_jobs_of_crashes_that_exist(made, monkeyp
 
 def test_files_are_kept_for_ever_only_under_the_address_of_their_version(made, monkeypatch):
     monkeypatch.setattr(_application, "_plotly", lambda: b"plot")
+    for kept in (_application._stamp, _application._page):  # not those with the plotly of this test
+        monkeypatch.setattr(_application, kept.__name__, cache(kept.__wrapped__))
     application = made()
     for name, kind in (("common.js", "text/javascript"), ("style.css", "text/css"), ("player.js", "text/javascript"),
                        ("plotly.js", "text/javascript")):  # fmt: skip
@@ -281,8 +284,6 @@ def test_files_are_kept_for_ever_only_under_the_address_of_their_version(made, m
         assert f'"/static/style.css?v={_application._stamp("style.css")}"' in text
         assert text.count('"/static/') == text.count("?v=")
         assert "<!--PLAYER-->" not in text
-    _application._stamp.cache_clear()  # of the plotly of this test
-    _application._page.cache_clear()
 
 
 def test_large_function_of_plotly_is_in_parentheses(monkeypatch):

@@ -124,7 +124,8 @@ def test_a_class_is_looked_at_again_when_it_or_its_bases_have_changed():
     assert kind_of(kind).drives == "controlled"
 
 
-def test_left_alone_names_members_of_moving_classes_only(caplog):
+def test_left_alone_names_members_of_moving_classes_only(caplog, monkeypatch):
+    monkeypatch.setattr(_versions, "left_alone", {})
     moving = type("Walker", (IDMVehicle,), {"mobil": lambda *_: False, "step": lambda *_: None})
     still = type("Post", (Obstacle,), {"polygon": lambda *_: None})
     with caplog.at_level("INFO", "crashhunt"):
@@ -137,7 +138,6 @@ def test_left_alone_names_members_of_moving_classes_only(caplog):
     assert [record.message.partition(": ")[2].rpartition(".")[2] for record in caplog.records] == [
         "Walker has its own mobil, step"
     ]
-    _versions.left_alone.clear()
 
 
 class Changing:
