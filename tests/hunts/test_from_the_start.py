@@ -133,6 +133,23 @@ def test_only_kinds_that_a_hunt_has_end_it():
         assert looked(Copies(**run), ended(2, branch=3.0)) == (None, [])
 
 
+def test_every_disturbance_of_a_crash_must_be_of_the_hunt():
+    brake = Disturbance(2, "ahead", "brake", 3.0, 2.0, "ego")
+    stop = replace(brake, step=4, what="stop")
+
+    def with_both(copies):
+        crashed = Branches(crashes=(Branch((brake, stop), 1, "collision", 5, -9.0),))
+        return looked(copies, replace(ended(2), branches=crashed))
+
+    assert with_both(Copies()) == (None, [])
+    copies = Copies()
+    copies.disturber = SimpleNamespace(models=copies.disturber.models, fixed=(stop,))  # planned for every trial
+    assert with_both(copies) == (2, [(2, "branches")])
+    copies = Copies()
+    copies.disturber = SimpleNamespace(models=copies.disturber.models, fixed=(replace(stop, step=5),))
+    assert with_both(copies) == (None, [])
+
+
 def test_a_copy_of_an_earlier_trial_comes_before_a_crash_where_that_is_asked_for():
     for deterministic, wanted in ((False, 4), (True, 2)):
         copies, progress = Copies(deterministic=deterministic), Progress()
