@@ -352,8 +352,13 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
     directory, ledger, keep = again.place.path, again.ledger, again.settings.run.near_misses
     if not keep or len(again.stops):
         return ()
-    wanted = {number: result for number in ledger.most_dangerous(keep)
-              if (result := ledger.result(number)) is not None}  # fmt: skip
+    numbers = ledger.most_dangerous(keep)
+    if not numbers and ledger.numbers_of(("survived", "finished")):
+        again.notes.append(
+            "no near miss is kept, because no trial without a crash has a criticality above 0 (the key gym.danger "
+            "names the criticality in a Gymnasium environment)"
+        )
+    wanted = {number: result for number in numbers if (result := ledger.result(number)) is not None}
     for bundle in list_near_misses(directory):
         result = wanted.get(bundle.result.spec.number)
         if result is not None and result.digest == bundle.result.digest:

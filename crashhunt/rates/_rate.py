@@ -160,6 +160,8 @@ def make_rate(
     why_not = why_no_interval or counter.why_not
     if not why_not and not counter.units:
         why_not = sequence.why_empty
+    if not why_not and not counter.is_measured:
+        why_not = "no trial has a driven distance and time"
     if not why_not and sequence.invalid_share > MAX_INVALID_SHARE:
         many = f"{sequence.invalid} of {sequence.invalid + sequence.valid} trials are invalid"
         why_not = f"{many}, more than {MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"

@@ -292,6 +292,7 @@ class RateCounter:
         self._early = 0  # units with a crash before the step length was known
         self.units = self.trials = self.crashes = self.steps = 0
         self.driven_s = self.driven_m = 0.0
+        self.is_measured = per == "trial"  # whether the exposure of any trial is known
         self.why_not = ""
 
     def add(self, unit: Unit) -> tuple[float, float] | None:
@@ -343,6 +344,7 @@ class RateCounter:
             if not trial.crashed:  # a crash whose recording is damaged counts with exposure 0
                 self.why_not = self.why_not or f"trial {trial.number} has no driven distance and time"
             return 0.0
+        self.is_measured = True
         return driven / (_S_PER_HOUR if self._per == "hour" else _M_PER_1000KM)
 
     def interval(self, alpha: float) -> Interval | None:

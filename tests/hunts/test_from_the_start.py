@@ -473,6 +473,16 @@ def test_near_misses_stay_where_none_are_asked_for_or_the_hunt_is_stopped(near):
         assert found.removed == []
 
 
+def test_trials_without_a_criticality_leave_no_near_misses_and_a_note(near, monkeypatch):
+    found = near(lambda specs, folder: iter(()))
+    for finished, count in (([0], 1), ([], 0)):
+        found.again.notes.clear()
+        monkeypatch.setattr(found.again.ledger, "most_dangerous", lambda keep: [])
+        monkeypatch.setattr(found.again.ledger, "numbers_of", lambda outcomes, found=finished: found, raising=False)
+        keep_near_misses(found.again)
+        assert [note.partition(",")[0] for note in found.again.notes] == ["no near miss is kept"] * count
+
+
 def test_near_misses_that_are_there_do_not_run_again(near):
     found = near(lambda specs, folder: iter([] if not specs else pytest.fail("it runs")), keep=2)
     found.kept[:] = [SimpleNamespace(result=trial(number), path=number) for number in (0, 1)]

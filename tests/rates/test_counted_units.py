@@ -63,6 +63,15 @@ def test_missing_rate_names_the_earlier_trial_that_has_not_ended():
     assert found.why_not == "trial 0 has not ended, and trials count in the order of their numbers"
 
 
+def test_crashes_without_any_driven_distance_have_no_rate_per_hour():
+    trials = [trial(number, crashed=True)._replace(driven_s=None, driven_m=None) for number in range(3)]
+    for per in ("hour", "1000km"):
+        found = counted(trials, per=per)
+        assert (found.certain, found.why_not) == (None, "no trial has a driven distance and time")
+        assert counted([*trials, trial(3)], per=per).certain is not None
+    assert counted(trials).certain is not None
+
+
 def test_trial_that_was_killed_from_outside_has_not_ended():
     found = counted([trial(0), trial(1, valid=False, has_ended=False), trial(2)])
     assert (found.trials, found.excluded) == (1, {"after_unfinished": 1})
