@@ -127,6 +127,7 @@ def _run(words: Sequence[str]) -> int:
         parser = make_parser()
         complete(parser)
         options = parser.parse_args(_spell_out(words))
+        _check_folder()
         remove_leftovers()
         with ended_by_signals():
             code: int = options.command(options, words)
@@ -135,6 +136,16 @@ def _run(words: Sequence[str]) -> int:
     except SystemExit as leaving:  # of --help and --version
         return leaving.code if isinstance(leaving.code, int) else 0
     return code
+
+
+def _check_folder() -> None:
+    """Refuse a current directory that was removed, because the processes of trials would fail for unclear reasons."""
+    try:
+        os.getcwd()  # noqa: PTH109
+    except OSError as error:
+        raise UsageError(
+            f"the current directory cannot be used: {error.strerror}", fix="change to an existing directory"
+        ) from None
 
 
 def _report(error: CrashhuntError, *, as_json: bool) -> int:

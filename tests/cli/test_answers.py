@@ -291,6 +291,20 @@ def test_end_of_the_command_line_has_one_line_and_a_code(monkeypatch, capsys, er
             assert json.loads(out)
 
 
+def test_removed_current_directory_is_refused(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    with pytest.raises(SystemExit) as left:
+        cli.main(["status", str(tmp_path)])
+    assert left.value.code == 2
+    said = (
+        "crashhunt: the current directory cannot be used: No such file or directory; change to an existing directory\n"
+    )
+    assert capsys.readouterr().err == said
+
+
 def test_argument_that_is_no_text_is_named():
     with pytest.raises(UsageError, match=r"the argument 'a\\udcff' is not valid UTF-8"):
         cli._check_names(["b", "a\udcff"])
