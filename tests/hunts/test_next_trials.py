@@ -18,8 +18,8 @@ from hypothesis import given, settings as how, strategies as st
 from crashhunt.base.integrity import digest_of_row
 from crashhunt.disturbances import FIRST_STEP
 from crashhunt.errors import HuntDirectoryError, PluginError
-from crashhunt.hunts import Trials, spec_of
-from crashhunt.hunts._next_trials import settings_again, settings_of_workers
+from crashhunt.hunts import Trials, _next_trials, spec_of
+from crashhunt.hunts._next_trials import growing_lag, settings_again, settings_of_workers
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
 from crashhunt.samplers import NamedSampler, RandomSampler, Sampler
@@ -399,3 +399,95 @@ def test_unanswered_trials_run_first_and_the_sampler_proposes_as_if_they_had_not
         assert order[:2] == unanswered
         assert sorted(spec.number for spec in order[2:]) == sorted(set(range(20)) - finished)
         assert [one.spec for one in ledger.results()] == [one.spec for one in whole.results()]
+
+
+# The order in which trials are provided, with a sampler that makes up specifications.
+
+
+@pytest.fixture
+def provided(monkeypatch):
+    """Makes the trials of a hunt of six; each specification is what was asked for."""
+    asked = []
+
+    def spec_of(number, settings, sampler, disturber, forcing=None):
+        asked.append((number, sampler, disturber, forcing))
+        return SimpleNamespace(number=number, parent=None, origin="")
+
+    monkeypatch.setattr(_next_trials, "spec_of", spec_of)
+
+    def make(finished=(), learns=False, deterministic=False, **options):
+        run = SimpleNamespace(deterministic=deterministic)
+        planned = SimpleNamespace(most_trials=6, run=run, sampler="s")
+        sampler = SimpleNamespace(learns=learns, version=1)
+        noted = []
+        ledger = SimpleNamespace(note=lambda **facts: noted.append(facts))
+        made = Trials(planned, sampler, ledger, set(finished), **{"lag": 4, "disturber": "disturber"} | options)
+        return SimpleNamespace(trials=made, asked=asked, noted=noted, sampler=sampler)
+
+    return make
+
+
+def numbers_of(specs):
+    return [spec.number for spec in specs]
+
+
+def test_trials_that_run_again_come_first_and_take_room(provided):
+    again = [SimpleNamespace(number=number, parent=None, origin="") for number in (1, 3)]
+    found = provided(finished={0, 1, 2, 3}, unanswered=again)
+    trials = found.trials
+    assert trials.upcoming == 1
+    assert trials.take(0) == []
+    assert numbers_of(trials.take(1)) == [1]
+    assert (trials.upcoming, trials.exhausted) == (3, False)
+    assert numbers_of(trials.take(2)) == [3, 4]
+    assert (trials.upcoming, trials.exhausted) == (5, False)
+    assert numbers_of(trials.take(9)) == [5]
+    assert (trials.upcoming, trials.exhausted) == (None, True)
+    assert trials.take(9) == []
+    assert found.asked == [(4, found.sampler, "disturber", None), (5, found.sampler, "disturber", None)]
+    for number in (1, 3, 4):
+        trials.ended(SimpleNamespace(spec=SimpleNamespace(number=number)))
+    assert trials._open == {5}
+    only = provided(finished=range(6), unanswered=again[:1]).trials
+    assert (only.upcoming, only.exhausted) == (1, False)
+
+
+def test_root_waits_until_the_trials_that_it_learns_from_have_ended(provided):
+    forcings = SimpleNamespace(needed=lambda number: 2 if number >= 3 else 0, of=lambda number: f"forcing {number}")
+    found = provided(forcings=forcings)
+    trials = found.trials
+    assert numbers_of(trials.take(9)) == [0, 1, 2]
+    assert trials.take(9) == []
+    trials.ended(SimpleNamespace(spec=SimpleNamespace(number=1)))
+    assert trials.take(9) == []  # trial 0 runs
+    trials.ended(SimpleNamespace(spec=SimpleNamespace(number=0)))
+    assert numbers_of(trials.take(9)) == [3, 4, 5]  # trial 2 is not needed
+    assert [forcing for *_, forcing in found.asked] == [f"forcing {number}" for number in range(6)]
+
+
+def test_ledger_notes_once_that_trials_have_origins(provided, monkeypatch):
+    origins = {1: (None, "climb"), 3: (0, ""), 4: (None, "climb")}
+
+    def spec_of(number, *_):
+        parent, origin = origins.get(number, (None, ""))
+        return SimpleNamespace(number=number, parent=parent, origin=origin)
+
+    monkeypatch.setattr(_next_trials, "spec_of", spec_of)
+    found = provided()
+    found.trials.take(1)
+    assert found.noted == []
+    found.trials.take(2)
+    assert found.noted == [{"origins": True}]
+    found.trials.take(3)
+    assert found.noted == [{"origins": True}]
+    other = provided()
+    del origins[1], origins[4]
+    other.trials.take(3)
+    assert other.noted == []
+    other.trials.take(2)  # a parent is enough
+    assert other.noted == [{"origins": True}]
+
+
+def test_delay_of_results_grows_by_one_each_eight_trials_up_to_its_maximum():
+    assert [growing_lag(number, 32) for number in (0, 7, 8, 15, 16, 223, 224, 9999)] == [4, 4, 5, 5, 6, 31, 32, 32]
+    assert growing_lag(0, 3) == 3

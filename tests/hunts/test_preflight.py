@@ -11,7 +11,7 @@ from crashhunt.base import layout
 from crashhunt.errors import ArgumentError, UsageError
 from crashhunt.executors import EXCLUDED_WORDS
 from crashhunt.hunts import Preflight
-from crashhunt.hunts._preflight import WorkerNotices, why_invalid
+from crashhunt.hunts._preflight import WorkerNotices, _describe_end, why_invalid
 from crashhunt.plans import Request, plan
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
@@ -172,3 +172,9 @@ def test_reason_of_an_invalid_trial_is_that_of_the_simulator_or_its_last_line():
     assert why_invalid(silent, plain) == silent.summary
     assert why_invalid(replace(failed, failure=None), scenario) == replace(failed, failure=None).summary
     assert len(told) == 2
+
+
+def test_end_of_a_process_is_a_signal_or_an_exit_code():
+    assert [_describe_end(code) for code in (-9, -1, 0, 1, 3)] == [
+        "signal 9", "signal 1", "exit code 0", "exit code 1", "exit code 3",
+    ]  # fmt: skip

@@ -6,16 +6,19 @@ import os
 import subprocess
 import time
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from crashhunt.base import layout
+from crashhunt.base.temporary import this_process
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.hunts import _state, find_hunts, hunt_state, is_hunt
 from crashhunt.hunts._state import HuntDirectory, copies_to_come, ledger_owner, state_of_facts, sums_of_branches
 from crashhunt.ledger import Ledger
+from crashhunt.plans import HuntSettings
 from crashhunt.trial import Branch, Branches, Outcome, TrialResult, TrialSpec
 
 NOW = 1000.0
@@ -257,3 +260,18 @@ def test_settings_are_removed_last_so_that_a_folder_stays_that_of_a_hunt(tmp_pat
     place._remove_own()
     assert removed[-1] == layout.HUNT
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_claim_removes_what_ended_processes_have_left(tmp_path):
+    here, place = this_process(), HuntDirectory(tmp_path)
+    dead = replace(here, pid=2**22 + 5, started=1)
+    folders = [tmp_path, *(tmp_path / name for name in (layout.CRASHES, *layout.BESIDE))]
+    for folder in folders:
+        for owner in (here, dead):
+            (folder / f".000001-collision.{owner.token}").mkdir(parents=True)
+    (tmp_path / f".scratch-{dead.token}" / "trial").mkdir(parents=True)
+    settings = HuntSettings(scenario="loop", scenario_digest="x", trials=1, max_steps=1, seed=1)
+    place.claim(settings, ["crashhunt"], overwrite=False, seed_given=True)
+    for folder in folders:
+        assert [path.name for path in folder.glob(".000001*")] == [f".000001-collision.{here.token}"]
+    assert [path.name for path in tmp_path.glob(".scratch*")] == [place.scratch.name]
