@@ -6,16 +6,18 @@ import math
 import time
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 import crashhunt
+from crashhunt.errors import CrashhuntError, ScenarioError
 from crashhunt.hunts import _hunt as hunt_module
 from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._next_trials import GREATEST_LAG
 from crashhunt.ledger import Ledger
-from crashhunt.trial import Failure, Outcome, TrialResult
+from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
 TOY = """
 title = "A toy"
@@ -356,3 +358,81 @@ def test_hunt_that_keeps_going_reports_its_shortest_crash_first(run, bundles, mo
     assert found.report.kinds == ()
     assert found.report.outcomes == {"survived": 5, "collision": 3}
     assert found.executor.cancelled == [-1]
+
+
+def test_error_in_a_file_of_the_scenario_names_the_file_of_the_user(run):
+    def fails(spec):
+        where = f"{made.executor.settings.scenario.origin}: line 3"
+        raise CrashhuntError("no road", fix="draw one", where=where)
+
+    made = SimpleNamespace()
+    init = Inline.__init__
+
+    def listen(executor, *words, **options):
+        made.executor = executor
+        init(executor, *words, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Inline, "__init__", listen)
+        with pytest.raises(ScenarioError, match="no road; draw one") as caught:
+            run(3, fails)
+        assert caught.value.where == f"{Path.cwd() / 'toy.toml'}: line 3"
+        assert caught.value.where != f"{made.executor.settings.scenario.origin}: line 3"
+        assert made.executor.closed == 1
+
+        def elsewhere(spec):
+            raise CrashhuntError("no disk", fix="buy one", where="/dev/sda")
+
+        with pytest.raises(CrashhuntError, match="no disk") as caught:
+            run(3, elsewhere, overwrite=True)
+        assert type(caught.value) is CrashhuntError
+        assert caught.value.where == "/dev/sda"
+
+
+def test_parts_of_a_hunt_are_closed_at_its_end(run, monkeypatch):
+    closed = []
+
+    def note(kind, name):
+        method = kind.close
+
+        def close(part, *words):
+            closed.append(name)
+            method(part, *words)
+
+        monkeypatch.setattr(kind, "close", close)
+
+    for kind in (hunt_module.Audit, hunt_module.Confirmation, hunt_module.SharedExecutors):
+        note(kind, kind.__name__)
+    released = []
+    monkeypatch.setattr(
+        hunt_module, "release_shared_memory", lambda scratch, *, of_ended: released.append((scratch, of_ended))
+    )
+    found = run(3)
+    assert closed == ["Audit", "Confirmation", "SharedExecutors"]
+    assert [(scratch.name[:8], of_ended) for scratch, of_ended in released[:1]] == [(".scratch", True)]
+    closed.clear()
+
+    def fails(spec):
+        raise ValueError("odd")
+
+    with pytest.raises(ValueError, match="odd"):
+        run(3, fails, overwrite=True)
+    assert closed == ["Audit", "Confirmation", "SharedExecutors"]
+    assert list(found.path.glob(".scratch*")) == []
+
+
+def test_bundle_whose_row_is_missing_is_recorded_when_a_hunt_resumes(run, monkeypatch):
+    """A hunt is killed between the bundle of a crash and its row."""
+    run(2)
+    bundle = SimpleNamespace(
+        result=replace(survives(SimpleNamespace(number=2)), spec=TrialSpec(2, 99, {"ego": {"speed": 7.0}}, {}, 60)),
+        id="000002-collision", snapshot="0f", confirmed=True,
+    )  # fmt: skip
+    monkeypatch.setattr(hunt_module, "list_bundles", lambda directory: [bundle])
+    monkeypatch.setattr(hunt_module.TrialReruns, "confirm", lambda again, crashes: list(crashes))
+    found = run(4, keep_going=False)
+    assert 2 in found.numbers
+    assert found.executor is None or 2 not in [spec.number for spec in found.executor.submitted]
+    with closing(Ledger(found.path / "ledger.sqlite")) as ledger:
+        assert ledger.result(2) == bundle.result
+        assert ledger.snapshot_of(2) == "0f"
