@@ -63,8 +63,10 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Refuse unknown options first. Otherwise, argparse would report an error about the option's value.
 
+        Arguments beyond those of a command are refused here, because argparse would name the help of all commands.
+
         Raises:
-            UsageError: an option does not exist.
+            UsageError: an option does not exist, or there are too many arguments.
         """
         known = [option for option in self._option_string_actions if option.startswith("--")]
         for word in takewhile(lambda word: word != "--", args or ()):
@@ -74,7 +76,12 @@ class Parser(argparse.ArgumentParser):
             if name.startswith("--") and " " not in name and not any(option.startswith(name) for option in known):
                 fix = f"{did_you_mean(name, known)} see {self.prog} --help".lstrip()
                 raise UsageError(f"there is no option {name!r}", fix=fix)
-        return super().parse_known_args(args, namespace)
+        found, rest = super().parse_known_args(args, namespace)
+        if rest and " " in self.prog:
+            is_option = rest[0].startswith("-")
+            what = f"there is no option {rest[0]!r}" if is_option else f"too many arguments: {' '.join(rest)}"
+            raise UsageError(what, fix=f"see {self.prog} --help")
+        return found, rest
 
     def _check_value(self, action: argparse.Action, value: object) -> None:
         choices = [str(choice) for choice in action.choices or ()]

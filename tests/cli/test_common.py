@@ -61,6 +61,10 @@ def test_unknown_command_is_named_and_its_own_options_are_left_to_it():
     verbs.add_parser("show").add_argument("--all", action="store_true")
     verbs.add_parser("run")
     assert made.parse_args(["show", "--all"]).all is True
+    with pytest.raises(UsageError, match=r"^too many arguments: h g; see crashhunt show --help$"):
+        made.parse_args(["show", "h", "--all", "g"])
+    with pytest.raises(UsageError, match=r"^there is no option '-x'; see crashhunt show --help$"):
+        made.parse_args(["show", "-x"])
     with pytest.raises(UsageError, match="there is no command 'shoe'; did you mean 'show'"):
         made.parse_args(["shoe"])
 
