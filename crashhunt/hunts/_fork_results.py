@@ -355,8 +355,8 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
     numbers = ledger.most_dangerous(keep)
     if not numbers and ledger.numbers_of(("survived", "finished")):
         again.notes.append(
-            "no near miss is kept, because no trial without a crash has a criticality above 0 (the key gym.danger "
-            "names the criticality in a Gymnasium environment)"
+            "no near miss is kept, because no trial without a crash has a criticality above 0, or because the scenario "
+            "defines no criticality"
         )
     wanted = {number: result for number in numbers if (result := ledger.result(number)) is not None}
     for bundle in list_near_misses(directory):

@@ -40,6 +40,14 @@ def fail(place):
         raise KeyError("of the environment")
 
 
+class Refusing(dict):
+    def refuse(self, *_):
+        fail("info")
+        return 0
+
+    get = __getitem__ = __contains__ = items = refuse
+
+
 class Word(gymnasium.Space):
     def __init__(self):
         super().__init__(None, None)
@@ -90,7 +98,8 @@ class Env(gymnasium.Env):
             if fails == "four":
                 return self.look(), 0.0, False, {}
         reward = "much" if fails == "reward" else 0.0
-        return self.look(), reward, False, False, None if fails == "info" else {"bad": 0}
+        info = {"no info": None, "info": Refusing(bad=0)}.get(fails, {"bad": 0})
+        return self.look(), reward, False, False, info
 
     def close(self):
         fail("close")
@@ -303,6 +312,7 @@ TABLE = [
     (E, "exit", ("simulator_error", E, "step", "")),
     (E, "four", ("simulator_error", E, "step", "")),
     (E, "reward", ("simulator_error", E, "reward", "")),
+    (E, "no info", ("simulator_error", E, "step", "")),
     (E, "info", ("simulator_error", E, "info", "")),
     (E, "rule", ("simulator_error", E, "info", "")),
     (E, "close", ("survived", "", "", "")),
