@@ -79,6 +79,10 @@ REMEDIES = [
     (OSError(errno.EDQUOT, "Disk quota exceeded"), DISK),
     (PermissionError(errno.EACCES, "Permission denied", "hunt.toml"), DISK),
     (FileNotFoundError(errno.ENOENT, "No such file or directory", "hunt.toml"), FILE),
+    (
+        OSError(errno.EMFILE, "Too many open files"),
+        "raise the limit on open files (ulimit -n), and run the same command again",
+    ),
     (BrokenPipeError(errno.EPIPE, "Broken pipe"), ""),
     (ConnectionResetError(errno.ECONNRESET, "Connection reset by peer"), ""),
     (OSError("without a number"), ""),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 from argparse import Namespace
@@ -289,6 +290,18 @@ def test_end_of_the_command_line_has_one_line_and_a_code(monkeypatch, capsys, er
         assert bool(out) == (bool(message) and "--json" in words)
         if out:
             assert json.loads(out)
+
+
+def test_letter_that_the_output_does_not_know_is_escaped(monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
+    parser = SimpleNamespace(parse_args=lambda words: Namespace(command=lambda options, words: print("8 m/s²") or 0))
+    monkeypatch.setattr(cli, "make_parser", lambda: parser)
+    monkeypatch.setattr(cli, "complete", lambda parser: None)
+    monkeypatch.setattr(cli, "remove_leftovers", lambda: None)
+    with pytest.raises(SystemExit) as left:
+        cli.main(["x"])
+    assert (left.value.code, written.getvalue()) == (0, b"8 m/s\\xb2\n")
 
 
 def test_removed_current_directory_is_refused(tmp_path, monkeypatch, capsys):

@@ -131,7 +131,12 @@ def test_classes_in_a_configuration_are_those_of_highway_env(tmp_path):
     assert "'my.Car'" in refused(highway(), settings(kind=("str", "my.Car")), values={})
 
 
-@pytest.mark.parametrize("option", ["netstate-dump", "summary", "ndump", "C", "made-up", "remote-port"])
+@pytest.mark.parametrize(
+    "option",
+    ["netstate-dump", "ndump", "tripinfo", "summary", "vehroutes", "C", "l", "log-file", "save-state.prefix",
+     "device.ssm.file", "device.toc.file", "fcd-output", "made-up", "remote-port", "configuration-file", "weights",
+     "scale=1 --summary"],
+)  # fmt: skip
 def test_options_that_write_or_that_no_one_knows_are_refused(sumo, option):
     try:
         scenario = sumo(argument=f'option = "{option}"')
@@ -146,6 +151,7 @@ def test_options_that_write_or_that_no_one_knows_are_refused(sumo, option):
         ('<event commandPosix="rm x"/>', "<event>"),
         ('<vType id="v" imgFile="/etc/passwd"/>', "imgFile"),
         ('<vType id="v"><param key="device.ssm.file" value="/home/x"/></vType>', "might name a file"),
+        ('<vType id="v"><param key="&#100;evice.ssm.file" value="/home/x"/></vType>', "might name a file"),
         ('<vType id="v"><param key="x" value="C:y"/></vType>', "might name a file"),
         ('<vType id="v"><param key="x" value="a\\b"/></vType>', "might name a file"),
         ("<unclosed>", "cannot be checked|which has an unknown effect"),

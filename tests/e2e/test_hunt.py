@@ -167,7 +167,7 @@ def test_a_killed_hunt_leaves_no_process_and_continues(toy):
     assert {key: after[key] for key in before} == before
 
 
-@pytest.mark.nightly  # by day, test_stops.py kills the process of a trial
+@pytest.mark.nightly  # by day, executors/test_killed_trials.py kills processes of trials
 def test_a_killed_worker_costs_its_own_trial_only(toy):
     words = ("run", "h", "2", "30", *LONG, "--crash-on", "hang", "--json")
     process = toy.begin(*words, start_new_session=True)
@@ -247,7 +247,7 @@ def test_option_to_recycle_workers_is_still_taken(toy):
     assert toy.crashhunt(*words).json["outcomes"] == {"survived": 6}
 
 
-@pytest.mark.nightly  # by day, test_stops.py limits the size of files
+@pytest.mark.nightly  # by day, ledger/test_ledger_reads.py and hunts/test_whole_hunts.py
 def test_a_full_disk_is_one_clear_line_and_nothing_is_lost(shell):
     small = shell.folder / "small"
     small.mkdir()

@@ -132,7 +132,7 @@ def test_what_is_wrong_with_a_sampler_is_one_line(own):
     assert "climber.py, line" in done.err
 
 
-@pytest.mark.nightly  # by day, test_stops.py writes a missing row
+@pytest.mark.nightly  # by day, hunts/test_hunt_loop.py writes a missing row
 def test_a_crash_without_a_row_gets_one_that_states_where_it_is_from(own):
     words = ("1", "3", "20", "--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=5", "--keep-going")
     own.crashhunt("run", "h", *words, "--sampler", "climber:Climber")

@@ -129,6 +129,7 @@ def test_one_that_is_damaged_is_found_and_made_again(hunt):
     assert log.exists()
 
 
+@pytest.mark.nightly  # by day, crashes/test_bundle.py
 def test_of_a_hunt_without_a_crash_the_most_dangerous_is_meant(toy):
     words = ("run", "h", "2", "3", "20", "--scenario", "toy", "--seed", "4", "--arg", "speed=11:13")
     done = toy.crashhunt(*words, "--near-misses", "3")
@@ -147,6 +148,7 @@ class Fast(Remembers):
 """
 
 
+@pytest.mark.nightly  # by day, hunts/test_from_the_start.py
 def test_one_that_is_another_trial_in_a_fresh_process_is_not_kept(toy):
     (toy.folder / "fast.py").write_text(REMEMBERS)
     words = ("run", "h", "1", "3", "30", "--scenario", "toy", "--seed", "4", "--agent", "fast:Fast")

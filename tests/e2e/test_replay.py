@@ -71,6 +71,7 @@ def crash_on_sumo(shell, made_once):
     return made_once(hunted_on_sumo, shell)
 
 
+@pytest.mark.nightly  # by day, test_snapshot.py removes the project, and the hunt is moved
 def test_the_originals_may_be_gone(crash_on_sumo):
     crash = crash_on_sumo
     for name in ("my_pkg", "own"):
@@ -126,7 +127,7 @@ def test_a_change_is_found_where_it_happens(crash):
     assert crash.crashhunt("replay", "h", "--from-log", "--force", "--json").json["verdict"] == "reproduced"
 
 
-@pytest.mark.parametrize(("step", "field"), [(25, "length"), (35, "action")])
+@pytest.mark.parametrize(("step", "field"), [pytest.param(25, "length", marks=pytest.mark.nightly), (35, "action")])
 def test_a_run_that_is_shorter_or_longer_diverges(crash, step, field):
     change_snapshot(crash, "== 30", f"== {step}")
     divergence = crash.crashhunt("replay", "h", "--force", "--trust", "--json", expect=1).json["divergence"]
@@ -153,6 +154,7 @@ def _flip(data: bytes) -> bytes:
     return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
 
 
+@pytest.mark.nightly  # by day, hunts/test_hunt_loop.py, crashes/test_bundle.py and base/test_names.py
 def test_replay_takes_the_crash_with_the_fewest_steps(toy):
     words = ("run", "h", "2", "2", "200", "--agent", "faulty:Raises", "--arg", "at=5:60", "--scenario", "toy")
     report = toy.crashhunt(*words, "--keep-going", "--json").json
@@ -169,6 +171,7 @@ def edit(path: Path, before: str, after: str) -> None:
     path.write_text(text.replace(before, after))
 
 
+@pytest.mark.nightly  # by day, test_scenarios.py, test_corpus.py and replays/test_verdicts.py
 def test_todays_code_is_judged_against_the_recorded_crash(crash):
     agents = crash.folder / "my_pkg" / "agents.py"
     same = crash.crashhunt("replay", "h", "--code", "current", "--json").json
@@ -191,6 +194,7 @@ def test_todays_code_is_judged_against_the_recorded_crash(crash):
     assert "helper_that_is_gone" in broken.err
 
 
+@pytest.mark.nightly  # by day, replays/test_edits.py, replays/test_verdicts.py and report/test_result_texts.py
 def test_another_value_is_no_longer_the_recorded_trial(crash):
     done = crash.crashhunt("replay", "h", "--set", "speed=9", "--json", expect=1)
     assert done.json["verdict"] == "changed"  # it raises all the same
@@ -211,6 +215,7 @@ def test_another_value_is_no_longer_the_recorded_trial(crash):
         assert len(refused.err.strip().splitlines()) == 1
 
 
+@pytest.mark.nightly  # by day, replays/test_edits.py and replays/test_verdicts.py
 def test_hunt_toml_is_what_a_replay_uses(crash):
     settings = crash.folder / "h" / "hunt.toml"
     edit(settings, "max_steps = 100", "max_steps = 12")
@@ -230,7 +235,12 @@ def test_an_agent_that_is_not_deterministic_is_found_out(toy):
         "    def act(self, observation):\n        self.step += 1\n        assert self.step < 20\n"
         "        return 5 + int.from_bytes(os.urandom(6)) / 2**49 * (self.step > 9), 0\n"
     )
-    toy.crashhunt("run", "h", "1", "1", "100", "--agent", "coin:Agent", "--scenario", "toy", "--json")
+    hunt = toy.crashhunt("run", "h", "1", "1", "100", "--agent", "coin:Agent", "--scenario", "toy", "--json").json
+    (crash,) = hunt["crashes"]
+    assert (crash["step"], crash["confirmed"]) == (19, False)
+    assert hunt["steps_total"] == 2 * 19  # what was simulated to confirm it is in vain
+    saved = json.loads((toy.folder / crash["path"] / "crash.json").read_text())["divergence"]
+    assert (saved["step"], saved["field"]) == (10, "action[target_speed]")
     done = toy.crashhunt("replay", "h", "--times", "3", "--json", expect=1).json
     assert (done["verdict"], done["times"]) == ("diverged", 3)
     assert done["divergence"]["step"] == 10
@@ -238,6 +248,7 @@ def test_an_agent_that_is_not_deterministic_is_found_out(toy):
     assert done["agreed"] < 3
 
 
+@pytest.mark.nightly  # by day, replays/test_verdicts.py and replays/test_prepare.py
 def test_what_cannot_be_compared_states_which(crash_on_sumo):
     crash = crash_on_sumo
     (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
@@ -351,6 +362,7 @@ def test_the_recorded_actions_run_no_code_of_the_bundle(crash):
     assert not (crash.folder / "evil").exists()
 
 
+@pytest.mark.nightly  # by day, episode/test_parts.py
 def test_code_comes_from_the_snapshot_or_the_replay_is_refused(crash):
     # Somebody's start-up file imports a module before anything else can.
     site = crash.folder / "site"

@@ -117,6 +117,7 @@ agent = "shaky:Swing"
 """
 
 
+@pytest.mark.nightly  # by day, an environment of ones own, and simulators/test_gym.py has the words
 def test_a_crash_of_a_gymnasium_environment_without_a_scene(shell):
     (shell.folder / "scenario.toml").write_text(POLE)
     (crash,) = shell.crashhunt("run", "h", "2", "20", "400", "--scenario", ".", "--seed", "1", "--json").json["crashes"]
@@ -138,8 +139,11 @@ def test_an_environment_of_ones_own_is_part_of_the_snapshot(shell):
     words = ("--scenario", ".", "--arg", "torque=1:2", "--seed", "1")
     (crash,) = shell.crashhunt("run", "h", "2", "20", "400", *words, "--json").json["crashes"]
     assert crash["confirmed"]
+    assert shell.crashhunt("replay", "h", "--from-log", "--json").json["verdict"] == "reproduced"
+    shell.crashhunt("report", "h")
     module.write_text(PENDULUM.replace("> 5", "> 500"))
-    assert shell.crashhunt("replay", "h", "--json").json["verdict"] == "reproduced"
+    film = ("--frames", "f", "--last-seconds", "0.5", "--size", "160x120")  # without a scene
+    assert shell.crashhunt("replay", "h", *film, "--json").json["verdict"] == "reproduced"
     assert shell.crashhunt("replay", "h", "--code", "current", "--json", expect=1).json["verdict"] == "fixed"
 
 
@@ -198,7 +202,7 @@ def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     assert told["divergence"] is None
     assert crashhunt.replay(shell.folder / "h", scenario="motorway").verdict == told["verdict"]
     for more, says in (
-        ("--from-log", "recorded actions cannot be repeated"),
+        ("--from-log", "recorded actions belong to the recorded scenario"),
         ("--scenario=loop-two-agents", "2 controlled"),
         ("--frames=f", "a film cannot be combined with --scenario, because it needs the scenario of the crash"),
         ("--until=3", "--until cannot be combined with --scenario, because it needs the scenario"),
@@ -247,6 +251,7 @@ agent = "keep-lane"
 """
 
 
+@pytest.mark.nightly  # by day, executors/test_maps_of_trials.py
 def test_every_crash_has_the_map_of_its_own_trial(shell):
     """An argument may change the road; what is drawn is the road that was driven."""
     (shell.folder / "scenario.toml").write_text(WIDER)

@@ -6,7 +6,6 @@ import json
 import re
 
 import pytest
-from conftest import mostly_nightly
 
 
 def hunted(shell):
@@ -18,6 +17,7 @@ def crash(shell, made_once):
     return made_once(hunted, shell)
 
 
+@pytest.mark.nightly  # by day, report/test_show_frozen.py and report/test_report_evidence.py
 def test_a_collision_is_reported_in_words_and_a_table(crash):
     text = crash.crashhunt("show", "h").out
     facts = crash.crashhunt("show", "h", "--json").json
@@ -54,12 +54,10 @@ def test_bad_numbers_are_refused(crash):
         assert len(refused.err.strip().splitlines()) == 1
 
 
+@pytest.mark.nightly  # by day, report/test_show_frozen.py
 @pytest.mark.parametrize(
     ("agent", "says"),
-    mostly_nightly(
-        [("faulty:Raises", "ValueError: no plan"), ("faulty:Segfaults", "SIGSEGV"), ("faulty:Nan", "target_speed")],
-        [("faulty:Segfaults", "SIGSEGV")],
-    ),
+    [("faulty:Raises", "ValueError: no plan"), ("faulty:Segfaults", "SIGSEGV"), ("faulty:Nan", "target_speed")],
 )
 def test_software_faults_are_reported_too(shell, agent, says):
     shell.crashhunt("run", "h", "1", "1", "100", "--agent", agent, "--set", "vehicles=10")
@@ -68,6 +66,7 @@ def test_software_faults_are_reported_too(shell, agent, says):
     assert "Its last observation, in step" in text
 
 
+@pytest.mark.nightly  # by day, cli/test_answers.py
 def test_a_terminal_that_does_not_know_every_letter_is_shown_the_others(crash):
     crash.environment["PYTHONIOENCODING"] = "ascii"
     text = crash.crashhunt("show", "h").out

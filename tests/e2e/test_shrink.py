@@ -71,6 +71,7 @@ def test_a_budget_that_is_too_small_leaves_the_best_and_is_gone_on_from(hunt):
     assert not list(bundle.path.parent.glob(".*"))
 
 
+@pytest.mark.nightly  # by day, shrinking/test_shrink_bundle.py
 def test_a_crash_that_does_not_come_again_is_reported(hunt, monkeypatch):
     bundle = find_bundle(hunt.folder / "h")
     monkeypatch.setattr("crashhunt.shrinking._runs.signature_of", lambda _: None)

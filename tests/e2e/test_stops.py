@@ -90,7 +90,8 @@ def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, whom):
     assert toy.crashhunt(*words).json["outcomes"] == {"survived": 8}
 
 
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.nightly), signal.SIGKILL])
+@pytest.mark.nightly  # by day, executors/test_killed_trials.py, and hunts/test_hunt_parts.py has the note
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_trial_that_was_killed_from_outside_is_run_again(toy, number):
     words = ("run", "h", "1", "2", "40", *FINE, *SLOW, "--json")
     process = toy.start(*words)
@@ -133,6 +134,7 @@ def test_a_killed_replay_leaves_no_process(toy):
         wait_for(lambda: not left_in(toy.folder))
 
 
+@pytest.mark.nightly  # by day, hunts/test_hunt_parts.py, and replays/test_verdicts.py stops a confirmation
 def test_an_interrupt_while_a_hang_is_confirmed_ends_it_at_once(toy):
     words = ("run", "h", "1", "1", "20", "--scenario", "toy", "--agent", "faulty:Hangs", "--arg", "at=5")
     process = toy.begin(*words, "--timeout", "3", "--json")
@@ -144,6 +146,7 @@ def test_an_interrupt_while_a_hang_is_confirmed_ends_it_at_once(toy):
     assert toy.crashhunt(*words, "--timeout", "2", "--json").json["crashes"][0]["confirmed"] is True
 
 
+@pytest.mark.nightly  # by day, ledger/test_ledger_cases.py, and hunts/test_hunt_parts.py has the note
 def test_a_ledger_that_is_removed_is_written_again(toy):
     process = toy.begin("run", "h", "2", "1000", "20", *FINE, *SLOW, "--json")
     wait_for(lambda: len(rows(toy.folder / "h")) >= 3)
@@ -159,6 +162,7 @@ def test_a_ledger_that_is_removed_is_written_again(toy):
     assert len(after) == report["trials_run"]
 
 
+@pytest.mark.nightly  # by day, ledger/test_ledger_cases.py, and cli/test_answers.py ends a command with an error
 def test_another_ledger_in_its_place_ends_the_hunt(toy):
     process = toy.begin("run", "h", "2", "1000", "20", *FINE, *SLOW, "--json")
     wait_for(lambda: len(rows(toy.folder / "h")) >= 1)
@@ -170,6 +174,7 @@ def test_another_ledger_in_its_place_ends_the_hunt(toy):
     assert err.count("\n") == 2  # the first says that it hunts
 
 
+@pytest.mark.nightly  # by day, hunts/test_hunt_loop.py
 def test_a_bundle_without_a_row_gets_one(toy):
     words = ("run", "h", "1", "3", "20", "--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=5")
     first = toy.crashhunt(*words, "--keep-going", "--json").json
@@ -186,7 +191,7 @@ def test_a_bundle_without_a_row_gets_one(toy):
 @pytest.mark.parametrize(
     "words",
     [
-        ("status", "h"),
+        pytest.param(("status", "h"), marks=pytest.mark.nightly),
         pytest.param(("trials", "h"), marks=pytest.mark.nightly),
         ("scenarios",),
         ("--help",),
@@ -212,6 +217,7 @@ def test_output_that_cannot_be_written_is_one_line(toy, words):
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.nightly  # by day, base/test_limits.py has the fix
 def test_too_few_files_are_one_line(toy):
     command = ["bash", "-c", 'ulimit -n 16; exec "$0" "$@"', str(CRASHHUNT), "run", "h", "2", "4", "20", *FINE]
     done = subprocess.run(command, cwd=toy.folder, env=toy.environment, capture_output=True, text=True, check=False)
@@ -222,6 +228,7 @@ def test_too_few_files_are_one_line(toy):
     wait_for(lambda: not left_in(toy.folder))
 
 
+@pytest.mark.nightly  # by day, ledger/test_ledger_reads.py and base/test_limits.py
 def test_limit_on_the_size_of_files_is_named(toy):
     command = ["bash", "-c", 'ulimit -f 1000; exec "$0" "$@"', str(CRASHHUNT), "run", "h", "1", "1", "20", *FINE]
     done = subprocess.run(command, cwd=toy.folder, env=toy.environment, capture_output=True, text=True, check=False)

@@ -97,6 +97,7 @@ ATTACKS = {
 }  # fmt: skip
 
 
+@pytest.mark.nightly  # by day, crashes/test_trust.py has each of them
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_what_is_not_known_to_be_harmless_asks_for_trust(crash, tmp_path, attack):
     victim = tmp_path / "victim"
@@ -112,6 +113,7 @@ def test_what_is_not_known_to_be_harmless_asks_for_trust(crash, tmp_path, attack
     assert victim.read_text() == "mine"
 
 
+@pytest.mark.nightly  # by day, crashes/test_trust.py, and scenario/test_sumo_files.py discards output
 def test_detectors_are_no_reason_to_distrust_and_write_nowhere(crash, tmp_path):
     victim = tmp_path / "victim"
     victim.write_text("mine")
@@ -129,6 +131,7 @@ files.FIXED_OPTIONS.pop("device.ssm.file", None)
 """
 
 
+@pytest.mark.nightly  # by day, base/test_sandbox.py, and executors/test_zygotes.py seals
 @pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
 @pytest.mark.parametrize("attack", mostly_nightly(["netstate-dump", "C", "a detector"], ["netstate-dump"]))
 def test_the_kernel_alone_holds_what_has_got_past_all_else(crash, tmp_path, monkeypatch, attack):

@@ -98,6 +98,7 @@ def test_every_hunt_stops_at_its_own_first_crash(toy):
     assert (toy.folder / "out/slow/0/ledger.sqlite").stat().st_mtime_ns == before
 
 
+@pytest.mark.nightly  # by day, suites/test_processes.py, cli/test_answers.py and cli/test_status.py
 def test_what_cannot_run_leaves_the_others_untouched_and_is_reported(toy):
     written(toy, SUITE + BROKEN)
     (toy.folder / "explodes.py").write_text("raise OSError('no such luck')")
@@ -215,6 +216,7 @@ def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
     assert (found["a/0"], found["b/0"], found["c/0"]) == ("interrupted", "interrupted", "queued")
 
 
+@pytest.mark.nightly  # by day, suites/test_processes.py
 def test_the_last_hunts_share_all_slots(toy):
     written(toy, SLOW.replace('[[hunts]]\nid = "b"\n[[hunts]]\nid = "c"\n', "").replace("80", "20"))
     toy.crashhunt("suite", "run", "suite.toml", "out", "2")

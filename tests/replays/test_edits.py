@@ -167,7 +167,8 @@ def test_edits_of_hunt_toml_apply_or_are_reported_as_ignored():
     ("changes", "says"),
     [
         ({"speed": "5:8"}, "'5:8' is not a single value"),
-        ({"sped": "5"}, "sped"),
+        ({"sped": "5"}, "did you mean 'ego.speed'"),
+        ({"speed": "fast"}, "fast"),
         ({"disturbances.brake@101": "ahead:1:1"}, "brake@101 cannot happen: the trial has 100 steps"),
     ],
 )

@@ -206,8 +206,9 @@ def test_recorded_actions_run_no_code_that_is_not_trusted(prepared):
     assert found.worker.sealed is None
     assert prepared.asked[-1][0] == "edited"
     prepared.edits = Edits(agents=("speed was 8",))
-    with pytest.raises(UsageError, match="speed was 8"):
+    with pytest.raises(UsageError, match="speed was 8") as caught:
         prepared.run(code="log")
+    assert "--code snapshot" in caught.value.fix
 
 
 def test_edits_and_another_scenario_may_explain_that_no_crash_occurs(prepared):
