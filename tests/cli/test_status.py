@@ -38,6 +38,8 @@ def test_row_has_counts_pace_and_outcomes():
     assert head.split() == ["hunt", "state", "trials", "pace", "left", "crashes", "errors", "outcomes"]
     assert row.split()[:3] == ["h", "running", "10/40"]
     assert row.split()[3:] == ["2.0/s", "0:15", "3", "2", "survived", "7,", "collision", "3"]
+    resumed = written(HuntState(dir="h", state="finished", trials_planned=2, trials_run=6))[-1]
+    assert resumed.split()[:3] == ["h", "finished", "6"]
     empty = written(HuntState(dir="h", state="queued"))[-1]
     assert empty.split() == ["h", "queued", "0", "-", "-", "0", "0"]
 

@@ -35,6 +35,7 @@ def started(shell, *words: str):
     return process
 
 
+@pytest.mark.nightly  # by day, hunts/test_states_and_reports.py, and test_hunt.py kills a hunt
 def test_a_hunt_is_running_until_its_process_is_gone(toy):
     process = started(toy)
     found = state(toy)
@@ -50,6 +51,7 @@ def test_a_hunt_is_running_until_its_process_is_gone(toy):
     assert state(toy)["state"] in ("finished", "crashed")
 
 
+@pytest.mark.nightly  # by day, hunts/test_states_and_reports.py
 def test_a_process_id_that_another_process_has_now_is_not_the_owner(toy):
     process = started(toy)
     os.kill(process.pid, signal.SIGKILL)
@@ -66,6 +68,7 @@ def test_a_process_id_that_another_process_has_now_is_not_the_owner(toy):
         assert state(toy)["state"] == "killed"
 
 
+@pytest.mark.nightly  # by day, hunts/test_states_and_reports.py and hunts/test_whole_hunts.py
 def test_every_end_has_its_state(toy):
     toy.crashhunt("run", "fine", "1", "5", "50", "--scenario", "toy", "--arg", "speed=4", "--seed", "1")
     toy.crashhunt("run", "crash", "1", "50", "99", "--scenario", "toy", "--arg", "speed=14", "--seed", "1")
@@ -125,6 +128,7 @@ def test_logs_are_found_wherever_they_are(shell):
     assert "contradict" in shell.crashhunt("logs", "h", "--errors-only", "--type", "run", expect=2).err
 
 
+@pytest.mark.nightly  # by day, hunts/test_logs.py and cli/test_answers_on_crashes.py
 def test_logs_follow_what_runs(toy):
     process = started(toy)
     following = subprocess.Popen(

@@ -13,6 +13,7 @@ from crashhunt.estimation import measure_rates
 from crashhunt.estimation._hunt_rate import _bins, _division, rate_of_counts, rate_of_trials
 from crashhunt.hunts import HuntResults
 from crashhunt.ledger import Ledger
+from crashhunt.report import describe_rates
 from crashhunt.training import HeldOutTraffics
 from crashhunt.trial import Choice, Range
 
@@ -139,7 +140,25 @@ def test_estimate_is_withheld_if_crashes_decide_the_number_of_trials(tmp_path, g
     (rate,) = measure_rates(hunt(tmp_path / "h", 10, **given), per="trial")
     assert (rate.estimate is None) == bool(why)
     assert rate.why_not.startswith(why)
-    assert rate.certain is not None
+    assert 0 < rate.certain.low < rate.certain.high <= 1
+
+
+def test_hunt_whose_trials_are_not_independent_has_no_rate(tmp_path):
+    path = hunt(tmp_path / "h", 10, sampler="grid")
+    (rate,) = measure_rates(path, per="trial", bar=0.1)
+    assert (rate.certain, rate.estimate, rate.verdict) == (None, None, "undecided")
+    assert "the sampler grid does not draw trials independently" in rate.why_not
+    assert "undecided about the bar of 0.10 per trial: there is no rate" in describe_rates([rate])
+
+
+@pytest.mark.parametrize(
+    ("crashes", "bar", "verdict", "text"), [(0, 0.3, "below", "0.30"), (10, 0.001, "above", "1.0e-3")]
+)
+def test_verdict_on_a_bar_is_a_line(tmp_path, crashes, bar, verdict, text):
+    (rate,) = measure_rates(hunt(tmp_path / "h", crashes), per="trial", bar=bar)
+    assert (rate.verdict, rate.crashes, rate.estimate) == (verdict, crashes, crashes / 40)
+    assert (rate.certain.low >= bar) == (verdict == "above")
+    assert f"certainly {verdict} the bar of {text} per trial" in describe_rates([rate])
 
 
 def test_rate_of_the_trials_up_to_the_decision_of_a_bar(tmp_path):

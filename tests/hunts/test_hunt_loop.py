@@ -290,6 +290,12 @@ def test_hunt_until_a_rate_ends_with_its_verdict(run):
     assert again.facts["until_rate"] == found.facts["until_rate"]
 
 
+def test_hunt_until_a_rate_ends_above_it_with_an_interval_above_it(run, bundles):
+    rate = run(0, crashes_from(*range(60)), until_rate="0.001/trial", most=60, keep=1).report.rate
+    assert (rate.verdict, rate.crashes) == ("above", rate.units)
+    assert rate.certain.low >= 0.001
+
+
 @pytest.fixture
 def bundles(monkeypatch):
     """Replace bundles: each is confirmed, and has the result of its trial."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import sys
 from contextlib import closing
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ import crashhunt
 from crashhunt.base.errors import InternalError
 from crashhunt.crashes import list_bundles, list_near_misses
 from crashhunt.errors import HuntDirectoryError, UsageError
+from crashhunt.estimation import measure_rates
 from crashhunt.hunts import check, hunt_state
 from crashhunt.ledger import Ledger
 
@@ -87,6 +89,7 @@ def test_a_hunt_records_confirms_audits_and_keeps_near_misses(tmp_path):
     (checked,) = check(hunt)
     assert checked.fine
     assert {path.name for path in hunt.glob(".*")} <= {".lock"}
+    assert not (hunt / "trials").exists()  # nothing is kept of what was audited
 
     # The same command runs nothing again; more trials are added to those that are there.
     again = crashhunt.run(hunt, 2, 8, 60, **options)
@@ -96,6 +99,11 @@ def test_a_hunt_records_confirms_audits_and_keeps_near_misses(tmp_path):
     assert facts_of(hunt)["replanned"] is True  # which forbids a p-value
     assert sum(more.outcomes.values()) == 10
     assert {number: rows(hunt)[number] for number in range(8)} == found
+    state, (rate,) = hunt_state(hunt), measure_rates(hunt, per="trial")
+    assert state.rate["certain"] == rate.to_json()["certain"]  # over all trials, also those of earlier runs
+    assert (state.rate["trials"], state.rate["crashes"]) == (10, state.crashes)
+    fewer = crashhunt.run(hunt, 1, 4, 60, **options)
+    assert (sum(fewer.outcomes.values()), hunt_state(hunt).trials_planned) == (10, 4)
     for other in ({"seed": 5}, {"sampler": "sobol"}):
         with pytest.raises((HuntDirectoryError, UsageError)):
             crashhunt.run(hunt, 2, 8, 60, **options | other)
@@ -110,7 +118,11 @@ def facts_of(hunt):
 
 
 @pytest.mark.long
-def test_a_hunt_ends_with_its_first_crash_and_does_not_depend_on_how_many_run_at_a_time(tmp_path):
+def test_a_hunt_ends_with_its_first_crash_and_does_not_depend_on_how_many_run_at_a_time(tmp_path, monkeypatch, capfd):
+    # Hunting from a script without a guard: if a worker imported it again, this would run there.
+    (tmp_path / "script.py").write_text(f"print('again')\nopen({str(tmp_path / 'again')!r}, 'w')\n")
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", str(tmp_path / "script.py"), raising=False)
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)
     found = {}
     for parallel in (1, 3):
         hunt = tmp_path / f"h{parallel}"
@@ -122,10 +134,15 @@ def test_a_hunt_ends_with_its_first_crash_and_does_not_depend_on_how_many_run_at
         assert set(range(number + 1)) <= rows(hunt).keys()
         assert all(rows(hunt)[before][0] == "survived" for before in range(number))
         assert hunt_state(hunt).state == "crashed"
+        again = crashhunt.run(hunt, parallel, 30, 60, deterministic=True, **OPTIONS)  # states again what it found
+        assert [(one.id, one.confirmed) for one in again.crashes] == [(one.id, True) for one in report.crashes]
+        assert (again.stopped_because, again.outcomes) == ("crash", report.outcomes)
         found[parallel] = number, crash.result.digest, [rows(hunt)[before] for before in range(number)]
-        assert report.kinds is None
+        assert (report.kinds, report.audit, report.to_json()["audit"]) == (None, None, None)
         assert "kinds" not in report.to_json()
     assert found[1] == found[3]
+    assert capfd.readouterr() == ("", "")
+    assert not (tmp_path / "again").exists()
 
 
 def test_a_hunt_without_one_valid_trial_states_why(tmp_path):
@@ -133,7 +150,9 @@ def test_a_hunt_without_one_valid_trial_states_why(tmp_path):
     report = crashhunt.run(tmp_path / "h", 2, 3, 60, **OPTIONS)
     assert (report.stopped_because, report.outcomes) == ("no_valid_trial", {"invalid": 3})
     assert report.reason
-    assert hunt_state(tmp_path / "h").state == "error"
+    state = hunt_state(tmp_path / "h")
+    assert (state.state, state.errors) == ("error", 3)
+    assert "fails as its scenario arguments demand" in state.detail
     assert report.crashes == ()
 
 

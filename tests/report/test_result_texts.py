@@ -48,6 +48,12 @@ def test_a_hunt_without_a_crash_states_why_it_ended(because, says):
     assert not any("Replay it" in line for line in found)
 
 
+def test_more_trials_than_are_planned_have_no_share():
+    found = lines(REPORT, outcomes={"survived": 6}, settings=replace(SETTINGS, trials=2))
+    assert found[0].startswith("6 trials, ")
+    assert not any("of 2" in line for line in found)
+
+
 def test_an_audit_counts_what_it_replayed_and_names_what_differs():
     audit = AuditReport(trials=10, not_finished=3, differences=("trial 4: a", "trial 5: b"))
     found = lines(REPORT, audit=audit)
