@@ -55,7 +55,7 @@ def test_other_missing_module_of_a_snapshot_ends_its_process(tmp_path):
     assert run_kept(tmp_path, "import no_such_library\ndef main(): pass\n") == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])
 def test_signal_of_a_terminal_does_not_end_a_reaper_while_its_python_starts(tmp_path, number):
     (tmp_path / "waits.py").write_text("import time\ndef main():\n    time.sleep(0.3)\n")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}

@@ -6,7 +6,7 @@ import http.client
 import json
 import socket
 import threading
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -72,13 +72,15 @@ class Dashboard:
 
 
 @contextmanager
-def served(*roots: Path, host: str = "127.0.0.1", token: str = "", control: bool = False) -> Iterator[Dashboard]:
-    from crashhunt.dashboard import _serving
+def served(*paths: Path, host: str = "127.0.0.1", token: str = "", control: bool = False) -> Iterator[Dashboard]:
+    from crashhunt.dashboard import _server, _serving
     from crashhunt.dashboard._application import make_application
     from crashhunt.dashboard._catalog import Catalog
 
+    archives = ExitStack()
+    folders, exported = _server._roots(paths, archives)
     listening = socket.create_server(("127.0.0.1", 0))
-    application = make_application(Catalog(roots), host=host, token=token, allow_control=control)
+    application = make_application(Catalog(folders, exported), host=host, token=token, allow_control=control)
     begun = threading.Event()
     server = _serving.make_server(application.asgi, begun.set)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
@@ -91,4 +93,5 @@ def served(*roots: Path, host: str = "127.0.0.1", token: str = "", control: bool
         application.close()
         thread.join(60)
         listening.close()
+        archives.close()
         assert not thread.is_alive()

@@ -15,6 +15,7 @@ from contextlib import suppress
 
 import pytest
 from dashboard_hunts import hunted
+from served import served
 
 
 def begun(shell, *words: str):
@@ -73,16 +74,19 @@ def test_a_taken_port_is_one_line_with_the_next_free_one(shell):
     assert port < free <= port + 100  # not bound again here: another test may take it at any time
 
 
+NIGHTLY = pytest.mark.nightly  # by day, test_dashboard_folders.py, and cli/test_common.py has words for numbers
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["nothing-here"], "'nothing-here' does not exist"),
-        (["--port", "70000"], "--port is 70000"),
-        (["--port", "-1"], "--port is -1"),
-        (["--port", "x"], "'x' is not a whole number"),
+        pytest.param(["--port", "70000"], "--port is 70000", marks=NIGHTLY),
+        pytest.param(["--port", "-1"], "--port is -1", marks=NIGHTLY),
+        pytest.param(["--port", "x"], "'x' is not a whole number", marks=NIGHTLY),
         (["--host", "no.such.host.invalid"], "--host 'no.such.host.invalid' is not known"),
         (["--host", "192.0.2.1", "--port", "0"], "cannot listen on 192.0.2.1"),
-        (["--host", "a" * 300], "is not known"),
+        pytest.param(["--host", "a" * 300], "is not known", marks=NIGHTLY),
         (["--token", "short"], "--token has 5 characters (allowed: at least 16"),
         (["--token", "with spaces in the text"], "printable ASCII without spaces"),
         (["faulty.py"], "faulty.py"),
@@ -148,18 +152,33 @@ def test_other_commands_import_nothing_of_it(shell):
     assert done.stdout.strip() == "[]"
 
 
-def test_an_exported_crash_is_shown(shell, made_once):
-    made_once(hunted, shell)
-    shell.crashhunt("export", "runs/one", "crash.zip")
-    process, address = begun(shell, "crash.zip")
+@pytest.fixture
+def exported(shell, made_once):
+    """The archive of one crash."""
+    made_once(hunted, shell).crashhunt("export", "runs/one", "crash.zip")
+    return shell.folder / "crash.zip"
+
+
+def test_an_exported_crash_is_shown(exported):
+    with served(exported) as dashboard:
+        check_exported(dashboard.get)
+
+
+@pytest.mark.nightly  # by day, the same as the command serves it
+def test_an_exported_crash_is_shown_by_the_command(shell, exported):
+    process, address = begun(shell, exported.name)
     try:
-        (row,) = json.loads(fetched(f"{address['url']}api/hunts"))["hunts"]
-        assert (row["name"], row["exported"], row["damaged"]) == ("crash.zip", True, False)
-        one = f"{address['url']}api/hunts/{row['id']}"
-        (crash,) = json.loads(fetched(f"{one}/crashes"))["crashes"]
-        assert json.loads(fetched(f"{one}/crashes/{crash['id']}"))["steps"] > 0
-        for what in ("", "/trials", "/map", "/importance"):
-            fetched(one + what)
+        check_exported(lambda target: json.loads(fetched(address["url"].rstrip("/") + target)))
     finally:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
+
+
+def check_exported(get) -> None:
+    (row,) = get("/api/hunts")["hunts"]
+    assert (row["name"], row["exported"], row["damaged"]) == ("crash.zip", True, False)
+    one = f"/api/hunts/{row['id']}"
+    (crash,) = get(f"{one}/crashes")["crashes"]
+    assert get(f"{one}/crashes/{crash['id']}")["steps"] > 0
+    for what in ("", "/trials", "/map", "/importance"):
+        get(one + what)

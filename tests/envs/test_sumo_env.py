@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 import pytest
+from conftest import mostly_nightly
 
 import crashhunt
 from crashhunt.envs import SumoEnv
@@ -218,6 +219,11 @@ def test_copies_of_an_episode_are_bit_identical_and_independent(branching):
     assert drive(other, 5) == tail == drive(nested, 5)  # copies outlive the original
     with pytest.raises(UsageError, match="a copy of an episode cannot be reset"):
         other.reset(seed=1)
+    pid = one._episodes.pid
+    os.kill(pid, signal.SIGKILL)
+    with pytest.raises(SimulatorError, match=rf"^copy 1 of 2 of the environment \(process {pid}\) ended; make a new"):
+        one.step((15.0, 0))
+    assert drive(other, 5) == drive(nested, 5)
 
 
 def test_reseeded_copies_differ_and_can_be_repeated(branching):
@@ -228,6 +234,7 @@ def test_reseeded_copies_differ_and_can_be_repeated(branching):
     assert (one, other) == (same, again)
 
 
+@pytest.mark.nightly  # by day, the end of the test of copies above
 def test_a_copy_that_dies_is_named_and_costs_no_other(branching):
     env, made = branching
     made += (copies := env.branch(2))
@@ -303,15 +310,20 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("context", ["", "fork", pytest.param("spawn", marks=pytest.mark.nightly)])
+IMPORTS = [
+    "import crashhunt, gymnasium",
+    "import gymnasium, crashhunt",
+    "import crashhunt; from gymnasium.envs import registration; import gymnasium",
+    "import crashhunt.envs, gymnasium",
+]
+
+
 @pytest.mark.parametrize(
-    "imports",
-    [
-        "import crashhunt, gymnasium",
-        pytest.param("import gymnasium, crashhunt", marks=pytest.mark.nightly),
-        "import crashhunt; from gymnasium.envs import registration; import gymnasium",
-        pytest.param("import crashhunt.envs, gymnasium", marks=pytest.mark.nightly),
-    ],
+    ("imports", "context"),
+    mostly_nightly(
+        [(imports, context) for imports in IMPORTS for context in ("", "fork", "spawn")],
+        always=[(IMPORTS[0], ""), (IMPORTS[2], "fork")],
+    ),
 )
 def test_environment_is_registered_in_either_order_of_imports(tmp_path, imports, context):
     (tmp_path / "order.py").write_text(ORDERS.format(imports=imports))

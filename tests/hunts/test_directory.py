@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import queue
+import threading
 from multiprocessing import get_context
+from types import SimpleNamespace
 
 import pytest
 
@@ -42,11 +45,20 @@ def _claim(path, said, meeting, *, is_first):
         said.put(f"{type(error).__name__}: {error}")
 
 
-def test_of_several_at_once_one_has_it_and_the_others_are_reported_that_it_is_busy(tmp_path):
-    context = get_context("spawn")  # forking a process with threads is asking for it
-    said, meeting = context.Queue(), context.Barrier(3, timeout=140)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        SimpleNamespace(Queue=queue.Queue, Barrier=threading.Barrier, Process=threading.Thread),  # the lock is a file's
+        pytest.param(
+            get_context("spawn"), marks=pytest.mark.nightly
+        ),  # forking a process with threads is asking for it
+    ],
+    ids=["threads", "processes"],
+)
+def test_of_several_at_once_one_has_it_and_the_others_are_reported_that_it_is_busy(tmp_path, kind):
+    said, meeting = kind.Queue(), kind.Barrier(3, timeout=140)
     processes = [
-        context.Process(target=_claim, args=(tmp_path / "hunt", said, meeting), kwargs={"is_first": number == 0})
+        kind.Process(target=_claim, args=(tmp_path / "hunt", said, meeting), kwargs={"is_first": number == 0})
         for number in range(3)
     ]
     for process in processes:

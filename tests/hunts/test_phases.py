@@ -11,6 +11,7 @@ from contextlib import closing
 from itertools import pairwise
 
 import pytest
+from conftest import copy_files, keeps_going
 
 from crashhunt.estimation import compare
 from crashhunt.hunts import PhaseStatus, hunt_state
@@ -188,26 +189,21 @@ def test_confirmation_is_seen_while_it_runs_and_resumed_after_an_interrupt(toy):
         assert ledger.facts().get("phase") is None
 
 
-def two_hunts(shell):
-    for name, speed in (("a", "12:20"), ("b", "4:20")):
-        words = ("--scenario", "toy", "--arg", f"speed={speed}", "--seed", "4", "--keep-going", "--keep", "1")
-        shell.crashhunt("run", name, "2", "6", "99", *words)
-
-
 def test_a_comparison_knows_whether_trials_are_left_or_only_confirmations(toy, made_once):
-    made_once(two_hunts, toy)
+    made_once(keeps_going, toy)
     hunt = toy.folder / "b"
+    copy_files(toy.folder / "h", hunt)
 
     def compared(**facts):
         with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
             ledger.enter("running", owner=ledger_owner(), heartbeat=time.time(), **facts)
-        found = compare(toy.folder / "a", hunt)
+        found = compare(toy.folder / "h", hunt)
         return found.hunts[1], found.pairs[0]
 
     phase = {"name": "confirming", "done": 3, "total": 9, "seconds_left": 4.0}
-    whole, pair = compared(planned=6)
+    whole, pair = compared(planned=25)
     assert (whole.state, whole.interval is not None, pair.test) == ("running", True, "pairs")
-    figures, pair = compared(planned=9)
+    figures, pair = compared(planned=30)
     assert (figures.interval, pair.test) == (whole.interval, "pairs")  # both hold at any time
     began = time.time()
     figures, pair = compared(planned=0, phase=phase)  # its time was up

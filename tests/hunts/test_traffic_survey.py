@@ -73,6 +73,7 @@ def test_trials_replace_vehicles_that_enter_only(town):
     assert {**hunted(town.folder), "trials": 4} == before
 
 
+@pytest.mark.nightly  # by day, a survey that was killed finds the same when it is run again
 def test_two_hunts_draw_from_the_same_vehicles(town):
     one, other = (surveyed(town.folder, hunt=hunt, seed=1)[1] for hunt in "ab")
     assert one == other
@@ -117,8 +118,10 @@ def test_the_demand_is_simulated_at_both_ends_of_its_range(town, monkeypatch):
 @pytest.mark.parametrize(
     ("demand", "code", "says"),
     [
-        (f'<vType id="train" vClass="rail_urban"/>{WAY}<vehicle id="a" type="train" route="way" depart="5"/>', 2,
-         "only rail vehicles enter"),
+        pytest.param(
+            f'<vType id="train" vClass="rail_urban"/>{WAY}<vehicle id="a" type="train" route="way" depart="5"/>', 2,
+            "only rail vehicles enter", marks=pytest.mark.nightly,  # by day, scenario/test_sumo_survey.py
+        ),
         ('<flow id="f" begin="10" end="20" probability="0.00001" from="south" to="east"/>', 3,
          "no vehicle enters in 25 s of simulation (50 steps from 0 s)"),
     ],
@@ -145,6 +148,7 @@ def test_vehicles_that_stand_for_ever_are_a_gridlock(shell):
     assert "in 2 of 2 runs" in note
 
 
+@pytest.mark.nightly  # by day, the survey alone, and test_whole_hunts.py has no valid trial
 def test_where_sumo_refuses_its_input_the_hunt_states_so(town):
     (town.folder / "r.rou.xml").write_text(f'<routes>{WAY}<vehicle id="a" route="gone" depart="1"/></routes>')
     done = town.crashhunt("run", "h", "1", "2", "20", *WORDS, expect=3)
@@ -282,6 +286,7 @@ def test_ctrl_c_ends_the_survey_and_leaves_nothing_behind(shell):
     assert not (shell.folder / "h").exists()
 
 
+@pytest.mark.nightly  # by day, base/test_temporary.py kills what has such a folder
 def test_next_command_removes_what_a_killed_survey_left(shell):
     write(shell.folder, '<trip id="a" depart="99999999" from="south" to="east"/>')
     temporary = shell.folder / "tmp"

@@ -128,6 +128,9 @@ def test_it_is_driven_by_keyboard_and_plays(hunt, browser):
         "const s = document.getElementById('scrub'); s.value = 3; s.dispatchEvent(new Event('input'))"
     )
     assert step(browser) == 3
+    check_contrast(browser, "light")
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [DARK]})
+    check_contrast(browser, "dark")
 
 
 @pytest.mark.nightly  # by day, keys work without one
@@ -220,17 +223,24 @@ def test_nothing_is_wider_than_a_telephone(hunt, telephone):
     assert {"speed (m/s)", "crash rate"} <= set(labels)
 
 
-@pytest.mark.parametrize("scheme", [pytest.param("light", marks=pytest.mark.nightly), "dark"])
+DARK = {"name": "prefers-color-scheme", "value": "dark"}
+
+
+@pytest.mark.nightly  # by day, the test of keys changes to dark on the page that it has
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_light_and_dark_differ_and_can_be_read(hunt, browser, scheme):
     hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
-    media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    media = {"features": [{**DARK, "value": scheme}]}
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
     opened(browser, hunt.folder / "report.html")
+    check_contrast(browser, scheme)
+
+
+def check_contrast(browser, scheme) -> None:
     colors = browser.execute_script(
         "const s = getComputedStyle(document.body);"
         "return [s.color, s.backgroundColor].map((c) => c.match(/\\d+/g).slice(0, 3).map(Number))"
     )
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
     bright = [contrast_part(color) for color in colors]
     assert (bright[1] > 0.5) == (scheme == "light")
     assert (max(bright) + 0.05) / (min(bright) + 0.05) > 7  # WCAG AAA

@@ -10,6 +10,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from conftest import keeps_going
 from rich.console import Console
 
 from crashhunt.executors import NodeFigures
@@ -217,9 +218,9 @@ def on_a_terminal(shell, *words: str) -> tuple[int, str]:
     return codes[0], shown.decode(errors="replace")
 
 
-def test_reports_exports_and_films_say_how_far_they_are(toy):
+def test_reports_exports_and_films_say_how_far_they_are(toy, made_once):
     pytest.importorskip("PIL")
-    toy.crashhunt("run", "h", "1", "3", "60", "--scenario", "toy", "--arg", "speed=14", "--seed", "1", "--keep-going")
+    made_once(keeps_going, toy)
     for words, file in (
         (("report", "h"), "h/report.html"),
         (("export", "h", "h.zip"), "h.zip"),
