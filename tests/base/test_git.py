@@ -44,7 +44,7 @@ def test_the_repository_is_found_from_inside_and_its_commits_by_name(repository,
         commit_of(repository, "HEAD~1")
     assert work_tree(repository / "inner").resolve() == repository.resolve()
     assert work_tree(tmp_path) is None
-    with pytest.raises(CrashhuntError):
+    with pytest.raises(CrashhuntError, match="run the command in the repository"):
         top_of(tmp_path)
 
 

@@ -38,6 +38,21 @@ def test_case_names_its_crash_and_what_is_expected(case):
     assert (case.kind_of_log(), case.to_json()["log"]) == ("", False)
 
 
+def test_case_without_log_names_the_command_that_records_it(case, tmp_path, run, monkeypatch):
+    """As of an earlier version."""
+    (log,) = case.path.rglob("log.mcap")
+    log.unlink()
+    with pytest.raises(BundleError, match="the case has no log") as caught:
+        case.bundle().recording()
+    assert caught.value.fix.startswith(f"run crashhunt corpus run {case.path} --keep out, ")
+    added = add_case(case.bundle(), tmp_path / "other").case  # as bisect adds it
+    assert (added.kind_of_log(), added.crash) == ("", case.crash)
+    run()  # which replaces what runs trials
+    monkeypatch.setattr(Executor, "results", [Outcome.COLLISION])
+    (found,) = run_cases([added.path], trusted=True)
+    assert (found.got, found.was) == ("still", case.crash)
+
+
 def test_case_has_exactly_one_crash(case):
     (crash,) = (case.path / "crashes").iterdir()
     shutil.copytree(crash, crash.with_name("000001-collision"))

@@ -185,7 +185,7 @@ def test_what_is_damaged_is_not_exported(crash, tmp_path):
     finally:
         module.write_text("x = 1\n")
     assert [path.name for path in tmp_path.iterdir()] == []
-    with pytest.raises(HuntDirectoryError):
+    with pytest.raises(HuntDirectoryError, match=r"gone/crash\.zip"):
         export_crash(crash, tmp_path / "gone" / "crash.zip")
 
 
@@ -226,6 +226,7 @@ def test_names_that_lead_elsewhere_are_refused(tmp_path, name, says):
         pass
     assert caught.value.where == str(path)
     assert caught.value.fix
+    assert [file.name for file in tmp_path.iterdir()] == ["bad.zip"]  # where it would be unpacked
 
 
 def test_links_twins_and_strangers_are_refused(tmp_path):

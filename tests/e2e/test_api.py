@@ -30,6 +30,7 @@ print(crashhunt.replay(found.crashes[0]).verdict)
 """
 
 
+@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py hunts from such a script
 def test_a_script_needs_no_guard(toy):
     (toy.folder / "script.py").write_text(SCRIPT)
     done = subprocess.run(
@@ -45,6 +46,7 @@ def hunt(toy, made_once, monkeypatch):
     return made_once(keeps_going, toy)
 
 
+@pytest.mark.nightly  # by day, hunts/test_results.py, and test_check.py replays with changes
 def test_results_are_typed_objects_and_arrays(hunt):
     found = crashhunt.load("h")
     assert isinstance(found, HuntResults)

@@ -19,6 +19,7 @@ from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 WORDS = ("run", "h", "2", "6", "20", "--scenario", "toy", "--seed", "4", "--json")
 
 
+@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py and report/test_result_texts.py
 def test_trials_that_are_the_same_are_said_to_be(toy):
     done = toy.crashhunt(*WORDS, "--arg", "speed=5", "--audit", "0.5")
     audit = done.json["audit"]
@@ -47,6 +48,7 @@ def test_a_difference_is_reported_with_the_first_step_and_field(toy):
     assert f"audit: {line}" in toy.crashhunt("logs", "h").out
 
 
+@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py
 def test_no_one_pays_who_does_not_ask(toy):
     assert toy.crashhunt(*WORDS, "--arg", "speed=5").json["audit"] is None
 
@@ -63,7 +65,7 @@ def left(toy):
     return json.loads(rows.get("audits_left", "[]"))
 
 
-@pytest.mark.nightly  # by day, the audit that is left over below
+@pytest.mark.nightly  # by day, hunts/test_verified_runs.py makes up for them
 @pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.nightly)])
 def test_audits_of_a_hunt_that_was_stopped_are_made_up_for_when_it_is_resumed(toy, how):
     words = ("run", "h", "1", "6", "20", "--scenario", "toy", "--seed", "4", "--json", "--arg", "speed=5")
@@ -94,6 +96,7 @@ def test_audits_of_a_hunt_that_was_stopped_are_made_up_for_when_it_is_resumed(to
     assert done.json["trials_run"] == 6
 
 
+@pytest.mark.nightly  # by day, hunts/test_verified_runs.py and hunts/test_hunt_parts.py
 def test_audit_left_over_of_a_trial_that_differs_is_reported_without_a_step(toy):
     toy.crashhunt(*WORDS, "--agent", "faulty:Remembers", "--audit", "1e-9")
     with closing(sqlite3.connect(toy.folder / "h" / "ledger.sqlite")) as ledger, ledger:

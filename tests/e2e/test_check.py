@@ -153,6 +153,7 @@ def test_a_crash_json_that_was_edited_is_refused(hunt, crash):
         file.write_text(before)
 
 
+@pytest.mark.nightly  # by day, replays/test_verdicts.py and test_replay.py
 def test_a_replay_is_the_same_only_if_the_same_things_collided(hunt, crash):
     file = crash / "crash.json"
     before = file.read_text()
@@ -283,6 +284,7 @@ def test_check_states_what_is_lost_and_saves_the_rest(hunt, crash, toy):
     assert second.name
 
 
+@pytest.mark.nightly  # by day, hunts/test_check_parts.py and hunts/test_results.py
 def test_check_finds_what_does_not_belong_together(hunt, crash, toy):
     shutil.rmtree(crash)
     code, out, _ = command("check", "h")
@@ -301,15 +303,24 @@ def test_check_finds_what_does_not_belong_together(hunt, crash, toy):
     assert (code, "there is no hunt" in err) == (2, True)
 
 
-def test_no_crash_in_other_traffic_is_no_fix(hunt, crash, toy):
-    """One draw of other traffic shows nothing, whichever way the traffic became another."""
-    for words in (("--set", "gap_m=500"), ("--scenario", "toy", "--set", "gap_m=500")):
-        code, out, _ = command("replay", crash, "--expect", "fixed", "--json", *words)
-        found = json.loads(out)
-        assert (code, found["verdict"]) == (1, "not_comparable"), words
-        assert "does not show a fix" in found["reason"]
+def test_no_crash_in_other_traffic_is_no_fix(hunt, crash):
+    """One draw of other traffic shows nothing."""
+    found = in_other_traffic(crash, "--scenario", "toy", "--set", "gap_m=500")
+    assert found == (1, "not_comparable")
     code, out, _ = command("replay", crash, "--expect", "fixed", "--json", "--set", "speed=4")
     assert (code, json.loads(out)["verdict"]) == (0, "fixed")
+
+
+def in_other_traffic(crash, *words):
+    code, out, _ = command("replay", crash, "--expect", "fixed", "--json", *words)
+    found = json.loads(out)
+    assert "does not show a fix" in found["reason"]
+    return code, found["verdict"]
+
+
+@pytest.mark.nightly  # by day, replays/test_edits.py and replays/test_verdicts.py
+def test_no_crash_in_other_traffic_is_no_fix_whichever_way_it_became_another(hunt, crash, toy):
+    assert in_other_traffic(crash, "--set", "gap_m=500") == (1, "not_comparable")
     settings = hunt / "hunt.toml"
     text = settings.read_text()
     for before, after in (

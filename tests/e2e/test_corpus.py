@@ -118,6 +118,16 @@ def test_case_inside_repository_names_its_files_by_relative_paths(kept, corpus, 
 
 
 def test_todays_code_is_judged(kept):
+    found = kept.crashhunt("corpus", "run", "kept crashes", "--keep", "out", "--json").json["cases"]
+    assert [(case["got"], case["ok"]) for case in found] == [("still", True)] * 2
+    assert kept.crashhunt("replay", found[0]["kept"], "--json").json["verdict"] == "reproduced"
+    drive(kept, MENDED)
+    done = kept.crashhunt("corpus", "run", "kept crashes")
+    assert done.out.count("to be warned if it crashes again") == 2
+
+
+@pytest.mark.nightly  # by day, the test above, corpus/test_corpus_cases.py, cli/test_answers.py and report/test_ci.py
+def test_todays_code_is_judged_each_time(kept):
     found = kept.crashhunt("corpus", "run", "kept crashes", "--json").json["cases"]
     assert all((kept.folder / case["path"]).is_dir() for case in found)
     assert [(case["expected"], case["got"], case["ok"]) for case in found] == [("still", "still", True)] * 2
@@ -169,6 +179,7 @@ def test_what_is_damaged_or_no_case_is_reported_and_does_not_keep_the_others(kep
     assert "did you mean 'kept crashes'" in kept.crashhunt("corpus", "run", "kept crashs", expect=2).err
 
 
+@pytest.mark.nightly  # by day, test_foreign_hunts.py adds what a stranger made
 def test_a_strangers_crash_is_added_only_with_trust(kept):
     kept.crashhunt("export", "h", "crash.zip", "--crash", "0")
     kept.crashhunt("corpus", "add", "crash.zip", "--to", "mine")
@@ -216,6 +227,7 @@ def test_every_documented_command_reads_a_case_with_a_compact_log(kept, monkeypa
     assert (found["verdict"], found["divergence"]["field"]) == ("fixed", "action[target_speed]")
 
 
+@pytest.mark.nightly  # by day, corpus/test_corpus_cases.py
 def test_case_without_log_names_the_command_that_records_it(kept, monkeypatch):
     """As of an earlier version."""
     case = small_case(kept, monkeypatch)

@@ -111,6 +111,7 @@ def test_a_forged_signature_is_a_strangers(exported):
     assert "evil:Agent" in refused
 
 
+@pytest.mark.nightly  # by day, crashes/test_archive.py
 def test_what_should_not_be_there_is_refused(exported, tmp_path):
     source = exported.folder / "crash ä.zip"
     link = zipfile.ZipInfo("crashes/link")
@@ -161,6 +162,7 @@ def test_what_should_not_be_there_is_refused(exported, tmp_path):
     assert not [*tmp_path.glob("**/evil"), *exported.folder.glob("**/evil")]
 
 
+@pytest.mark.nightly  # by day, crashes/test_archive.py and test_strangers.py
 def test_a_bomb_is_refused(exported, tmp_path):
     def bomb(name, data):
         if name != "archive.json":
@@ -229,6 +231,7 @@ def test_a_strangers_recorded_actions_do_nothing_but_simulate(exported_on_sumo, 
     assert "not made on this machine" in refused.err
 
 
+@pytest.mark.nightly  # by day, crashes/test_archive.py
 def test_where_an_archive_cannot_be_written_or_made(exported):
     exported.environment.pop("XDG_STATE_HOME")
     (exported.folder / "mine.py").write_text(AGENT)

@@ -128,6 +128,7 @@ def test_a_closed_window_is_no_divergence(crash, screen):
     assert "diverged" not in out
 
 
+@pytest.mark.nightly  # by day, cli/test_answers_on_crashes.py and replays/test_debugged_process.py
 def test_what_cannot_be_shown_is_said(crash, shell):
     shell.environment.pop("DISPLAY", None)
     assert "DISPLAY is not set" in crash.crashhunt("replay", "h", "--gui", expect=2).err

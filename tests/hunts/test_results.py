@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import warnings
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -88,6 +90,27 @@ def test_a_table_has_an_array_of_its_kind_for_each_column(hunt):
     assert kinds == {"number": "i", "seed": "i", "ego.speed": "f", "danger": "f", "outcome": "U", "digest": "U"}
     assert np.isnan(table["danger"]).all()  # that version did not measure it
     assert table["outcome"].tolist() == ["collision", "survived"] * 2
+
+
+def test_a_dataframe_has_the_columns_of_the_table_and_needs_pandas(hunt, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=lambda table: list(table.dtype.names)))
+    assert load(hunt).dataframe() == list(load(hunt).columns)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(UsageError, match="a dataframe needs pandas"):
+        load(hunt).dataframe()
+
+
+def test_a_crash_has_its_recording_as_arrays(hunt):
+    found = load(hunt)
+    crash = found.crashes[0]
+    recording, steps = crash.recording(), crash.result.steps
+    assert recording.observations("ego").shape[0] == steps > 0
+    assert recording.observations("ego").ndim == 3
+    assert recording.actions("ego").shape == (steps, 2)
+    assert recording.scene(steps).roster.index["ego"] == 0
+    acted = found.agent(0, trust=True).act(recording.observations("ego")[0])
+    assert acted[0] == pytest.approx(found.trials()["ego.speed"][0])
+    assert found.scenario.title
 
 
 def test_columns_follow_what_the_hunt_was_asked(hunt):

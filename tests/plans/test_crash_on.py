@@ -38,6 +38,7 @@ def test_names_and_limits():
     [
         (["red-light"], "did you mean 'red_light'?"),
         (["redlight"], "did you mean 'red_light'?"),
+        (["too_fast"], "'too_fast' is not an outcome that can count as a crash"),  # of an oracle that is not chosen
         (["survived"], "'survived' is not an outcome that can count as a crash"),
         (["teleport:3"], "teleport has no limit; write teleport alone; only not_moving and hard_braking have a limit"),
         (["not_moving:"], "'' is not a limit; give s above 0, such as not_moving:30"),

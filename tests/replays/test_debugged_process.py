@@ -131,7 +131,7 @@ def test_leaving_the_debugger_and_closing_the_window_are_interrupts(ends, monkey
     with pytest.raises(KeyboardInterrupt):
         _debugger.debug(rerun(), Look(until=12, window=1.0))
     monkeypatch.delenv("DISPLAY")
-    with pytest.raises(UsageError, match="needs a display"):
+    with pytest.raises(UsageError, match="needs a display, but DISPLAY is not set"):
         _debugger.debug(rerun(), Look(until=12, window=1.0))
 
 
