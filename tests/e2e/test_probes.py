@@ -93,6 +93,7 @@ class Threads:
 """
 
 
+@pytest.mark.nightly  # by day, hunts/test_preflight.py, episode/test_fork.py and episode/test_forks.py
 def test_an_agent_that_cannot_be_copied_is_refused_at_its_first_step(shell):
     """One that can be at first is told of once, and the hunt goes on."""
     (shell.folder / "toy.toml").write_text(TOY)

@@ -14,8 +14,8 @@ from pages import PAGES, ROOT, Page, prepare, tree
 ROOTS = [topic for topic in PAGES if not Page(topic).before and Page(topic).commands]
 # The dearest pages; what they show is asked by day elsewhere, without their words.
 AT_NIGHT = (
-    "api", "ci", "compare", "disturbances", "executor", "film", "files", "find-a-crash", "gymnasium", "hand-over",
-    "highway-env", "how-often-does-it-crash", "learn-from-crashes", "look-into-a-crash", "oracle",
+    "agent", "api", "ci", "compare", "disturbances", "executor", "film", "files", "find-a-crash", "gymnasium",
+    "hand-over", "highway-env", "how-often-does-it-crash", "learn-from-crashes", "look-into-a-crash", "oracle",
     "prove-that-it-is-fixed", "sampler", "scenario", "simulator", "suites", "train-on-crashes", "watch-and-see-why",
     "which-version-is-better", "your-town",
 )  # fmt: skip

@@ -74,6 +74,7 @@ def snapshots(shell) -> list:
     return sorted((shell.folder.parent / "out" / "snapshots").iterdir(), key=lambda path: path.stat().st_mtime_ns)
 
 
+@pytest.mark.nightly  # by day, snapshots/test_projects.py
 def test_the_whole_work_tree_is_kept_and_nothing_else(project):
     before = (project.folder / ".git" / "index").read_bytes()
     status = git(project.folder, "status", "--porcelain")
@@ -119,6 +120,7 @@ def test_a_crash_replays_when_the_project_is_gone(project):
     assert project.crashhunt("replay", "elsewhere", "--json").json["verdict"] == "reproduced"
 
 
+@pytest.mark.nightly  # by day, snapshots/test_projects.py
 def test_files_that_arguments_name_are_kept(project):
     folder = project.folder.parent
     weights = folder / "policy ä.npz"
@@ -134,6 +136,7 @@ def test_files_that_arguments_name_are_kept(project):
     assert "policy ä.npz has changed" in refused.err
 
 
+@pytest.mark.nightly  # by day, snapshots/test_projects.py
 def test_what_python_and_others_generate_is_not_code(project):
     """Nothing of it is ignored there; Python writes its caches again whenever it likes."""
     for name in ("src/planner/__pycache__/tuning.cpython-311.pyc", ".venv/lib/huge.py"):
@@ -147,6 +150,7 @@ def test_what_python_and_others_generate_is_not_code(project):
     assert project.crashhunt("replay", "../out", "--json").json["verdict"] == "reproduced"
 
 
+@pytest.mark.nightly  # by day, snapshots/test_projects.py, and test_replay.py forces a replay
 def test_a_missing_file_is_named_and_a_new_module_too(project):
     project.crashhunt(*RUN)
     (snapshot,) = snapshots(project)
@@ -166,6 +170,7 @@ def test_a_missing_file_is_named_and_a_new_module_too(project):
     assert "manifest" in project.crashhunt("replay", "../out", expect=2).err
 
 
+@pytest.mark.nightly  # by day, snapshots/test_projects.py
 def test_the_same_code_is_stored_once_and_changed_code_again(project):
     words = [*RUN, "--keep-going"]
     project.crashhunt(*words)
@@ -185,6 +190,7 @@ def test_the_same_code_is_stored_once_and_changed_code_again(project):
         assert (done["verdict"], done["steps_replayed"]) == ("reproduced", 24 if crash["trial"] == 1 else 19)
 
 
+@pytest.mark.nightly  # by day, snapshots/test_projects.py
 def test_a_snapshot_has_a_limit(project):
     big = project.folder / "recording.bin"
     big.write_bytes(bytes(3_000_000))
@@ -195,6 +201,7 @@ def test_a_snapshot_has_a_limit(project):
     project.crashhunt(*RUN, "--snapshot-limit", "10")
 
 
+@pytest.mark.nightly  # by day, snapshots/test_projects.py and replays/test_prepare.py
 def test_without_a_snapshot_todays_code_is_replayed(project):
     project.crashhunt(*RUN, "--no-snapshot")
     (snapshot,) = snapshots(project)
@@ -204,6 +211,7 @@ def test_without_a_snapshot_todays_code_is_replayed(project):
     assert "--no-snapshot" in done.json["warnings"][0]
 
 
+@pytest.mark.nightly  # by day, snapshots/test_projects.py
 def test_more_can_be_taken_in(project):
     extra = project.folder.parent / "extra"
     extra.mkdir()
@@ -218,6 +226,7 @@ def test_more_can_be_taken_in(project):
     assert "'../gone' does not exist" in refused.err
 
 
+@pytest.mark.nightly  # by day, snapshots/test_projects.py
 def test_hunts_inside_the_work_tree_are_excluded(project):
     words = list(RUN)
     for name in ("hunts/first", "second"):
@@ -230,6 +239,7 @@ def test_hunts_inside_the_work_tree_are_excluded(project):
         assert not list(snapshot.rglob("log.mcap"))
 
 
+@pytest.mark.nightly  # by day, snapshots/test_projects.py
 def test_a_submodule_comes_along(project):
     other = project.folder.parent / "library"
     other.mkdir()
