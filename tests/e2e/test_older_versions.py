@@ -56,6 +56,7 @@ def test_a_hunt_is_listed_read_and_checked(shell, place):
     assert "leader" in (shell.folder / "page.html").read_text()
 
 
+@pytest.mark.nightly  # by day, hunts/test_next_trials.py draws them, and crashes are replayed below
 @hunts
 def test_a_hunt_continues_with_the_trials_that_it_would_have_had(shell, place):
     shutil.copytree(place / "hunt", shell.folder / "hunt")

@@ -45,7 +45,7 @@ def crash(toy, made_once):
     return made_once(hunted, toy)
 
 
-@pytest.mark.parametrize("step", mostly_nightly([0, 1, 30, 52], [0, 30]))
+@pytest.mark.parametrize("step", mostly_nightly([0, 1, 30, 52], [30]))
 def test_same_agent_from_any_step_on_crashes_as_it_was_recorded(crash, step):
     was = find_bundle(crash.folder / "h").result
     found = crash.crashhunt("whatif", "h", "--from-step", str(step), "--code", "current", "--times", "3", "--json").json
@@ -97,6 +97,7 @@ def test_agent_of_today_is_found_in_the_working_directory(crash):
     assert "speed" in err
 
 
+@pytest.mark.nightly  # by day, Python and the command run the same futures
 def test_futures_are_the_same_in_every_call_and_share_the_recorded_steps(crash):
     words = ("whatif", "h", "--from-step", "20", "--futures", "--times", "12", "--json")
     one, two = (crash.crashhunt(*words, "--parallel", parallel).json for parallel in ("1", "2"))
@@ -212,9 +213,14 @@ def test_ctrl_c_counts_the_runs_that_ended(toy):
 
 def test_python_counts_as_the_command_does(crash):
     folder = crash.folder / "h"
-    told = crash.crashhunt("whatif", "h", "--before", "3", "--futures", "--times", "5", "--json").json
-    found = crashhunt.what_if(folder, before_s=3, futures=True, times=5)
+    told = crash.crashhunt(
+        "whatif", "h", "--before", "3", "--futures", "--times", "5", "--parallel", "1", "--json"
+    ).json
+    found = crashhunt.what_if(folder, before_s=3, futures=True, times=5, parallel=2)
     assert found.to_json() == told
+    assert (found.runs, found.different > 2) == (5, True)
+    assert [each["number"] for each in told["each"]] == list(range(5))
+    assert told["interval"][0] <= told["share"] <= told["interval"][1]
     assert crashhunt.what_if(folder, changes={"speed": 8.0}).survived == 1
     with pytest.raises(UsageError, match="recorded actions cannot react"):
         crashhunt.what_if(folder, code="log")
@@ -241,6 +247,7 @@ class Tampered(Reruns):
 OTHER: list = []
 
 
+@pytest.mark.nightly  # by day, whatif/test_what_is_counted.py
 def test_runs_that_are_killed_or_differ_before_the_step_do_not_count(crash, monkeypatch):
     crash.crashhunt("run", "other", "1", "20", "300", "--scenario", "toy", "--arg", "speed=13", "--seed", "7")
     OTHER[:] = [crash.folder / "other"]
@@ -256,7 +263,8 @@ def test_runs_that_are_killed_or_differ_before_the_step_do_not_count(crash, monk
     assert sum(found.excluded.values()) == 3
 
 
-@pytest.mark.parametrize("name", mostly_nightly(["crashhunt-0.1.0", "crashhunt-0.1.0-packages"], ["crashhunt-0.1.0"]))
+@pytest.mark.nightly  # by day, whatif/test_reruns.py
+@pytest.mark.parametrize("name", ["crashhunt-0.1.0", "crashhunt-0.1.0-packages"])
 def test_crash_of_an_earlier_version_takes_changes_and_names_what_needs_todays_code(toy, name):
     bundle = str(Path(__file__).with_name("bundles") / f"{name}.zip")
     done = toy.crashhunt("whatif", bundle, "--trust", "--from-step", "3", "--futures", "--times", "2", expect=2)

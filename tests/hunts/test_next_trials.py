@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -21,13 +22,14 @@ from crashhunt.errors import HuntDirectoryError, PluginError
 from crashhunt.hunts import Trials, _next_trials, spec_of
 from crashhunt.hunts._next_trials import growing_lag, settings_again, settings_of_workers
 from crashhunt.ledger import Ledger
-from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
+from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
 from crashhunt.samplers import NamedSampler, RandomSampler, Sampler
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import Forcing, Outcome, TrialResult
 from crashhunt.world import ClosestApproach
 
 TRIALS = 60
+HUNTS = sorted((Path(__file__).parents[1] / "e2e" / "frozen").glob("*/hunt"))
 
 
 def settings(sampler="climber:Climber", *, parallel=2, deterministic=False, trials=TRIALS, argument="gap_m"):
@@ -155,6 +157,19 @@ def test_each_trial_is_drawn_from_its_number_and_the_seed_of_the_hunt():
     assert [spec.arguments["ego"]["speed"] for spec in specs] == pytest.approx([8.196639, 5.231068, 8.460145])
     other = replace(chosen, seed=4)
     assert spec_of(0, other, sampler).seed not in [spec.seed for spec in specs]
+
+
+@pytest.mark.parametrize("place", HUNTS, ids=[place.parent.name for place in HUNTS])
+def test_trials_of_a_hunt_of_an_older_version_are_drawn_as_they_were(place, tmp_path):
+    shutil.copytree(place, tmp_path / "h")
+    chosen = read_settings(tmp_path / "h" / "hunt.toml")
+    sampler = NamedSampler(chosen.sampler, chosen.space, points=chosen.points)
+    with closing(Ledger(tmp_path / "h" / "ledger.sqlite")) as ledger:
+        recorded = [result.spec for result in ledger.results()]
+        assert [spec_of(spec.number, chosen, sampler) for spec in recorded] == recorded
+        more = replace(chosen, trials=len(recorded) + 2)
+        rest = Trials(more, sampler, ledger, ledger.finished(), lag=2).take(9)
+        assert list(rest) == [spec_of(len(recorded) + number, more, sampler) for number in range(2)]
 
 
 def test_with_one_worker_nothing_depends_on_time(tmp_path):

@@ -10,8 +10,8 @@ import pytest
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.crashes import wilson
 from crashhunt.episode import HandedOver, _action_override
-from crashhunt.trial import Disturbance, Handover, Outcome, Reseeding, TrialSpec
-from crashhunt.whatif import Counts, Disturb, LeaveOut, Overrule, Reseed, Run, SetArguments, WhatIfOptions
+from crashhunt.trial import KILLED, Disturbance, Failure, Handover, Outcome, Reseeding, TrialResult, TrialSpec
+from crashhunt.whatif import Counts, Disturb, LeaveOut, Overrule, Reseed, Run, SetArguments, WhatIfOptions, _engine
 from crashhunt.whatif._engine import _from_step, _Runs, future_seed
 
 
@@ -69,6 +69,51 @@ def test_stopped_runs_count_up_to_the_first_unfinished_number():
     assert counts(*runs.counted, asked=9, interrupted="stopped").lines()[-1] == (
         "  interrupted: stopped, after 2 of 9 runs (those before the first run that had not finished)"
     )
+
+
+@pytest.mark.parametrize(
+    ("result", "recorded", "why"),
+    [
+        ({}, [1, 2, 3, 4], ""),
+        ({}, [1, 2, 3, 9], ""),  # after the step, where the change begins
+        ({}, [1, 9, 3, 4], "it differs from the recording: step 1"),
+        ({}, [1, 2], "it ended at step 2, before step 3"),
+        ({}, None, "it left no recording"),
+        ({"outcome": Outcome.SURVIVED}, [1, 2, 3, 4], ""),
+        ({"outcome": Outcome.HANG}, [1, 2, 3, 4], "hang is no outcome that this hunt counts"),
+        (
+            {"outcome": Outcome.INVALID, "failure": Failure(KILLED, "killed from outside 3 times", exit_code=-9)},
+            None, "its process was killed from outside: killed from outside 3 times",
+        ),
+    ],
+)  # fmt: skip
+def test_runs_that_are_killed_or_differ_before_the_step_do_not_count(monkeypatch, result, recorded, why):
+    def differ(one, other):
+        return next((f"step {place}" for place, (a, b) in enumerate(zip(one, other, strict=True)) if a != b), None)
+
+    monkeypatch.setattr(_engine, "up_to", lambda recording, step: recording.numbers[:step])
+    monkeypatch.setattr(_engine, "first_divergence", differ)
+    spec = TrialSpec(0, 1, {}, {}, 9)
+    rerun = SimpleNamespace(
+        spec=spec, recorded=SimpleNamespace(numbers=[1, 2, 3, 4]),
+        worker=SimpleNamespace(crash_on=(Outcome.COLLISION,)),
+    )  # fmt: skip
+    recording = recorded and SimpleNamespace(numbers=recorded, steps=len(recorded))
+    ended = TrialResult(spec, **{"outcome": Outcome.COLLISION, "steps": 4, **result})
+    reruns = SimpleNamespace(run=lambda specs: [SimpleNamespace(place=0, result=ended, recording=recording)])
+    runs = _Runs(rerun, reruns, 3, WhatIfOptions(), 1)
+    runs.run_alike()
+    (found,) = runs.counted
+    assert (found.excluded, found.crashed) == (why, ended.outcome is Outcome.COLLISION)
+
+
+def test_run_that_cannot_be_set_up_is_an_error():
+    spec = TrialSpec(0, 1, {}, {}, 9)
+    ended = TrialResult(spec, Outcome.INVALID, steps=0, failure=Failure("invalid", "no map"))
+    reruns = SimpleNamespace(run=lambda specs: [SimpleNamespace(place=0, result=ended, recording=None)])
+    runs = _Runs(_Rerun(spec, None), reruns, None, WhatIfOptions(), 1)
+    with pytest.raises(UsageError, match="the run cannot be set up: no map"):
+        runs.run_alike()
 
 
 def test_recorded_prefix_ends_where_the_first_change_begins():
