@@ -48,6 +48,7 @@ def test_a_collision_is_reported_in_words_and_a_table(crash):
     assert "Braking at 20 m/s² (in the run, it braked with at most 8.0) could have avoided it" in harder
 
 
+@pytest.mark.nightly  # by day, cli/test_answers_on_crashes.py and base/test_names.py
 def test_bad_numbers_are_refused(crash):
     for words in (("--braking", "1e-9"), ("--last-seconds", "-1"), ("--braking", "nan"), ("--crash", "999")):
         refused = crash.crashhunt("show", "h", *words, expect=2)

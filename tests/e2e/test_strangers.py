@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from conftest import Shell, mostly_nightly
-from test_show import hunted
+from test_replay import hunted_on_sumo
 
 from crashhunt.base.sandbox import landlock_version
 from crashhunt.crashes import find_bundle, open_archive
@@ -37,8 +37,8 @@ def crash(tmp_path_factory):
 
 @pytest.fixture
 def with_code(shell, made_once):
-    """A crash of the shipped scenario with its code; `test_show` hunts for it as well."""
-    made_once(hunted, shell).crashhunt("export", "h", "crash.zip")
+    """A crash of a copy of the shipped scenario, with its code; `test_replay` hunts for it as well."""
+    made_once(hunted_on_sumo, shell).crashhunt("export", "h", "crash.zip")
     return shell.folder / "crash.zip"
 
 
@@ -161,13 +161,11 @@ EVIL = 'from pathlib import Path\nPath("evil was here").touch()\n'
 @pytest.mark.parametrize(
     ("file", "before", "after"),
     [
-        ("hunt.toml", 'agent = "crashhunt.agents:KeepLaneWithSpeed"', 'agent = "evil:Agent"'),
+        ("hunt.toml", 'agent = "my_pkg.agents:Planner"', 'agent = "evil:Agent"'),
         pytest.param("hunt.toml", 'sampler = "random"', 'sampler = "evil:Sampler"', marks=pytest.mark.nightly),
         pytest.param("hunt.toml", '"overlap"', '"evil:Oracle"', marks=pytest.mark.nightly),
         pytest.param(OPTIONS, 'simulator = "sumo"', 'simulator = "evil:Simulator"', marks=pytest.mark.nightly),
-        pytest.param(
-            OPTIONS, 'agent = "crashhunt.agents:KeepLaneWithSpeed"', 'agent = "evil:Agent"', marks=pytest.mark.nightly
-        ),
+        pytest.param(OPTIONS, 'agent = "my_pkg.agents:Planner"', 'agent = "evil:Agent"', marks=pytest.mark.nightly),
     ],
 )
 def test_no_code_is_imported(with_code, tmp_path, monkeypatch, capsys, file, before, after):
