@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import time
+from pathlib import Path
 
 import pytest
 
@@ -25,6 +26,17 @@ def hunt(toy, made_once, monkeypatch):
     made_once(hunted, toy)
     monkeypatch.chdir(toy.folder)
     return toy
+
+
+def test_a_crash_becomes_smaller_and_replays(shell):
+    """A crash that an older version recorded, so that no hunt is needed."""
+    shutil.copytree(Path(__file__).parent / "frozen" / "0.1.0-packages" / "hunt", shell.folder / "h")
+    words = ("--crash", "0", "--trust", "--budget", "12", "--parallel", "1")
+    told = shell.crashhunt("shrink", "h", *words, "--json").json
+    assert (told["verdict"], told["confirmed"], told["signature_kept"]) == ("shrunk", True, True)
+    assert "ego.speed" in told["changed"]
+    replayed = shell.crashhunt("replay", told["path"], "--trust", "--json").json
+    assert (replayed["verdict"], replayed["steps_replayed"]) == ("reproduced", told["steps_after"])
 
 
 @pytest.mark.nightly  # by day, shrinking/test_shrink_bundle.py
@@ -186,6 +198,7 @@ def test_ctrl_c_leaves_the_best(hunt):
     assert "Traceback" not in err
 
 
+@pytest.mark.nightly  # by day, cli/test_answers_on_crashes.py
 def test_what_is_asked_for_must_make_sense(hunt):
     assert "--budget is 0" in hunt.crashhunt("shrink", "h", "--budget", "0", expect=2).err
     hunt.crashhunt("export", "h", "crash.zip")
