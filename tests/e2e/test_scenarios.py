@@ -186,7 +186,7 @@ def test_the_accelerator_changes_nothing_but_the_time(shell):
         assert shell.crashhunt("replay", "fast", "--no-accelerate", "--json").json["verdict"] == "reproduced"
 
 
-@pytest.mark.nightly  # by day, test_check.py replays a crash in another scenario
+@pytest.mark.nightly  # by day, replays/test_prepare.py and replays/test_verdicts.py
 def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     words = ("--scenario", "highway", "--agent", "keep-lane", "--arg", "speed=30", "--seed", "1", "--deterministic")
     shell.crashhunt("run", "h", "2", "20", "150", *words)

@@ -105,7 +105,7 @@ def test_a_trial_that_was_killed_from_outside_is_run_again(toy, number):
     assert report["notes"][0] in toy.crashhunt("logs", "h").out
 
 
-@pytest.mark.nightly  # by day, what Ctrl-C and a killed worker leave behind is looked at
+@pytest.mark.nightly  # by day, executors/test_pool_of_trials.py and executors/test_new_processes.py
 def test_when_the_fork_server_is_killed_another_one_takes_over(toy):
     process = toy.start("run", "h", "2", "6", "40", *FINE, *SLOW, "--json")
     wait_for(lambda: len(rows(toy.folder / "h")) >= 1)
