@@ -50,7 +50,9 @@ def ask(tmp_path):
     return ask_it
 
 
-@pytest.mark.parametrize("scenario", ["toy", "loop", pytest.param("highway", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "scenario", ["toy", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("loop", "highway"))]
+)
 def test_a_copy_and_a_copy_of_it_continue_to_the_same_bits(ask, scenario):
     unforked, *others = ask(scenario)["ends"]
     assert len(others) == 3

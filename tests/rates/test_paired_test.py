@@ -114,7 +114,7 @@ def ever_outside(rng, only_first, only_second, pairs):
     return any(counted(first[k], second[k], number[k] - first[k] - second[k]).excludes(difference) for k in looks)
 
 
-@pytest.mark.parametrize("rates", [(0.05, 0.05), (0.02, 0.06), (0.15, 0.15)])
+@pytest.mark.parametrize("rates", [(0.05, 0.05), (0.02, 0.06), pytest.param((0.15, 0.15), marks=pytest.mark.nightly)])
 def test_interval_seldom_ever_excludes_the_true_difference(rates):
     rng = np.random.default_rng(26)
     outside = sum(ever_outside(rng, *rates, 300) for _ in range(100))

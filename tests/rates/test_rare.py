@@ -23,7 +23,14 @@ def z_score(values, truth):
     return (statistics.fmean(values) - truth) / (statistics.stdev(values) / math.sqrt(len(values)))
 
 
-@pytest.mark.parametrize("model", [Model(SPARSE), Model(DENSE), Model(TWO), Model(SPARSE, hidden=1e-2)])
+@pytest.mark.parametrize(
+    "model",
+    [
+        Model(SPARSE),
+        *(pytest.param(Model(onsets), marks=pytest.mark.nightly) for onsets in (DENSE, TWO)),
+        Model(SPARSE, hidden=1e-2),
+    ],
+)
 def test_roots_estimate_both_parts_without_bias(model):
     roots = run_roots(model, 96, 5)
     undisturbed, disturbed = model.truth()

@@ -222,7 +222,15 @@ def test_interrupted_frames_leave_nothing_behind(tmp_path, there):
     assert list(tmp_path.rglob("*.png")) == []
 
 
-@pytest.mark.parametrize("options", [{}, {"last_s": 0.5}, {"fps": 3.0, "blank_frames": 4}, {"last_step_repeats": 0}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({}, marks=pytest.mark.nightly),
+        {"last_s": 0.5},
+        {"fps": 3.0, "blank_frames": 4},
+        pytest.param({"last_step_repeats": 0}, marks=pytest.mark.nightly),
+    ],
+)
 def test_how_many_pictures_there_will_be_is_known_before(tmp_path, options):
     seen = []
     shots = [shot(4), shot(7)]

@@ -72,9 +72,8 @@ class TestSumo(SimulatorContract):
 """
 
 
-# How an agent acts and where it drives have nothing to do with each other: by day each form comes once, one of them
-# with two agents on a ring, the other with one on a road that ends and is crossed.
-BY_DAY = [("loop-two-agents", "continuous"), ("intersection", "meta")]
+# By day, two agents on a ring; meta-actions are in Gymnasium's own checker below.
+BY_DAY = [("loop-two-agents", "continuous")]
 BY_NIGHT = [
     (name, form)
     for name in ("loop", "loop-two-agents", "merge", "intersection")
@@ -384,8 +383,12 @@ for form in forms:
 """
 
 
+NIGHT = [("here", ["continuous"]), ("own", ["meta"])]
+
+
 @pytest.mark.parametrize(
-    ("where", "forms"), [("here", ["continuous", "meta"]), pytest.param("own", ["meta"], marks=pytest.mark.nightly)]
+    ("where", "forms"),  # by day, the contract above has the continuous form
+    [("here", ["meta"]), *(pytest.param(*case, marks=pytest.mark.nightly) for case in NIGHT)],
 )
 def test_the_gymnasium_environment_passes_gymnasiums_own_checker(where, forms):
     command = [sys.executable, "-c", ENVIRONMENT, where, *forms]

@@ -222,7 +222,7 @@ def test_an_interrupt_in_the_middle_of_a_message_ends_the_process(remote, monkey
     assert not os.path.exists(f"/proc/{remote._episodes.pid}")  # noqa: PTH110
 
 
-@pytest.mark.parametrize("crash", ["", None])
+@pytest.mark.parametrize("crash", [pytest.param("", marks=pytest.mark.nightly), None])
 def test_a_killed_process_is_reported_whatever_is_asked_next(remote, crash):
     remote.reset(seed=1)
     os.kill(remote._episodes.pid, signal.SIGKILL)
