@@ -766,6 +766,27 @@ def test_dashboard_is_served_as_asked_and_announced(monkeypatch, capsys):
     assert (asked[1][1]["port"], asked[1][1]["token"], asked[1][1]["allow_control"]) == (8642, "", False)
 
 
+@pytest.mark.parametrize(
+    ("words", "report", "code"),
+    [
+        ([], {"crashes": ["one"]}, 0), (["--fail-on-crash"], {"crashes": ["one"]}, 1), (["--fail-on-crash"], {}, 0),
+        (["--fail-on-crash"], {"copied": "one"}, 1), ([], {"stopped_because": "no_valid_trial"}, 3),
+        ([], {"stopped_because": "interrupted", "crashes": ["one"]}, 130), ([], {"unconfirmed": 2}, 130),
+        ([], {"rate": SimpleNamespace(verdict="below")}, 0), ([], {"rate": SimpleNamespace(verdict="above")}, 1),
+    ],
+)  # fmt: skip
+def test_run_ends_with_the_code_of_its_report(monkeypatch, capsys, words, report, code):
+    usual = {"stopped_because": "all_trials", "crashes": [], "copied": None, "unconfirmed": 0, "rate": None}
+    found = named("the report", **usual | report)
+    setup = SimpleNamespace(agents={"ego": SimpleNamespace(agent="keep-lane")})
+    hunt = SimpleNamespace(settings=setup, scenario=SimpleNamespace(name="toy", notes=()), run=lambda watcher: found)
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    monkeypatch.setattr("crashhunt.api.prepare", lambda *words, **options: hunt)
+    monkeypatch.setattr("crashhunt.report.describe_hunt", lambda report: "found")
+    assert run("run", "h", "1", "5", "60", *words, "--json") == code
+    assert capsys.readouterr() == ('"the report"\n', "found\n")
+
+
 @pytest.mark.parametrize(("ego", "starts"), [(None, True), ("", True), ("any", True), ("car.3", False)])
 def test_long_wait_is_explained_where_traffic_is_surveyed(monkeypatch, capsys, tmp_path, ego, starts):
     module = importlib.import_module("crashhunt.cli._run")

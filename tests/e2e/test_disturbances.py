@@ -83,6 +83,7 @@ def test_trials_in_which_nothing_is_drawn_are_those_of_an_undisturbed_hunt(toy):
     assert 'disturb = [\n    "stop=1e-06",\n]' in (toy.folder / "h" / "hunt.toml").read_text()
 
 
+@pytest.mark.nightly  # by day, plans/test_what_is_resolved.py
 def test_a_scenario_states_it_and_none_takes_it_back(toy):
     file = toy.folder / "toy" / "scenario.toml"
     before = file.read_text()
@@ -99,7 +100,7 @@ def test_a_scenario_states_it_and_none_takes_it_back(toy):
     assert "[disturbances] brake=-1.0: '-1.0' is not a rate" in hunt_refused(toy)
 
 
-@pytest.mark.nightly  # by day, test_hunt.py refuses other settings
+@pytest.mark.nightly  # by day, hunts/test_hunt_parts.py refuses other settings
 def test_another_rate_is_another_hunt_and_a_rerun_keeps_its_own(toy):
     file = toy.folder / "toy" / "scenario.toml"
     hunt(toy, "--disturb", "brake=0.5", trials="1")

@@ -115,6 +115,7 @@ def test_an_executor_of_somebodys_own_runs_the_trials(mine):
     assert digests[0] == digests[1]
 
 
+@pytest.mark.nightly  # by day, plans/test_what_is_resolved.py makes each by its name
 def test_ours_are_chosen_by_name(mine):
     done = mine.crashhunt(*WORDS[:2], "1", "2", *WORDS[4:], "--executor", "fresh", "--json")
     assert done.json["outcomes"] == {"survived": 2}
@@ -123,6 +124,7 @@ def test_ours_are_chosen_by_name(mine):
     assert calls(mine)[:2] == ["made 1 1000 ", "submit 2"]
 
 
+@pytest.mark.nightly  # by day, plans/test_what_is_resolved.py and cli/test_status.py
 def test_it_may_know_better_than_this_machine_what_0_represents(mine):
     mine.crashhunt(*WORDS[:2], "0", *WORDS[3:], "--executor", "mine:Everywhere")
     assert calls(mine)[0] == "made 2 1000 asked 0"

@@ -151,7 +151,8 @@ def test_a_crash_that_kills_the_process_is_filmed_up_to_it(toy, agent, where):
     assert done["written"] == {"f": 14 + 1 + 10}
 
 
-@pytest.mark.parametrize("number", [pytest.param("SIGINT", marks=pytest.mark.nightly), "SIGKILL"])
+@pytest.mark.nightly  # by day, replays/test_debugged_process.py runs what was killed again
+@pytest.mark.parametrize("number", ["SIGINT", "SIGKILL"])
 def test_film_of_a_replay_that_is_killed_once_is_made(toy, number):
     (toy.folder / "killed.py").write_text(
         "import os, signal\nfrom pathlib import Path\nfrom faulty import Raises\nclass Killed(Raises):\n    def "
@@ -196,7 +197,9 @@ def test_bad_options_are_reported_before_anything_is_run(crash, words, message):
     assert not list(crash.folder.glob("*.mp4"))
 
 
-@pytest.mark.parametrize(("missing", "word"), [("PIL", "Pillow"), ("av", "PyAV")])
+@pytest.mark.parametrize(
+    ("missing", "word"), [("PIL", "Pillow"), pytest.param("av", "PyAV", marks=pytest.mark.nightly)]
+)
 def test_what_is_not_installed_is_named(crash, missing, word):
     folder = crash.folder / "hidden"
     folder.mkdir()

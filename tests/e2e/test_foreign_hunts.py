@@ -84,7 +84,7 @@ COMMANDS = (
 )
 
 
-@pytest.mark.parametrize("command", mostly_nightly(COMMANDS, COMMANDS[::3]))
+@pytest.mark.parametrize("command", mostly_nightly(COMMANDS, always=(COMMANDS[0], *COMMANDS[6::3])))
 def test_command_refuses_in_one_line_and_runs_nothing(theirs, command):
     words = command.split()
     before = sorted(theirs.folder.rglob("*"))
@@ -191,6 +191,7 @@ def test_hunt_that_continues_runs_no_code_of_another_user(theirs):
     assert ran(theirs)
 
 
+@pytest.mark.nightly  # by day, cli/test_common.py
 def test_at_the_terminal_it_is_asked_once(theirs):
     def answered(answer, *words):
         mine, their_end = pty.openpty()
@@ -218,6 +219,7 @@ def test_at_the_terminal_it_is_asked_once(theirs):
     assert answered("y", "replay", "h", "--json")[0] == 2  # --json is for programs
 
 
+@pytest.mark.nightly  # by day, crashes/test_origins.py
 def test_corpus_of_ones_own_repository_needs_no_question(theirs, tmp_path):
     """As a CI has it that checks the repository out, on a machine that has made none of it."""
     theirs.crashhunt("corpus", "run", "corpus", expect=2)

@@ -218,6 +218,7 @@ def test_gate_whose_time_is_up_is_undecided(drivers):
     assert found["why"].startswith("the time is up; give --for more")
 
 
+@pytest.mark.nightly  # by day, test_foreign_modules.py
 def test_agent_whose_module_ends_its_process_is_refused(drivers):
     (drivers.folder / "gone.py").write_text("import os\n\nos._exit(7)\n")
     done = drivers.crashhunt("gate", CALM, "gone:Driver", *TOY, "--most", "3", expect=2)

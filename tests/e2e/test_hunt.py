@@ -58,7 +58,10 @@ def session_is_gone(pid: int) -> bool:
     return True
 
 
-@pytest.mark.parametrize(("parallel", "trials"), [("1", 3), ("3", 2), ("0", 5)])
+@pytest.mark.parametrize(
+    ("parallel", "trials"),  # by day, hunts/test_whole_hunts.py hunts with one and three workers
+    [pytest.param("1", 3, marks=pytest.mark.nightly), pytest.param("3", 2, marks=pytest.mark.nightly), ("0", 5)],
+)
 def test_exactly_so_many_trials_run(toy, parallel, trials):
     report = toy.crashhunt("run", "h", parallel, str(trials), "30", *FINE, "--json").json
     assert report["trials_planned"] == report["trials_run"] == trials
@@ -196,6 +199,7 @@ def running_worker(folder: Path) -> int:
     return found[0]
 
 
+@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py and hunts/test_hunt_parts.py
 def test_other_settings_are_refused_and_overwrite_begins_again(toy):
     toy.crashhunt("run", "h", "1", "2", "30", *FINE)
     done = toy.crashhunt("run", "h", "1", "2", "40", *FINE, "--json", expect=2)
@@ -207,6 +211,7 @@ def test_other_settings_are_refused_and_overwrite_begins_again(toy):
     assert toy.crashhunt("run", "h", "1", "1", "40", *FINE, "--overwrite", "--json").json["trials_run"] == 1
 
 
+@pytest.mark.nightly  # by day, hunts/test_hunt_parts.py locks the directory
 def test_a_second_hunt_on_one_directory_is_refused(toy):
     process = toy.begin("run", "h", "1", "500", "300", *FINE)
     try:
@@ -219,6 +224,7 @@ def test_a_second_hunt_on_one_directory_is_refused(toy):
         process.communicate()
 
 
+@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py and cli/test_answers_on_crashes.py
 def test_a_finished_hunt_states_again_what_it_found(toy):
     words = ("run", "h", "1", "5", "60", "--agent", "faulty:Raises", "--scenario", "toy", "--json")
     first, second = toy.crashhunt(*words).json, toy.crashhunt(*words).json
@@ -242,6 +248,7 @@ def test_the_smallest_time_limit_that_fits_is_no_hang(toy):
     assert report["outcomes"] == {"survived": 4}
 
 
+@pytest.mark.nightly  # by day, plans/test_run_options.py and hunts/test_hunt_loop.py
 def test_option_to_recycle_workers_is_still_taken(toy):
     words = ("run", "h", "1", "6", "30", *FINE, "--recycle-after", "2", "--json")
     assert toy.crashhunt(*words).json["outcomes"] == {"survived": 6}

@@ -364,6 +364,8 @@ def test_directory_keeps_its_hunt_unless_it_is_overwritten(tmp_path):
     other = replace(SETTINGS, seed=5)
     with pytest.raises(HuntDirectoryError, match="the directory contains another hunt: seed"):
         claim(other)
+    with pytest.raises(HuntDirectoryError, match="max_steps was 20 and is now 40"):
+        claim(replace(SETTINGS, max_steps=40))
     assert claim(other, seed_given=False).seed == 3
     many = replace(other, max_steps=7, crash_on=(), scenario="loop", scenario_digest="1", oracles=("overlap",))
     with pytest.raises(HuntDirectoryError) as caught:

@@ -199,10 +199,16 @@ def test_disturbances_are_those_that_are_asked_for_or_those_of_the_scenario(fold
     assert plan(asked(disturb=["brake@100=ahead:4:2"]))[1].disturb == ("brake@100=ahead:4.0:2.0",)
     assert plan(asked(disturb=["none"]))[1].disturb in ((), ("none",))
     assert plan(asked(branch=True))[1].branch
-    (folder / "scenario.toml").write_text(text.replace("brake", "brakes"))
-    with pytest.raises((UsageError, ScenarioError)) as refused:
-        plan(asked())
-    assert "--disturb" not in str(refused.value)
+    for old, new, says in (
+        ("brake", "braek", "[disturbances]: there is no disturbance 'braek'; did you mean 'brake'"),
+        ("0.5", "-1", "[disturbances] brake=-1.0: '-1.0' is not a rate"),
+    ):
+        (folder / "scenario.toml").write_text(text.replace(old, new))
+        with pytest.raises((UsageError, ScenarioError)) as refused:
+            plan(asked())
+        assert says in str(refused.value)
+        assert "scenario.toml" in str(refused.value)
+        assert "--disturb" not in str(refused.value)
 
 
 def test_a_survey_sees_what_was_asked_and_its_scenario_is_planned(folder):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from types import SimpleNamespace
 
 import av
@@ -187,6 +188,13 @@ def test_frames_are_files(tmp_path):
     assert names == [f"{number:06d}.png" for number in range(5)]
     with Image.open(tmp_path / "f/000004.png") as image:
         assert (np.asarray(image) == film(shot(4))[4]).all()
+
+
+def test_video_without_pyav_is_refused_with_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(UsageError, match=r"--video needs PyAV.*; pip install 'crashhunt\[video\]'"):
+        check_places(video=tmp_path / "a.mp4")
+    check_places(gif=tmp_path / "a.gif")
 
 
 def test_a_film_that_cannot_be_written_leaves_nothing_behind(tmp_path):
