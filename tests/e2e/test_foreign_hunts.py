@@ -232,7 +232,7 @@ def test_corpus_of_ones_own_repository_needs_no_question(theirs, tmp_path):
     theirs.crashhunt("corpus", "run", "unpacked", "--trust")
 
 
-@pytest.mark.nightly  # by day, test_corpus.py has pytest run cases
+@pytest.mark.nightly  # by day, corpus/test_pytest_cases.py
 def test_pytest_runs_a_corpus_as_it_runs_the_tests_next_to_it(theirs):
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:randomly", "corpus"],

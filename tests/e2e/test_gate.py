@@ -146,7 +146,7 @@ def repository(drivers):
 IN_REPOSITORY = ("--scenario", "../toy", "--set", "gap_m=20:30", "--max-steps", "99", "--agent", CALM, *SEED)
 
 
-@pytest.mark.nightly  # by day, test_bisect.py runs commits in work trees
+@pytest.mark.nightly  # by day, suites/test_gate_parts.py and base/test_git.py
 def test_commits_are_compared_in_work_trees_of_their_own(repository):
     done = repository.crashhunt("gate", "calm", "HEAD", *IN_REPOSITORY, "--keep", "../kept", "--json", expect=1)
     found = done.json
