@@ -74,8 +74,8 @@ def off_path(row: Sequence[float], *, lateral: float, curvature: float) -> float
     """Return how far an actor is from a path, in m; 0 if the actor may be on the path.
 
     A bend may begin or end anywhere between the vehicle and the actor, and an observation does not show where. The path
-    of constant curvature is one extreme, and the arc that ends in the actor's own heading is the other extreme. An
-    actor in between counts as on the path, because braking for it is safe.
+    therefore lies between two curves: one keeps the present curvature, and the other is an arc that has the actor's
+    heading at its end. An actor between these curves counts as on the path, because braking for it is safe.
 
     Args:
         row: row of the actor in the observation.

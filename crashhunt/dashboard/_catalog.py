@@ -60,7 +60,7 @@ class FoundHunt:
 
 
 class Catalog:
-    """The hunts below some folders; the search is repeated while requests arrive.
+    """The hunts in some folders and their subfolders, which are scanned for new hunts while requests arrive.
 
     Args:
         roots: the existing folders to search.

@@ -320,7 +320,7 @@ class RateCounter:
         return len(crashed), exposure
 
     def add_counted(self, *, trials: int, crashes: int, steps: int) -> None:
-        """Add trials as counts, for the rate per trial if each trial is a unit.
+        """Add the numbers of trials and of crashes, which determine the rate per trial if each trial is a unit.
 
         Args:
             trials: number of valid trials.

@@ -287,7 +287,7 @@ _MAX_LISTED_EVENTS = 5  # a jam has many
 
 
 def about_events(recording: Recording, first_step: int, *, besides: Event | None) -> list[str]:
-    """Return other traffic events of the last steps, one sentence each.
+    """Return a sentence for each traffic event of the last steps, except for the event that ended the trial.
 
     Args:
         recording: recording of the episode.

@@ -37,7 +37,7 @@ def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]
         if vehicle in found:
             raise InvalidEpisodeError(
                 f"{found[vehicle]} and {agent} both replace the vehicle {vehicle!r}",
-                fix="give each of the two vehicles its own candidates",
+                fix=f"give {found[vehicle]} and {agent} different vehicles to replace",
             )
         found[vehicle] = agent
     return found
