@@ -4,6 +4,7 @@ import math
 from types import SimpleNamespace
 
 import pytest
+from conftest import examples
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.crashes import Encounter, last_escape
@@ -50,7 +51,7 @@ def test_the_moments_before_a_rear_end_collision():
 
 
 @given(st.floats(8, 30), st.floats(3, 9))
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=examples(30))
 def test_the_last_escape_is_where_the_braking_distance_states(speed, braking):
     """v² / (2 b) is what is needed to stop; the last step with more room than that is the last escape."""
     episode = rear_end(speed=speed, gap=speed**2 / (2 * braking) + 3.3 * speed)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from conftest import examples
 from dashboard_hunts import hunted
 from hypothesis import given, settings, strategies as st
 
@@ -61,7 +62,7 @@ def expected_prefix(trials: dict[int, TrialResult]):
     )
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(
     st.integers(1, 90), st.randoms(use_true_random=False), st.lists(st.integers(0, 89), max_size=3, unique=True),
     st.sampled_from([4, 16, 256]), st.booleans(), st.sampled_from([3, 4_000]),

@@ -9,6 +9,7 @@ import sys
 import time
 
 import pytest
+from conftest import mostly_nightly
 
 from crashhunt.base.processes import children_of
 from crashhunt.episode import WorkerSettings
@@ -60,7 +61,9 @@ def victim(pool, name, supervisor):
     return {"fork server": fork_server, "template": template, "supervisor": supervisor, "zygote": zygote}[name]
 
 
-@pytest.mark.parametrize("name", ["fork server", "template", "supervisor", "zygote"])
+@pytest.mark.parametrize(
+    "name", mostly_nightly(["fork server", "template", "supervisor", "zygote"], always=["template", "zygote"])
+)
 def test_process_that_dies_before_it_is_written_to_costs_no_trial(pool, monkeypatch, name):
     first = run(pool, 0)
     give, killed = pool._send_trial, []

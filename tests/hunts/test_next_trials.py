@@ -243,6 +243,7 @@ def test_a_trial_that_is_run_again_is_what_was_proposed(tmp_path):
     assert len(after) == TRIALS + 9
 
 
+@pytest.mark.nightly  # by day, the hunts above, and test_optuna.py makes one again, which continues
 def test_a_hunt_with_a_sampler_of_optuna_runs_the_same_trials_however_often_it_is_killed(tmp_path):
     """What it has drawn and its generations are in no ledger, and follow from what it is told."""
     pytest.importorskip("optuna")

@@ -21,13 +21,14 @@ import gymnasium
 import numpy as np
 import pytest
 from conftest import Shell
+from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 import crashhunt
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import CrashhuntError, SimulatorError, UsageError
 from crashhunt.replays import ReplayOptions, prepare
-from crashhunt.training import CrashEnv, is_test_traffic
+from crashhunt.training import CrashEnv, _episodes, is_test_traffic
 from crashhunt.training._episodes import _Start
 from crashhunt.training._prioritized_replay import CrashReplay
 
@@ -316,7 +317,26 @@ def test_bad_input_is_one_line(crashes, tmp_path):
     assert "crashes is in the training part (test=0.999999)" in refused(crashes, test=0.999999)
 
 
-def test_crashes_of_other_scenarios_and_spaces_are_refused(crashes, tmp_path):
+def test_crashes_of_other_scenarios_and_spaces_are_refused(crashes, tmp_path, monkeypatch):
+    other, begin = tmp_path / "other", _episodes._Stage.__init__
+    shutil.copytree(crashes, other)
+    for name, value, said in (
+        ("name", "another.toml", "the crashes belong to two scenarios: 'toy.toml' and 'another.toml'"),
+        ("action_space", spaces.Box(-1.0, 1.0), "the action spaces differ: Discrete(5) and Box("),
+        ("observation_space", spaces.Discrete(2), "the observation spaces differ: Box("),
+    ):
+
+        def begin_another(stage, bundle, *words, name=name, value=value):
+            begin(stage, bundle, *words)
+            if bundle.hunt == other:
+                setattr(stage, name, value)
+
+        monkeypatch.setattr(_episodes._Stage, "__init__", begin_another)
+        assert said in refused([crashes, other], test=0.0)
+
+
+@pytest.mark.nightly  # by day, of copies of one hunt, above
+def test_crashes_of_hunts_with_other_scenarios_and_spaces_are_refused(crashes, tmp_path):
     other = hunt(tmp_path, "other", scenario="another", trials=2)
     assert "the crashes belong to two scenarios: 'toy.toml' and 'another.toml'" in refused([crashes, other], test=0.0)
     continuous = hunt(tmp_path, "continuous", action="continuous", trials=2)
