@@ -98,7 +98,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[T
 @pytest.mark.parametrize(
     ("module", "scenario"),
     [
-        (SETS_CLASSES, "merge-highway-env"),
+        pytest.param(SETS_CLASSES, "merge-highway-env", marks=pytest.mark.nightly),  # by day, numbers at import
         (SETS_CLASSES_LATE, "merge-highway-env"),
         (STARTS_A_THREAD, "toy"),
         (DRAWS_AT_IMPORT, "toy"),

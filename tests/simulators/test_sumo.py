@@ -58,7 +58,7 @@ EGOS = {"odd.name#1.2": ("--ego", "odd.name#1.2"), "ego": ("--ego", "edges=-sout
 
 
 @pytest.mark.parametrize(
-    ("agent", "ego"),  # by day, the test below takes vehicles that are there
+    ("agent", "ego"),  # by day, the tests below name vehicles
     [pytest.param(agent, ego, marks=[pytest.mark.nightly] * (ego != EGOS["ego"])) for agent, ego in EGOS.items()],
     ids=["named", "added"],
 )
@@ -82,6 +82,11 @@ def test_another_vehicle_is_driven_in_each_trial(town):
     specs = [json.loads(path.read_text())["spec"] for path in (town.folder / "h" / "trials").glob("*/params.json")]
     assert {"ego"} == {agent for spec in specs for agent in spec["arguments"]}
     assert len({spec["scenario_arguments"]["vehicle"] for spec in specs}) > 1
+
+
+@pytest.mark.nightly  # by day, without a hunt below, and plans/ has arguments of scenarios
+def test_a_vehicle_that_is_asked_for_is_driven_or_reported_of(town):
+    words = ("--scenario", "town.sumocfg", "--arg", "speed=5:9", "--keep-going", "--keep-trials", "--seed", "3")
     town.crashhunt("run", "one", "1", "1", "20", *words, "--set", "vehicle=odd.name#1.2", "--json")
     (params,) = (town.folder / "one" / "trials").glob("*/params.json")
     assert json.loads(params.read_text())["spec"]["scenario_arguments"]["vehicle"] == "odd.name#1.2"
@@ -134,6 +139,12 @@ def test_who_has_departed_in_the_warm_up_is_reported_of(town, tmp_path):
     ):
         entered(town, tmp_path, "odd.name#1.0", warmup_s=20.0)
     assert entered(town, tmp_path, "odd.name#1.4", warmup_s=20.0)[0] == "south"
+
+
+def test_who_is_nowhere_is_reported_of(town, tmp_path):
+    with pytest.raises(InvalidEpisodeError, match=r"the vehicle 'nobody' was not on the road"):
+        entered(town, tmp_path, "nobody")
+    assert entered(town, tmp_path, "odd.name#1.2") == ("south", ("south", "east", "north", "west"))
 
 
 def test_two_agents_cannot_take_one_place(town, tmp_path):
