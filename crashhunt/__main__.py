@@ -3,7 +3,7 @@
 import sys
 from typing import NoReturn
 
-from crashhunt.base.signals import remember_interrupts
+from crashhunt.base.signals import is_interrupt, remember_interrupts
 
 __all__ = ["main"]
 
@@ -13,8 +13,10 @@ def main() -> NoReturn:
     remember_interrupts()  # before the imports that may drop one
     try:
         from crashhunt.cli import main as run
-    except KeyboardInterrupt:
-        sys.exit(130)
+    except BaseException as error:
+        if is_interrupt(error):
+            sys.exit(130)
+        raise
     run()
 
 

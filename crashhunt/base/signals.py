@@ -16,6 +16,7 @@ __all__ = [
     "blocked_signals",
     "describe_death",
     "ended_by_signals",
+    "is_interrupt",
     "is_sent_from_outside",
     "remember_interrupts",
     "stop_requests",
@@ -51,6 +52,16 @@ def remember_interrupts() -> None:
 
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not under nohup, which ignores it
         signal.signal(signal.SIGINT, interrupt)
+
+
+def is_interrupt(error: BaseException | None) -> bool:
+    """Return whether an error is a Ctrl-C, or is caused by one.
+
+    Up to version 3.11, Python turns a Ctrl-C that comes while a class is created into a `RuntimeError`.
+    """
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error is not None
 
 
 class _EndedError(BaseException):

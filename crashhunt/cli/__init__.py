@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import DISK, CrashhuntError, InternalError, UsageError, remedy
 from crashhunt.base.resources import limit_behind
-from crashhunt.base.signals import ended_by_signals
+from crashhunt.base.signals import ended_by_signals, is_interrupt
 from crashhunt.base.temporary import remove_leftovers
 from crashhunt.base.text import one_line
 from crashhunt.base.version import __version__
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except KeyboardInterrupt:
         code = INTERRUPTED
     except Exception as error:
-        code = _report(_explained(error), as_json="--json" in words)
+        code = INTERRUPTED if is_interrupt(error) else _report(_explained(error), as_json="--json" in words)
     sys.exit(code)
 
 

@@ -8,6 +8,7 @@ import threading
 
 import pytest
 
+from crashhunt import __main__, cli
 from crashhunt.base import signals
 from crashhunt.base.signals import block_signals, blocked_signals, stop_requests
 
@@ -113,3 +114,44 @@ def test_an_ignored_interrupt_stays_ignored():
     ignoring = ["sh", "-c", 'trap "" INT; exec "$@"', "-", sys.executable, "-c", program]
     done = subprocess.run(ignoring, capture_output=True, text=True, check=True)
     assert "SIG_IGN" in done.stdout
+
+
+def raise_from(*kinds):
+    """Raise an error of the last type, caused by one of the type before it, and so on."""
+    caught = None
+    for kind in kinds:
+        try:
+            raise kind("what") from caught
+        except BaseException as error:
+            caught = error
+    raise caught
+
+
+@pytest.mark.parametrize(
+    ("kinds", "is_one"),
+    [
+        ((KeyboardInterrupt,), True),
+        ((KeyboardInterrupt, RuntimeError), True),  # of a class that was being created
+        ((KeyboardInterrupt, RuntimeError, ImportError), True),
+        ((RuntimeError,), False),
+        ((ValueError, RuntimeError), False),
+    ],
+)
+def test_a_ctrl_c_during_the_imports_of_the_command_ends_it_with_130(monkeypatch, kinds, is_one):
+    class Imports:
+        def __getattr__(self, name):
+            raise_from(*kinds)
+
+    monkeypatch.setitem(sys.modules, "crashhunt.cli", Imports())
+    monkeypatch.setattr(__main__, "remember_interrupts", lambda: None)
+    with pytest.raises(SystemExit if is_one else kinds[-1]) as caught:
+        __main__.main()
+    assert not is_one or caught.value.code == 130
+
+
+@pytest.mark.parametrize(("kinds", "code"), [((KeyboardInterrupt, RuntimeError), 130), ((RuntimeError,), 2)])
+def test_a_ctrl_c_during_the_imports_of_a_command_ends_it_with_130(monkeypatch, kinds, code):
+    monkeypatch.setattr(cli, "_run", lambda words: raise_from(*kinds))
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["list"])
+    assert caught.value.code == code
