@@ -112,7 +112,6 @@ class TrialProcess:
         self._home = Path.cwd()
         self._notices: list[str] = []
         self._modules = frozenset(sys.modules)
-        self._modules = frozenset(sys.modules)
         self._reference: ReferenceDriver | None = None
         self._fork_runners: tuple[ForkRunner, ...] = ()  # of copies of the trial
         # Line by line, so that what a dying process printed last is in the file.
@@ -262,7 +261,6 @@ class TrialProcess:
         del data["spec"]  # which the supervisor knows
         report: Report = {"result": data, "notices": self._notices}
         report["notices"] += simulator.notices if supports(simulator, ReportsNotices) else ()
-        report["notices"] += notices_of_late_imports(self._modules, settings.code)
         report["notices"] += notices_of_late_imports(self._modules, settings.code)
         kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
         kept = kept or settings.is_audited(result)

@@ -97,6 +97,16 @@ def test_report_of_a_kept_trial_has_what_the_hunt_needs(process):
     assert "responses" not in reported(driven, FINE)
 
 
+def test_a_module_that_is_imported_late_is_reported_once(process, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        _trial_process, "notices_of_late_imports", lambda before, code: seen.append((before, code)) or ["late"]
+    )
+    made = process(code=("/code",))
+    assert reported(made, FINE)["notices"] == ["a notice", "of the simulator", "late"]
+    assert seen == [(made._modules, ("/code",))]
+
+
 def test_report_of_a_trial_that_is_not_kept_is_short(process):
     assert reported(process(find_escapes=True), FINE).keys() == {"result", "notices"}
     assert "map" in reported(process(), FINE, wants_map=True)
