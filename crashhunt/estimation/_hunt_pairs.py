@@ -187,7 +187,7 @@ class PairedHunts:
     def __init__(self, name: str, base: Path, head: Path, pairs: int) -> None:
         self.name, self.folders, self.most = name, (base, head), pairs
         self.trained_on = 0
-        self._held_out = HeldOutTraffics(0)
+        self._held_out: HeldOutTraffics | None = None
         self._sequence: PairSequence | None = None
         self._crash_on: tuple[str, ...] = ()
         self._test = PairTest()
@@ -206,15 +206,13 @@ class PairedHunts:
         sequence = self._sequence = self._sequence or self._pair_sequence()
         if sequence is None:
             return
-        has_records = False
         for pair in self._read(sequence):
             if watch.verdict != "undecided" or sequence.position > self.most:
                 return
-            if not has_records:
+            if self._held_out is None:
                 # A hunt creates its ledger before its snapshot, which has the training records of its agents. The
                 # snapshot exists before the first trial, so read the records only after both trials of a pair.
-                base = read_settings(self.folders[0] / layout.HUNT)
-                self._held_out, has_records = held_out_traffics(base, self.folders), True
+                self._held_out = held_out_traffics(read_settings(self.folders[0] / layout.HUNT), self.folders)
             if self._held_out.is_empty:
                 self.trained_on = self.most
                 return
@@ -242,7 +240,9 @@ class PairedHunts:
     @property
     def is_complete(self) -> bool:
         """Whether all pairs have been counted, or none can count."""
-        return self._held_out.is_empty or (self._sequence is not None and self._sequence.position >= self.most)
+        if self._held_out is not None and self._held_out.is_empty:
+            return True
+        return self._sequence is not None and self._sequence.position >= self.most
 
     @property
     def why_not(self) -> str:
