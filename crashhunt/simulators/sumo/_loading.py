@@ -30,10 +30,10 @@ _XERCES_INITIALIZE_SYMBOL = (
 def keep_xml_ready() -> bool:
     """Keep SUMO's XML library (Xerces) initialized after the running simulation; return whether that was possible.
 
-    SUMO terminates the library after each simulation and initializes it again for the next one. This
-    initialization builds Unicode tables, which is a third of the time for loading a small network, and is avoided here.
-    The library counts its initializations. With one more initialization, the count never reaches 0. Call this function
-    once per process, while a simulation runs.
+    SUMO terminates the library after each simulation and initializes it again for the next one. Each initialization
+    builds Unicode tables, which takes a third of the time for loading a small network. The library counts its
+    initializations. With one more initialization, the count never reaches 0, so that the tables stay. Call this
+    function once per process, while a simulation runs.
     """
     try:
         initialize = getattr(ctypes.CDLL(sumo.__file__), _XERCES_INITIALIZE_SYMBOL)
