@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from dashboard_hunts import View
 
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError, UsageError
 from crashhunt.dashboard import _application, _details
@@ -49,28 +50,6 @@ def ask(application, target, method="GET", **headers):
 
     asyncio.run(application.asgi(scope, receive, send))
     return Reply(sent)
-
-
-class View:
-    """The view of a hunt, with a row of its own."""
-
-    def __init__(self, name="one", **more):
-        self.found = SimpleNamespace(id=name)
-        self.path = Path("/hunts") / name
-        self.settings = self.sample = self.counts = None
-        self.events, self.facts, self.refreshed = [], {}, []
-        self.said = {"id": name, "name": name, "dir": str(self.path), "state": "finished", "trials_run": 2}
-        vars(self).update(more)
-
-    def row(self):
-        return dict(self.said)
-
-    def refresh(self, *, points=False):
-        self.refreshed.append(points)
-        return SimpleNamespace(state=self.said["state"])
-
-    def unreadable(self):
-        return vars(self).get("why", "")
 
 
 class Crashes:

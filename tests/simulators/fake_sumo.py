@@ -26,7 +26,7 @@ class FakeSumo:
                 self.calls.append((what, *given))
             if name not in self.answers:
                 if what.startswith(("get", "is", "convert")):
-                    raise AssertionError(f"nobody asks for {name}")
+                    raise AssertionError(f"the test has no answer of {name}")
                 return None
             answer = self.answers[name]
             return answer(*given) if callable(answer) else answer
