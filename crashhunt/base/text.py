@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import shlex
 import unicodedata
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "any_of",
+    "command_line",
     "count_of",
     "did_you_mean",
     "encodable",
@@ -65,6 +67,30 @@ def one_line(text: str) -> str:
 def count_of(number: int, noun: str) -> str:
     """Return a number with its noun, such as ``1 trial`` or ``3 trials``; the plural is formed with s."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def command_line(*words: str | Path) -> str:
+    """Return words as one line that a shell such as bash or zsh splits into the same words.
+
+    Characters that a terminal would obey, and line breaks, are written as escapes in ``$'...'``.
+    """
+    return " ".join(_shell_word(str(word)) for word in words)
+
+
+def _shell_word(word: str) -> str:
+    if one_line(word) == word:
+        return shlex.quote(word)
+    return f"$'{''.join(map(_shell_character, word))}'"
+
+
+def _shell_character(character: str) -> str:
+    if character in "\\'":
+        return f"\\{character}"
+    if one_line(f"{character}.") == f"{character}.":  # the dot, because spaces at the end would be removed
+        return character
+    # Undecodable bytes of a file name are lone surrogates from U+DC80 on.
+    errors = "surrogateescape" if "\udc80" <= character <= "\udcff" else "surrogatepass"
+    return "".join(f"\\x{byte:02x}" for byte in character.encode("utf-8", errors))
 
 
 def in_lines(lines: Iterable[str]) -> str:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.base.text import one_line, visible
+from crashhunt.base.text import command_line, one_line, visible
 from crashhunt.cli._common import add_json
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def _scenarios(options: argparse.Namespace, _words: list[str]) -> int:
         if options.json:
             entries = [entry for entry in list_scenarios() if entry.get("name") == name]
             return _print_listing("scenarios", entries, as_json=True)
-        hunt = f"crashhunt run OUT 0 100 1000 --scenario {folder}"
+        hunt = f"crashhunt run OUT 0 100 1000 {command_line('--scenario', folder)}"
         print(visible(f"{folder} has the files of {name}. Hunt in it: {hunt}"))
         return 0
     return _print_listing("scenarios", list_scenarios(), as_json=options.json)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shlex
 import signal
 import sys
 import textwrap
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import OWN_THREAD
+from crashhunt.base.text import command_line
 from crashhunt.cli._common import add_json, add_options, chosen_options, integer
 from crashhunt.cli._exit_codes import DONE, INTERRUPTED, NO_ANSWER, NO_VALID_TRIAL, THE_ANSWER_IS_NO
 from crashhunt.cli._rate import exit_code_of
@@ -138,7 +138,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     console.print(describe_hunt(report), markup=False, soft_wrap=True)
     if console.is_terminal and report.crashes and has_dashboard():
         console.print(
-            f"Look at it: crashhunt dashboard {shlex.quote(str(options.directory))}", markup=False, soft_wrap=True
+            f"Look at it: {command_line('crashhunt', 'dashboard', options.directory)}", markup=False, soft_wrap=True
         )
     if options.json:
         print(json.dumps(report.to_json()))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from crashhunt.base.errors import UntrustedError
+from crashhunt.base.text import command_line
 from crashhunt.cli._common import (
     add_json,
     add_options_of_machine,
@@ -204,6 +205,7 @@ def _print_states(
     errors = [state for state in states if state.state == "error"]
     if errors:
         some = f"{len(errors)} hunt{'s' if len(errors) > 1 else ''} could not run"
-        fix = f"see crashhunt logs {directory} --errors-only, then crashhunt rerun {directory}"
+        logs = command_line("crashhunt", "logs", directory, "--errors-only")
+        fix = f"see {logs}, then {command_line('crashhunt', 'rerun', directory)}"
         console.print(f"{some}; {fix}", markup=False, soft_wrap=True)
     return THE_ANSWER_IS_NO if errors else DONE

@@ -13,7 +13,7 @@ from crashhunt.base import layout
 from crashhunt.base.codec import OMIT_DEFAULT, Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.temporary import TemporaryFolder
-from crashhunt.base.text import in_lines, one_line
+from crashhunt.base.text import command_line, in_lines, one_line
 from crashhunt.corpus._cases import Case, Expectation, read_case
 from crashhunt.crashes import Bundle, is_bundle_trusted, refuse_untrusted, signature_of, snapshot_of, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
@@ -97,7 +97,7 @@ class CaseReport(Serializable):
             lines.append(f"  note: {self.note}")
         lines += [f"  warning: {warning}" for warning in self.warnings]
         if self.kept is not None:
-            lines.append(f"  look at it: crashhunt show {self.kept}")
+            lines.append(f"  look at it: {command_line('crashhunt', 'show', self.kept)}")
         return in_lines(lines)
 
 

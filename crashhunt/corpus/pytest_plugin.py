@@ -58,13 +58,12 @@ class _FailedError(Exception):
 
 
 def _how_to_look(item: pytest.Item) -> str:
-    from shlex import quote
+    from crashhunt.base.text import command_line
 
     case = item.path.parent
     place = case.relative_to(item.config.invocation_params.dir) if _is_below(case, item) else case
-    return (
-        f"look at it: crashhunt corpus run {quote(str(place))} --keep out && crashhunt show {quote(f'out/{case.name}')}"
-    )
+    run = command_line("crashhunt", "corpus", "run", place, "--keep", "out")
+    return f"look at it: {run} && {command_line('crashhunt', 'show', f'out/{case.name}')}"
 
 
 def _is_below(path: Path, item: pytest.Item) -> bool:

@@ -24,7 +24,7 @@ from crashhunt.base.integrity import (
     typed,
 )
 from crashhunt.base.temporary import temporary_beside
-from crashhunt.base.text import listed, near_path, one_of
+from crashhunt.base.text import command_line, listed, near_path, one_of
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.snapshots import Snapshot, versions
 from crashhunt.trial import (
@@ -312,7 +312,8 @@ class Bundle:
         if not log.exists() and (self.hunt / layout.CASE).is_file():
             raise BundleError(
                 "the case has no log, because an earlier crashhunt did not save it",
-                fix=f"run crashhunt corpus run {self.hunt} --keep out, and use out/{self.hunt.name}",
+                fix=f"run {command_line('crashhunt', 'corpus', 'run', self.hunt)} --keep out, and use "
+                f"out/{self.hunt.name}",
                 where=str(self.path),
             )
         found = read_log(log)

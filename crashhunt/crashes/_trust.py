@@ -5,7 +5,6 @@ from __future__ import annotations
 import hmac
 import json
 import os
-import shlex
 import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
@@ -18,6 +17,7 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.git import tracked_files, work_tree
 from crashhunt.base.integrity import parse_object, state_folders, user_key
 from crashhunt.base.plugins import registered
+from crashhunt.base.text import command_line
 from crashhunt.crashes._bundle import is_bundle_made_here, snapshot_of
 from crashhunt.oracles import oracle_name
 from crashhunt.plans import read_settings, with_settings
@@ -263,7 +263,7 @@ def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> U
         made_by: name of the tool that made the file, according to the file itself.
     """
     place = where or str(bundle.path)
-    fix = f"if you trust that code, run crashhunt trust {shlex.quote(place)} once, or add --trust"
+    fix = f"if you trust that code, run {command_line('crashhunt', 'trust', place)} once, or add --trust"
     snapshot = snapshot_of(bundle)
     changed = ""
     try:

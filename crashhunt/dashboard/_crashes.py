@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import shlex
 import threading
 from typing import TYPE_CHECKING, NamedTuple
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
+from crashhunt.base.text import command_line
 from crashhunt.crashes import crash_folders, fault_of, most_dangerous, read_bundle, signature_of
 from crashhunt.dashboard._catalog import is_inside, unreadable, unreadable_below
 from crashhunt.dashboard._hunt import read_tail
@@ -298,4 +298,4 @@ def _commands(hunt: Path, crash: str, bundle: Bundle) -> list[list[str]]:
         "export": ["export", str(hunt), f"{crash}.zip", "--crash", crash],
         **({} if near else {"add to corpus": ["corpus", "add", str(bundle.path), "--to", "corpus"]}),
     }
-    return [[name, shlex.join(["crashhunt", *given])] for name, given in words.items()]
+    return [[name, command_line("crashhunt", *given)] for name, given in words.items()]

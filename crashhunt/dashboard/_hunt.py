@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import threading
 import time
 from contextlib import suppress
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError
+from crashhunt.base.text import command_line
 from crashhunt.crashes import crash_folders
 from crashhunt.dashboard._catalog import unreadable, unreadable_below
 from crashhunt.dashboard._trials import Sample, TrialCounts
@@ -102,7 +102,9 @@ class HuntView:
 
     def _refresh(self, *, points: bool) -> HuntState:
         if why := self.unreadable():
-            raise HuntDirectoryError(why, fix=f"do not trust this hunt, or see crashhunt check {self.path}")
+            raise HuntDirectoryError(
+                why, fix=f"do not trust this hunt, or see {command_line('crashhunt', 'check', self.path)}"
+            )
         self._read_settings()
         ledger = self.path / layout.LEDGER
         if not has_begun(ledger):
@@ -110,7 +112,8 @@ class HuntView:
             return HuntState(str(self.path), "finished") if self.found.exported else hunt_state(self.path)
         if self.settings is None:
             raise HuntDirectoryError(
-                f"the directory has no {layout.HUNT}", fix=f"run crashhunt check {self.path} to see what is left"
+                f"the directory has no {layout.HUNT}",
+                fix=f"run {command_line('crashhunt', 'check', self.path)} to see what is left",
             )
         key = (_sign(ledger), _sign(ledger.with_name(f"{ledger.name}-wal")))
         if key != self._key or self.counts is None or (points and self.sample is None):
@@ -280,7 +283,7 @@ class HuntView:
         """Compute a crash rate that needs all trials, within its share of the time."""
         if counts.trials > _MAX_TRIALS_READ:
             why = f"it reads all trials, of which there are more than {_MAX_TRIALS_READ:,}"
-            return {"why_not": f"{why}; run: {shlex.join(['crashhunt', 'rate', str(self.path)])}"}
+            return {"why_not": f"{why}; run: {command_line('crashhunt', 'rate', self.path)}"}
         began = time.monotonic()
         key = (self._key, counts.trials)
         if key != self._rate_key and (began >= self._rate_due or state.state != "running"):

@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, NoReturn, TypedDict
 
 from crashhunt.base import layout
@@ -24,6 +23,7 @@ from crashhunt.base.exceptions import is_users
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.shared_state import SharedState
 from crashhunt.base.signals import block_signals
+from crashhunt.base.text import command_line
 from crashhunt.episode import (
     BUDGET,
     BUDGET_BESIDE,
@@ -347,7 +347,7 @@ def notices_of_late_imports(before: frozenset[str], code: Sequence[str]) -> list
                 folder = path.parent.parent if path.stem == "__init__" else path.parent
                 found.append(
                     f"the module {name!r} is not in the snapshot, because it is imported only during a trial: replays "
-                    f"run its code of today; add --snapshot-root {quote(str(folder))}"
+                    f"run its code of today; add {command_line('--snapshot-root', folder)}"
                 )
     return found
 

@@ -6,7 +6,6 @@ import fcntl
 import json
 import math
 import os
-import shlex
 import shutil
 import socket
 import time
@@ -20,7 +19,7 @@ from crashhunt.base.codec import OMIT_DEFAULT, Serializable, written_if
 from crashhunt.base.errors import BusyError, HuntDirectoryError
 from crashhunt.base.integrity import changed_file
 from crashhunt.base.temporary import remove_ended, remove_scratch, temporary_beside, this_process
-from crashhunt.base.text import near_path
+from crashhunt.base.text import command_line, near_path
 from crashhunt.crashes import crash_folders, files_of
 from crashhunt.hunts._crashes import outcomes_of_crashes, tally_crashes
 from crashhunt.ledger import KindData, Ledger, RunningRate, damaged, has_begun
@@ -302,7 +301,7 @@ def find_searches(directory: Path) -> list[Path]:
     if not hunts:
         raise HuntDirectoryError(
             f"{str(directory)!r} has cases of a corpus, but no hunt",
-            fix=f"run crashhunt corpus list {shlex.quote(str(directory))}, or give the directory of a hunt",
+            fix=f"run {command_line('crashhunt', 'corpus', 'list', directory)}, or give the directory of a hunt",
         )
     return hunts
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError
 from crashhunt.base.temporary import remove_at_once, remove_scratch
+from crashhunt.base.text import command_line
 from crashhunt.crashes import is_bundle_made_here, is_snapshot_trusted, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import (
@@ -194,10 +195,10 @@ class TrialReruns:
         for digest, group in by_snapshot.items():
             snapshot = Snapshot(self.place.path / layout.SNAPSHOTS / digest)
             if digest != self.taken and not is_snapshot_trusted(snapshot):
+                trust = command_line("crashhunt", "trust", self.place.path)
                 self.notes.append(
                     f"{len(group)} trials for {folder} did not run again: nothing proves that you took the snapshot "
-                    f"{digest} on this machine; if you trust its code, run crashhunt trust {self.place.path}, and then "
-                    "the same command again"
+                    f"{digest} on this machine; if you trust its code, run {trust}, and then the same command again"
                 )
                 continue
             scratch.mkdir(exist_ok=True)

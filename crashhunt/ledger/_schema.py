@@ -15,6 +15,7 @@ from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import digest_of_row
 from crashhunt.base.resources import limit_behind
+from crashhunt.base.text import command_line
 from crashhunt.trial import check_plain
 
 if TYPE_CHECKING:
@@ -295,8 +296,6 @@ def migrate(database: sqlite3.Connection, version: int) -> None:
 Row: TypeAlias = tuple[Any, ...]
 """A row as SQLite returns it. The caller's query names its columns."""
 
-_CHECK_FIX = "run crashhunt check {} to see what can be recovered"
-
 
 def checked(row: Row, what: str, path: Path) -> Row:
     """Return a row after checking it against its digest, which is the last column.
@@ -330,7 +329,8 @@ def plain_trial(row: Row, path: Path, *, trusted: bool) -> JsonObject:
 
 def damaged(path: Path, message: str) -> HuntDirectoryError:
     """Return the error for a ledger that has changed since it was written."""
-    return HuntDirectoryError(f"the ledger is damaged: {message}", fix=_CHECK_FIX.format(path.parent), where=str(path))
+    fix = f"run {command_line('crashhunt', 'check', path.parent)} to see what can be recovered"
+    return HuntDirectoryError(f"the ledger is damaged: {message}", fix=fix, where=str(path))
 
 
 def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
@@ -359,7 +359,7 @@ def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
     if "not a database" in text:
         return HuntDirectoryError(
             f"not a ledger of crashhunt ({text})",
-            fix=f"choose another directory, or see with crashhunt check {path.parent} what is left",
+            fix=f"choose another directory, or see with {command_line('crashhunt', 'check', path.parent)} what is left",
             where=where,
         )
     return damaged(path, text)

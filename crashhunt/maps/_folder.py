@@ -8,6 +8,7 @@ import shlex
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from crashhunt.base.text import command_line
 from crashhunt.base.version import __version__
 
 if TYPE_CHECKING:
@@ -230,7 +231,7 @@ def next_commands(folder: str, steps: int) -> list[str]:
         folder: folder of the scenario, as the user named it; empty for the current folder.
         steps: maximum number of steps of a trial.
     """
-    enter = [f"cd {shlex.quote(folder)}"] if folder else []
+    enter = [command_line("cd", folder)] if folder else []
     return [
         *enter,
         f"crashhunt run hunt 0 200 {steps} --scenario . --agent {AGENT} --seed 1",
@@ -341,6 +342,7 @@ def workflow(folder: str, steps: int) -> str:
         steps: maximum number of steps of a trial.
     """
     crashes = "crashes" if folder == "." else f"{folder}/crashes"
+    # The action splits these words with shlex, which does not know all that a shell knows.
     words = f"--scenario {shlex.quote(folder)} --agent {AGENT} --seed 1"
     exists = f"hashFiles({_expression(f'{crashes}/**')}) != ''"
     values = {

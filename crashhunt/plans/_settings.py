@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import os
-import shlex
 import sys
 import tomllib
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields, replace
@@ -16,7 +15,7 @@ from crashhunt.base.codec import known_part, merged, slip
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.plugins import locate, registered
-from crashhunt.base.text import near_path
+from crashhunt.base.text import command_line, near_path
 from crashhunt.oracles import DEFAULT_ORACLES
 from crashhunt.plans._declaration import at_least
 from crashhunt.plans._durations import seconds_of
@@ -204,9 +203,7 @@ def write_settings(path: Path, settings: HuntSettings, command: list[str], *, li
         del data["events"]
     data = {**_in_order(data, settings, _FIRST_KEYS), "run": _in_order(data["run"], settings.run, _RUN_KEYS)}
     data = merged(data, _changed_settings(like or path))
-    # No line break of an argument may end the comment.
-    line = shlex.join(command).replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
-    text = f"# {line}\n{tomli_w.dumps(data)}"
+    text = f"# {command_line(*command)}\n{tomli_w.dumps(data)}"
     with whole_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

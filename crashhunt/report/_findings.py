@@ -15,7 +15,7 @@ from urllib.parse import quote
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import one_line
+from crashhunt.base.text import command_line, one_line
 from crashhunt.base.version import __version__
 from crashhunt.crashes import own_frames
 from crashhunt.snapshots import Snapshot
@@ -76,7 +76,8 @@ def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None =
         file, line = _place(example)
         count = "1 crash" if group.count == 1 else f"{group.count} crashes"
         fault = f" At fault: {group.fault}." if group.fault not in ("", "nobody can tell") else ""
-        message = f"{example.result.summary}.{fault} {count}. To look at it: crashhunt show {example.path}"
+        show = command_line("crashhunt", "show", example.path)
+        message = f"{example.result.summary}.{fault} {count}. To look at it: {show}"
         found.append(
             CrashFinding(
                 rule=group.signature.outcome,

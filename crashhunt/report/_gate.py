@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree as Xml
 
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import in_lines, one_line, visible
+from crashhunt.base.text import command_line, in_lines, one_line, visible
 from crashhunt.report._rate import count_training_trials, format_interval
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def describe_gate(found: GateReport) -> str:
     if found.seed is not None:
         lines.append(f"  seed of the hunts: {found.seed}")
     if found.dir:
-        lines.append(f"see crashhunt compare {found.dir}")
+        lines.append(f"see {command_line('crashhunt', 'compare', found.dir)}")
     return in_lines(lines)
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-import shlex
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.text import count_of, in_lines, out_of
+from crashhunt.base.text import command_line, count_of, in_lines, out_of
 from crashhunt.crashes import count_causes, join_causes
 from crashhunt.report._rate import describe_rates
 from crashhunt.report._status_screen import describe_types, format_arguments, format_inputs, format_seconds
@@ -174,13 +173,13 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     lines += _near_misses(report, program)
     if report.copied is not None:
         lines += ["", *_describe_crash(report.copied)]
-        lines += ["", f"Replay it:  {shlex.join([program, 'replay', str(report.copied.path)])}"]
+        lines += ["", f"Replay it:  {command_line(program, 'replay', report.copied.path)}"]
     if report.crashes:
         first = crashes[0]
         command = [program, "replay", str(report.directory)]
         if len(report.crashes) > 1:
             command += ["--crash", first.id]
-        lines += ["", f"Replay it:  {shlex.join(command)}"]
+        lines += ["", f"Replay it:  {command_line(*command)}"]
     return in_lines(lines)
 
 
@@ -195,7 +194,7 @@ def _near_misses(report: HuntReport, program: str) -> list[str]:
     if len(report.near_misses) > _MAX_SHOWN:
         lines.append(f"  {_MAX_SHOWN} of {len(report.near_misses)} near misses shown")
     first = report.near_misses[0].id
-    return [*lines, f"Replay one:  {shlex.join([program, 'replay', str(report.directory), '--crash', first])}"]
+    return [*lines, f"Replay one:  {command_line(program, 'replay', report.directory, '--crash', first)}"]
 
 
 def _describe_events(report: HuntReport) -> list[str]:

@@ -6,7 +6,6 @@ import ctypes
 import hashlib
 import json
 import os
-import shlex
 import signal
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from crashhunt.base.files import exchange, put_in_place, whole_file
 from crashhunt.base.integrity import authentication_code, is_authentic
 from crashhunt.base.signals import stop_requests
 from crashhunt.base.temporary import temporary_beside
+from crashhunt.base.text import command_line
 from crashhunt.crashes import add_trusted, describe_code, is_fingerprint_trusted, is_hunt_trusted, trust_snapshot
 from crashhunt.hunts import HuntDirectory
 from crashhunt.ledger import Ledger
@@ -360,7 +360,7 @@ def refuse_untrusted_hunt(hunt: Path) -> None:
     raise UntrustedError(
         "nothing proves that you began this hunt on this machine (earlier versions of crashhunt wrote no proof), and "
         f"running it again would run code: {runs}",
-        fix=f"if you trust that code, run crashhunt trust {shlex.quote(str(hunt))} once, or add --trust",
+        fix=f"if you trust that code, run {command_line('crashhunt', 'trust', hunt)} once, or add --trust",
         where=str(hunt),
     )
 

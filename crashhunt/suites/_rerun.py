@@ -12,6 +12,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.files import is_empty_folder, sync_folder
 from crashhunt.base.temporary import temporary_beside
+from crashhunt.base.text import command_line
 from crashhunt.disturbances import NONE
 from crashhunt.hunts import HuntState, hunt_state
 from crashhunt.ledger import Ledger
@@ -259,5 +260,5 @@ def _require_same_request(to: Path, request: RunRequest) -> None:
     if state == "running":
         raise HuntDirectoryError("the hunt is running", fix="wait for it, or stop it", where=str(to))
     if state == "error":
-        fix = f"see crashhunt logs {to}, then crashhunt rerun {to}"
+        fix = f"see {command_line('crashhunt', 'logs', to)}, then {command_line('crashhunt', 'rerun', to)}"
         raise HuntDirectoryError("the directory exists, and its hunt ended in an error", fix=fix, where=str(to))

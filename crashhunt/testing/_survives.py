@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypedDict
 from crashhunt.api import run
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.temporary import temporary_folder
-from crashhunt.base.text import one_of, visible
+from crashhunt.base.text import command_line, one_of, visible
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
 from crashhunt.plans import HuntOptions, plan, request_of
@@ -106,7 +106,7 @@ def assert_survives(
             raise CrashhuntError(f"no trial could be set up: {report.reason}", fix="correct the scenario")
         if report.crashes:
             bundle = _smaller(report.crashes[0], budget, parallel)
-            look = f"look at it: crashhunt show {place} --crash {bundle.id}" if directory else ""
+            look = f"look at it: {command_line('crashhunt', 'show', place)} --crash {bundle.id}" if directory else ""
             raise AssertionError(_told(bundle.result, call, look))
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.base.temporary import temporary_folder
+from crashhunt.base.text import command_line
 from crashhunt.crashes import (
     INTERRUPTED,
     Attempt,
@@ -301,7 +302,7 @@ def _require_judgeable(bundle: Bundle, *, of_two: bool, why: int) -> None:
     if outcome is Outcome.HANG:
         raise UsageError(
             f"{bundle.id} is a hang, so every run would reach the time limit",
-            fix=f"find where it hangs with: crashhunt show {bundle.path}",
+            fix=f"find where it hangs with: {command_line('crashhunt', 'show', bundle.path)}",
         )
     if not of_two and why == 0:
         raise UsageError(

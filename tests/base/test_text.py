@@ -1,14 +1,17 @@
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import unicodedata
 from io import StringIO
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, strategies as st
 
-from crashhunt.base.text import count_of, in_lines, one_line, out_of, visible
+from crashhunt.base.text import command_line, count_of, in_lines, one_line, out_of, visible
 
 SPOKEN = "\x1b[2J\x1b]0;title\x07 up\x1b[1A\r\x9b2K \u202eesrever\u2066 a\u0085b\u2028c [bold red]x[/] z"
 HOSTILE = f"{SPOKEN} \udc80"
@@ -37,6 +40,18 @@ def test_examples():
     assert visible("a\x1b[1m\tb\r\nc\rd") == "a\\x1b[1m\tb\nc\\rd"
     assert one_line("  a:\n    b\r\n\tc \n") == "  a: b c"
     assert visible("ü 漢字 👩\u200d🚗") == "ü 漢字 👩\u200d🚗"
+
+
+def test_printed_command_is_one_line_that_a_shell_reads_back():
+    words = ["plain", "a b", "", "new\nline", "end\n", "it's \\n\t\x1b[2J", "ü\u202e漢\u2028x", "byte \udcff2", SPOKEN]
+    line = in_lines([command_line(*words)])
+    assert not obeyed(line, "")
+    told = subprocess.run(["bash", "-c", f"printf '%s\\0' {line}"], stdout=subprocess.PIPE, check=True).stdout
+    assert [os.fsdecode(word) for word in told.split(b"\0")[:-1]] == words
+
+
+def test_printed_command_quotes_only_what_needs_it():
+    assert command_line("crashhunt", "replay", Path("a/ü b"), "c-1.zip") == "crashhunt replay 'a/ü b' c-1.zip"
 
 
 AGENT = f"""

@@ -329,7 +329,7 @@ def test_a_command_is_one_line_of_the_settings(folder):
     path = folder / "hunt.toml"
     write_settings(path, settings, ["crashhunt", "run", "a b", "x\\y", "one\ntwo\rthree"])
     lines = path.read_bytes().split(b"\n")
-    assert lines[0] == rb"# crashhunt run 'a b' 'x\\y' 'one\ntwo\rthree'"
+    assert lines[0] == rb"# crashhunt run 'a b' 'x\y' $'one\x0atwo\x0dthree'"
     assert lines[1].startswith(b"scenario = ")
     assert read_settings(path) == settings
 
