@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Commands",
+    "GivenOnce",
     "Parser",
+    "WordsWithCommas",
     "add_ci_options",
     "add_crash",
     "add_json",
@@ -108,6 +110,30 @@ class Parser(argparse.ArgumentParser):
         raise UsageError(message, fix=f"see {self.prog} --help")
 
 
+class GivenOnce(argparse.Action):
+    """An option that cannot be given twice, because a user would expect both values to count."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        """Store the value.
+
+        Raises:
+            UsageError: the option has another value already.
+        """
+        before = getattr(namespace, self.dest)
+        if before not in (self.default, values):
+            raise UsageError(f"{option} is given twice: {before} and {values}", fix="give it once")
+        setattr(namespace, self.dest, values)
+
+
+class WordsWithCommas(argparse.Action):
+    """An option whose value is a list with commas; if it is given several times, all its values count."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        """Store the value, or append it to the earlier value."""
+        before = getattr(namespace, self.dest)
+        setattr(namespace, self.dest, values if before == self.default else f"{before},{values}")
+
+
 def add_json(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
     """Add the option ``--json``, which is the same for every command."""
     parser.add_argument(
@@ -126,6 +152,7 @@ def add_crash(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--crash",
         metavar="ID",
+        action=GivenOnce,
         default="",
         help="the id of a crash, or the number of its trial; default: the crash with the fewest steps",
     )
@@ -411,7 +438,9 @@ def _add(group: argparse._ActionsContainer, option: HuntOption, help_text: str =
     words: dict[str, Any] = {"default": option.default}
     if option.form in ("integer", "number"):
         words["type"] = integer if option.form == "integer" else number
-    elif option.form == "table" or (option.form == "list" and not about.separator):
+    elif option.form == "list" and about.separator:
+        words["action"] = WordsWithCommas
+    elif option.form in ("table", "list"):
         words = {"action": "append", "default": [], "type": Path if about.metavar == "PATH" else None}
     group.add_argument(about.flag, metavar=about.metavar, dest=option.name, help=help_text or option.help, **words)
 

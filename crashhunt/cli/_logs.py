@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_line, visible
-from crashhunt.cli._common import chosen_runs, integer
+from crashhunt.cli._common import GivenOnce, chosen_runs, integer
 
 if TYPE_CHECKING:
     import argparse
@@ -28,10 +28,17 @@ def add_logs(commands: Commands) -> None:
         "(type error), and the changes of a hunt's state (type state). Only crashes and kept trials have logs.",
     )
     logs.add_argument("directory", metavar="DIR", type=Path, help="directory of a hunt or a suite")
-    logs.add_argument("--run", metavar="ID", default="", help="show only this run of a suite, such as town/0")
-    logs.add_argument("--trial", metavar="N", type=integer, help="show only the logs of this trial")
+    logs.add_argument(
+        "--run",
+        metavar="ID",
+        action="append",
+        default=[],
+        help="show only this run of a suite, such as town/0; the option may be given several times",
+    )
+    logs.add_argument("--trial", metavar="N", type=integer, action=GivenOnce, help="show only the logs of this trial")
     logs.add_argument(
         "--type",
+        action=GivenOnce,
         choices=("run", "error", "state"),
         help="show only the output of trials (run), only errors (error) or only state changes (state); default: all",
     )
@@ -47,7 +54,7 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
         raise UsageError(f"--errors-only and --type {options.type} contradict each other", fix="give one of them")
     if options.trial is not None and options.trial < 0:
         raise UsageError(f"--trial is {options.trial}", fix="give at least 0")
-    hunts = chosen_runs(options.directory, [options.run] if options.run else [])
+    hunts = chosen_runs(options.directory, options.run)
     kinds: tuple[LogKind, ...] = ("run", "error", "state")
     if options.errors_only or options.type is not None:
         kinds = ("error",) if options.errors_only else (options.type,)

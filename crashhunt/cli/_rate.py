@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import add_json, number, say
+from crashhunt.cli._common import GivenOnce, add_json, number, say
 from crashhunt.cli._exit_codes import DONE, NO_ANSWER, THE_ANSWER_IS_NO
 from crashhunt.plans import RATE_PERS
 
@@ -46,7 +46,7 @@ def add_rate(commands: Commands) -> None:
         help="confidence of the intervals, in percent; default: 95",
     )
     rate.add_argument(
-        "--by", metavar="PART", default="",
+        "--by", metavar="PART", action=GivenOnce, default="",
         help="report a rate for each group. The words kind, fault and disturbance group the crashes; ARG or ARG:BINS "
         "groups the trials by the value of the argument ARG, in BINS bins (default: 4)",
     )  # fmt: skip

@@ -14,6 +14,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.cli._common import (
+    WordsWithCommas,
     add_crash,
     add_json,
     add_trust,
@@ -284,7 +285,7 @@ def add_replay(commands: Commands) -> None:
         "and step are local variables",
     )  # fmt: skip
     look.add_argument(
-        "--print", metavar="FIELD,…", default="", dest="fields",
+        "--print", metavar="FIELD,…", action=WordsWithCommas, default="", dest="fields",
         help="print a table with these values of each step: x, y, heading, speed, reward, time_to_collision_s, gap_m "
         "and required_deceleration (to the nearest actor), gap_to_other_m, time_to_other_s, closing_speed, action or "
         "its parts, observation[ROW,NAME]",

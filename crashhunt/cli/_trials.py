@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_of, visible
+from crashhunt.cli._common import WordsWithCommas
 
 if TYPE_CHECKING:
     import argparse
@@ -37,6 +38,7 @@ def add_trials(commands: Commands) -> None:
     trials.add_argument(
         "--outcome",
         metavar="KIND,…",
+        action=WordsWithCommas,
         default="",
         help=f"write only trials with these outcomes: {', '.join(str(kind) for kind in Outcome)}",
     )

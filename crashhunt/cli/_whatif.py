@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, get_args
 
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import (
+    GivenOnce,
+    WordsWithCommas,
     add_crash,
     add_json,
     add_trust,
@@ -60,7 +62,7 @@ def add_whatif(commands: Commands) -> None:
         help="in place of --from-step: the change begins this many seconds of simulation before the crash",
     )
     whatif.add_argument(
-        "--agent", metavar="MODULE:NAME", default="",
+        "--agent", metavar="MODULE:NAME", action=GivenOnce, default="",
         help="another agent, which drives after the step K of --from-step, or from the start. Up to step K, the "
         "recorded actions are repeated; then the agent is reset. If there are several agents, write ID=MODULE:NAME",
     )  # fmt: skip
@@ -82,7 +84,11 @@ def add_whatif(commands: Commands) -> None:
         "(reference_lanes) or both (reference)",
     )  # fmt: skip
     whatif.add_argument(
-        "--leave-out", metavar="ID,…", default="", help="run the trial without the actors that have these ids"
+        "--leave-out",
+        metavar="ID,…",
+        action=WordsWithCommas,
+        default="",
+        help="run the trial without the actors that have these ids",
     )
     whatif.add_argument(
         "--code", choices=("snapshot", "current"), default=None,

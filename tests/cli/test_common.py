@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.cli import _common
+from crashhunt.cli import _common, make_parser
 from crashhunt.cli._common import Parser
 from crashhunt.errors import HuntDirectoryError, UntrustedError, UsageError
 
@@ -243,6 +243,40 @@ def test_options_of_a_hunt_are_read_as_python_has_them():
     assert found["agents"] == {"": "idm"}
     off = hunt_parser(("accelerate", "seed")).parse_args(["--no-accelerate"])
     assert _common.chosen_options(off, ("accelerate", "seed")) == {"accelerate": False, "seed": None}
+
+
+@pytest.mark.parametrize(
+    ("words", "counted"),
+    [
+        (("whatif", "h", "--leave-out", "a", "--leave-out", "b,c"), {"leave_out": "a,b,c"}),
+        (("replay", "h", "--print", "x", "--print", "y,speed", "--print", "x"), {"fields": "x,y,speed,x"}),
+        (("trials", "h", "--outcome", "hang", "--outcome", "survived"), {"outcome": "hang,survived"}),
+        (("logs", "h", "--run", "a", "--run", "b/0"), {"run": ["a", "b/0"]}),
+        (("run", "h", "1", "1", "1", "--disturb", "brake=1", "--disturb", "stop=1"), {"disturb": "brake=1,stop=1"}),
+        (("run", "h", "1", "1", "1", "--crash-on", "hang", "--crash-on", "collision"), {"crash_on": "hang,collision"}),
+        (("run", "h", "1", "1", "1", "--seed", "1", "--seed", "2"), {"seed": 2}),
+        (("rate", "h", "--by", "fault", "--by", "fault"), {"by": "fault"}),
+    ],
+)
+def test_all_values_of_an_option_with_a_list_count(words, counted):
+    given = vars(make_parser().parse_args(words))
+    assert {name: given[name] for name in counted} == counted
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("rate", "h", "--by", "fault", "--by", "speed:3"), "--by is given twice: fault and speed:3; give it once"),
+        (("logs", "h", "--trial", "0", "--trial", "3"), "--trial is given twice: 0 and 3; give it once"),
+        (("logs", "h", "--type", "run", "--type", "error"), "--type is given twice: run and error; give it once"),
+        (("show", "h", "--crash", "1", "--crash", "4"), "--crash is given twice: 1 and 4; give it once"),
+        (("whatif", "h", "--agent", "a=m:A", "--agent", "b=m:B"), "--agent is given twice: a=m:A and b=m:B; give it"),
+    ],
+)
+def test_option_of_which_a_user_expects_both_values_to_count_is_refused_twice(words, message):
+    with pytest.raises(UsageError) as caught:
+        make_parser().parse_args(words)
+    assert str(caught.value).startswith(message)
 
 
 def test_options_of_the_machine_count_only_where_they_are_given():
