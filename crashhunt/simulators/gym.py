@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = ["GymSimulator"]
 
+_RESET_OPTIONS = "reset_options"  # the key of the table [gym], and the first part of an argument's option
 _NO_ACTORS = Roster(())
 _RESET_PARTS = ("observation", "info")
 _STEP_PARTS = ("observation", "reward", "terminated", "truncated", "info")
@@ -52,9 +53,9 @@ _CONSTRUCTOR, _RESET, _STEP, _REWARD, _INFO, _CLOSE = (
 class GymSimulator:
     """Runs the episodes of a scenario in a Gymnasium environment, each in a new environment.
 
-    Scenario arguments are keyword arguments of the environment. When the crash rule holds, the step has a collision
-    without a collision partner. An episode that ends without a crash has finished. The environment's own step limit is
-    disabled.
+    Scenario arguments are keyword arguments of the environment, or entries of the options of its reset. When the
+    crash rule holds, the step has a collision without a collision partner. An episode that ends without a crash has
+    finished. The environment's own step limit is disabled.
 
     Args:
         scenario: The scenario to run.
@@ -79,7 +80,7 @@ class GymSimulator:
         self.notices: dict[str, None] = {}
         self._steps = 0
         try:
-            self._adopt(self._make(argument_values(scenario)))  # to read its spaces
+            self._adopt(self._make(self._configured(argument_values(scenario))[0]))  # to read its spaces
         except ForeignError as error:
             place = place_of(error.error)
             what = f"its {error.place} fails{f' at {place}' if place else ''}: {in_words(error.error)}"
@@ -91,10 +92,13 @@ class GymSimulator:
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
         """Make the environment and reset it."""
         self._close()
+        keywords, reset_options = self._configured((options or {}).get("arguments", {}))
         try:
-            self._adopt(self._make((options or {}).get("arguments", {})))
+            self._adopt(self._make(keywords))
             with _RESET:
-                observation, info = _parts("reset", self._env.reset(seed=seed), _RESET_PARTS)
+                # An environment without ``reset_options`` may have a method without the parameter ``options``.
+                given = {} if reset_options is None else {"options": reset_options}
+                observation, info = _parts("reset", self._env.reset(seed=seed, **given), _RESET_PARTS)
         except ForeignError as error:
             raise InvalidEpisodeError(f"the environment could not be set up: {in_words(error.error)}") from error.error
         self.agents = [self._agent]
@@ -189,17 +193,27 @@ class GymSimulator:
         # The trial limits the number of steps, not the environment.
         return lambda **kwargs: gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True, **kwargs)
 
-    def _make(self, arguments: Mapping[str, Value]) -> gymnasium.Env[Any, Any]:
-        kwargs = deepcopy(self._setup.kwargs)
+    def _configured(self, arguments: Mapping[str, Value]) -> tuple[dict[str, object], dict[str, object] | None]:
+        """Return the keyword arguments of the environment, and the options of its reset."""
+        keywords, options = deepcopy((self._setup.kwargs, self._setup.reset_options))
         for table in as_tables(self._scenario, arguments):
-            merge(kwargs, table)
+            entries = table.get(_RESET_OPTIONS)
+            if options is not None and isinstance(entries, dict):
+                merge(options, entries)
+            else:
+                merge(keywords, table)
+        return keywords, options
+
+    def _make(self, keywords: dict[str, object]) -> gymnasium.Env[Any, Any]:
         try:
             with _CONSTRUCTOR, warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)  # for an outdated version, which the user chose
-                made = self._factory(**kwargs)
+                made = self._factory(**keywords)
         except ForeignError as error:
             if isinstance(error.error, gymnasium.error.Error | ImportError | TypeError):
-                raise self._mistake(str(error.error)) from None
+                is_of_reset = _RESET_OPTIONS in keywords and self._setup.reset_options is None
+                fix = "add reset_options = {} to the table [gym]" if is_of_reset else ""
+                raise self._mistake(str(error.error), fix=fix) from None
             raise
         if is_parallel(made):
             learner, names = self._setup.learner, list(map(str, made.possible_agents))

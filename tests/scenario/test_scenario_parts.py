@@ -294,6 +294,20 @@ def test_descriptors_say_what_simulators_do(town):
     assert SUMO.load_order.why_not(kept) == "the scenario says so"
 
 
+def test_options_of_reset_are_kept_with_a_scenario_and_are_arguments_of_its_environment():
+    plain = Scenario(simulator="gym", tables={"gym": GymSetup(id="a:A")}, agents={"ego": AgentSetup()})
+    found = plain.with_table(GymSetup(id="a:A", reset_options={"at": {"x": 1}}))
+    assert [GYM.side_effect(one, {}, []) for one in (plain, found)] == ["", "it gives its environment arguments"]
+    for one in (plain, found):
+        data = as_plain_data(one)
+        assert ("reset_options" in data["gym"]) == (one is found)  # an earlier version reads the file of the others
+        again = scenario_from_dict(data, where="scenario.toml", folder=Path())
+        assert again.table(GymSetup) == one.table(GymSetup)
+    data["gym"]["reset_options"] = 3
+    with pytest.raises(ScenarioError, match=r"gym\.reset_options = 3: not a table"):
+        scenario_from_dict(data, where="scenario.toml", folder=Path())
+
+
 def test_survey_of_traffic_refines_and_restores_the_scenario_itself(town, monkeypatch):
     monkeypatch.setattr(_ego, "refine", lambda *given: ("refined", *given))
     monkeypatch.setattr(_ego, "restore", lambda *given: ("restored", *given))

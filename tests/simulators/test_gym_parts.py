@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from crashhunt.base.boundaries import ForeignError
-from crashhunt.base.errors import ActionError, ScenarioError
+from crashhunt.base.errors import ActionError, InvalidEpisodeError, ScenarioError
 from crashhunt.recording import encode_value
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.scenario.backends.gym import CrashRule, GymSetup
@@ -248,6 +248,9 @@ class Environment(gymnasium.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.steps.append(("reset", seed))
+        self.options = options
+        if options:
+            options["low"] = "changed"  # as environments do that fill in defaults
         return np.zeros(2, np.float32), {"begin": True}
 
     def step(self, action):
@@ -264,8 +267,9 @@ def make(monkeypatch):
     monkeypatch.setattr(Environment, "result", (np.zeros(2, np.float32), 0.5, False, False, {}), raising=False)
     monkeypatch.setattr(gym, "load_object", lambda name: Environment)
 
-    def make(danger="", arguments=None, **crash):
-        setup = GymSetup(id="m:Environment", kwargs={"a": {"x": 1}}, crash=CrashRule(**crash), danger=danger)
+    def make(danger="", arguments=None, reset_options=None, **crash):
+        setup = GymSetup(id="m:Environment", kwargs={"a": {"x": 1}}, crash=CrashRule(**crash), danger=danger,
+                         reset_options=reset_options)  # fmt: skip
         return GymSimulator(Scenario(simulator="gym", step_length_s=0.5, agents={"ego": AgentSetup()},
                                      tables={"gym": setup}, arguments=arguments or {}), None)  # fmt: skip
 
@@ -294,6 +298,30 @@ def test_each_episode_has_an_environment_of_its_own_with_its_arguments(make):
     before = Environment.made[1].np_random.bit_generator.state
     made.reseed(4)
     assert Environment.made[1].np_random.bit_generator.state != before
+
+
+def test_reset_gets_the_options_of_the_scenario_with_the_values_of_its_arguments(make):
+    given = {"low": -0.1, "at": {"x": 1}}
+    arguments = {"y": ArgumentSetup(default=2, option="reset_options.at.y"), "z": ArgumentSetup(default=5)}
+    made = make(arguments=arguments, reset_options=given)
+    for y in (3, 4):
+        made.reset(seed=7, options={"arguments": {"y": y, "z": 6}})
+        last = Environment.made[-1]
+        assert last.given == {"a": {"x": 1}, "z": 6}
+        assert last.options == {"low": "changed", "at": {"x": 1, "y": y}}
+    assert given == {"low": -0.1, "at": {"x": 1}}  # an environment cannot change what later trials get
+    made = make(reset_options={})
+    made.reset(seed=7)
+    assert Environment.made[-1].options == {}
+
+
+def test_reset_without_options_may_lack_the_parameter_and_keywords_may_have_its_name(make, monkeypatch):
+    monkeypatch.setattr(Environment, "reset", lambda self, seed: (np.zeros(2, np.float32), {}))
+    made = make(arguments={"y": ArgumentSetup(default=2, option="reset_options.y")})
+    made.reset(seed=7)
+    assert Environment.made[0].given == {"a": {"x": 1}, "reset_options": {"y": 2}}
+    with pytest.raises(InvalidEpisodeError, match="unexpected keyword argument 'options'"):
+        make(reset_options={"y": 2}).reset(seed=7)
 
 
 def test_step_ends_an_episode_that_is_over_or_has_crashed(make):

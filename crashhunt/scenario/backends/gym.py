@@ -49,6 +49,8 @@ class GymSetup:
     Args:
         id: id for `gymnasium.make`, or ``module:factory``, which is called with ``kwargs``.
         kwargs: keyword arguments of the environment.
+        reset_options: the table ``options`` that the environment's ``reset`` receives in each trial. An argument with
+            ``option = "reset_options.NAME"`` sets its entry NAME. Without this key, ``reset`` receives no options.
         crash: rules that define a crash.
         learner: name of the tested agent in a parallel environment of PettingZoo; empty for the first agent.
         others: for a parallel environment, ``module:function``, which is called with name, observation, action space
@@ -61,6 +63,7 @@ class GymSetup:
 
     id: str
     kwargs: dict[str, object] = field(default_factory=dict)
+    reset_options: dict[str, object] | None = None
     crash: CrashRule = field(default_factory=CrashRule)
     danger: str = ""
     learner: str = ""
@@ -93,7 +96,8 @@ def _modules(scenario: Scenario) -> Iterable[str]:
 
 def _side_effect(scenario: Scenario, values: Mapping[str, Value], _specifications: Iterable[str]) -> str:
     # What an environment does with its keywords, only its own code can tell.
-    given = scenario.table(GymSetup).kwargs or scenario.arguments or values
+    setup = scenario.table(GymSetup)
+    given = setup.kwargs or setup.reset_options or scenario.arguments or values
     return "it gives its environment arguments" if given else ""
 
 
