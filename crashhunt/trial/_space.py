@@ -134,25 +134,7 @@ class Range:
     integer: bool = False
 
     def __post_init__(self) -> None:
-        text = str(self)
-        if not (_is_finite(self.low) and _is_finite(self.high)):
-            raise ArgumentError(f"the range {text!r} has an end that is not finite", fix="give two finite numbers")
-        if self.low > self.high:
-            raise ArgumentError(
-                f"the range {text!r} begins above its end",
-                fix=f"write it as {_number(self.high)}:{_number(self.low)}",
-            )
-        if not math.isfinite(self.high - self.low):
-            raise ArgumentError(f"the range {text!r} is wider than a float can represent", fix="give a narrower range")
-        if self.log and self.low <= 0:
-            raise ArgumentError(f"the log range {text!r} must begin above 0", fix="give a positive lower end")
-        if self.step is not None and not (math.isfinite(self.step) and self.step > 0):
-            raise ArgumentError(f"the range {text!r} has the step {self.step!r}", fix="give a step above 0")
-        if not self.log and (self.integer or self.step is not None) and not self._steps < _MOST_STEPS:
-            raise ArgumentError(
-                f"the range {text!r} has {self._steps:.3g} values, more than can be drawn from",
-                fix="give a narrower range, or a greater step",
-            )
+        _check_range(str(self), self.low, self.high, self.step, log=self.log, integer=self.integer)
 
     @property
     def steps(self) -> int:
@@ -161,7 +143,7 @@ class Range:
 
     @property
     def _steps(self) -> float:
-        return (self.high - self.low) / (self.step if self.step is not None else 1.0) * (1 + 1e-12) + 1e-9
+        return _steps_between(self.low, self.high, self.step)
 
     def _at(self, index: int) -> Value:
         value = min(self.low + index * (self.step if self.step is not None else 1.0), self.high)
@@ -231,6 +213,47 @@ class Range:
     def __str__(self) -> str:
         step = "" if self.step is None else f":{_number(self.step)}"
         return f"{'log:' if self.log else ''}{_number(self.low)}:{_number(self.high)}{step}"
+
+
+def _check_range(text: str, low: float, high: float, step: float | None, *, log: bool, integer: bool) -> None:
+    """Refuse an invalid range.
+
+    Args:
+        text: the range, as the message shows it.
+        low: as for `Range`.
+        high: as for `Range`.
+        step: as for `Range`.
+        log: as for `Range`.
+        integer: as for `Range`.
+
+    Raises:
+        ArgumentError: the range is invalid.
+    """
+    if not (_is_finite(low) and _is_finite(high)):
+        raise ArgumentError(f"the range {text!r} has an end that is not finite", fix="give two finite numbers")
+    if low > high:
+        first, second, *rest = text.removeprefix("log:").split(":")
+        ordered = ":".join([second, first, *rest])
+        raise ArgumentError(
+            f"the range {text!r} begins above its end", fix=f"write it as {'log:' if log else ''}{ordered}"
+        )
+    if not math.isfinite(high - low):
+        raise ArgumentError(f"the range {text!r} is wider than a float can represent", fix="give a narrower range")
+    if log and low <= 0:
+        raise ArgumentError(f"the log range {text!r} must begin above 0", fix="give a positive lower end")
+    if step is not None and not (math.isfinite(step) and step > 0):
+        raise ArgumentError(f"the range {text!r} has the step {step:g}", fix="give a step above 0")
+    steps = _steps_between(low, high, step)
+    if not log and (integer or step is not None) and not steps < _MOST_STEPS:
+        raise ArgumentError(
+            f"the range {text!r} has {steps:.3g} values, more than can be drawn from",
+            fix="give a narrower range, or a greater step",
+        )
+
+
+def _steps_between(low: float, high: float, step: float | None) -> float:
+    """Return the number of steps from one end of a range to the other, with room for rounding errors."""
+    return (high - low) / (step if step is not None else 1.0) * (1 + 1e-12) + 1e-9
 
 
 Distribution = Constant | Choice | Range
@@ -315,8 +338,10 @@ def _range(parts: list[str], kind: Kind | None, *, log: bool, text: str) -> Rang
         raise ArgumentError(f"{text!r} has ends that are not whole numbers", fix="this argument takes whole numbers")
     if log and len(parts) == 3:
         raise ArgumentError(f"the log range {text!r} has a step", fix="write it as log:LOW:HIGH")
-    low, high, *step = (float(number) if not integer else int(number) for number in numbers)
-    return Range(low, high, step=step[0] if step else None, log=log, integer=integer)
+    low, high, *steps = (float(number) if not integer else int(number) for number in numbers)
+    step = steps[0] if steps else None
+    _check_range(text, low, high, step, log=log, integer=integer)  # the message shows what the user wrote
+    return Range(low, high, step=step, log=log, integer=integer)
 
 
 def _scalar(text: str, kind: Kind | None) -> Value:

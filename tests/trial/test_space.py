@@ -4,6 +4,7 @@ import enum
 import functools
 import json
 import math
+import re
 import types
 from typing import Annotated, Literal
 
@@ -131,6 +132,24 @@ def test_mistakes_name_the_fix(text, kind, fix):
     with pytest.raises(ArgumentError) as caught:
         parse_spec(text, kind)
     assert fix in caught.value.fix
+
+
+@pytest.mark.parametrize(
+    ("text", "message", "fix"),
+    [
+        ("40:5", "the range '40:5' begins above its end", "write it as 5:40"),
+        ("1e2:5:0.50", "the range '1e2:5:0.50' begins above its end", "write it as 5:1e2:0.50"),
+        ("log:1:1e-3", "the range 'log:1:1e-3' begins above its end", "write it as log:1e-3:1"),
+        ("log:0:1", "the log range 'log:0:1' must begin above 0", "give a positive lower end"),
+        ("1:5:0.0", "the range '1:5:0.0' has the step 0", "give a step above 0"),
+        ("-1e308:1e308", "the range '-1e308:1e308' is wider than a float can represent", "give a narrower range"),
+        ("0:9e18:0.1", "the range '0:9e18:0.1' has 9e+19 values, more than can be drawn from", "give a narrower range"),
+    ],
+)
+def test_mistake_shows_the_range_as_the_user_wrote_it(text, message, fix):
+    with pytest.raises(ArgumentError, match=re.escape(message)) as caught:
+        parse_spec(text, "float")
+    assert caught.value.fix.startswith(fix)
 
 
 def test_every_whole_number_of_a_range_is_drawn():
