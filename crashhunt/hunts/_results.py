@@ -504,7 +504,7 @@ def _kinds(hunt: HuntResults, batch: list[dict[str, Cell]]) -> dict[str, str]:
     columns = hunt.columns
     for name in columns:
         kind = specs[name].kind if name in specs else "float"
-        if kind is None:  # the agent does not say; what was tried first does
+        if kind in (None, "float|str"):  # the agent does not say; what was tried first does
             numeric = all(isinstance(row[name], int | float | None) for row in batch)
             kind = "float" if numeric else "str"
         kinds.setdefault(name, known[kind])

@@ -683,9 +683,10 @@ def _spec(
             except ArgumentError:
                 if argument is known:
                     raise
-                return None  # a default of another type than the annotation, such as `gap: float | str = "auto"`
-            # A text such as "a|b" would be read as a choice; so its owner keeps it as a default.
-            return ArgumentSpec(spec=str(constant), kind=kind) if isinstance(constant, Constant) else None
+                return None  # a default of another type than the annotation, such as `gap: float = "auto"`
+            # A text such as "a|b" would be read as a choice, and "7" as a number; so its owner keeps it as a default.
+            is_kept = isinstance(constant, Constant) and (argument is known or constant.value == argument.default)
+            return ArgumentSpec(spec=str(constant), kind=kind) if is_kept else None
     return None
 
 

@@ -48,7 +48,8 @@ __all__ = [
 
 _MOST_STEPS = 2**63 - 1  # NumPy's integers have 64 bits
 Value = bool | int | float | str
-Kind = Literal["float", "int", "bool", "str"]
+Kind = Literal["float", "int", "bool", "str", "float|str"]
+"""The type of an argument. Of ``float|str``, every text that is a number is a float, and all other texts are texts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,7 +304,7 @@ def parse_spec(text: str, kind: Kind | None = None, *, where: str = "") -> Distr
 
     Args:
         text: the specification.
-        kind: the type of the argument; None to derive it from the text.
+        kind: the type of the argument; None to derive it from the text. Of ``float|str``, numbers are floats.
         where: option or key that an error message names, such as ``--arg speed``.
 
     Raises:
@@ -324,7 +325,7 @@ def _parse(text: str, kind: Kind | None) -> Distribution:
     if kind not in ("str", "bool"):
         log, body = text.startswith("log:"), text.removeprefix("log:")
         parts = body.split(":")
-        if len(parts) in (2, 3) and (kind is not None or all(_is_number(part) for part in parts)):
+        if len(parts) in (2, 3) and (kind not in (None, "float|str") or all(_is_number(part) for part in parts)):
             return _range(parts, kind, log=log, text=text)
         if log:
             raise ArgumentError(f"{text!r} is not a log range", fix="write it as log:LOW:HIGH, such as log:1e-3:1")
@@ -333,7 +334,7 @@ def _parse(text: str, kind: Kind | None) -> Distribution:
 
 def _range(parts: list[str], kind: Kind | None, *, log: bool, text: str) -> Range:
     numbers = [_scalar(part, "int" if _is_integer(part) else "float") for part in parts]
-    integer = kind != "float" and all(isinstance(number, int) for number in numbers)
+    integer = kind not in ("float", "float|str") and all(isinstance(number, int) for number in numbers)
     if kind == "int" and not integer:
         raise ArgumentError(f"{text!r} has ends that are not whole numbers", fix="this argument takes whole numbers")
     if log and len(parts) == 3:
@@ -567,7 +568,6 @@ def _kinds_of(hint: object) -> dict[Kind, None]:
 
 def _joint_kind(kinds: Sequence[Kind]) -> Kind | None:
     """Return the type of an argument that allows several types; None if each text determines its type."""
-    if len(kinds) > 1 and ("float" not in kinds or not {*kinds} <= {"float", "int", "str"} or kinds[0] == "str"):
-        return None
-    # An integer is also a float. Of `float | str`, numbers are the rule, and a range such as 5:40 has no whole numbers.
-    return "float" if "float" in kinds else next(iter(kinds), None)
+    if "float" in kinds and {*kinds} <= {"float", "int", "str"}:  # an integer is also a float
+        return "float|str" if "str" in kinds else "float"
+    return kinds[0] if len(kinds) == 1 else None

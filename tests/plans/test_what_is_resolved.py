@@ -58,10 +58,14 @@ range = "8:14"
 """
 AGENT = """
 class Agent:
-    def __init__(self, speed: float = 7.0, mode: str = "a|b", needed=None, gap: float | str = "wide", step_length_s=1):
+    def __init__(self, speed: float = 7.0, mode: str = "a|b", needed=None, gap: float = "wide", step_length_s=1):
         pass
     def reset(self, seed): ...
     def act(self, observation): ...
+
+class Either(Agent):
+    def __init__(self, gap: float | str = "wide", far: str | float = 30, name: str | float = "7"):
+        pass
 
 class Needs(Agent):
     def __init__(self, speed: float, weights: str):
@@ -153,6 +157,12 @@ def test_arguments_are_those_of_scenario_agent_and_request_in_this_order(folder)
     own, its = specs(asked(sampler="sweep", arguments={"speed": "3:5"}))
     assert own == {"speed": ("3.0:5.0", "float")}
     assert its == {"gap_m": ("12.0", "float"), "needed": ("1", "int")}
+    own, _ = specs(asked(agents={"ego": "drives:Either"}))
+    assert own == {"far": ("30.0", "float|str"), "gap": ("wide", "float|str")}  # "7" would be a number
+    own, _ = specs(asked(agents={"ego": "drives:Either"}, arguments={"gap": "5:40", "far": "near|40", "name": "x"}))
+    assert own == {
+        name: (spec, "float|str") for name, spec in (("gap", "5.0:40.0"), ("far", "near|40.0"), ("name", "x"))
+    }
     own, _ = specs(asked(agents={"ego": "drives:Open"}, arguments={"other": "2:3"}))
     assert own["other"][0] == "2:3"
 

@@ -99,6 +99,13 @@ def test_any_text_is_read_or_refused_with_a_fix(text, kind):
         ("true", None, Constant(True)),
         ("module:attribute", None, Constant("module:attribute")),
         ("-3:-1", "int", Range(-3, -1, integer=True)),
+        ("5:40", "float|str", Range(5.0, 40.0)),
+        ("log:1:9", "float|str", Range(1.0, 9.0, log=True)),
+        ("5", "float|str", Constant(5.0)),
+        ("wide", "float|str", Constant("wide")),
+        ("true", "float|str", Constant("true")),
+        ("a:b", "float|str", Constant("a:b")),
+        ("3|wide", "float|str", Choice((3.0, "wide"))),
     ],
 )
 def test_specifications(text, kind, expected):
@@ -297,6 +304,8 @@ def several_types(
     name_or_index: int | str = 3,
     gap: float | str = "wide",
     mode_or_gap: str | float = "wide",
+    size: int | str | float = 3,  # noqa: PYI041 - users write it
+    flag: float | bool = True,
     optional: Gap | None = None,
     mode: Literal["1", "2"] | None = None,
     far: float = math.inf,
@@ -308,7 +317,8 @@ def several_types(
 def test_types_of_an_argument_are_those_of_all_parts_of_its_annotation():
     found = signature_of(several_types).arguments
     assert {name: argument.kind for name, argument in found.items()} == {
-        "number": "float", "name_or_index": None, "gap": "float", "mode_or_gap": None,
+        "number": "float", "name_or_index": None, "gap": "float|str", "mode_or_gap": "float|str",
+        "size": "float|str", "flag": None,
         "optional": "float", "mode": "str", "far": "float", "level": "int",
         "angle": "float",
     }  # fmt: skip
@@ -323,6 +333,8 @@ def test_default_that_text_cannot_represent_stays_with_the_factory():
         "name_or_index": 3,
         "gap": "wide",
         "mode_or_gap": "wide",
+        "size": 3,
+        "flag": True,
     }
 
 
