@@ -17,7 +17,7 @@ from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.text import near_path
 from crashhunt.base.validation import validate
 from crashhunt.hunts import HuntState, hunt_state, is_hunt
-from crashhunt.plans import HuntOptions, Request, SnapshotChoices, fields_of, request_of
+from crashhunt.plans import HuntOptions, Request, SnapshotChoices, fields_of, hunt_options, request_of
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.suites._processes import (
     REQUEST,
@@ -77,7 +77,7 @@ class Suite:
         folder: folder to which relative paths of scenarios refer, and from which agents are imported.
 
     Raises:
-        UsageError: an id is missing, is used twice, or is not a valid folder name.
+        UsageError: an id is missing, is used twice, or is not a valid folder name; or a value of an entry is invalid.
     """
 
     def __init__(self, entries: Sequence[SuiteEntry], *, folder: Path | None = None) -> None:
@@ -101,6 +101,12 @@ class Suite:
                     raise UsageError(f"hunts.{entry.id}: {str(path)!r} is not a path", fix="remove the null byte")
             if entry.agent and entry.agents:
                 raise UsageError(f"hunts.{entry.id} has both agent and agents", fix="give one of them")
+            try:
+                asked = self.request(entry, 0)
+                asked.request.checked()
+                asked.snapshot.checked()
+            except UsageError as error:
+                raise UsageError(f"hunts.{entry.id}: {_in_keys(error.message)}", fix=_in_keys(error.fix)) from None
 
     def __repr__(self) -> str:
         runs = sum(entry.runs for entry in self.entries)
@@ -273,6 +279,15 @@ def default_suite() -> str:
         for argument, known in scenario.scenario_arguments().items():
             lines.append(f'# scenario_arguments.{argument} = "{known.distribution or known.default}"')
     return "\n".join(lines) + "\n"
+
+
+def _in_keys(text: str) -> str:
+    """Return a text in which the keys of the file replace the options of the command line."""
+    keys = {"TRIALS": "trials", "MAX_STEPS": "max_steps"}
+    for option in hunt_options():
+        flag = f"{option.name} = {json.dumps(not option.default)}"
+        keys[option.about.flag] = flag if option.form == "flag" else option.name
+    return re.sub(r"(?<![\w-])(?:--[a-z-]+|[A-Z_]+)", lambda found: keys.get(found[0], found[0]), text)
 
 
 def _merged(defaults: Given, given: Given) -> Given:

@@ -319,7 +319,13 @@ def suite(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "says"),
     [("hunts = [", "TOML"), ("hunts = []", "no hunts"), ("schema = 2\n[[hunts]]\nid = 'a'", "schema = 2"),
-     ("[[hunts]]\nid = 'a'\nruns = 0", "hunts.a.runs = 0"), ("[[hunts]]\nid = 'a'\nodd = 1", "odd")],
+     ("[[hunts]]\nid = 'a'\nruns = 0", "hunts.a.runs = 0"), ("[[hunts]]\nid = 'a'\nodd = 1", "odd"),
+     ("[[hunts]]\nid = 'a'\n[[hunts]]\nid = 'b'\ntrials = -3", "suite.toml: hunts.b: trials is -3; give at least 0$"),
+     ("[[hunts]]\nid = 'a'\nmax_steps = 0", "hunts.a: max_steps is 0; give at least 1"),
+     ("[defaults]\ntimeout_s = -1.0\n[[hunts]]\nid = 'a'", "hunts.a: timeout_s is -1; give seconds above 0"),
+     ("[[hunts]]\nid = 'a'\nkeep = 2", "hunts.a: keep 2 requires .*; give keep_going = true or distinct as well"),
+     ("[[hunts]]\nid = 'a'\nsnapshot_limit_mb = 0", "snapshot_limit_mb is 0; .* above 0, or snapshot_code = false"),
+     ("[[hunts]]\nid = 'a'\ntrials = 0", "trials is 0; give .* a time with duration")],
 )  # fmt: skip
 def test_mistake_in_a_suite_names_its_file(tmp_path, text, says):
     with pytest.raises(UsageError, match=says) as caught:
