@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections import deque
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.base.errors import ArgumentError, SimulatorError, UsageError
@@ -22,14 +25,13 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    import numpy as np
     from gymnasium import Space
     from numpy.typing import NDArray
 
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.scenario import Scenario
     from crashhunt.simulators import Simulator
-    from crashhunt.trial import Disturbance, Value
+    from crashhunt.trial import Disturbance, Kind, Value
     from crashhunt.world import Scene
 
 __all__ = ["Episodes"]
@@ -37,6 +39,14 @@ __all__ = ["Episodes"]
 _PICTURE_PIXELS = (960, 540)  # width and height of the picture, in pixels
 _TRAIL_S = 4.0  # how long the picture shows the agent's past path, in s
 _ASSUMED_SPEED_MPS = 10.0  # m/s
+_ALLOWED: Final[dict[Kind | None, tuple[tuple[type, ...], str]]] = {
+    "bool": ((bool,), "True or False"),
+    "int": ((int,), "a whole number"),
+    "float": ((int, float), "a finite number"),
+    "str": ((str,), "text"),
+    None: ((bool, int, float, str), "a finite number or text"),
+}
+"""The types that the values of an argument may have, and their description, for each kind of argument."""
 
 
 class Episodes:
@@ -68,7 +78,7 @@ class Episodes:
         self.agent = agent or next(iter(chosen.agents))
         if action:
             chosen = with_action(chosen, self.agent, action)
-        self._arguments, self._known = argument_values(chosen), tuple(chosen.scenario_arguments())
+        self._arguments, self._known = argument_values(chosen), chosen.scenario_arguments()
         self._disturber = _disturber(chosen, self.agent, disturb, max_steps)
         self._stage = TemporaryFolder("environment")
         self._simulator = SumoSimulator(chosen, self._stage.path)
@@ -76,6 +86,7 @@ class Episodes:
         self._max_steps = max_steps
         self._oracles = (ReportedCollision(), Overlap(), OffRoad())
         self._episode: Episode | None = None
+        self._is_closed = False
         self.observation_space: Space[object] = self._simulator.observation_spaces[self.agent]
         self.action_space: Space[object] = self._form.space
         self.step_length_s = self._simulator.step_length_s
@@ -87,16 +98,14 @@ class Episodes:
         """Begin an episode; return the observation and the info.
 
         Raises:
-            ArgumentError: the scenario has no argument of that name.
+            ArgumentError: the scenario has no argument of that name, or the argument cannot have that value.
+            SimulatorError: the environment has been closed, or SUMO could not set up the episode.
         """
-        for name in arguments:
-            if name not in self._known:
-                raise ArgumentError(
-                    f"options: the scenario has no argument {name!r}", fix=one_of(name, self._known, give="it has")
-                )
+        self._require_open()
+        checked = {name: self._checked(name, value) for name, value in arguments.items()}
         if self._episode is not None:
             self._episode.close()
-        given = {**self._arguments, **arguments}
+        given: dict[str, Value] = {**self._arguments, **checked}
         disturbances = self._disturber.draw(seed, self._max_steps) if self._disturber is not None else ()
         # The caller of the environment decides when an episode ends.
         spec = TrialSpec(
@@ -118,6 +127,7 @@ class Episodes:
 
     def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, dict[str, object]]:
         """Advance one control step; return observation, reward, whether the episode has ended, and the info."""
+        self._require_open()
         encoded = self._form.encode(action)  # a wrong action is an error of the caller, so it does not end the episode
         episode = self._episode
         if episode is None:
@@ -162,6 +172,7 @@ class Episodes:
 
     def picture(self) -> NDArray[np.generic]:
         """Return the scene from above, uint8, shape (540, 960, 3)."""
+        self._require_open()
         from crashhunt.recording import lane_borders
         from crashhunt.render import SceneView
 
@@ -190,6 +201,28 @@ class Episodes:
             self._episode.close()
         self._simulator.close()
         self._stage.remove()
+        self._is_closed = True
+
+    def _require_open(self) -> None:
+        if self._is_closed:
+            raise SimulatorError("the environment has been closed", fix="make a new environment")
+
+    def _checked(self, name: str, value: object) -> Value:
+        """Return the value of a scenario argument, after its name and type have been checked."""
+        if name not in self._known:
+            raise ArgumentError(
+                f"options: the scenario has no argument {name!r}", fix=one_of(str(name), self._known, give="it has")
+            )
+        kind = self._known[name].kind
+        types, form = _ALLOWED[kind]
+        found: Any = value.item() if isinstance(value, np.generic) else value
+        # For Python, a bool is a number, too.
+        if not isinstance(found, types) or (isinstance(found, bool) and bool not in types):
+            raise ArgumentError(f"options: {name} is {value!r}", fix=f"give {form}")
+        if isinstance(found, float) and not math.isfinite(found):
+            raise ArgumentError(f"options: {name} is {value!r}", fix=f"give {form}")
+        checked: Value = found
+        return checked
 
 
 class _Trail(Observer):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import importlib.util
 import os
 import weakref
+from numbers import Integral
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -17,8 +18,6 @@ from crashhunt.envs._episodes import Episodes
 from crashhunt.envs._process import RemoteEpisodes
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from numpy.typing import NDArray
 
 __all__ = ["SumoEnv"]
@@ -52,6 +51,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
 
     Raises:
         CrashhuntError: The scenario, the agent or a disturbance does not exist, or SUMO does not support it.
+        UsageError: An option has the wrong type, or is out of range.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's base class declares it so
@@ -71,6 +71,13 @@ class SumoEnv(gymnasium.Env[Any, Any]):
             raise UsageError(f"render_mode is {render_mode!r}", fix=one_of(str(render_mode), ("rgb_array",)))
         if render_mode is not None and importlib.util.find_spec("PIL") is None:
             raise UsageError("render_mode needs Pillow", fix="pip install 'crashhunt[video]'")
+        if not isinstance(scenario, str | Path) or not str(scenario):
+            raise UsageError(f"scenario is {scenario!r}", fix="give the name of a shipped scenario, or a path")
+        for name, text in (("agent", agent), ("action", action), ("disturb", disturb)):
+            if not isinstance(text, str):
+                raise UsageError(f"{name} is {text!r}", fix=f"give {name} as text, or omit it")
+        if max_steps is not None and (not isinstance(max_steps, Integral) or max_steps < 1):
+            raise UsageError(f"max_steps is {max_steps!r}", fix="give at least 1, or None for no limit")
         words = tuple(filter(None, (word.strip() for word in disturb.split(","))))
         self._max_steps = max_steps
         self._episodes: Episodes | RemoteEpisodes
@@ -101,16 +108,19 @@ class SumoEnv(gymnasium.Env[Any, Any]):
             options: Scenario arguments that differ from their defaults, as ``{"arguments": {name: value}}``.
 
         Raises:
-            ArgumentError: The scenario has no argument of that name.
+            ArgumentError: The scenario has no argument of that name, or the argument cannot have that value.
+            UsageError: The options contain something else.
+            SimulatorError: The environment has been closed, or SUMO could not set up the episode.
         """
         if self._is_copy:
             raise UsageError(
                 "a copy of an episode cannot be reset", fix="reset the original, or make a new environment"
             )
+        arguments = _arguments_in(options)
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**31))
         self._steps = 0
-        return self._episodes.reset(drawn, (options or {}).get("arguments", {}))
+        return self._episodes.reset(drawn, arguments)
 
     def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, bool, dict[str, object]]:
         """Advance one control step.
@@ -141,10 +151,10 @@ class SumoEnv(gymnasium.Env[Any, Any]):
             UsageError: this environment runs in the user's process, or SUMO's generators cannot be re-seeded.
             SimulatorError: no episode is running, or its process cannot be forked.
         """
-        if n < 1:
-            raise UsageError(f"n is {n}", fix="give the number of copies, at least 1")
-        if seed is not None and seed < 0:
-            raise UsageError(f"seed is {seed}", fix="give 0 or more")
+        if not isinstance(n, Integral) or n < 1:
+            raise UsageError(f"n is {n!r}", fix="give the number of copies, at least 1")
+        if seed is not None and (not isinstance(seed, Integral) or seed < 0):
+            raise UsageError(f"seed is {seed!r}", fix="give 0 or more")
         if not isinstance(self._episodes, RemoteEpisodes):
             message = "only an environment with a process of its own can be branched"
             raise UsageError(message, fix="make it with process=True")
@@ -153,10 +163,18 @@ class SumoEnv(gymnasium.Env[Any, Any]):
             seeds = [int(one) >> 1 for one in np.random.SeedSequence(seed).generate_state(n)]
         found = []
         for episodes in self._episodes.branch(seeds):
-            env = copy.copy(self)
+            env = object.__new__(type(self))
+            env.__dict__.update(self.__dict__)
             env._episodes, env._is_copy = episodes, True
             found.append(env)
         return found
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Refuse to be copied or pickled, because a simulation of SUMO is bound to its process."""
+        raise UsageError(
+            "an environment on SUMO cannot be copied or pickled",
+            fix="make another one; branch copies a running episode",
+        )
 
     def render(self) -> NDArray[np.generic] | None:
         """Return the scene from above if ``render_mode`` is ``rgb_array``; otherwise None.
@@ -175,3 +193,16 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         self._episodes.close()
         if isinstance(self._episodes, Episodes):
             _here.discard(self._episodes)
+
+
+def _arguments_in(options: object) -> dict[str, Any]:
+    """Return the scenario arguments in the options of a reset; a misspelt entry would otherwise have no effect."""
+    given = {} if options is None else options
+    if not isinstance(given, dict):
+        raise UsageError(f"options is {options!r}", fix="give {'arguments': {NAME: VALUE}}")
+    if unknown := [key for key in given if key != "arguments"]:
+        raise UsageError(f"options has {unknown[0]!r}", fix="give only 'arguments'")
+    arguments = given.get("arguments", {})
+    if not isinstance(arguments, dict):
+        raise UsageError(f"options: arguments is {arguments!r}", fix="give {NAME: VALUE}")
+    return arguments

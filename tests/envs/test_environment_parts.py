@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import gc
+import math
 import os
+import pickle
 import signal
 import sys
 from multiprocessing.connection import Pipe
@@ -20,7 +23,7 @@ from crashhunt.envs import SumoEnv, _episodes, _process, _sumo_env
 from crashhunt.envs._episodes import Episodes, _Trail
 from crashhunt.envs._process import RemoteEpisodes
 from crashhunt.errors import ArgumentError, SimulatorError, UsageError
-from crashhunt.trial import Outcome
+from crashhunt.trial import Argument, Outcome
 
 
 def scene(step=0, **more):
@@ -83,7 +86,10 @@ def parts(monkeypatch, tmp_path):
     notes = SimpleNamespace(loaded=[], actions=[], disturbers=[], drawn=[], simulator_closed=0, oracle=Oracle())
     form = SimpleNamespace(encode=lambda action: f"encoded {action}", space="actions")
     other = SimpleNamespace(encode=None, space=gymnasium.spaces.Discrete(5))
-    chosen = SimpleNamespace(agents={"ego": 1, "other": 2}, scenario_arguments=lambda: ["cars", "speed"])
+    chosen = SimpleNamespace(
+        agents={"ego": 1, "other": 2},
+        scenario_arguments=lambda: {"cars": Argument("cars", "int"), "speed": Argument("speed", "float")},
+    )
     notes.simulator = SimpleNamespace(
         actions={"ego": form, "other": other}, observation_spaces={"ego": "observations", "other": "others"},
         step_length_s=0.5, agents=["ego", "other"], why_no_reseeding="", lanes=lambda: "lanes",
@@ -563,3 +569,78 @@ def test_end_of_the_users_program_is_looked_for_every_second():
     pipe = SimpleNamespace(poll=lambda seconds: waits.append(seconds) or False)
     assert _process._serve(pipe, lambda: len(waits) == 3, "episodes") == "episodes"
     assert waits == [1.0] * 3
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ({"scenario": 3}, "scenario is 3; give the name of a shipped scenario, or a path"),
+        ({"scenario": ""}, "scenario is ''; give the name of a shipped scenario, or a path"),
+        ({"max_steps": 0}, "max_steps is 0; give at least 1, or None for no limit"),
+        ({"max_steps": 1.5}, "max_steps is 1.5; give at least 1, or None for no limit"),
+        ({"disturb": 3}, "disturb is 3; give disturb as text, or omit it"),
+        ({"agent": None}, "agent is None; give agent as text, or omit it"),
+    ],
+)
+def test_option_of_a_wrong_type_or_size_is_refused(environments, options, problem):
+    with pytest.raises(UsageError) as caught:
+        SumoEnv(**options)
+    assert str(caught.value) == problem
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ({"argument": {"cars": 3}}, "options has 'argument'; give only 'arguments'"),
+        ([("cars", 3)], "options is [('cars', 3)]; give {'arguments': {NAME: VALUE}}"),
+        ({"arguments": None}, "options: arguments is None; give {NAME: VALUE}"),
+    ],
+)
+def test_misspelt_option_of_a_reset_is_refused_and_draws_no_seed(environments, options, problem):
+    env = SumoEnv()
+    env.reset(seed=5)
+    with pytest.raises(UsageError) as caught:
+        env.reset(options=options)
+    assert str(caught.value) == problem
+    env.reset()
+    again = SumoEnv(process=False)
+    again.reset(seed=5)
+    again.reset()
+    assert env._episodes.calls == again._episodes.calls
+
+
+@pytest.mark.parametrize(
+    ("value", "allowed"),
+    [
+        ({"cars": "x"}, "cars is 'x'; give a whole number"),
+        ({"cars": True}, "cars is True; give a whole number"),
+        ({"cars": [3]}, "cars is [3]; give a whole number"),
+        ({"speed": math.nan}, "speed is nan; give a finite number"),
+        ({"speed": "fast"}, "speed is 'fast'; give a finite number"),
+    ],
+)
+def test_value_that_an_argument_cannot_have_is_refused(parts, value, allowed):
+    made = Episodes("toy", "", "")
+    with pytest.raises(ArgumentError) as caught:
+        made.reset(1, value)
+    assert str(caught.value) == f"options: {allowed}"
+    assert not Episode.made
+    made.reset(1, {"cars": np.int64(4), "speed": 2})
+    assert Episode.made[0].spec.scenario_arguments == {"cars": 4, "speed": 2}
+    assert type(Episode.made[0].spec.scenario_arguments["cars"]) is int
+
+
+def test_closed_environment_says_so(parts):
+    made = Episodes("toy", "", "")
+    made.reset(1, {})
+    made.close()
+    for use in (lambda: made.reset(1, {}), lambda: made.step(1), made.picture):
+        with pytest.raises(SimulatorError, match="the environment has been closed; make a new environment"):
+            use()
+
+
+def test_environment_is_neither_copied_nor_pickled(environments):
+    env = SumoEnv()
+    for use in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(UsageError, match="cannot be copied or pickled; make another one; branch copies"):
+            use(env)
