@@ -213,16 +213,13 @@ class Episodes:
             raise ArgumentError(
                 f"options: the scenario has no argument {name!r}", fix=one_of(str(name), self._known, give="it has")
             )
-        kind = self._known[name].kind
-        types, form = _ALLOWED[kind]
-        found: Any = value.item() if isinstance(value, np.generic) else value
+        types, form = _ALLOWED[self._known[name].kind]
+        found = value.item() if isinstance(value, np.generic) else value
         # For Python, a bool is a number, too.
-        if not isinstance(found, types) or (isinstance(found, bool) and bool not in types):
+        fits = isinstance(found, types) and not (isinstance(found, bool) and bool not in types)
+        if not fits or not isinstance(found, bool | int | float | str) or not _is_finite(found):
             raise ArgumentError(f"options: {name} is {value!r}", fix=f"give {form}")
-        if isinstance(found, float) and not math.isfinite(found):
-            raise ArgumentError(f"options: {name} is {value!r}", fix=f"give {form}")
-        checked: Value = found
-        return checked
+        return found
 
 
 class _Trail(Observer):
@@ -254,6 +251,10 @@ def _disturber(scenario: Scenario, agent: str, disturb: Sequence[str], max_steps
     if made is not None and max_steps < 1:
         raise UsageError("disturb needs a limit on the length of an episode", fix="give max_steps")
     return made
+
+
+def _is_finite(value: Value) -> bool:
+    return not isinstance(value, float) or math.isfinite(value)
 
 
 def _make_agent(agent: str, simulator: Simulator, _arguments: Mapping[str, Value]) -> KeepLaneWithSpeed:

@@ -630,7 +630,7 @@ def test_value_that_an_argument_cannot_have_is_refused(parts, value, allowed):
     assert type(Episode.made[0].spec.scenario_arguments["cars"]) is int
 
 
-def test_closed_environment_says_so(parts):
+def test_closed_environment_refuses_every_use(parts):
     made = Episodes("toy", "", "")
     made.reset(1, {})
     made.close()
