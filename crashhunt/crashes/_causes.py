@@ -353,6 +353,24 @@ class Division:
         if cause is not None:
             self._known[number] = cause
 
+    def answer(self, number: int) -> JsonObject | None:
+        """Return a judged crash in the form that `restore` reads; None if the crash has not been judged."""
+        if number not in self._chosen or number in self._open:
+            return None
+        cause = self._known.get(number)
+        return {"features": list(self._features[number]), "cause": None if cause is None else cause.to_json()}
+
+    def restore(self, number: int, answer: JsonObject) -> Cause | None:
+        """Add a judged crash whose bundle was deleted; return its cause.
+
+        Args:
+            number: number of the crash.
+            answer: the crash as `answer` returned it.
+        """
+        self._features[number] = tuple(answer["features"])
+        self.settle(number, None if answer["cause"] is None else Cause.from_json(answer["cause"]))
+        return self._known.get(number)
+
     def postpone(self, number: int) -> None:
         """Withdraw a crash that was chosen but not judged; it may be chosen again."""
         self._open.remove(number)

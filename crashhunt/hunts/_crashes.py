@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, Cause, Signature
     from crashhunt.ledger import Facts, KindData
     from crashhunt.trial import TrialResult
@@ -242,6 +243,7 @@ class Kinds:
         only_at_fault: whether only crashes that are the agent's fault count towards the number of wanted crash types.
         dropped: trials of each crash type (as text) whose bundles were deleted in earlier runs of the hunt.
         dropped_at_fault: those of the trials in `dropped` whose crashes are the agent's fault.
+        dropped_judged: those of the trials in `dropped` whose crashes were judged, with their causes.
         by_cause: number of crashes of each type to judge, so that causes count; 0 if types count.
     """
 
@@ -254,6 +256,7 @@ class Kinds:
         only_at_fault: bool = False,
         dropped: Mapping[str, Sequence[int]] | None = None,
         dropped_at_fault: Sequence[int] = (),
+        dropped_judged: Mapping[str, Mapping[str, JsonObject]] | None = None,
         by_cause: int = 0,
     ) -> None:
         self._by_cause = by_cause
@@ -275,11 +278,18 @@ class Kinds:
             words: [number for number in numbers if number not in there] for words, numbers in (dropped or {}).items()
         }
         self._dropped_at_fault = {number for number in dropped_at_fault if number not in there}
+        self.dropped_judged = {
+            words: {number: answer for number, answer in answers.items() if int(number) not in there}
+            for words, answers in (dropped_judged or {}).items()
+        }
         for bundle in crashes:
             self._add_signature(bundle)
         for signature in self._seen:
             for number in self.dropped.get(str(signature), ()):
                 self._count(number, signature, None)
+        for signature, division in self._divisions.items():
+            for word, answer in self.dropped_judged.get(str(signature), {}).items():
+                self._count(int(word), signature, division.restore(int(word), answer))
 
     def add(self, bundle: Bundle, ended: int) -> None:
         """Add a saved crash.
@@ -334,6 +344,9 @@ class Kinds:
                         self._at_fault.discard(number)
                         self._dropped_at_fault.add(number)
                     self.dropped.setdefault(str(group.signature), []).append(number)
+                    division = self._divisions.get(group.signature)
+                    if division is not None and (answer := division.answer(number)) is not None:
+                        self.dropped_judged.setdefault(str(group.signature), {})[str(number)] = answer
                     found.append(bundle)
         if found:
             self._groups = None
@@ -494,7 +507,8 @@ def prune_bundles(
     excess = kinds.drop_excess(keep, final=final) if kinds is not None and keep else []
     if not excess or kinds is None:
         return crashes
-    ledger.note(dropped=kinds.dropped, dropped_at_fault=kinds.dropped_at_fault)
+    judged = kinds.dropped_judged or None
+    ledger.note(dropped=kinds.dropped, dropped_at_fault=kinds.dropped_at_fault, dropped_judged=judged)
     for bundle in excess:
         remove_at_once(bundle.path)  # half a bundle would be a damaged one
     gone = {bundle.id for bundle in excess}

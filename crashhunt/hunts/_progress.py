@@ -271,6 +271,7 @@ class Progress:
                 only_at_fault=run.only_at_fault,
                 dropped=before.get("dropped"),
                 dropped_at_fault=before.get("dropped_at_fault") or (),
+                dropped_judged=before.get("dropped_judged"),
                 by_cause=run.by_cause,
             )
 

@@ -139,6 +139,8 @@ class Noted(TypedDict, total=False):
         dropped: trials of each crash type (in words) whose bundles were not kept because shorter crashes were kept.
         dropped_at_fault: those of the trials in `dropped` whose crashes are the agent's fault, if the hunt determines
             the fault.
+        dropped_judged: the judged crashes among the trials in `dropped`, by crash type (in words) and number of the
+            trial. Each has its cause, and the features that compare it with other crashes. None if there are none.
         newest_kind: time at which the last new crash type was found, in s since the epoch; None if there is none, or if
             it is unknown.
         audits_left: the trials that the audit has not yet run again; None if there are none.
@@ -181,6 +183,7 @@ class Noted(TypedDict, total=False):
     failed_steps: int
     dropped: dict[str, list[int]]
     dropped_at_fault: list[int]
+    dropped_judged: dict[str, dict[str, JsonObject]] | None
     until_rate: UntilRate | None
     running_rate: RunningRate | None
 

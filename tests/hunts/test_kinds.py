@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from contextlib import closing
 from dataclasses import dataclass
@@ -314,6 +315,36 @@ def test_resumed_hunt_counts_a_type_of_which_the_crash_at_fault_was_deleted(thre
     assert Kinds(1, [collision(3)], only_at_fault=True, dropped={"0": [9]}, dropped_at_fault=[9]).until == 9
 
 
+@pytest.mark.parametrize("only_at_fault", [False, True])
+def test_resumed_hunt_knows_the_causes_of_crashes_whose_bundles_were_deleted(one_type, monkeypatch, only_at_fault):
+    monkeypatch.setattr(_crashes, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id != "c9"))
+    kinds = Kinds(1, by_cause=4, only_at_fault=only_at_fault)
+    crashes = [collision(number, steps) for number, steps in ((1, 9), (2, 7), (5, 8), (9, 3), (11, 5))]
+    for bundle in crashes:
+        kinds.add(bundle, 1)
+    causes = {1: "vehicle", 2: "vehicle", 5: None, 9: "vehicle", 11: "red light"}
+    while (chosen := kinds.next_to_judge()) is not None:
+        settle(kinds, chosen, causes[chosen.result.spec.number])
+    gone = {bundle.id for bundle in kinds.drop_excess(1)}
+    stored = json.loads(json.dumps(kinds.dropped_judged))
+
+    judged = {number: SimpleNamespace(is_interrupted=False, what=what) for number, what in causes.items() if what}
+    monkeypatch.setattr(_crashes, "judgement_of", lambda bundle: judged.get(bundle.result.spec.number))
+    monkeypatch.setattr(_crashes, "cause_of", lambda _, judgement: Cause("omission", judgement.what))
+    left = [bundle for bundle in crashes if bundle.id not in gone]
+    more = {"dropped": kinds.dropped, "dropped_at_fault": kinds.dropped_at_fault, "only_at_fault": only_at_fault}
+    again = Kinds(1, left, by_cause=4, dropped_judged=stored, **more)
+    assert (again.until, again.types_by_cause, again.count_to_judge()) == (kinds.until, 2, 0)
+    for both in (kinds, again):
+        both.add(collision(3, 2), 6)
+        both.add(collision(12, 1), 7)
+    assert [bundle.id for bundle in again.drop_excess(1)] == [bundle.id for bundle in kinds.drop_excess(1)]
+    assert again.dropped_judged == kinds.dropped_judged == stored
+    # It was killed before it had deleted them.
+    killed = Kinds(1, crashes, by_cause=4, dropped_judged=stored, **more)
+    assert (killed.until, killed.dropped_judged) == (kinds.until, {"collision": {}})
+
+
 def test_software_faults_need_no_runs_for_their_cause():
     kinds = Kinds(2, [crash(1, "KeyError"), crash(2, "IndexError")], by_cause=8)
     assert (kinds.until, kinds.next_to_judge(), kinds.types_by_cause) == (2, None, 2)
@@ -355,12 +386,13 @@ def test_deleted_bundles_are_noted_before_they_are_removed(tmp_path, monkeypatch
     crashes = [Saved(f"{number:06d}-collision", tmp_path / str(number)) for number in range(4)]
     kinds = SimpleNamespace(
         drop_excess=lambda keep, *, final: asked.append((keep, final)) or [crashes[2], crashes[0]],
-        dropped={"a": [2, 0]}, dropped_at_fault=[2],
+        dropped={"a": [2, 0]}, dropped_at_fault=[2], dropped_judged={},
     )  # fmt: skip
     monkeypatch.setattr(_crashes, "remove_at_once", lambda path: calls.append(path.name))
     ledger = SimpleNamespace(note=lambda **facts: calls.append(facts))
     assert prune_bundles(ledger, kinds, crashes, 3) == [crashes[1], crashes[3]]
-    assert calls == [{"dropped": {"a": [2, 0]}, "dropped_at_fault": [2]}, "2", "0"]
+    noted = {"dropped": {"a": [2, 0]}, "dropped_at_fault": [2], "dropped_judged": None}
+    assert calls == [noted, "2", "0"]
     assert asked == [(3, False)]
     calls.clear()
     kinds.drop_excess = lambda keep, *, final: asked.append((keep, final)) or []

@@ -404,7 +404,8 @@ def test_progress_of_a_hunt_ends_with_its_lowest_crash():
 def test_resumed_hunt_knows_which_types_it_wants(monkeypatch):
     made = []
     monkeypatch.setattr(_progress, "Kinds", lambda *given, **more: made.append((given, more)) or "kinds")
-    before = {"failed_steps": 7, "newest_kind": 5.0, "dropped": {"a": [1]}, "dropped_at_fault": [1]}
+    noted = {"dropped": {"a": [1]}, "dropped_at_fault": [1], "dropped_judged": {"a": {"1": {"cause": None}}}}
+    before = {"failed_steps": 7, "newest_kind": 5.0, **noted}
     for run, wanted in (
         (RunSettings(), None), (RunSettings(keep_going=True, distinct=4), 4), (RunSettings(only_at_fault=True), 1),
     ):  # fmt: skip
@@ -414,7 +415,7 @@ def test_resumed_hunt_knows_which_types_it_wants(monkeypatch):
         assert (progress.crashes, progress.failed_steps) == (["crash"], 7)
         assert progress.kinds == (None if wanted is None else "kinds")
         if wanted is not None:
-            more = {"only_at_fault": run.only_at_fault, "dropped": {"a": [1]}, "dropped_at_fault": [1], "by_cause": 0}
+            more = {"only_at_fault": run.only_at_fault, "by_cause": 0, **noted}
             assert made == [((wanted, ["crash"], 5.0), more)]
 
 
