@@ -160,7 +160,7 @@ class RareEstimate:
 
     Args:
         roots: number of roots.
-        estimate: estimated crash probability per trial; None if there is no root.
+        estimate: estimated crash probability per trial, from 0 to 1; None if there is no root.
         undisturbed: the part of the estimate from crashes on which no disturbance had an effect.
         disturbed: the part of the estimate from all other crashes.
         estimated: interval of ``estimate``; None if the roots do not allow an interval.
@@ -177,7 +177,7 @@ class RareEstimate:
         steps: number of simulated steps.
         plain_steps: number of simulated steps of plain trials.
         plain_equivalent_steps: number of steps that plain trials would need for the same standard error; None if there
-            is no standard error.
+            is no standard error, or if the mean of the roots' values is 1 or more.
         relative_error: half the width of ``estimated``, divided by the estimate; infinite if there is no interval.
     """
 
@@ -540,15 +540,16 @@ class RareCounter:
             why_not = f"plain trials crash more often than the copies explain ({whole.low:.2g} to {whole.high:.2g})"
             whole = part = None
             why_not_part = why_not
+        whole, part = _at_most_1(whole), _at_most_1(part)
         plain_steps = None
-        if estimate and count > 1 and (spread := self._whole.standard_error(count)) > 0:
-            plain_steps = estimate * (1.0 - min(estimate, 1.0)) / spread**2 * counts["own_steps"] / count
+        if estimate and estimate < 1.0 and count > 1 and (spread := self._whole.standard_error(count)) > 0:
+            plain_steps = estimate * (1.0 - estimate) / spread**2 * counts["own_steps"] / count
         parts = {cell: part / count for cell, part in self._parts.items()}
         return RareEstimate(
             roots=count,
-            estimate=None if why else estimate,
-            undisturbed=self._undisturbed / count if count else 0.0,
-            disturbed=self._disturbed.total / count if count else 0.0,
+            estimate=None if why or estimate is None else min(1.0, estimate),
+            undisturbed=min(1.0, self._undisturbed / count) if count else 0.0,
+            disturbed=min(1.0, self._disturbed.total / count) if count else 0.0,
             estimated=None if why else whole,
             estimated_disturbed=None if why else part,
             why_not=why or why_not,
@@ -599,6 +600,11 @@ def rare_estimate(
     for _ in range(excluded):
         counter.add(None)
     return counter.estimate()
+
+
+def _at_most_1(one: Estimated | None) -> Estimated | None:
+    """Return the interval without its part above 1: a sum of weights can exceed 1, a probability cannot."""
+    return None if one is None else replace(one, low=min(1.0, one.low), high=min(1.0, one.high))
 
 
 class _Sums:

@@ -255,6 +255,19 @@ def test_interval_of_equal_roots_is_a_point():
     assert (found.low, found.high) == pytest.approx((1e-3, 1e-3))
 
 
+def test_probability_is_at_most_1_although_the_sum_of_weights_is_not():
+    roots = [Root(0.99, 0.005 * (number % 7), counted=0.99, own=0.99, bound=0.5, own_steps=9) for number in range(60)]
+    found = rare_estimate(roots, least_bound=0.1)
+    assert found.estimate == found.estimated.high == 1.0
+    assert 0.9 < found.estimated.low < 1.0
+    assert found.plain_equivalent_steps is None
+    heavy = rare_estimate([Root(0.0, 0.5 + 0.2 * (number % 7), bound=2.0, own_steps=9) for number in range(60)])
+    assert heavy.estimate == heavy.disturbed == heavy.estimated.high == heavy.estimated_disturbed.high == 1.0
+    below = rare_estimate([Root(0.0, 0.1 * (number % 7), bound=2.0, own_steps=9) for number in range(60)])
+    assert below.estimated.high < 1.0
+    assert below.plain_equivalent_steps > 0.0
+
+
 def test_nothing_is_estimated_with_too_many_incomplete_roots():
     estimate = rare_estimate(roots(*[1e-3] * 40), excluded=3)
     assert estimate.estimate is None
