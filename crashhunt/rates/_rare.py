@@ -176,8 +176,8 @@ class RareEstimate:
         plain_crashes: number of plain trials that crashed.
         steps: number of simulated steps.
         plain_steps: number of simulated steps of plain trials.
-        plain_equivalent_steps: number of steps that plain trials would need for the same standard error; None if there
-            is no standard error, or if the mean of the roots' values is 1 or more.
+        plain_equivalent_steps: number of steps that plain trials would need for the same standard error. None if there
+            is no standard error, or if the estimate is 1.
         relative_error: half the width of ``estimated``, divided by the estimate; infinite if there is no interval.
     """
 
