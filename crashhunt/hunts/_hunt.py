@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from contextlib import suppress
 from dataclasses import replace
@@ -18,7 +19,7 @@ from crashhunt.episode import internal_error, scratch_of
 from crashhunt.executors import SharedExecutors, make_executor, read_map
 from crashhunt.hunts._crashes import prune_bundles, tally_crashes
 from crashhunt.hunts._fork_results import ForkCrashes, keep_near_misses, verify_fork_results, verify_rare
-from crashhunt.hunts._next_trials import GREATEST_LAG, Trials, Unanswered, settings_of_workers
+from crashhunt.hunts._next_trials import GREATEST_LAG, Pace, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._preflight import Preflight, WorkerNotices, is_hopeless, why_invalid
 from crashhunt.hunts._progress import HuntStatus, PhaseClock, PhaseStatus, Progress, RemainingTime
 from crashhunt.hunts._rates import bar_watch, forcings_of, rare_watch, rate_watch, refuse_training_traffic
@@ -57,6 +58,9 @@ __all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
 T = TypeVar("T")
 
 _TICK_S = 0.1  # how late a stop, a heartbeat or the screen may be
+# Trials, or seconds of work, that a hunt is ahead of its partner. Results that `Preflight` holds back are not in
+# the ledger, so the lead must be longer: otherwise, two hunts could wait for each other.
+_MAX_LEAD_PER_WORKER, _MAX_LEAD_S = 8, 5.0
 _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker waits for the hunt
 
 
@@ -74,6 +78,8 @@ class Hunt:
         seed_given: whether the user chose the seed; if not, a resumed hunt keeps its own seed.
         snapshot: options of the snapshot of the code.
         imported: the modules that trials import, in the form for `take_snapshot`.
+        partner: directory of a hunt that runs at the same time and is compared with this hunt, trial by trial. A hunt
+            that is far ahead waits for its partner.
     """
 
     def __init__(
@@ -87,6 +93,7 @@ class Hunt:
         seed_given: bool = True,
         snapshot: SnapshotOptions | None = None,
         imported: ImportedModules | None = None,
+        partner: Path | None = None,
     ) -> None:
         self.directory = directory
         self.scenario = scenario
@@ -97,6 +104,7 @@ class Hunt:
         self._seed_given = seed_given
         self._snapshot_options = snapshot
         self._imported = imported
+        self._pace = Pace(partner) if partner is not None else None
         self._stops: Sequence[int] = ()
         self._progress: Progress | None = None  # once the ledger says that the hunt runs
 
@@ -364,10 +372,11 @@ class Hunt:
                     progress.rare.read(min(in_flight, default=trials.upcoming))
                 precise = progress.rare is not None and progress.rare.is_over
                 stopping = progress.last_wanted is not None or progress.time_left_s <= 0 or precise
-                for spec in [] if stopping else trials.take(_under_way(executor.capacity) - len(in_flight)):
+                room = self._room(trials, progress, executor.capacity)
+                for spec in [] if stopping else trials.take(min(room, _under_way(executor.capacity) - len(in_flight))):
                     executor.submit(spec)
                     in_flight.add(spec.number)
-                if not in_flight or precise:
+                if (not in_flight and (room > 0 or stopping)) or precise:
                     break
                 with ledger.together():
                     for result in executor.completed(_TICK_S):
@@ -420,6 +429,13 @@ class Hunt:
         if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
             return "no_valid_trial"
         return "all_trials" if trials.exhausted else "time"
+
+    def _room(self, trials: Trials, progress: Progress, capacity: int) -> int:
+        """Return how many trials may start, so that a hunt is not far ahead of its partner."""
+        if self._pace is None:
+            return sys.maxsize
+        per_s = progress.ended_here / max(time.monotonic() - progress.began, _TICK_S)
+        return self._pace.room(trials.upcoming, max(_MAX_LEAD_PER_WORKER * capacity, int(_MAX_LEAD_S * per_s)))
 
     def _expect_end(self, progress: Progress, parallel: int) -> None:
         """Estimate the time at which the last trial ends."""

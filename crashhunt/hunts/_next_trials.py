@@ -5,6 +5,9 @@ A trial that does not follow from the seed is in the ledger before it starts.
 
 from __future__ import annotations
 
+import math
+import sys
+import time
 from collections import Counter, deque
 from dataclasses import replace
 from heapq import heappop, heappush
@@ -15,6 +18,7 @@ import numpy as np
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.disturbances import FIRST_STEP
 from crashhunt.episode import WorkerSettings
+from crashhunt.hunts._state import trials_of_running
 from crashhunt.ledger import Turn
 from crashhunt.plans import with_settings
 from crashhunt.trial import KILLED, TrialSpec
@@ -35,6 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "GREATEST_LAG",
+    "Pace",
     "Trials",
     "Unanswered",
     "find_unanswered",
@@ -49,6 +54,7 @@ _TRAFFIC_STREAM = 0x74726166  # apart from what else is drawn of the hunt's seed
 GREATEST_LAG = 32
 """Greatest delay of results for a sampler in a deterministic hunt, in trials. It does not depend on the workers, so
 that 1 and 16 of them run the same trials."""
+_LOOK_EVERY_S = 0.1  # at the hunt on which another hunt waits
 _FIRST_LAG, _TRIALS_PER_LAG = 4, 8  # delay of the first trials, and trials after which it is one more
 
 
@@ -231,6 +237,38 @@ class Trials:
             if turn.spec.number not in finished:
                 self._proposed[turn.spec.number] = turn.spec
         self._untold = sorted(finished - told)
+
+
+class Pace:
+    """Limits how far a hunt runs ahead of another hunt whose trials are compared with its own, number by number.
+
+    Without this limit, the faster of two hunts runs trials that are not needed if the comparison ends early. Only the
+    hunt that is ahead waits, so the pairs come as fast as without the limit. If the other hunt is not running, there is
+    no limit, because it may have ended or failed.
+
+    Args:
+        other: directory of the other hunt.
+    """
+
+    def __init__(self, other: Path) -> None:
+        self._other = other
+        self._finished: int | None = None  # trials of the other hunt
+        self._looked = -math.inf
+
+    def room(self, upcoming: int | None, lead: int) -> int:
+        """Return how many trials may start now.
+
+        Args:
+            upcoming: number of the next trial; None if no trial is left.
+            lead: number of trials that this hunt may be ahead of the other hunt.
+        """
+        if upcoming is None:
+            return sys.maxsize
+        now = time.monotonic()
+        is_limited = self._finished is not None and upcoming < self._finished + lead
+        if not is_limited and now - self._looked >= _LOOK_EVERY_S:
+            self._looked, self._finished = now, trials_of_running(self._other)
+        return sys.maxsize if self._finished is None else max(0, self._finished + lead - upcoming)
 
 
 def spec_of(

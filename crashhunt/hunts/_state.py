@@ -55,6 +55,7 @@ __all__ = [
     "state_of_facts",
     "sums_of_branches",
     "sums_of_probes",
+    "trials_of_running",
 ]
 
 
@@ -427,6 +428,20 @@ def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
 def ledger_owner() -> HuntOwner:
     """Return a description that identifies this process, so that others can check whether it is still running."""
     return {"host": socket.gethostname(), "pid": os.getpid(), "started": _started(os.getpid())}
+
+
+def trials_of_running(directory: Path) -> int | None:
+    """Return the number of finished trials of a hunt; None if the hunt is not running."""
+    if not has_begun(directory / layout.LEDGER):
+        return None
+    try:
+        with closing(Ledger(directory / layout.LEDGER)) as ledger:
+            facts = ledger.facts()
+            owner = facts.get("owner")
+            alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))
+            return len(ledger.finished()) if alive and facts.get("state") == "running" else None
+    except HuntDirectoryError:
+        return None
 
 
 def _planned(request: Path) -> int:

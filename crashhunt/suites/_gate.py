@@ -466,6 +466,7 @@ class _Run:
                     waiting, slots, watch=lambda: self._count_pairs(paired, is_last=is_last),  # noqa: B023 - called here
                     machine={**(self._gate.machine or {}), "trials": paired.most},
                     is_enough=lambda: self._is_enough(paired), environments=environments,  # noqa: B023
+                    partners=dict(zip(paired.folders, reversed(paired.folders), strict=True)),
                 )  # fmt: skip
                 self._count_pairs(paired, is_last=is_last)
             if self._refuse_failed(paired) or self._pairs.verdict != "undecided" or time.monotonic() > self._until:

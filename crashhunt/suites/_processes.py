@@ -147,6 +147,7 @@ def run_all(
     machine: Given | None = None,
     is_enough: Callable[[], bool] = lambda: False,
     environments: Mapping[Path, Mapping[str, str]] | None = None,
+    partners: Mapping[Path, Path] | None = None,
 ) -> None:
     """Run hunts, each in its own process, until all have ended, no more are needed, or the user interrupts.
 
@@ -157,6 +158,7 @@ def run_all(
         machine: execution options for all hunts, which replace the options of each request.
         is_enough: function called after each `watch`; if it returns true, the hunts stop as after an interrupt.
         environments: environment variables of the process of each folder; by default the variables of this process.
+        partners: the folder of the hunt with which each hunt is compared. The hunt that is ahead waits for its partner.
 
     Raises:
         UsageError: ``parallel`` is negative.
@@ -179,6 +181,8 @@ def run_all(
                     folder = waiting.popleft()
                     try:
                         run = {**(machine or {}), "parallel": width}
+                        if partners is not None and folder in partners:
+                            run["partner"] = str(partners[folder].resolve())
                         running[_start(folder, run, (environments or {}).get(folder))] = width
                         free -= width
                     except (CrashhuntError, OSError) as error:
@@ -273,10 +277,12 @@ def _main(folder: Path, run: Given, parent: int) -> None:
 
     try:
         asked = RunRequest.read(folder / REQUEST)
-        scenario, settings, imported = _planned(folder, asked.request, run)
+        options = dict(run)
+        partner = Path(other) if (other := options.pop("partner", None)) is not None else None
+        scenario, settings, imported = _planned(folder, asked.request, options)
         snapshot = SnapshotOptions.of(asked.snapshot)
         command = ["crashhunt", "suite", "run"]
-        hunt = Hunt(folder, scenario, settings, command=command, snapshot=snapshot, imported=imported)
+        hunt = Hunt(folder, scenario, settings, command=command, snapshot=snapshot, imported=imported, partner=partner)
         deadline = time.monotonic() + _BUSY_S
         while True:
             try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from contextlib import closing
 from dataclasses import replace
@@ -13,9 +14,10 @@ import pytest
 
 import crashhunt
 from crashhunt.errors import CrashhuntError, ScenarioError
-from crashhunt.hunts import _hunt as hunt_module
+from crashhunt.hunts import _hunt as hunt_module, _next_trials
 from crashhunt.hunts._hunt import Hunt
-from crashhunt.hunts._next_trials import GREATEST_LAG
+from crashhunt.hunts._next_trials import GREATEST_LAG, Pace
+from crashhunt.hunts._state import ledger_owner
 from crashhunt.ledger import Ledger
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
@@ -121,6 +123,55 @@ def test_loop_submits_as_many_trials_as_workers_need_and_ends_with_the_last(run)
     assert all(status.disturbed is None and status.kinds is None for status in found.seen)
     assert last.time_left_s == math.inf
     assert (last.crashes, last.branched, last.stressed) == (0, 0, None)
+
+
+def test_hunt_waits_while_it_is_far_ahead_of_its_partner(run, tmp_path, monkeypatch):
+    """The partner finishes ten trials at every second look, and has ended at trial 60."""
+    looks, started = [], []
+
+    def finished(place):
+        assert place == tmp_path / "other"
+        looks.append(max(started, default=-1))
+        count = 10 * (len(looks) // 2)
+        return count if count < 60 else None
+
+    def begin(*given, **more):
+        return Hunt(*given, **more, partner=tmp_path / "other")
+
+    def ends(spec):
+        started.append(spec.number)
+        assert len(looks) >= 12 or spec.number < 10 * (len(looks) // 2) + 16
+        return survives(spec)
+
+    monkeypatch.setattr("crashhunt.hunts.Hunt", begin)
+    monkeypatch.setattr(_next_trials, "trials_of_running", finished)
+    monkeypatch.setattr(_next_trials, "_LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr(hunt_module, "_MAX_LEAD_S", 0.0)
+    found = run(99, ends)
+    assert found.numbers == list(range(99))
+    assert found.report.stopped_because == "all_trials"
+    assert len(looks) >= 12  # it has waited, until the other one had ended
+
+
+def test_pace_is_that_of_the_other_hunt_while_it_runs(tmp_path, monkeypatch):
+    pace = Pace(tmp_path)
+    monkeypatch.setattr(_next_trials, "_LOOK_EVERY_S", 0.0)
+    assert pace.room(500, 4) == sys.maxsize  # it has not begun
+    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
+        for number in range(3):
+            ledger.record(survives(TrialSpec(number, 1, {}, {}, 9)), snapshot="")
+        ledger.enter("running", owner=ledger_owner(), heartbeat=time.time())
+        assert [pace.room(number, 4) for number in (0, 6, 7, 9)] == [7, 1, 0, 0]
+        ledger.record(survives(TrialSpec(3, 1, {}, {}, 9)), snapshot="")
+        assert (pace.room(7, 4), pace.room(7, 9), pace.room(None, 4)) == (1, 6, sys.maxsize)
+        monkeypatch.setattr(_next_trials, "_LOOK_EVERY_S", 60.0)
+        ledger.record(survives(TrialSpec(4, 1, {}, {}, 9)), snapshot="")
+        assert pace.room(8, 4) == 0  # it has just been looked at
+        monkeypatch.setattr(_next_trials, "_LOOK_EVERY_S", 0.0)
+        ledger.enter("all_trials", owner=None)
+    assert pace.room(9, 4) == sys.maxsize
+    (tmp_path / "ledger.sqlite").write_bytes(b"no database" * 99)
+    assert pace.room(9, 4) == sys.maxsize
 
 
 def test_fewer_trials_than_workers_need_fewer_workers(run):

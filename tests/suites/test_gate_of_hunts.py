@@ -16,6 +16,7 @@ from crashhunt.suites import Gate, GateVersion, RunRequest, _gate
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
 SEED = 4
+OTHER = {"base": "head", "head": "base"}
 
 
 def gate(tmp_path, names=("a", "b", "c"), *, most=10, **more):
@@ -32,7 +33,8 @@ def ran(monkeypatch):
     """Hunts run at once: BASE crashes in the trials in `crashes[0]`, HEAD in those in `crashes[1]`."""
     calls, crashes = [], [set(), set()]
 
-    def run_all(folders, slots, *, watch, machine, is_enough, environments):
+    def run_all(folders, slots, *, watch, machine, is_enough, environments, partners):
+        assert all(partners[folder] == folder.with_name(OTHER[folder.name]) for folder in folders)
         for folder in folders:
             asked = RunRequest.read(folder / layout.REQUEST).request
             calls.append((folder, slots, machine, asked))

@@ -67,6 +67,10 @@ def test_the_last_hunts_share_the_slots_and_have_the_options_of_the_machine(fold
     assert [(name, run["parallel"]) for name, run, *_ in calls] == [("a", 1), ("b", 1), ("c", 1)]
     assert all(run["executor"] == "fresh" for _, run, *_ in calls)
     assert [environment for *_, environment, _ in calls] == [None, {"WHO": "b"}, None]
+    assert [run.get("partner") for _, run, *_ in calls] == [None] * 3
+    calls.clear()
+    run_all(folders[:2], 2, partners={folders[0]: folders[1]})
+    assert [run.get("partner") for _, run, *_ in calls] == [str(folders[1]), None]
     calls.clear()
     run_all(folders, 8)
     assert [(name, run["parallel"]) for name, run, *_ in calls] == [("a", 2), ("b", 3), ("c", 3)]

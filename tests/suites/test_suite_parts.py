@@ -88,9 +88,12 @@ def test_process_of_a_hunt_waits_for_an_earlier_one(hunt, monkeypatch, capsys):
     _processes._main(hunt, {"parallel": 2}, 0)
     ((given, more),) = made
     assert given == (hunt, "scenario", {"parallel": 2})
-    assert (more["command"], more["imported"]) == (["crashhunt", "suite", "run"], 7)
+    assert (more["command"], more["imported"], more["partner"]) == (["crashhunt", "suite", "run"], 7, None)
     assert slept == [0.5, 0.5]
     assert capsys.readouterr().out == "described report\n"
+    busy[:] = [False]
+    _processes._main(hunt, {"parallel": 2, "partner": "/other"}, 0)
+    assert (made[-1][0], made[-1][1]["partner"]) == (given, Path("/other"))
     monkeypatch.setattr(_processes, "_BUSY_S", -1.0)
     busy[:] = [True]
     _processes._main(hunt, {}, 0)
