@@ -385,9 +385,10 @@ def stale_equivalents(listed: dict[tuple[str, str], str]) -> list[str]:
     found: set[tuple[str, str]] = set()
     for module in {module for module, _ in listed}:
         source = (ROOT / module).read_text(encoding="utf-8") if (ROOT / module).is_file() else ""
-        changed, lines = {diff.partition("\n")[0][1:] for _, diff in listed}, source.splitlines()
         # A diff is slow to make, so it is made of lines that are listed only.
-        found |= {(module, slip.diff(source)) for slip in find_slips(source) if lines[slip.line - 1] in changed}
+        removed = {line[1:] for of, diff in listed if of == module for line in diff.split("\n") if line.startswith("-")}
+        slips = (slip for slip in find_slips(source) if not removed.isdisjoint(slip.lines(source)))
+        found |= {(module, slip.diff(source)) for slip in slips}
     return sorted(module for module, diff in listed if (module, diff) not in found)
 
 

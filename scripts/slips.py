@@ -64,6 +64,13 @@ class Slip:
         """Return the source with the slip."""
         return source[: self.start] + self.text + source[self.end :]
 
+    def lines(self, source: str) -> list[str]:
+        """Return the lines of the source that the slip changes.
+
+        A diff of elements that are swapped on neighbouring lines may remove any of these lines.
+        """
+        return source.splitlines()[self.line - 1 : source.count("\n", 0, self.end) + 1]
+
     def diff(self, source: str) -> str:
         """Return the lines before and after, as a diff without its head."""
         lines = difflib.unified_diff(source.splitlines(), self.apply(source).splitlines(), n=0, lineterm="")

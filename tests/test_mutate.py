@@ -41,6 +41,17 @@ def test_equivalent_slip_of_changed_code_is_stale(mutate):
     assert mutate.stale_equivalents(gone) == ["crashhunt/errors.py", "crashhunt/no_such_module.py"]
 
 
+def test_swap_of_elements_on_neighbouring_lines_can_be_listed(mutate, tmp_path, monkeypatch):
+    source = "def pair(a, b):\n    return (\n        a + 1,\n        b,\n        a,\n    )\n"
+    (tmp_path / "pair.py").write_text(source)
+    monkeypatch.setattr(mutate, "ROOT", tmp_path)
+    diffs = [slip.diff(source) for slip in mutate.find_slips(source) if "swapped" in slip.what]
+    assert diffs[0] == "+        b,\n-        b,"  # the slip begins at the line above
+    for diff in diffs:
+        assert mutate.stale_equivalents({("pair.py", diff): "reason"}) == []
+    assert mutate.stale_equivalents({("pair.py", "+        a,\n-        b,"): "reason"}) == ["pair.py"]
+
+
 def test_tests_that_start_processes_run_after_those_that_reach_the_line(mutate):
     source = "def double(x):\n    return 2 * x\n"
     target = mutate.Target(package="p", file=Path("crashhunt/p.py"), source=source, tests=())
