@@ -529,7 +529,10 @@ bool publish_movement(Traffic *self, Actor &actor) {
         PyObject_SetAttr(object, s_lane, PyList_GET_ITEM(self->network->objects, actor.lane))) {
         return false;
     }
-    if (actor.changes_lanes && !set(object, s_timer, as_python(actor.timer))) {
+    // After an error, an actor may have reset its timer since its last movement.
+    const bool is_whole = actor.timer.is_whole && !actor.timer.is_numpy;
+    if (actor.changes_lanes &&
+        !set(object, s_timer, is_whole ? PyLong_FromDouble(actor.timer.value) : as_python(actor.timer))) {
         return false;
     }
     return true;
@@ -559,7 +562,6 @@ bool publish_all(Traffic *self, bool moved) {
         if (!actor.moves) {
             continue;
         }
-        actor.reset_timer = actor.reset_timer && !moved; // a movement has increased the timer since
         if (!publish_decision(self, actor) || (moved && !publish_movement(self, actor))) {
             return false;
         }

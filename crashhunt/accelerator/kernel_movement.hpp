@@ -145,6 +145,7 @@ void move(Actor &actor, double dt) {
     actor.moved = true;
     if (actor.changes_lanes) {
         actor.timer = {actor.timer.value + dt, actor.timer.is_numpy, false};
+        actor.reset_timer = false;
     }
     clip_actions(actor);
     double slip = call(ARCTAN, 1 / 2. * call(TAN, actor.steering.value));

@@ -154,7 +154,7 @@ void change_lane_policy(Traffic *self, size_t row) {
     if (!(actor.parameters.lane_change_delay < actor.timer.value)) {
         return;
     }
-    actor.timer = Number();
+    actor.timer = {0, false, true};
     actor.reset_timer = true;
     const Lane &lane = network.lane(actor.lane);
     for (int number : {lane.left, lane.right}) {

@@ -162,6 +162,26 @@ def environment(**config):
     return env
 
 
+@pytest.mark.parametrize("timer", [0.9, 5.0])  # of the second sub-step and of the first
+def test_timer_that_begins_again_in_the_sub_step_of_an_error_is_a_whole_number(timer):
+    """The last vehicle leaves its lane after the other one has thought of changing lanes in the same sub-step."""
+
+    def drive():
+        env = environment()
+        thinks, leaves = env.road.vehicles[1], env.road.vehicles[-1]
+        thinks.timer = timer
+        leaves.position[0], leaves.speed = 9998.0 - 4.0 * (timer < 1), 20.0
+        leaves.target_speed, leaves.route = 20.0, [leaves.lane_index, ("1", "2", 0)]
+        with pytest.raises(KeyError):  # the road has no continuation
+            env.step(1)
+        return state(env.road), thinks.timer
+
+    slow, number = drive()
+    assert (number, type(number)) == (0, int)
+    assert switch_on() == ""
+    assert drive() == (slow, number)
+
+
 def shown(features, change=lambda env: None):
     found = []
     for fast in (False, True):
