@@ -109,6 +109,16 @@ def is_emptied() -> bool:
     return __name__ not in sys.modules
 
 
+def restore_modules() -> None:
+    """Restore ``sys.modules`` if it has been emptied, so that crashhunt and NumPy can import again.
+
+    Modules that were imported again since then may be broken copies, such as a module ``sys`` without attributes.
+    """
+    if is_emptied() and _originals:
+        sys.modules.update(_originals[0].modules)
+        _originals[0].was_emptied = True
+
+
 def message_of_error(error: BaseException) -> str:
     """Return the message of an exception, even if its class fails to produce it; a long message is cut."""
     return message_of(error)
@@ -168,11 +178,13 @@ class _Originals:
     """The functions and limits of the process before any trial ran."""
 
     packages: frozenset[str]
+    modules: dict[str, ModuleType]
     functions: dict[str, dict[str, object]]
     classes: dict[str, dict[type, dict[str, object]]]
     used: dict[str, dict[str, object]]
     recursion_limit: int
     limits: dict[str, int]
+    was_emptied: bool = False
 
 
 _originals: list[_Originals] = []
@@ -194,6 +206,7 @@ def record_originals() -> None:
     _originals[:] = [
         _Originals(
             packages=packages,
+            modules=dict(sys.modules),
             functions=functions,
             classes=classes,
             used={name: _contents_of(name, sys.modules[name])[0] for name in _USED_FUNCTIONS if name in sys.modules},
@@ -225,6 +238,8 @@ def is_tampered() -> bool:
     if not _originals:
         return False
     before = _originals[0]
+    if before.was_emptied:
+        return True
     for name, held in before.used.items():
         now = vars(sys.modules[name]) if name in sys.modules else {}
         if any(now.get(key) is not value and _is_users_or_nothing(now.get(key)) for key, value in held.items()):
@@ -577,12 +592,14 @@ class Ending:
 
     def _end(self, outcome: Outcome, **evidence: Any) -> TrialResult:
         """End the episode, and let all observers add their data to the result."""
+        restore_modules()
         # A user's simulator that has failed may fail again. The last scene of crashhunt's own may not have been read.
         scene = self._scene if self._scene is None or self._look is not None else self.simulator.scene()
         time_s = 0.0 if scene is None else scene.time_s
         return self._add(TrialResult(self.spec, outcome, steps=self.steps, sim_time_s=time_s, **evidence))
 
     def _add(self, result: TrialResult) -> TrialResult:
+        restore_modules()  # otherwise, an observer that fails would leave a result without its digest
         for tell in self._on_end:
             result = tell(result)
         self.result = result

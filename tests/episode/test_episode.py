@@ -11,6 +11,7 @@ import pytest
 
 from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.episode import Episode, Nearness, Observer, Recorder, failure_of, run_episode
+from crashhunt.episode._failures import is_tampered, record_originals
 from crashhunt.errors import RecorderError, SimulatorError
 from crashhunt.oracles import Overlap, ReportedCollision
 from crashhunt.recording import BlackBox
@@ -379,6 +380,43 @@ def test_who_empties_sys_modules_is_to_blame_for_what_fails_next(tmp_path):
     assert (outcome, steps) == ("agent_error", "4")
     # What fails is the toy, or before it NumPy, where this process has not used yet what NumPy imports later.
     assert message.startswith("the code has emptied sys.modules, upon which this fails: ")
+
+
+@pytest.mark.parametrize("arguments", [{"fail_at_step": 5}, {}])
+def test_trial_that_empties_sys_modules_has_the_digest_and_the_measures_of_its_steps(tmp_path, arguments):
+    class Empties(Driver):
+        def act(self, observation):
+            if self.steps == 3:
+                sys.modules.clear()
+            return super().act(observation)
+
+    class Imports(Observer):
+        def end(self, result):
+            import warnings  # as NumPy does where it has not been used before
+
+            assert warnings
+            return result
+
+    def facts(result):
+        return f"{result.steps}|{result.digest}|{result.closest}|{is_tampered()}"
+
+    options = {"arguments": arguments, "steps": 6, "observers": (Imports(),)}
+    plain = run(tmp_path, **options)
+    receive, send = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            record_originals()
+            result = run(tmp_path, agent=Empties(30.0), **options)
+            os.write(send, facts(result).encode())
+        finally:
+            os._exit(0)
+    os.close(send)
+    with os.fdopen(receive) as pipe:
+        found = pipe.read()
+    os.waitpid(child, 0)
+    assert found == facts(plain).replace("False", "True")
+    assert plain.digest
 
 
 @pytest.mark.parametrize(
