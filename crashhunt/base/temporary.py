@@ -24,6 +24,7 @@ The page `reference/files.md` of the guide lists every temporary file.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import importlib
 import os
@@ -47,6 +48,7 @@ __all__ = [
     "OwnerProcess",
     "TemporaryFolder",
     "has_ended",
+    "new_folder",
     "owner_in",
     "record_shared_memory",
     "release_shared_memory",
@@ -61,6 +63,8 @@ __all__ = [
     "temporary_name",
     "this_process",
 ]
+
+_WRITTEN_MEANWHILE = "another process has written there in the meantime"
 
 
 # Owners of temporary things: a name for a process that no other process on any machine shares, and whether it ended.
@@ -316,6 +320,39 @@ def temporary_beside(path: Path, *, name: str = "") -> Iterator[Path]:
             remove_scratch(target)
             if link is not None:
                 _things.end(link, removed=not _exists(target))
+
+
+@contextmanager
+def new_folder(path: Path, *, mode: int = 0o777) -> Iterator[Path]:
+    """Yield a temporary folder, which becomes the given folder at the end.
+
+    An existing folder receives the contents and stays the same folder, because it may be the current folder of the
+    user, a mount point, or the target of a link.
+
+    Args:
+        path: the final path; a folder that exists must be empty.
+        mode: permissions of the folder, if it is new.
+
+    Raises:
+        OSError: the folder cannot be written, or another process has written into it in the meantime.
+    """
+    target = path.absolute()
+    is_there = target.is_dir()
+    with temporary_beside(target / "new" if is_there else target) as building:
+        building.mkdir(mode=mode)
+        yield building
+        if is_there:
+            if any(entry.suffix != building.suffix for entry in target.iterdir()):
+                raise FileExistsError(errno.EEXIST, _WRITTEN_MEANWHILE, str(path))
+            for entry in sorted(building.iterdir()):
+                entry.rename(target / entry.name)
+            return
+        try:
+            building.rename(target)
+        except OSError as error:
+            if target.exists():
+                raise FileExistsError(errno.EEXIST, _WRITTEN_MEANWHILE, str(path)) from error
+            raise
 
 
 def temporary_name(path: Path, suffix: str = "") -> str:

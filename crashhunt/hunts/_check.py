@@ -12,7 +12,7 @@ from crashhunt.base import layout
 from crashhunt.base.codec import JsonObject, Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError
 from crashhunt.base.files import cannot_write, is_empty_folder, sync_folder, sync_tree
-from crashhunt.base.temporary import has_ended, owner_in, temporary_beside
+from crashhunt.base.temporary import has_ended, new_folder, owner_in
 from crashhunt.crashes import Bundle, read_bundle, read_params
 from crashhunt.hunts._state import find_hunts, hunt_state, is_hunt
 from crashhunt.ledger import Ledger, has_begun
@@ -421,11 +421,9 @@ def salvage(found: Checked, to: Path) -> dict[str, int]:
             if not _is_same(found, settings, to):
                 raise HuntDirectoryError("the directory exists already", fix="give a new directory", where=str(to))
             return {"trials": len(_copied_trials(found, settings)), "crashes": len(found.crashes)}
-        with temporary_beside(to) as building:
-            building.mkdir()
+        with new_folder(to) as building:
             trials = _copy(found, settings, building, to)
-            building.rename(to)
-            sync_folder(to.absolute().parent)
+        sync_folder(to.absolute().parent, to)
     except (OSError, shutil.Error) as error:
         wrong = error if not isinstance(error, shutil.Error) else OSError(0, str(error.args[0][0][2]))
         raise cannot_write(to, wrong) from error
@@ -433,7 +431,7 @@ def salvage(found: Checked, to: Path) -> dict[str, int]:
 
 
 def _copy(found: Checked, settings: HuntSettings, building: Path, to: Path) -> int:
-    """Copy all files into a temporary folder, which is renamed later; return the number of trials in it."""
+    """Copy all files into a temporary folder, which is moved later; return the number of trials in it."""
     for snapshot in intact_snapshots(found.dir):
         shutil.copytree(snapshot.path, building / layout.SNAPSHOTS / snapshot.digest)
     for name in found.crashes:

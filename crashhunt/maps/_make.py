@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import shutil
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, ScenarioError, UsageError
 from crashhunt.base.files import cannot_write, is_empty_folder, sync_tree
 from crashhunt.base.git import work_tree
-from crashhunt.base.temporary import temporary_beside, temporary_folder
+from crashhunt.base.temporary import new_folder, temporary_folder
 from crashhunt.base.text import count_of
 from crashhunt.maps._convert import NET, ConvertOptions, convert
 from crashhunt.maps._demand import ROUTES, Demand, find_demand, route_file
@@ -33,7 +34,6 @@ from crashhunt.maps._traffic_flow import RUN_S, PlainRun, calibrate
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from crashhunt.maps._source import BBox, MapSource
     from crashhunt.maps._tools import Tools
@@ -183,8 +183,7 @@ def make_scenario(
     target = directory.absolute()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with temporary_beside(target) as building:
-            building.mkdir(mode=0o755)
+        with new_folder(target, mode=0o755) as building:
             found = _build(source, options, tools, building, target, say)
             if try_out is not None:
                 say("running one trial")
@@ -192,10 +191,10 @@ def make_scenario(
                 found = replace(found, trial=trial, notes=(*found.notes, *_trial_notes(trial, found.agent)))
             _write_texts(found, options, building, target)
             sync_tree(building)
-            _put_in_place(building, target, directory)
     except OSError as error:
         raise cannot_write(directory, error) from error
-    return replace(found, folder=directory, commands=next_commands(str(directory), found.steps))
+    named = "" if target == Path.cwd() else str(directory)
+    return replace(found, folder=directory, commands=next_commands(named, found.steps))
 
 
 def _check_directory(directory: Path) -> None:
@@ -207,21 +206,6 @@ def _check_directory(directory: Path) -> None:
             raise cannot_write(directory, error) from error
         what = "exists and is not empty" if directory.is_dir() else "exists and is not a folder"
         raise HuntDirectoryError(what, fix="name another folder, or remove it", where=str(directory))
-
-
-def _put_in_place(building: Path, target: Path, directory: Path) -> None:
-    try:
-        if target.is_dir() and not target.is_symlink():
-            target.rmdir()
-        building.rename(target)
-    except OSError as error:
-        # Another process has made it in the meantime: its folder stays as it is.
-        if target.exists():
-            fix = "name another folder"
-            raise HuntDirectoryError(
-                "another process has created this folder in the meantime", fix=fix, where=str(directory)
-            ) from error
-        raise
 
 
 def _check_options(source: MapSource, options: MapOptions) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.files import is_empty_folder, sync_folder
-from crashhunt.base.temporary import temporary_beside
+from crashhunt.base.temporary import new_folder
 from crashhunt.base.text import command_line
 from crashhunt.disturbances import NONE
 from crashhunt.hunts import HuntState, hunt_state
@@ -230,11 +230,9 @@ def _run_copies(
         if to.exists() and not is_empty_folder(to):
             _require_same_request(to, request)
         else:
-            with temporary_beside(to) as building:  # one that is there has its request
-                building.mkdir()
+            with new_folder(to) as building:  # one that is there has its request
                 write_request(building, request)
-                building.rename(to)
-                sync_folder(to.absolute().parent)
+            sync_folder(to.absolute().parent, to)
     except OSError as error:
         raise HuntDirectoryError(
             f"cannot be created: {error.strerror}", fix="choose another directory", where=str(to)

@@ -23,6 +23,7 @@ from crashhunt.base.temporary import (
     OwnerProcess,
     TemporaryFolder,
     has_ended,
+    new_folder,
     owner_in,
     remove_at_once,
     remove_ended,
@@ -610,3 +611,38 @@ def test_owners_are_read_from_names():
         "1-2-aaaaaaaaaaaa-bbbbbbb",
     ):
         assert owner_in(name) is None, name
+
+
+def test_new_folder_appears_when_it_is_complete(tmp_path):
+    place = tmp_path / "place"
+    place.mkdir()
+    with new_folder(place / "made", mode=0o700) as building:
+        (building / "file").touch()
+        assert not (place / "made").exists()
+    assert [path.name for path in place.iterdir()] == ["made"]
+    assert (place / "made" / "file").exists()
+    assert (place / "made").stat().st_mode & 0o777 == 0o700
+    with pytest.raises(FileExistsError, match="another process has written there"), new_folder(place / "b"):
+        (place / "b" / "of another process").mkdir(parents=True)
+    with pytest.raises(ZeroDivisionError), new_folder(place / "c"):
+        raise ZeroDivisionError
+    assert sorted(path.name for path in place.iterdir()) == ["b", "made"]
+
+
+def test_existing_folder_stays_itself_and_receives_the_contents(tmp_path, monkeypatch):
+    place = tmp_path / "place"
+    place.mkdir()
+    monkeypatch.chdir(place)  # a user's shell would be left in a removed folder
+    before = place.stat().st_ino
+    with new_folder(Path()) as building:
+        assert building.parent == place
+        (building / "folder").mkdir()
+        (building / "folder" / "file").touch()
+        (place / f"{building.name[:-6]}0.part").mkdir()  # another process begins to write there
+        assert not (place / "folder").exists()
+    assert (place / "folder" / "file").exists()
+    assert not building.exists()
+    assert Path.cwd().stat().st_ino == before
+    with pytest.raises(FileExistsError, match="another process has written there"), new_folder(Path()) as building:
+        (building / "folder").touch()
+    assert (place / "folder").is_dir()

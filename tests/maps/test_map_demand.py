@@ -11,7 +11,7 @@ from crashhunt.base.errors import HuntDirectoryError, ScenarioError
 from crashhunt.maps import MapSource, _make
 from crashhunt.maps._demand import Demand, Route, _counted, _ego_routes, _entry_capacity, find_demand, route_file
 from crashhunt.maps._folder import arguments_of
-from crashhunt.maps._make import MadeScenario, PlainTrial, _busiest, _check_directory, _put_in_place, _thin_traffic
+from crashhunt.maps._make import MadeScenario, PlainTrial, _busiest, _check_directory, _thin_traffic
 from crashhunt.maps._network import Edge, NetworkLane, RoadNetwork
 from crashhunt.maps._traffic_flow import RUN_S, PlainRun
 
@@ -273,11 +273,3 @@ def test_folder_of_a_made_scenario_is_new_or_empty(tmp_path):
     (tmp_path / "link").symlink_to("nowhere")
     with pytest.raises(HuntDirectoryError, match="exists and is not a folder"):
         _check_directory(tmp_path / "link")
-    for name in ("one", "two", "three"):
-        (tmp_path / name).mkdir()
-    _put_in_place(tmp_path / "one", tmp_path / "two", tmp_path / "two")
-    assert not (tmp_path / "one").exists()
-    with pytest.raises(HuntDirectoryError, match="another process has created this folder"):
-        _put_in_place(tmp_path / "two", tmp_path / "empty", tmp_path / "empty")
-    with pytest.raises(OSError, match="No such file"):
-        _put_in_place(tmp_path / "gone", tmp_path / "new", tmp_path / "new")
