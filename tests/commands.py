@@ -6,6 +6,7 @@ it changes reaches the next. What it does not show is how Python starts; `Shell.
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import importlib
 import json
@@ -52,6 +53,7 @@ _WHILE_RUNNING = (
 )  # fmt: skip
 _FOR_COMMAND = {"compare": ("crashhunt.estimation", "scipy.stats")}  # the latter takes 0.8 s
 _MESSAGE = 1 << 20
+_DUMP_S = 0.5  # for a process that does not end to say where it is
 _REPOSITORY = Path(__file__).parents[1]
 
 
@@ -138,9 +140,8 @@ class Commands:
         begun = self.begin(words, folder, environment, terminal=terminal, streams=streams)
         try:
             return begun.wait(timeout_s), *begun.communicate()
-        except BaseException:
-            begun.kill()
-            begun.communicate()
+        except BaseException as error:
+            begun.abandon(error)
             raise
 
     def close(self) -> None:
@@ -189,6 +190,14 @@ class Begun(Process):
             out, err = map(_text_of, self._files)
             self._printed = out, err
         return self._printed
+
+    def abandon(self, error: BaseException) -> None:
+        """Kill it, and add to an error what it has printed, and where its threads were."""
+        self.send_signal(signal.SIGUSR1)  # which faulthandler has
+        with suppress(subprocess.TimeoutExpired):
+            self.wait(_DUMP_S)
+        self.kill()
+        error.add_note("\n".join(self.communicate()))
 
 
 def _text_of(file: IO[bytes]) -> str:
@@ -239,6 +248,7 @@ def _be_command(request: dict, typed: int, out: int, err: int) -> NoReturn:
     # The streams of this process know whether the file that they had before could seek; a terminal cannot.
     sys.stdout = open(1, "w", buffering=1, encoding="utf-8", closefd=False)  # noqa: SIM115
     sys.stderr = open(2, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
+    faulthandler.register(signal.SIGUSR1, 2)
     if request["apart"]:
         os.setsid()
     os.environ.clear()

@@ -50,6 +50,16 @@ def test_servers_outlast_a_signal_to_the_group_of_the_session(toy):
     command.communicate()
 
 
+def test_abandoned_command_reports_where_its_threads_were(toy):
+    command = toy.begin("dashboard", ".", "--no-browser", "--port", "0")
+    while not any(os.fstat(file.fileno()).st_size for file in command._files) and command.poll() is None:
+        time.sleep(0.01)  # until it serves, and says so
+    command.abandon(error := ValueError())
+    assert "most recent call first" in error.__notes__[0]
+    assert "_dashboard.py" in error.__notes__[0]
+    assert command.poll() == -signal.SIGKILL
+
+
 def test_server_of_keepers_outlasts_a_killed_process_that_asked(start_keeper, monkeypatch):
     assert start_keeper().wait(60) == 0
     _, server = _commands().pids

@@ -266,8 +266,12 @@ def ended(process: Process) -> tuple[int, str]:
     """Wait for the end of a command; return its exit code and what it said."""
     try:
         said = process.communicate(timeout=LATEST_S)[1]
-    except BaseException:
-        process.kill()
+    except BaseException as error:
+        if isinstance(process, subprocess.Popen):
+            process.kill()
+            process.communicate()  # an unclosed file would fail another test
+        else:
+            process.abandon(error)
         raise
     assert process.returncode is not None
     return process.returncode, said
@@ -282,6 +286,7 @@ def whole(tmp_path_factory, made_once):
     def make(name: str) -> Killing:
         if name not in known:
             folder = base / name / "work"
+            remove_tree(base / name)  # of a test that failed
             folder.mkdir(parents=True)
             shutil.copy(FAULTY, folder / "faulty.py")
             make = prepared_on_sumo if "SUMO" in name or name == "film" else prepared
