@@ -201,6 +201,7 @@ class Hunt:
             began=time.time(),
             done_before=len(finished),
             heartbeat=time.time(),
+            elapsed_s=0.0,
             planned=settings.trials,
             replanned=before.get("replanned") or (bool(finished) and before.get("planned") != settings.trials) or None,
             until=time.time() + settings.run.duration_s if settings.run.duration else None,

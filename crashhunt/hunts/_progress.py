@@ -405,7 +405,8 @@ class Progress:
         bar: Noted = {} if self.rate is None else {"until_rate": self.rate.noted()}
         rate: Noted = {"running_rate": self.running_rate(now=now)}
         phase: Noted = {"phase": None if self.phase is None else self.phase.to_json(), "ends_at": self.ends_at}
-        return {"heartbeat": time.time(), **audits, **nodes, **kinds, **in_vain, **bar, **phase, **rate}
+        beat: Noted = {"heartbeat": time.time(), "elapsed_s": time.monotonic() - self.began}
+        return {**beat, **audits, **nodes, **kinds, **in_vain, **bar, **phase, **rate}
 
     def about_kinds(self, *, running: bool = False) -> tuple[tuple[Group, ...] | None, float | None, int | None]:
         """Return the fields of `HuntStatus` about crash types; `running` has the same meaning as for `Kinds.groups`."""

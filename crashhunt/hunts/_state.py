@@ -178,6 +178,7 @@ State = Literal["queued", "running", "finished", "crashed", "error", "interrupte
 _HUNT_FILES = (layout.LEDGER, layout.REQUEST, layout.HUNT)  # of a hunt, or of one that is planned
 _MAX_DEPTH = 2  # of hunts below the directory of a suite
 HEARTBEAT_S = 1.0  # every so often a hunt says in its ledger that it is alive
+_HEARTBEAT_DELAY_S = 20.0  # how much later than its last heartbeat a running hunt may be
 _SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
 _STATE_BY_REASON: dict[str, State] = {
     "crash": "crashed", "distinct": "crashed", "all_trials": "finished", "no_valid_trial": "error",
@@ -349,10 +350,10 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
     alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))
     state: State = ("running" if alive else "killed") if said == "running" else _STATE_BY_REASON.get(said, "error")
     run = sum(outcomes.values())
-    planned, began = int(facts.get("planned", 0)), float(facts.get("began", 0.0))
-    until = time.time() if state == "running" and not facts.get("phase") else (last or began)
+    planned = int(facts.get("planned", 0))
     here = run - int(facts.get("done_before", 0))
-    rate = here / (until - began) if until > began and here > 0 else 0.0
+    lasted = _duration_s(facts, time.time() if state == "running" and not facts.get("phase") else last)
+    rate = here / lasted if lasted > 0 and here > 0 else 0.0
     return HuntState(
         dir=str(directory),
         state=state,
@@ -372,6 +373,24 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
         rate=facts.get("running_rate"),
         newest_kind_s=max(0.0, time.time() - newest) if (newest := facts.get("newest_kind")) is not None else None,
     )
+
+
+def _duration_s(facts: Facts, until: float | None) -> float:
+    """Return how long the last run of a hunt lasted up to a time, in s; 0 if that is unknown.
+
+    If the system's clock was set or the machine was suspended, the hunt's own measurement counts.
+
+    Args:
+        facts: facts from the hunt's ledger.
+        until: the time, in s since the epoch; None if no trial has ended.
+    """
+    began, measured = facts.get("began"), facts.get("elapsed_s")
+    if began is None or until is None:  # such as in a copy that `check --salvage` has made
+        return 0.0
+    by_clock = until - began
+    if measured is not None and not 0.0 <= by_clock <= measured + _HEARTBEAT_DELAY_S:
+        return measured
+    return by_clock
 
 
 def _phase(facts: Facts) -> dict[str, Any] | None:

@@ -111,6 +111,7 @@ class Noted(TypedDict, total=False):
         owner: the process that runs the hunt; None while no process runs it.
         began: time at which the hunt was started or resumed, in s since the epoch.
         heartbeat: time of the last sign of life of the hunt, in s since the epoch.
+        elapsed_s: duration of this run of the hunt up to that sign of life, in s, by the monotonic clock.
         done_before: number of trials that had ended at the start of this run.
         planned: number of planned trials; 0 if only the time is limited.
         replanned: whether the number of planned trials was changed after some trials had ended.
@@ -156,6 +157,7 @@ class Noted(TypedDict, total=False):
     owner: HuntOwner | None
     began: float
     heartbeat: float
+    elapsed_s: float
     done_before: int
     planned: int
     replanned: bool | None

@@ -100,7 +100,8 @@ def test_rate_of_a_hunt_that_has_ended_is_up_to_its_last_trial():
     assert (found.rate_per_s, found.seconds_left) == (0.0, None)
     queued = state({}, {}, None)
     assert (queued.state, queued.trials_planned, queued.trials_run, queued.rate_per_s) == ("queued", 0, 0, 0.0)
-    assert state({"done_before": 0, "state": "time"}, {"survived": 3}, 6.0).rate_per_s == 0.5  # began at 0
+    assert state({"began": 0.0, "state": "time"}, {"survived": 3}, 6.0).rate_per_s == 0.5
+    assert state({"done_before": 0, "state": "interrupted"}, {"survived": 3}, 6.0).rate_per_s == 0.0  # a salvaged copy
     killed = state(running(owner=None, detail="x"))
     assert (killed.state, killed.detail, killed.owner_alive, killed.seconds_left) == (
         "killed", "its process is gone", False, None,
@@ -275,3 +276,26 @@ def test_claim_removes_what_ended_processes_have_left(tmp_path):
     for folder in folders:
         assert [path.name for path in folder.glob(".000001*")] == [f".000001-collision.{here.token}"]
     assert [path.name for path in tmp_path.glob(".scratch*")] == [place.scratch.name]
+
+
+@pytest.mark.parametrize(
+    ("began", "elapsed_s", "rate"),
+    [
+        (900.0, 50.0, 7 / 50),  # up to the last trial
+        (900.0, 45.0, 7 / 50),  # the last trial ended after the last heartbeat
+        (900.0, 70.0, 7 / 50),  # the hunt ended after its last trial
+        (-6300.0, 50.0, 7 / 50),  # the clock was put forward by 2 h, or the machine was suspended
+        (8100.0, 50.0, 7 / 50),  # put back
+        (8100.0, 0.0, 0.0),
+    ],
+)
+def test_rate_does_not_depend_on_the_setting_of_the_clock(began, elapsed_s, rate):
+    for changed in ({}, {"state": "all_trials", "owner": None}):
+        phase = {"name": "confirming", "done": 0, "total": 1, "seconds_left": None}
+        facts = running(began=began, elapsed_s=elapsed_s, phase=phase) | changed
+        assert state(facts).rate_per_s == pytest.approx(rate)
+
+
+def test_rate_of_a_running_hunt_is_up_to_now_unless_the_clock_was_set():
+    assert state(running(elapsed_s=99.0)).rate_per_s == pytest.approx(7 / 100)
+    assert state(running(elapsed_s=40.0)).rate_per_s == pytest.approx(7 / 40)

@@ -449,7 +449,7 @@ def test_age_of_the_newest_type_has_trials_and_seconds():
 
 def test_ledger_records_failed_runs_and_the_phase():
     progress = Progress()
-    assert progress.noted().keys() == {"heartbeat", "phase", "ends_at", "running_rate"}
+    assert progress.noted().keys() == {"heartbeat", "elapsed_s", "phase", "ends_at", "running_rate"}
     progress.failed_steps, progress.failed = 7, [result(1, steps=3), result(2, steps=4)]
     progress.ends_at = 5.0
     progress.rate = SimpleNamespace(noted=lambda: "bar", decided_at=None)
