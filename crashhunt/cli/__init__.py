@@ -31,7 +31,7 @@ from crashhunt.cli._completion import add_completion, complete
 from crashhunt.cli._corpus import add_corpus
 from crashhunt.cli._crashes import add_crashes
 from crashhunt.cli._dashboard import add_dashboard
-from crashhunt.cli._exit_codes import INTERRUPTED
+from crashhunt.cli._exit_codes import INTERRUPTED, OUTPUT_CLOSED
 from crashhunt.cli._export import add_export
 from crashhunt.cli._gate import add_gate
 from crashhunt.cli._guide import add_guide
@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         code = _run(words)
         _flush()
     except BrokenPipeError as error:
-        code = 0
+        code = OUTPUT_CLOSED
         if _is_output_closed():
             _discard_output()
         else:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import os
 import re
 import sys
 from contextlib import contextmanager
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from _typeshed import SupportsWrite
+    from rich.console import Console
 
     from crashhunt.base.progress import Watch
     from crashhunt.crashes import Archive, Bundle
@@ -43,6 +46,7 @@ __all__ = [
     "chosen_options",
     "chosen_runs",
     "integer",
+    "make_console",
     "number",
     "opened_crash",
     "opened_hunt",
@@ -329,6 +333,24 @@ def ask_to_trust(refusal: UntrustedError, *, as_json: bool) -> bool:
 # The bar of `film`, `export` and whatever takes its time; what a hunt shows while it runs is in `report`.
 
 
+def make_console(*, stderr: bool = False, width: int | None = None) -> Console:
+    """Return a console that highlights nothing, and that raises `BrokenPipeError` if its reader has gone.
+
+    Rich would end this process with exit code 1, which is an answer of several commands.
+
+    Args:
+        stderr: whether to print to stderr.
+        width: number of columns; None for that of the terminal.
+    """
+    from rich.console import Console
+
+    class Raising(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+    return Raising(stderr=stderr, highlight=False, width=width)
+
+
 @contextmanager
 def shown_progress(what: str, *, as_json: bool) -> Iterator[Watch | None]:
     """Yield a function that shows progress in one line; the line is removed at the end, also after Ctrl-C.
@@ -337,10 +359,9 @@ def shown_progress(what: str, *, as_json: bool) -> Iterator[Watch | None]:
         what: description of the work, such as ``writing crash.mp4``.
         as_json: whether the output is JSON; in this case, no progress is shown.
     """
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
+    console = make_console(stderr=True)
     if as_json or not console.is_terminal:
         yield None
         return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = ["BAD_INPUT", "DONE", "INTERRUPTED", "NO_ANSWER", "NO_VALID_TRIAL", "THE_ANSWER_IS_NO"]
+__all__ = ["BAD_INPUT", "DONE", "INTERRUPTED", "NO_ANSWER", "NO_VALID_TRIAL", "OUTPUT_CLOSED", "THE_ANSWER_IS_NO"]
 
 DONE: Final = 0
 THE_ANSWER_IS_NO: Final = 1
@@ -13,3 +13,5 @@ NO_VALID_TRIAL: Final = 3
 NO_ANSWER: Final = 3
 INTERRUPTED: Final = 130
 """As a shell says it after Ctrl-C."""
+OUTPUT_CLOSED: Final = 141
+"""As a shell says it after SIGPIPE: neither 0 nor 1, because the reader of the output has not seen the answer."""

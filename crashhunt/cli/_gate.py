@@ -19,6 +19,7 @@ from crashhunt.cli._common import (
     add_trust,
     chosen_options,
     integer,
+    make_console,
     number,
     say,
     tell,
@@ -220,10 +221,9 @@ def _flags(words: list[str]) -> set[str]:
 @contextmanager
 def _watched(*, as_json: bool) -> Iterator[Callable[[GateProgress], None]]:
     """Yield a function that shows the progress of a gate: a changing line on a terminal, else a line each 30 s."""
-    from rich.console import Console
     from rich.status import Status
 
-    console = Console(stderr=True, highlight=False)
+    console = make_console(stderr=True)
     if console.is_terminal and not as_json:
         with Status("preparing", console=console) as status:
             yield lambda progress: status.update(_progress(progress).replace("[", r"\["))

@@ -8,7 +8,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import add_json
+from crashhunt.cli._common import add_json, make_console
 
 if TYPE_CHECKING:
     import argparse
@@ -79,10 +79,9 @@ def _listing(pages: list[Page], which: str) -> str:
 
 def _show(text: str) -> None:
     """Print Markdown in lines of readable length."""
-    from rich.console import Console
     from rich.markdown import Markdown
 
-    console = Console()
+    console = make_console()
     console.width = min(console.width, _MAX_COLUMNS)
     console.print(Markdown(text, code_theme="ansi_dark", hyperlinks=True))
 

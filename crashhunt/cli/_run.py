@@ -15,13 +15,16 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import OWN_THREAD
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import add_json, add_options, chosen_options, integer
+from crashhunt.cli._common import add_json, add_options, chosen_options, integer, make_console
 from crashhunt.cli._exit_codes import DONE, INTERRUPTED, NO_ANSWER, NO_VALID_TRIAL, THE_ANSWER_IS_NO
 from crashhunt.cli._rate import exit_code_of
 from crashhunt.plans import hunt_options
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from crashhunt.cli._common import Commands
+    from crashhunt.hunts import HuntStatus
 
 __all__ = ["add_run", "short_help"]
 
@@ -125,15 +128,16 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         )
     finally:
         waiting.cancel()
-    from rich.console import Console
-
     from crashhunt.dashboard import has_dashboard
     from crashhunt.report import Watcher, describe_hunt
 
-    console = Console(stderr=options.json, highlight=False)
+    console = make_console(stderr=options.json)
     agents = ", ".join(setup.agent for setup in hunt.settings.agents.values())
     with Watcher(console, f"crashhunt: {hunt.scenario.name}, {agents}", hunt.scenario.notes) as watcher:
-        report = hunt.run(watcher)
+        try:
+            report = hunt.run(_of_output(watcher))
+        except _OutputClosedError as error:
+            raise BrokenPipeError from error
         watcher.tell_notes()  # where there was nothing to run
     console.print(describe_hunt(report), markup=False, soft_wrap=True)
     if console.is_terminal and report.crashes and has_dashboard():
@@ -154,6 +158,25 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         return exit_code_of([report.rate.verdict])
     found = report.crashes or report.copied is not None
     return THE_ANSWER_IS_NO if found and options.fail_on_crash else DONE
+
+
+class _OutputClosedError(BaseException):
+    """The reader of the output has gone. No exception of a hunt, which would be recorded as a failure of the hunt."""
+
+
+def _of_output(watch: Callable[[HuntStatus], None]) -> Callable[[HuntStatus], None]:
+    """Return a function that shows a status, and whose errors name the output instead of the directory of the hunt."""
+
+    def show(status: HuntStatus) -> None:
+        try:
+            watch(status)
+        except BrokenPipeError as error:
+            raise _OutputClosedError from error
+        except OSError as error:
+            message = f"the output cannot be written: {error.strerror or error}"
+            raise CrashhuntError(message, fix="send it elsewhere, and run the same command again") from error
+
+    return show
 
 
 def _start_wait_notice(options: argparse.Namespace) -> threading.Timer:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import one_line, out_of
-from crashhunt.cli._common import add_json
+from crashhunt.cli._common import add_json, make_console
 from crashhunt.cli._exit_codes import BAD_INPUT, DONE
 
 if TYPE_CHECKING:
@@ -75,10 +75,8 @@ def _states(directories: list[Path]) -> list[HuntState]:
 
 def states_console(*, stderr: bool = False) -> Console:
     """Return the console for the table of states; it has 120 columns if it is not a terminal."""
-    from rich.console import Console
-
-    console = Console(stderr=stderr, highlight=False)
-    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_COLUMNS_WITHOUT_TERMINAL)
+    console = make_console(stderr=stderr)
+    return console if console.is_terminal else make_console(stderr=stderr, width=_COLUMNS_WITHOUT_TERMINAL)
 
 
 def states_table(states: list[HuntState]) -> Group:

@@ -1,12 +1,16 @@
-"""A broken pipe ends a command with 0 only where the reader of its output has gone."""
+"""A broken pipe ends a command with 141 only where the reader of its output has gone."""
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
 
 import pytest
+
+from crashhunt.cli._run import _of_output, _OutputClosedError
+from crashhunt.errors import CrashhuntError
 
 FAILS = """
 import sys
@@ -33,7 +37,7 @@ def test_broken_pipe_between_processes_is_an_error_and_one_of_the_output_is_not(
         assert "this should not happen: BrokenPipeError" in done.stderr
         assert len(done.stderr.splitlines()) == 1
     else:
-        assert (done.returncode, done.stderr) == (0, "")
+        assert (done.returncode, done.stderr) == (141, "")
 
 
 def test_closed_output_is_no_error():
@@ -71,3 +75,43 @@ def test_no_file_takes_the_descriptor_of_a_closed_standard_stream(tmp_path, clos
     assert [shown[("<&-", ">&-", "2>&-").index(name)] for name in names] == ["/dev/null"] * len(names)
     assert len(shown) == 3  # nothing else has been written into the file
     assert done.stdout == ("" if ">&-" in names else "from a child\n")
+
+
+SAYS_NO = """
+import sys
+from crashhunt import cli
+from crashhunt.cli._common import make_console
+
+cli._run = lambda _: [make_console(stderr="stderr" in sys.argv).print("worse"), 1][1]
+cli.main([])
+"""
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_unread_answer_is_neither_yes_nor_no(stream):
+    reader, output = os.pipe()
+    os.close(reader)
+    streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, stream: output}
+    done = subprocess.run([sys.executable, "-c", SAYS_NO, stream], **streams, check=False)
+    os.close(output)
+    assert done.returncode == 141
+
+
+@pytest.mark.parametrize(
+    ("raised", "wanted"),
+    [
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), None),
+        (
+            OSError(errno.ENOSPC, "No space left on device"),
+            "the output cannot be written: No space left on device; send",
+        ),
+    ],
+)
+def test_hunt_does_not_blame_its_directory_for_its_output(raised, wanted):
+    def watch(_):
+        raise raised
+
+    show = _of_output(watch)
+    with pytest.raises(_OutputClosedError if wanted is None else CrashhuntError, match=wanted):
+        show(None)
+    assert not issubclass(_OutputClosedError, Exception)  # else the ledger of the hunt would call it its failure
