@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_constructor
-from crashhunt.base.errors import BundleError, SnapshotError, UsageError
+from crashhunt.base.errors import BundleError, SnapshotError, UsageError, remedy
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree
 from crashhunt.base.git import environment_of_git
 from crashhunt.base.integrity import describe_files, digest_of_content, digest_of_data, digest_of_file
@@ -351,11 +352,17 @@ def take_snapshot(
         with temporary_beside(snapshots / layout.MANIFEST, name=f"{layout.BUILDING}{this_process().token}") as building:
             return _build(building, files, found, argument_files, scenario, settings, environment(imported))
     except OSError as error:
-        raise SnapshotError(
-            f"the snapshot cannot be made: {error.strerror or error}",
-            fix="free some space, make the file readable, or give --no-snapshot",
-            where=str(error.filename or snapshots),
-        ) from error
+        raise _cannot_make(error, snapshots) from error
+
+
+def _cannot_make(error: OSError, snapshots: Path) -> SnapshotError:
+    """Return the error for a snapshot that cannot be made, with the fix for its cause."""
+    is_limit = error.errno in (errno.EMFILE, errno.ENFILE, errno.EFBIG)
+    return SnapshotError(
+        f"the snapshot cannot be made: {error.strerror or error}",
+        fix=remedy(error) if is_limit else "free some space, make the file readable, or give --no-snapshot",
+        where=str(error.filename or snapshots),
+    )
 
 
 def _build(

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
+import errno
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import pytest
 
 from crashhunt.base.plugins import ImportedModules
-from crashhunt.snapshots._take import find_sources, git
+from crashhunt.snapshots._take import _cannot_make, find_sources, git
 
 
 def test_crashhunt_comes_along_without_the_pages_of_its_guide():
@@ -82,3 +84,12 @@ def test_zip_file_that_holds_a_module_is_copied_and_imported_from(tmp_path, monk
     assert found.files[place] == str(archive)
     assert found.paths == ["code", place]
     assert not [kept for kept in found.files if "zipped" in kept]
+
+
+@pytest.mark.parametrize(
+    ("number", "fix"),
+    [(errno.EMFILE, "raise the limit on open files (ulimit -n)"), (errno.EFBIG, "raise the limit on the size of a"),
+     (errno.ENOSPC, "free some space, make the file readable, or give --no-snapshot")],
+)  # fmt: skip
+def test_error_of_a_snapshot_names_the_fix_for_its_cause(number, fix):
+    assert fix in str(_cannot_make(OSError(number, "why", "code/agent.py"), Path("snapshots")))
