@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -43,6 +44,7 @@ __all__ = ["FreshProcessExecutor", "SharedExecutors", "run_alone", "snapshot_exe
 
 _LOOK_EVERY_S = 0.01  # starting one takes thirty times as long
 _DAMAGED_EXIT_CODE = 79  # the exit code of a process of crashhunt 0.2 and before whose trial damaged it
+_FULL_BYTES = 1 << 20  # with less free space, a recording cannot be made
 _ESCAPE_S = 60.0  # for what is found out about a crash after its own trial has ended
 
 
@@ -165,13 +167,7 @@ class FreshProcessExecutor:
             answer: Answer = json.loads(running.answer.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             if exit_code > 0 and where_it_is(scratch, spec.number) is None:
-                log = self._log(spec.number)
-                lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-                raise WorkerError(
-                    f"the process of trial {spec.number} could not start: {lines[-1] if lines else exit_code}",
-                    fix="read its log",
-                    where=str(log),
-                ) from None
+                raise _not_started(spec.number, self._log(spec.number), exit_code) from None
             if exit_code == _DAMAGED_EXIT_CODE:
                 return damaged(spec, scratch, "the process could not report the result, as it is damaged")
             return self._account_for_end(running, exit_code)
@@ -372,3 +368,22 @@ class _Shared:
         except Exception as error:
             self._error = error
             raise
+
+
+def _not_started(number: int, log: Path, exit_code: int) -> WorkerError:
+    """Return the error for a trial whose process ended before the trial began.
+
+    Args:
+        number: number of the trial.
+        log: file with the output of the process, which is empty if the disk is full.
+        exit_code: exit code of the process.
+    """
+    what = f"the process of trial {number} could not start"
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    if lines:
+        return WorkerError(f"{what}: {lines[-1]}", fix="read its log", where=str(log))
+    if shutil.disk_usage(log.parent).free < _FULL_BYTES:
+        fix = "free some space there, or set TMPDIR to a folder on another disk"
+        return WorkerError(f"{what}: the disk is full", fix=fix, where=str(log.parent))
+    fix = "run the same command again"
+    return WorkerError(f"{what}: it exited with {exit_code} without output", fix=fix, where=str(log.parent))

@@ -606,3 +606,17 @@ def test_pool_starts_no_more_supervisors_than_it_has_slots(pool):
     pool._link.ready = True
     pool._assign_trials()
     assert forked == [1, 2, 3, 4]  # those that have retired hold no slot
+
+
+@pytest.mark.parametrize(
+    ("free", "said"),
+    [
+        (1000, "could not start: the disk is full; free some space there, or set TMPDIR to a folder on another disk"),
+        (1 << 30, "could not start: it exited with 1 without output; run the same command again"),
+    ],
+)
+def test_process_that_could_write_nothing_is_explained_without_its_log(tmp_path, monkeypatch, free, said):
+    log = tmp_path / "start.log"
+    log.touch()
+    monkeypatch.setattr(_fresh.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
+    assert str(_fresh._not_started(3, log, 1)) == f"{tmp_path}: the process of trial 3 {said}"
