@@ -53,7 +53,7 @@ _WHILE_RUNNING = (
 )  # fmt: skip
 _FOR_COMMAND = {"compare": ("crashhunt.estimation", "scipy.stats")}  # the latter takes 0.8 s
 _MESSAGE = 1 << 20
-_DUMP_S = 0.5  # for a process that does not end to say where it is
+_DUMP_S = 20.0  # for a process to dump its threads and end; it takes milliseconds
 _REPOSITORY = Path(__file__).parents[1]
 
 
@@ -192,12 +192,20 @@ class Begun(Process):
         return self._printed
 
     def abandon(self, error: BaseException) -> None:
-        """Kill it, and add to an error what it has printed, and where its threads were."""
-        self.send_signal(signal.SIGUSR1)  # which faulthandler has
+        """Kill it, and add to an error what it has printed, where its threads were, and its state."""
+        state = f"state: {state_of(self.pid)}"  # a stopped process does not dump its threads
+        self.send_signal(signal.SIGUSR1)  # of which faulthandler dumps the threads, and then it ends
         with suppress(subprocess.TimeoutExpired):
             self.wait(_DUMP_S)
         self.kill()
-        error.add_note("\n".join(self.communicate()))
+        error.add_note("\n".join([*self.communicate(), state]))
+
+
+def state_of(pid: int) -> str:
+    """Return the letter for the state of a process, as in `ps`; empty if it is gone."""
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    return ""
 
 
 def _text_of(file: IO[bytes]) -> str:
@@ -248,7 +256,7 @@ def _be_command(request: dict, typed: int, out: int, err: int) -> NoReturn:
     # The streams of this process know whether the file that they had before could seek; a terminal cannot.
     sys.stdout = open(1, "w", buffering=1, encoding="utf-8", closefd=False)  # noqa: SIM115
     sys.stderr = open(2, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
-    faulthandler.register(signal.SIGUSR1, 2)
+    faulthandler.register(signal.SIGUSR1, 2, chain=True)  # and end, see `abandon`
     if request["apart"]:
         os.setsid()
     os.environ.clear()

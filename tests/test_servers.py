@@ -8,10 +8,10 @@ import subprocess
 import sys
 import time
 import types
-from pathlib import Path
 
 import pytest
 import warm
+from commands import state_of
 from conftest import _commands
 
 from crashhunt.episode._failures import _contents_of
@@ -57,7 +57,8 @@ def test_abandoned_command_reports_where_its_threads_were(toy):
     command.abandon(error := ValueError())
     assert "most recent call first" in error.__notes__[0]
     assert "_dashboard.py" in error.__notes__[0]
-    assert command.poll() == -signal.SIGKILL
+    assert error.__notes__[0].endswith(("state: S", "state: R", "state: D"))
+    assert command.poll() == -signal.SIGUSR1
 
 
 def test_server_of_keepers_outlasts_a_killed_process_that_asked(start_keeper, monkeypatch):
@@ -66,7 +67,7 @@ def test_server_of_keepers_outlasts_a_killed_process_that_asked(start_keeper, mo
     with monkeypatch.context() as patch:
         patch.setattr(warm.Process, "__init__", lambda self, words, reply: reply.close())  # as the kernel does
         os.kill(server, signal.SIGSTOP)
-        while Path(f"/proc/{server}/stat").read_text().rpartition(")")[2].split()[0] != "T":
+        while state_of(server) != "T":
             time.sleep(0.01)
         try:
             start_keeper()
