@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["add_run", "short_help"]
 
 _leave = os._exit  # which is refused to samplers, also while they are imported
+_MIN_HELP_COLUMNS = 20  # in a narrower terminal, the terminal breaks the lines
 _LONG_WAIT_S = 3.0  # after which people wonder
 
 
@@ -58,7 +59,7 @@ def short_help(parser: argparse.ArgumentParser) -> str:
         parser.prog, usage=parser.usage, description=parser.description, add_help=False,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    width = short._get_formatter()._width
+    width = max(_MIN_HELP_COLUMNS, short._get_formatter()._width)
     short.description = textwrap.fill(parser.description or "", width)
     most_used, others = short.add_argument_group("most used options"), []
     for group in parser._action_groups:

@@ -38,6 +38,13 @@ def test_short_help_names_every_option_on_two_screens(monkeypatch, width, lines)
     assert [line.strip().partition(":")[0] for line in shown if line.strip().partition(":")[0] in GROUPS] == GROUPS
 
 
+@pytest.mark.parametrize("width", [1, 2, 3])
+def test_short_help_is_shown_in_the_narrowest_terminal(monkeypatch, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    parser = run_parser()
+    assert {*re.findall(r"--[a-z-]+", short_help(parser))} == options_of(parser) - {"--help"}
+
+
 def test_full_help_describes_every_option_in_six_groups(toy):
     parser = run_parser()
     full = toy.crashhunt("run", "--help-all").out
