@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
@@ -35,6 +36,8 @@ def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Itera
         HuntDirectoryError: the file cannot be written.
     """
     _refuse_device(path)
+    if not path.name:  # the current folder, or that of the system
+        raise cannot_write(path, IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR)))
     name = temporary_name(path)
     with temporary_beside(path, name=name) if noted else nullcontext(path.with_name(name)) as temporary:
         try:

@@ -75,7 +75,7 @@ def _convert(options: argparse.Namespace) -> int:
     if options.file.suffix != suffix:
         raise UsageError(
             f"{options.file}: --as {options.form} writes a {suffix} file",
-            fix=f"name it {options.file.with_suffix(suffix)}",
+            fix=f"name it {options.file.with_suffix(suffix) if options.file.name else f'crash{suffix}'}",
         )
     write: Callable[..., Any] = write_openscenario if options.form == "openscenario" else write_commonroad
     with opened_crash(options.directory, options.crash) as (bundle, _):

@@ -15,6 +15,7 @@ from crashhunt.errors import HuntDirectoryError
     ("name", "says"),
     [
         ("a" * 300, "cannot be written: File name too long"),
+        ("/", "cannot be written: Is a directory; choose another place"),
         ("missing/file", "cannot be written: No such file or directory"),
         ("pipe", "is a device or a pipe"),
         ("/dev/null", "is a device or a pipe"),
