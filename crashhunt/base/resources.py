@@ -18,13 +18,15 @@ _NO_MEMORY_MESSAGES = (
     "cannot allocate memory",
     "unable to allocate",
 )
+_NO_THREAD_MESSAGES = ("can't start new thread", "unable to start watchdog thread")
 
 
 def limit_behind(error: BaseException) -> str:
     """Return as text the limit that caused an error, and how to raise the limit; empty if no limit is set.
 
     A limit on memory (``RLIMIT_AS``) can cause many errors: in Python, in a thread, or in a library that does not load.
-    A limit on the size of files (``RLIMIT_FSIZE``) causes an `OSError`, because Python ignores its signal.
+    A limit on the size of files (``RLIMIT_FSIZE``) causes an `OSError`, because Python ignores its signal. A limit on
+    processes (``RLIMIT_NPROC``) also counts threads.
     """
     if _is_no_memory(error) and (limit := _soft_limit(resource.RLIMIT_AS)) is not None:
         return f"the limit on memory is {limit / _MEBIBYTE:.4g} MiB: raise it with ulimit -v"
@@ -34,6 +36,9 @@ def limit_behind(error: BaseException) -> str:
         and (limit := _soft_limit(resource.RLIMIT_FSIZE)) is not None
     ):
         return f"the limit on the size of a file is {limit / _MEBIBYTE:.4g} MiB: raise it with ulimit -f"
+    is_thread = isinstance(error, RuntimeError) and str(error) in _NO_THREAD_MESSAGES
+    if is_thread and (limit := _soft_limit(resource.RLIMIT_NPROC)) is not None:
+        return f"the limit on processes and threads is {limit}: raise it with ulimit -u, or that of the container"
     return ""
 
 

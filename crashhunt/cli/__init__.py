@@ -173,7 +173,8 @@ def _explained(error: Exception) -> CrashhuntError:
         if fix := remedy(error):
             return CrashhuntError(str(error.strerror or error), fix=fix, where=str(error.filename or ""))
     if limit := limit_behind(error):
-        return CrashhuntError(f"the memory does not suffice: {type(error).__name__}", fix=limit)
+        what = "no thread could be started" if "ulimit -u" in limit else "the memory does not suffice"
+        return CrashhuntError(f"{what}: {type(error).__name__}", fix=limit)
     from crashhunt.base.exceptions import in_words
 
     frames = traceback.extract_tb(error.__traceback__)

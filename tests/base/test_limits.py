@@ -9,6 +9,7 @@ import pytest
 
 from crashhunt.base.errors import remedy
 from crashhunt.base.resources import limit_behind
+from crashhunt.cli import _explained
 from crashhunt.episode._failures import failure_of
 
 MEMORY = (
@@ -46,6 +47,15 @@ def test_limit_on_memory_is_named_where_there_is_one(limits, error):
     assert limit_behind(error) == ""
     limits[resource.RLIMIT_AS] = 1500 << 20
     assert limit_behind(error) == "the limit on memory is 1500 MiB: raise it with ulimit -v"
+
+
+@pytest.mark.parametrize("message", ["can't start new thread", "unable to start watchdog thread"])
+def test_limit_on_processes_is_named_if_no_thread_can_be_started(limits, message):
+    limits[resource.RLIMIT_NPROC] = 10
+    said = "the limit on processes and threads is 10: raise it with ulimit -u, or that of the container"
+    assert limit_behind(RuntimeError(message)) == said
+    assert str(_explained(RuntimeError(message))) == f"no thread could be started: RuntimeError; {said}"
+    assert limit_behind(ValueError(message)) == ""
 
 
 def test_limit_on_files_is_named_where_there_is_one(limits):
