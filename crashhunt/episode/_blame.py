@@ -14,6 +14,7 @@ from crashhunt.base.boundaries import Boundary, ForeignError, Party, is_ours
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, InternalError
 from crashhunt.base.exceptions import format_error, in_words, is_users
+from crashhunt.base.resources import limit_behind
 from crashhunt.base.text import count_of
 from crashhunt.oracles import Finding
 from crashhunt.simulators import RunsForeignCode
@@ -203,6 +204,6 @@ def internal_error(error: BaseException, trial: int | None = None, steps: int | 
         when = f" after {count_of(steps, 'step')}" if steps >= 0 else " while the episode was being set up"
     trial_words = "" if trial is None else f" in trial {trial}{when}"
     message = f"crashhunt itself failed{trial_words}: {in_words(error)}"
-    fault = InternalError(message, fix=_REPORT_FIX.format(_ISSUES_URL), where=where)
+    fault = InternalError(message, fix=limit_behind(error) or _REPORT_FIX.format(_ISSUES_URL), where=where)
     fault.traceback = format_error(error) or message
     return fault

@@ -10,6 +10,7 @@ import pytest
 from crashhunt.base.errors import remedy
 from crashhunt.base.resources import limit_behind
 from crashhunt.cli import _explained
+from crashhunt.episode._blame import internal_error
 from crashhunt.episode._failures import failure_of
 
 MEMORY = (
@@ -55,6 +56,7 @@ def test_limit_on_processes_is_named_if_no_thread_can_be_started(limits, message
     said = "the limit on processes and threads is 10: raise it with ulimit -u, or that of the container"
     assert limit_behind(RuntimeError(message)) == said
     assert str(_explained(RuntimeError(message))) == f"no thread could be started: RuntimeError; {said}"
+    assert internal_error(RuntimeError(message), 3).fix == said
     assert limit_behind(ValueError(message)) == ""
 
 
