@@ -104,7 +104,7 @@ def rare(found: dict[str, dict[str, float]], sampler: str) -> float:
 def table(runs: Sequence[Run]) -> str:
     """Return it as Markdown."""
     found = costs(runs)
-    known = ("random", "guided-3", "guided-2", "sobol", "cma-es", *_MARKS, "eight-constants", "smac", "turbo")
+    known = ("random", "guided-4", "sobol", "cma-es", *_MARKS, "smac", "turbo")
     samplers = [name for name in known if any(name in row for row in found.values())]
     samplers.sort(key=lambda name: ["random", "guided"].index(name) if name in ("random", "guided") else 2)
     lines = [f"| problem | one in | {' | '.join(samplers)} |", f"| --- | ---: |{' ---: |' * len(samplers)}"]

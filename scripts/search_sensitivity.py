@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CONSTANTS", "METHOD", "sensitivity_table", "write_sensitivity"]
 
-CONSTANTS = ("TRIALS", "_PARENTS", "_FAR", "_WORTHWHILE", "_PRIOR", "_NEARER", "_PATIENCE")
+CONSTANTS = ("TRIALS", "_CANDIDATES", "_FAR", "_WORTHWHILE", "_PRIOR", "_NEARER", "_PATIENCE")
 """Constants that were chosen; the eighth is `_REPEATS`, which has no effect before the first crash."""
 METHOD = ("_ANYWHERE", "_AROUND", "_NEAR", "_KEEP_SEED", "_AMBITION", "_FIRST_ODDS", "_ODDS_STEP", "_STARTS")
 """Numbers of the method that were not varied when a version was chosen."""

@@ -236,7 +236,7 @@ class Portfolio:
         self._peaks = None
         is_guided = trial.origin == _MODEL
         if is_guided:
-            self._earned += 1.0 if self._is_inherited(trial) else self._payoff(trial.score)
+            self._earned += self._own_payoff(trial)
             self._counted += 1.0
         else:
             insort(self._unguided, trial.score)
@@ -300,10 +300,14 @@ class Portfolio:
         best, last = self._known.outside([*self._best]), self._known.outside([*self._last])
         return _in_order([*last[-half:], *best[:half]])
 
-    def _is_inherited(self, trial: ScoredTrial) -> bool:
-        """Return whether a trial has its parent's seed and is no more critical: the traffic alone may explain that."""
+    def _own_payoff(self, trial: ScoredTrial) -> float:
+        """Return the payoff of a trial of the model, without what the traffic of its parent explains of it."""
+        payoff = self._payoff(trial.score)
         parent = next((one for one in self._best if one.number == trial.parent), None)
-        return parent is not None and parent.seed == trial.seed and trial.score <= parent.score
+        if parent is None or parent.seed != trial.seed or trial.score > parent.score:
+            return payoff
+        _, traffic = self._model.parameters.shares
+        return (1.0 - traffic) * payoff + traffic * min(payoff, 1.0)
 
     def _payoff(self, score: float) -> float:
         below, at_most = bisect_left(self._unguided, score), bisect_right(self._unguided, score)

@@ -98,7 +98,7 @@ class GuidedSampler(Learning):
     """Proposes trials by a model of criticality, whose share of the trials depends on its success (`Portfolio`)."""
 
     origin = "guided"
-    version = 4  # 1 excluded neighbourhoods of known crashes, 2 their basins; 3 had no mutation, 4 has no niches
+    version = 5  # 1 excluded neighbourhoods of known crashes, 3 had no mutation, 4 no niches; 5 fits ranks
 
     def _make(self, space: Space) -> Strategy:
         return Portfolio(self._cube, space, self._hunt)

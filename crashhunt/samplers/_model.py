@@ -60,12 +60,16 @@ class Process:
         self._points, self._seeds = points, seeds
         self._categorical, self._scales = categorical, scales
         self._noise, self._seeded = noise / (1.0 - noise), seeded
-        worths = _worths(scores)
-        self._target = (worths - worths.mean()) / (float(worths.std()) or 1.0)
+        ranks = _ranks(scores)
+        self._target = (ranks - ranks.mean()) / (float(ranks.std()) or 1.0)
         kernel = self._kernel(points, seeds)
         kernel[np.diag_indices(len(kernel))] += self._noise
         self._lower = np.linalg.cholesky(kernel)
-        self._half = np.linalg.solve(self._lower, self._target)
+        # The mean is estimated by generalized least squares (section 2.7). The average would be too high, because most
+        # trials are near a peak: the model would then expect high scores far from all trials.
+        target, one = np.linalg.solve(self._lower, np.column_stack([self._target, np.ones(len(points))])).T
+        self._mean = float(one @ target) / float(one @ one)
+        self._half = target - self._mean * one
         self._amplitude = max(float(self._half @ self._half) / len(points), 1e-9)
         self.likelihood = -0.5 * len(points) * math.log(self._amplitude) - float(np.log(np.diag(self._lower)).sum())
         """The logarithm of the likelihood of the scores, up to a constant."""
@@ -84,7 +88,7 @@ class Process:
         best = float((self._target if among is None else self._target[among]).max())
         half = np.linalg.solve(self._lower, self._kernel(points, seeds).T)
         spread = self._amplitude * np.maximum(1.0 + self._noise - (half**2).sum(axis=0), self._noise)
-        worth: Floats = (half.T @ self._half - best - ambition) / np.sqrt(spread)
+        worth: Floats = (self._mean + half.T @ self._half - best - ambition) / np.sqrt(spread)
         return worth
 
     def _kernel(self, points: Floats, seeds: NDArray[np.int64]) -> Floats:
@@ -95,24 +99,23 @@ class Process:
         for place in np.flatnonzero(self._categorical):
             differ = points[:, place, None] != self._points[:, place]
             squared += self._scales[place] ** 2 * differ
-        kernel: Floats = np.exp(-0.5 * squared)
+        far = np.sqrt(5.0 * squared)  # Matérn's kernel with 5/2 (equation 4.17): criticality has edges
+        kernel: Floats = (1.0 + far + far**2 / 3.0) * np.exp(-far)
         if self._seeded:
             kernel *= 1.0 - self._seeded + self._seeded * (seeds[:, None] == self._seeds)
         return kernel
 
 
-def _worths(scores: Floats) -> Floats:
-    """Return values that depend only on the order of scores, with greater differences for greater scores."""
-    order, count = np.sort(scores), len(scores)
-    below = np.searchsorted(order, scores, "left")
-    above = count - np.searchsorted(order, scores, "right")
-    worths: Floats = -np.log((above + 0.5 * (count - above - below)) / count)
-    return worths
+def _ranks(scores: Floats) -> Floats:
+    """Return the share of scores below each score; of equal scores, half count as below."""
+    order = np.sort(scores)
+    ranks: Floats = (np.searchsorted(order, scores, "left") + np.searchsorted(order, scores, "right")) / 2 / len(scores)
+    return ranks
 
 
 TRIALS = 96
-"""Trials in the process, trials in each memory, and candidates for a proposal: a solution takes about 0.2 ms."""
-_PARENTS = 12  # most critical trials whose neighbours are candidates: more are less critical, fewer are one peak
+"""Trials in the process, and trials in each memory: a solution takes about 0.2 ms."""
+_CANDIDATES = 384  # points from which a proposal is chosen: their worths take about half a millisecond
 
 # The following numbers are part of the method, and were not varied when a version was chosen.
 
@@ -188,11 +191,12 @@ class Model:
         self._process: Process | None = None
 
     def learn(self, trials: Sequence[ScoredTrial]) -> None:
-        """Replace the trials, and at growing intervals fit one of the parameters again."""
+        """Replace the trials, and fit some of the parameters again: the more, the fewer trials there are."""
         self.remember(trials)
         self._told += 1
         if self._is_ready and self._told % (1 + self._told // TRIALS) == 0:
-            self._fit()
+            for _ in range(max(1, TRIALS // len(trials))):
+                self._fit()
 
     def remember(self, trials: Sequence[ScoredTrial]) -> None:
         """Replace the trials without fitting."""
@@ -215,15 +219,13 @@ class Model:
             among: which trials are parents, and have the score to exceed; None for all.
         """
         order = np.argsort(-self._scores, kind="stable") if self._is_ready else np.empty(0, dtype=np.intp)
-        best = (order if among is None else order[among[order]])[:_PARENTS]
-        if not len(best):
+        ranked = order if among is None else order[among[order]]
+        if not len(ranked):
             return None
-        if self._process is None:
-            self._process = self._with(self.parameters)
-        points, places, kept = self._candidates(self._points[best], rng)
-        parents = best[places]
+        points, places, kept = self._candidates(self._points[ranked], rng)
+        parents = ranked[places]
         seeds = np.where(kept, self._seeds[parents], -1)
-        worth = self._process.worth(self._cube.values(points), seeds, _AMBITION * float(rng.random()), among)
+        worth = self._fitted().worth(self._cube.values(points), seeds, _AMBITION * float(rng.random()), among)
         if excluded is not None:
             worth[excluded(points, seeds)] = -np.inf
         chosen = int(np.argmax(worth))
@@ -251,10 +253,18 @@ class Model:
             seeded=seeded,
         )
 
+    def _fitted(self) -> Process:
+        """Return the process with the present parameters."""
+        if self._process is None:
+            self._process = self._with(self.parameters)
+        return self._process
+
     def _fit(self) -> None:
         """Compare one parameter with its two neighbours, and keep the value with the greatest likelihood."""
-        tried = [self.parameters, *(self.parameters.stepped(self._turn, by) for by in (-1, 1))]
-        self.parameters = max(tried, key=lambda one: self._with(one).likelihood + one.log_prior)
+        for tried in [self.parameters.stepped(self._turn, by) for by in (-1, 1)]:
+            process = self._with(tried)
+            if process.likelihood + tried.log_prior > self._fitted().likelihood + self.parameters.log_prior:
+                self.parameters, self._process = tried, process
         self._turn += 1
 
     def _candidates(
@@ -264,20 +274,24 @@ class Model:
 
         A sixth is anywhere, a third around all parents, and half near one parent, which is drawn by its rank (Zipf
         1949).
+
+        Args:
+            known: points of the trials, from the most to the least critical one.
+            rng: source of the candidates.
         """
-        shape, categorical = (TRIALS, self._cube.dimensions), self._cube.categorical
+        shape, categorical = (_CANDIDATES, self._cube.dimensions), self._cube.categorical
         energy = np.cumsum(1.0 / (1.0 + np.arange(len(known))))
-        places = np.searchsorted(energy / energy[-1], rng.random(TRIALS))
+        places = np.searchsorted(energy / energy[-1], rng.random(_CANDIDATES))
         places = np.minimum(places, len(known) - 1)
         centers, drawn = known[places], rng.random(shape)
-        scale = _WIDEST * (_FINEST / _WIDEST) ** rng.random((TRIALS, 1))
+        scale = _WIDEST * (_FINEST / _WIDEST) ** rng.random((_CANDIDATES, 1))
         points = np.where(categorical, drawn, reflected(centers + scale * rng.standard_normal(shape)))
-        touched = rng.random(shape) < 2.0 ** -rng.integers(0, max(1, shape[1].bit_length()), (TRIALS, 1))
-        touched[np.arange(TRIALS), rng.integers(shape[1], size=TRIALS)] = True
+        touched = rng.random(shape) < 2.0 ** -rng.integers(0, max(1, shape[1].bit_length()), (_CANDIDATES, 1))
+        touched[np.arange(_CANDIDATES), rng.integers(shape[1], size=_CANDIDATES)] = True
         points = np.where(touched, points, centers)
         around = centers.mean(axis=0) + np.maximum(centers.std(axis=0), _FINEST) * rng.standard_normal(shape)
-        others = centers[rng.integers(TRIALS, size=shape), np.arange(shape[1])]
+        others = centers[rng.integers(_CANDIDATES, size=shape), np.arange(shape[1])]
         around = np.where(categorical, others, reflected(around))
-        how = rng.integers(_ANYWHERE + _AROUND + _NEAR, size=(TRIALS, 1))
+        how = rng.integers(_ANYWHERE + _AROUND + _NEAR, size=(_CANDIDATES, 1))
         points = np.where(how < _ANYWHERE, drawn, np.where(how < _ANYWHERE + _AROUND, around, points))
-        return points, places, (rng.random(TRIALS) < _KEEP_SEED) & (how[:, 0] >= _ANYWHERE)
+        return points, places, (rng.random(_CANDIDATES) < _KEEP_SEED) & (how[:, 0] >= _ANYWHERE)

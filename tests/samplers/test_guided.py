@@ -17,17 +17,17 @@ from crashhunt.trial import Outcome, TrialResult
 SPACE = {("ego", name): Range(0.0, 1.0) for name in "xy"}
 PLACES = np.random.default_rng(1).random((400, 2))
 ORDER = (
-    "rhhhhrMMMMrMMMMrMMMhrMhMMrhhhMrMMhMrMhhMrMhMMrMMMhrhMhhrhMMMrMMMhrhMMhrMMhhrhhMhrhhhMrMMMMrhhhhrhMhMrMhhMrMhhM"
-    "rhMhMrhMhMrMhMhrhMhhrMhMhrMhhMrhMhhrhMMMrhhMMrhhhh"
+    "rhhhhrMMhMrMMhMrhhhhrMhMMrhMMhrMhhMrhhhhrMMMMrMMMMrMMMMrhMMMrMMMhrhMMhrMMhhrhhMhrhMhMrMMMMrhMhMrhMhMrMhhMrMhhM"
+    "rhMhMrhMhMrMhMhrhMhMrMhMhrMhhMrhMhhrhMMMrhhMMrhhhh"
 )
 """The origin of each trial: r is random, h the even search, M the model."""
 EXAMPLES = (
-    (6, 1, 1, 3, "c", 0.35003863053, 47.0814476883),
-    (13, 8, 8, 6, "b", 0.14819216898, 17.4128919538),
-    (39, 30, 34, 6, "b", 0.33519234336, 28.8394060547),
-    (62, 30, 61, 7, "b", 0.31274574022, 42.4865864113),
-    (99, 30, 39, 7, "b", 0.36246307975, 36.2970844294),
-    (131, 30, 41, 6, "b", 0.3514011571, 26.6610039363),
+    (6, 1, 1, 2, "c", 0.140904965848, 19.907727678),
+    (23, 10, 12, 3, "b", 0.252606461152, 36.3482439369),
+    (44, 10, 34, 5, "b", 0.309534205846, 30.0550818037),
+    (72, 57, 57, 6, "b", 0.280770520203, 26.5331487658),
+    (104, 101, 101, 6, "b", 0.29252860552, 30.614367232),
+    (131, 101, 106, 6, "b", 0.292464964451, 34.1304091916),
 )
 """Number, seed, parent and arguments of some trials of the model."""
 
@@ -128,19 +128,25 @@ def test_where_all_trials_are_as_critical_there_is_no_peak_that_is_worth_a_trial
     assert share_of_the_model(portfolio_told(*[("random", 0.0)] * 40, ("random", 0.1)), 41) > 0.5
 
 
-@pytest.mark.parametrize(("name", "version"), [("guided", 4), ("mutation", 2), ("cross-entropy", 2), ("cma-es", 2)])
+@pytest.mark.parametrize(("name", "version"), [("guided", 5), ("mutation", 2), ("cross-entropy", 2), ("cma-es", 2)])
 def test_hunts_of_another_version_are_recognized(name, version):
     assert NamedSampler(name, SPACE, points=4).version == version
 
 
-def test_traffic_of_the_parent_does_not_count_as_payoff_of_the_model():
-    def earned(score, seed):
+def test_traffic_of_the_parent_does_not_count_as_payoff_as_far_as_it_explains_danger():
+    def earned(score, seed, odds=-2.0):
         made = portfolio_told(*RISING)
+        made._model.parameters = made._model.parameters._replace(seeded=odds)
         made.tell(ScoredTrial(100, PLACES[100], seed, score, "model", parent=99))
         return made._earned - 2.0
 
-    assert earned(0.985, 99) == 1.0
-    assert earned(0.985, 100) == pytest.approx(math.log(101 / 1.5))
+    payoff = math.log(101 / 1.5)
+    assert earned(0.985, 99, odds=0.0) == pytest.approx(0.5 * payoff + 0.5)
+    assert earned(0.985, 99, odds=9.0) == pytest.approx(1.0, abs=0.02)
+    assert earned(0.99, 99, odds=9.0) == pytest.approx(1.0, abs=0.02)  # as critical as its parent
+    assert earned(0.985, 99, odds=-9.0) == pytest.approx(payoff, abs=0.02)
+    assert earned(0.005, 99, odds=9.0) == earned(0.005, 99, odds=-9.0) == pytest.approx(math.log(101 / 99.5))
+    assert earned(0.985, 100) == pytest.approx(payoff)
     assert earned(0.995, 99) == pytest.approx(math.log(101 / 0.5))
 
 
@@ -201,7 +207,9 @@ def test_without_a_type_a_crash_is_new_where_none_is_known_near_to_it():
 
 
 def test_nothing_keeps_the_traffic_of_a_crash_that_is_known():
-    made = portfolio_told(*[("random", 0.6 if number == 7 else 0.005 * number) for number in range(40)])
+    made = portfolio_told(
+        *[("random", 0.6 - 0.4 * float(np.linalg.norm(PLACES[number] - PLACES[7]))) for number in range(40)]
+    )
     assert 7 in {draft.seed for draft in proposals(made, 40)}
     made.tell(ScoredTrial(40, np.clip(PLACES[7] + 0.4, 0.0, 1.0), 7, 1.0, "model", parent=7, kind="rear end"))
     made.tell(ScoredTrial(41, PLACES[7] + 0.05, 7, 0.9, "model", parent=7))  # which was under way

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crashhunt.samplers import Cube
-from crashhunt.samplers._model import TRIALS, Model, Process, _Parameters
+from crashhunt.samplers._model import TRIALS, Model, Process, _Parameters, _ranks
 from crashhunt.samplers._strategy import ScoredTrial
 from crashhunt.space import Choice, Range
 
@@ -39,6 +39,31 @@ def test_only_the_order_of_scores_counts():
     assert process(points, scores).worth(*asked) == pytest.approx(process(points, scores**5).worth(*asked))
 
 
+def test_score_of_a_trial_is_the_share_that_is_below_it_and_half_of_its_equals():
+    assert _ranks(np.array([0.0, 0.9, 0.0, 0.5])).tolist() == [0.25, 0.875, 0.25, 0.625]
+
+
+def test_many_trials_at_a_peak_do_not_raise_what_is_expected_far_away():
+    far = np.array([[-20.0]]), np.array([-1]), 0.0
+
+    def expected(peak):
+        """In units of the ranks, of which the least is 0 here, and the greatest is 1."""
+        points, scores = [[4.0], [8.0], [12.0], *([0.001 * place] for place in range(peak))], [0.0] * 3 + [0.9] * peak
+        known = process(points, scores)
+        low, high = known._target.min(), known._target.max()
+        assert known.worth(*far)[0] < 0
+        return (known._mean - low) / (high - low)
+
+    assert expected(1) == pytest.approx(0.25, abs=0.01)
+    assert expected(60) == pytest.approx(0.25, abs=0.02)
+
+
+def test_kernel_is_that_of_matern_with_five_halves():
+    known = process([[0.0]], [0.5], scales=np.ones(1))
+    found = known._kernel(np.array([[0.0], [1.0], [2.0]]), np.full(3, -1))[:, 0]
+    assert found == pytest.approx([1.0, 0.523994, 0.138660], abs=1e-6)
+
+
 def test_the_seed_of_a_dangerous_trial_is_worth_more_than_that_of_a_harmless_one():
     known = process([[0.0], [0.3], [0.5]], [0.1, 0.9, 0.2], seeds=[7, 8, 9], seeded=0.8)
     kept, other = known.worth(np.array([[0.33]] * 2), np.array([8, 7]), 0.3)
@@ -56,8 +81,8 @@ def test_a_value_of_a_choice_is_like_itself_and_unlike_all_others():
     assert cube.values(np.array([[0.5, 0.5], [1.0, 0.2]])).tolist() == [[1.0, 0.5], [2.0, 0.2]]
 
 
-def trials(danger_of, count, seeds=None):
-    rng = np.random.default_rng(3)
+def trials(danger_of, count, seeds=None, drawn_by=3):
+    rng = np.random.default_rng(drawn_by)
     for number in range(count):
         point = rng.random(2)
         yield ScoredTrial(number, point, number if seeds is None else number % seeds, danger_of(point, number))
@@ -102,6 +127,14 @@ def test_a_fit_with_much_noise_is_left_for_short_lengths_without_noise():
     assert model.parameters.lengths[0] < -1
 
 
+def test_the_fewer_trials_there_are_the_more_parameters_are_fitted_after_each():
+    model, known = Model(PLANE), [*trials(lambda point, _: float(point[0]), TRIALS)]
+    for count, fitted in ((3, 32), (10, 9), (47, 2), (49, 1), (TRIALS, 1)):
+        before = model._turn
+        model.learn(known[:count])
+        assert model._turn - before == fitted
+
+
 def test_shares_stay_between_half_a_value_of_an_argument_and_the_rest():
     for odds, share in ((-50.0, 0.5 / TRIALS), (0.0, 0.5), (50.0, 1.0 - 0.5 / TRIALS)):
         assert _Parameters(np.zeros(2), odds, odds).shares == pytest.approx((share, share))
@@ -133,18 +166,21 @@ def test_a_model_climbs_another_peak_where_only_its_trials_are_parents():
     def two(point, _):
         return float(max(0.9 - np.linalg.norm(point - 0.8), 0.6 - 2 * np.linalg.norm(point - 0.2)))
 
-    model = model_of([*trials(two, 60)])
-    around = np.array([np.linalg.norm(trial.point - 0.2) < 0.3 for trial in model.trials])
-    drafts = [
-        model.propose(
-            np.random.default_rng(number), lambda points, _: np.linalg.norm(points - 0.2, axis=1) > 0.3, around
-        )
-        for number in range(20)
-    ]
-    assert {draft.parent for draft in drafts} <= {
-        trial.number for trial, near in zip(model.trials, around, strict=True) if near
-    }
-    assert np.median([np.linalg.norm(draft.point - 0.2) for draft in drafts]) < 0.2
+    away = []
+    for drawn_by in range(4):
+        model = model_of([*trials(two, 60, drawn_by=drawn_by)])
+        around = np.array([np.linalg.norm(trial.point - 0.2) < 0.3 for trial in model.trials])
+        drafts = [
+            model.propose(
+                np.random.default_rng(number), lambda points, _: np.linalg.norm(points - 0.2, axis=1) > 0.3, around
+            )
+            for number in range(20)
+        ]
+        assert {draft.parent for draft in drafts} <= {
+            trial.number for trial, near in zip(model.trials, around, strict=True) if near
+        }
+        away += [np.linalg.norm(draft.point - 0.2) for draft in drafts]
+    assert np.median(away) < 0.15  # 0.21 of points that are drawn at random around the peak
     assert model.propose(np.random.default_rng(1), None, np.zeros(60, dtype=bool)) is None
 
 
@@ -157,6 +193,7 @@ def test_best_score_to_exceed_is_that_of_the_given_trials():
 def test_what_is_most_dangerous_has_most_neighbours_and_each_candidate_is_one_of_its_parent():
     known = np.array([np.full(2, (place + 0.5) / 12) for place in range(12)])
     points, places, kept = Model(PLANE)._candidates(known, np.random.default_rng(1))
+    assert points.shape == (384, 2)
     assert places.mean() < 5
     away = np.abs(points - known[places]).min(axis=1)
     assert (away < 1e-12).mean() > 0.1  # one of two arguments is as its parent's
