@@ -19,6 +19,7 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from crashhunt.samplers._strategy import Draft, reflected
 
@@ -67,7 +68,7 @@ class Process:
         self._lower = np.linalg.cholesky(kernel)
         # The mean is estimated by generalized least squares (section 2.7). The average would be too high, because most
         # trials are near a peak: the model would then expect high scores far from all trials.
-        target, one = np.linalg.solve(self._lower, np.column_stack([self._target, np.ones(len(points))])).T
+        target, one = self._solved(np.column_stack([self._target, np.ones(len(points))])).T
         self._mean = float(one @ target) / float(one @ one)
         self._half = target - self._mean * one
         self._amplitude = max(float(self._half @ self._half) / len(points), 1e-9)
@@ -86,10 +87,14 @@ class Process:
             among: of which trials the best score is; None for all.
         """
         best = float((self._target if among is None else self._target[among]).max())
-        half = np.linalg.solve(self._lower, self._kernel(points, seeds).T)
+        half = self._solved(self._kernel(points, seeds).T)
         spread = self._amplitude * np.maximum(1.0 + self._noise - (half**2).sum(axis=0), self._noise)
         worth: Floats = (self._mean + half.T @ self._half - best - ambition) / np.sqrt(spread)
         return worth
+
+    def _solved(self, right: Floats) -> Floats:
+        solved: Floats = solve_triangular(self._lower, right, lower=True, check_finite=False)
+        return solved
 
     def _kernel(self, points: Floats, seeds: NDArray[np.int64]) -> Floats:
         numbers = ~self._categorical
@@ -117,7 +122,7 @@ TRIALS = 96
 """Trials in the process, and trials in each memory: a solution takes about 0.2 ms."""
 _CANDIDATES = 384  # points from which a proposal is chosen: their worths take about half a millisecond
 
-# The following numbers are part of the method, and were not varied when a version was chosen.
+# The following numbers are part of the method. None was changed when a version was chosen.
 
 _ANYWHERE, _AROUND, _NEAR = 1, 2, 3  # odds of candidates: anywhere, around all parents, near one parent
 _KEEP_SEED = 0.5  # probability that a candidate keeps the seed of its parent: a fair coin
