@@ -22,7 +22,7 @@ __all__ = ["costs", "delay_table", "interval", "one_in", "pairs_table", "rare", 
 
 GIVE_UP = 3.0  # times what random draws need
 _LEFT, _WIDTH, _ROW, _TOP = 190, 860, 24, 74
-_LEAST, _MOST = 0.03, 5.0
+_LEAST, _MOST = 0.02, 5.0
 _MARKS = {
     "guided": ("#1f5fbf", "#7db0ff", "disc"),
     "cross-entropy": ("#b06a00", "#ffc247", "square"),
