@@ -306,11 +306,16 @@ def _figures(side: _Side) -> HuntFigures:
 
 
 def _share(hunt: HuntResults, rate: CrashRate) -> float:
-    """Return the share of trials that crashed; NaN if the number of trials depends on the crashes."""
+    """Return the share of trials that crashed; NaN if the share would be biased.
+
+    The number of trials may depend on the crashes. In rare mode, one of five trials runs without disturbances.
+    """
     if rate.estimate is not None:
         return rate.estimate
     run = hunt.settings.run
     is_whole = hunt.state.state in ("finished", "crashed") and run.keep_going and not run.distinct
+    if hunt.settings.rare:
+        return math.nan
     if rate.certain is None and is_whole and rate.trials:  # a grid has a share as well, but no interval
         return rate.crashes / rate.trials
     return math.nan

@@ -76,7 +76,7 @@ def describe_comparison(found: Comparison) -> str:
     ]
     for hunt in found.hunts:
         if hunt.why_not:
-            missing = "no interval" if hunt.interval is None else "no crash rate"
+            missing = "no interval" if np.isfinite(hunt.crash_rate) else "no crash rate"
             lines.append(f"{hunt.dir}: {missing}: {hunt.why_not}")
         if trained_on := hunt.exclusions.get("trained_on"):
             lines.append(f"{hunt.dir}: {count_training_trials(trained_on)}")

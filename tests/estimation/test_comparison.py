@@ -166,9 +166,10 @@ def invalidate(folder, *numbers):
 
 def test_hunts_in_rare_mode_are_not_paired(tmp_path):
     words = {"disturb": ("brake=0.1",)}
-    (pair,) = crashhunt.compare(
-        hunt(tmp_path / "a", 20, rare=True, **words), hunt(tmp_path / "b", 2, rare=True, **words)
-    ).pairs
+    found = crashhunt.compare(hunt(tmp_path / "a", 20, rare=True, **words), hunt(tmp_path / "b", 2, rare=True, **words))
+    (pair,) = found.pairs
+    assert [math.isnan(figures.crash_rate) for figures in found.hunts] == [True, True]
+    assert all("in rare mode" in figures.why_not for figures in found.hunts)
     assert (pair.test, pair.answer, pair.difference) == ("", "", None)
     assert "are in rare mode" in pair.verdict
 

@@ -39,9 +39,9 @@ def test_unknown_figures_are_dashes_with_the_reason():
     nothing = {"crash_rate": math.nan, "interval": None, "median_steps_to_crash": math.nan}
     _, row, reason = lines_of(figures(**nothing, median_time_to_collision_s=math.inf, why_not="no trial has ended"))
     assert re.split(r"  +", row.strip()) == ["a", "40", "10", "-", "-", "-", "-"]
-    assert reason == "a: no interval: no trial has ended"
+    assert reason == "a: no crash rate: no trial has ended"
     assert lines_of(figures(why_not="a grid", interval=None))[2] == "a: no interval: a grid"
-    assert lines_of(figures(why_not="too few"))[2] == "a: no crash rate: too few"
+    assert lines_of(figures(crash_rate=math.nan, why_not="too few"))[2] == "a: no crash rate: too few"
 
 
 def test_lines_below_the_table_tell_what_counts():
