@@ -77,7 +77,7 @@ def test_every_shipped_scenario_is_valid_and_complete(name):
         (("agents", "ego", "route"), None, ["agents.ego", "existing, route, edges"]),
         (("agents", "ego", "edges"), ["south"], ["agents.ego", "exactly one"]),
         (("agents", "ego", "action"), "telepathic", ["agents.ego.action", "'telepathic'"]),
-        (("agents", "ego", "arguments", "speed", "range"), "30:5", ["speed", "5.0:30.0"]),
+        (("agents", "ego", "arguments", "speed", "range"), "30:5", ["speed", "5:30"]),
         (("agents",), {}, ["agents", "[agents.ego]"]),
         (("observation",), {"vehicles": 0}, ["observation.vehicles", "0"]),
         (("observation",), {"features": ["smell"]}, ["observation.features", "'smell'"]),
