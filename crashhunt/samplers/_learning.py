@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from threadpoolctl import ThreadpoolController
+
 from crashhunt.samplers._guided import Portfolio
 from crashhunt.samplers._protocol import HuntFacts, Proposal
 from crashhunt.samplers._space_filling import Cube, RandomSampler
@@ -44,6 +46,9 @@ class Learning:
         self._random = RandomSampler(space)
         self._cube = Cube(space)
         self._strategy = self._make(space)
+        # With several threads, sums of linear algebra differ in their last bits, so a hunt would not resume with the
+        # same trials on another machine. For matrices of this size, threads also take more CPU time than they save.
+        self._libraries = ThreadpoolController()
 
     def _make(self, space: Space) -> Strategy:
         raise NotImplementedError
@@ -54,7 +59,8 @@ class Learning:
             return Proposal(self._random.ask(number, rng).arguments, origin=_PLAIN)
         # Count the strategy's trials alone: without every fifth point, Halton's sequence in base 5 has a hole.
         place = number - number // PLAIN_EVERY - 1
-        draft = self._strategy.propose(place, rng) if self._cube.dimensions else None
+        with self._libraries.limit(limits=1):
+            draft = self._strategy.propose(place, rng) if self._cube.dimensions else None
         if draft is None:  # too few results yet, or no argument varies
             return Proposal(self._random.ask(number, rng).arguments, origin=_START)
         arguments = self._cube.arguments(draft.point)
@@ -64,7 +70,8 @@ class Learning:
         """Learn from the result of a trial."""
         trial = scored_trial(result, self._cube, self._hunt)
         if trial is not None and self._cube.dimensions:
-            self._strategy.tell(trial)
+            with self._libraries.limit(limits=1):
+                self._strategy.tell(trial)
 
 
 class CrossEntropySampler(Learning):

@@ -196,11 +196,11 @@ class Model:
         self._process: Process | None = None
 
     def learn(self, trials: Sequence[ScoredTrial]) -> None:
-        """Replace the trials, and fit some of the parameters again: the more, the fewer trials there are."""
+        """Replace the trials, and fit some of the parameters again: the more, the fewer results there are."""
         self.remember(trials)
         self._told += 1
         if self._is_ready and self._told % (1 + self._told // TRIALS) == 0:
-            for _ in range(max(1, TRIALS // len(trials))):
+            for _ in range(max(1, TRIALS // self._told)):
                 self._fit()
 
     def remember(self, trials: Sequence[ScoredTrial]) -> None:

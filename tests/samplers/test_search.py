@@ -6,11 +6,13 @@ import importlib.util
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings, strategies as st
 from spaces import are_inside, ask, spaces, spec_of
+from threadpoolctl import threadpool_info
 
 from crashhunt.errors import UsageError
 from crashhunt.samplers import (
@@ -193,6 +195,26 @@ def test_words_and_whole_numbers_are_found_too(kind):
 
     _, results = hunt(kind(space), danger_of, 3000)
     assert results[-1].danger == 1.0
+
+
+def test_linear_algebra_of_a_strategy_has_one_thread_and_later_as_many_as_before():
+    seen = []
+
+    def threads():
+        return [library["num_threads"] for library in threadpool_info()]
+
+    class Watched(GuidedSampler):
+        def _make(self, space):
+            return SimpleNamespace(
+                propose=lambda *_: seen.append(threads()), tell=lambda _trial: seen.append(threads())
+            )
+
+    before = threads()
+    sampler = Watched({("ego", "x"): Range(0.0, 1.0)})
+    proposal = ask(sampler, 1)
+    sampler.tell(TrialResult(spec_of(1, proposal), Outcome.SURVIVED, danger=0.5))
+    assert seen == [[1] * len(before)] * 2
+    assert threads() == before
 
 
 @pytest.mark.nightly
