@@ -46,8 +46,8 @@ class Learning:
         self._random = RandomSampler(space)
         self._cube = Cube(space)
         self._strategy = self._make(space)
-        # With several threads, sums of linear algebra differ in their last bits, so a hunt would not resume with the
-        # same trials on another machine. For matrices of this size, threads also take more CPU time than they save.
+        # For matrices of this size, several threads take more CPU time than they save. They may also add numbers in
+        # another order, and then a hunt would not resume with the same trials on a machine with more cores.
         self._libraries = ThreadpoolController()
 
     def _make(self, space: Space) -> Strategy:
