@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 from threadpoolctl import ThreadpoolController
 
-from crashhunt.samplers._guided import Portfolio
 from crashhunt.samplers._protocol import HuntFacts, Proposal
 from crashhunt.samplers._space_filling import Cube, RandomSampler
 from crashhunt.samplers._strategies import CmaEs, CrossEntropy, Mutation
@@ -105,7 +104,9 @@ class GuidedSampler(Learning):
     """Proposes trials by a model of criticality, whose share of the trials depends on its success (`Portfolio`)."""
 
     origin = "guided"
-    version = 5  # 1 excluded neighbourhoods of known crashes, 3 had no mutation, 4 no niches; 5 fits ranks
+    version = 5  # 2 excluded basins of known crashes, 3 had no mutation, 4 had no niches, 5 has another model
 
     def _make(self, space: Space) -> Strategy:
+        from crashhunt.samplers._guided import Portfolio  # its linear algebra takes a fifth of a second to import
+
         return Portfolio(self._cube, space, self._hunt)
