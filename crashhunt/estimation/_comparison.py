@@ -314,9 +314,9 @@ def _share(hunt: HuntResults, rate: CrashRate) -> float:
         return rate.estimate
     run = hunt.settings.run
     is_whole = hunt.state.state in ("finished", "crashed") and run.keep_going and not run.distinct
-    if hunt.settings.rare:
-        return math.nan
-    if rate.certain is None and is_whole and rate.trials:  # a grid has a share as well, but no interval
+    if (
+        rate.certain is None and is_whole and not hunt.settings.rare and rate.trials
+    ):  # a grid has a share as well, but no interval
         return rate.crashes / rate.trials
     return math.nan
 

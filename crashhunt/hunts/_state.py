@@ -458,7 +458,7 @@ def trials_of_running(directory: Path) -> int | None:
             facts = ledger.facts()
             owner = facts.get("owner")
             alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))
-            return len(ledger.finished()) if alive and facts.get("state") == "running" else None
+            return sum(ledger.outcomes().values()) if alive and facts.get("state") == "running" else None
     except HuntDirectoryError:
         return None
 

@@ -78,7 +78,7 @@ def take(project, tmp_path):
 
 
 def test_work_tree_is_kept_as_it_is_and_nothing_else(project, take):
-    status = git(project, "status", "--porcelain")  # which writes the index of a copied tree anew
+    status = git(project, "status", "--porcelain")  # git writes the index of a copied tree again
     before = (project / ".git" / "index").read_bytes()
     snapshot = take()
     assert (project / ".git" / "index").read_bytes() == before
