@@ -271,5 +271,17 @@ REAL = {
          "arguments": {"delay_s": "0:1.6", "headway_s": "0.3:2", "desired_speed": "15:28", "max_brake": "3:8"},
          "scenario_arguments": {"vehicles": "12:20", "speed_spread": "0:0.4"}}, warmup_s=3.0, held_out=True,
     ),
+    "motorway-follow": Real(
+        "car following with a delay on a full motorway of SUMO", 1 / 30,
+        {"scenario": "motorway", "agents": {"": "car-following"}, "max_steps": 140,
+         "arguments": {"delay_s": "0.2:2", "headway_s": "0.2:1.5", "desired_speed": "24:36", "max_brake": "2:8"},
+         "scenario_arguments": {"demand": "3000:4500"}}, warmup_s=8.0, held_out=True,
+    ),
+    "loop-overtaker": Real(
+        "two agents on a ring of SUMO: one overtakes with a short blind spot", 1 / 30,
+        {"scenario": "loop-two-agents", "max_steps": 100,
+         "arguments": {"overtaker.blind_spot_m": "0:1.5", "overtaker.patience_s": "2:8",
+                       "overtaker.desired_speed": "14:20", "keeper.speed": "8:14"}}, warmup_s=3.0, held_out=True,
+    ),
 }  # fmt: skip
 """Each has other traffic with every seed. What rates they have, the table says."""
