@@ -25,7 +25,7 @@ from crashhunt.base.text import one_line
 from crashhunt.base.version import __version__
 from crashhunt.cli._bisect import add_bisect
 from crashhunt.cli._check import add_check
-from crashhunt.cli._common import Parser
+from crashhunt.cli._common import Parser, unwritable_output
 from crashhunt.cli._compare import add_compare
 from crashhunt.cli._completion import add_completion, complete
 from crashhunt.cli._corpus import add_corpus
@@ -168,8 +168,9 @@ def _explained(error: Exception) -> CrashhuntError:
         traceback.print_exc()
     if isinstance(error, OSError):
         if error.filename is None and error.errno in DISK | {errno.EBADF}:
+            explained = unwritable_output(error, 1)
             _discard_output()
-            return CrashhuntError(f"the output cannot be written: {error.strerror}", fix="send it elsewhere")
+            return explained
         if fix := remedy(error):
             return CrashhuntError(str(error.strerror or error), fix=fix, where=str(error.filename or ""))
     if limit := limit_behind(error):

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
 from crashhunt.base import layout
-from crashhunt.base.errors import UntrustedError, UsageError
+from crashhunt.base.errors import FULL, CrashhuntError, UntrustedError, UsageError
 from crashhunt.base.files import cannot_write
-from crashhunt.base.text import did_you_mean, one_line, one_of, visible
+from crashhunt.base.text import command_line, did_you_mean, one_line, one_of, visible
 from crashhunt.plans import hunt_options
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ __all__ = [
     "say",
     "shown_progress",
     "tell",
+    "unwritable_output",
 ]
 
 
@@ -349,6 +350,26 @@ def make_console(*, stderr: bool = False, width: int | None = None) -> Console:
             raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
 
     return Raising(stderr=stderr, highlight=False, width=width)
+
+
+def unwritable_output(error: OSError, descriptor: int) -> CrashhuntError:
+    """Return the error for output that cannot be written, which names the stream and its file.
+
+    Args:
+        error: the error of the system.
+        descriptor: 1 for standard output, 2 for standard error.
+    """
+    stream = {1: "standard output", 2: "standard error"}[descriptor]
+    try:
+        file = command_line(
+            Path(f"/proc/self/fd/{descriptor}").readlink()
+        )  # because Python has only the name "<stdout>"
+    except OSError:
+        file = "closed"
+    fix = f"{'free some space or ' if error.errno in FULL else ''}redirect {stream} to another file"
+    return CrashhuntError(
+        f"{stream} ({file}) cannot be written: {error.strerror or error}", fix=f"{fix}, and run the same command again"
+    )
 
 
 @contextmanager

@@ -9,13 +9,14 @@ import signal
 import sys
 import textwrap
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import OWN_THREAD
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import add_json, add_options, chosen_options, integer, make_console
+from crashhunt.cli._common import add_json, add_options, chosen_options, integer, make_console, unwritable_output
 from crashhunt.cli._exit_codes import DONE, INTERRUPTED, NO_ANSWER, NO_VALID_TRIAL, THE_ANSWER_IS_NO
 from crashhunt.cli._rate import exit_code_of
 from crashhunt.plans import hunt_options
@@ -136,7 +137,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     agents = ", ".join(setup.agent for setup in hunt.settings.agents.values())
     with Watcher(console, f"crashhunt: {hunt.scenario.name}, {agents}", hunt.scenario.notes) as watcher:
         try:
-            report = hunt.run(_of_output(watcher))
+            report = hunt.run(_of_output(watcher, 2 if options.json else 1))
         except _OutputClosedError as error:
             raise BrokenPipeError from error
         watcher.tell_notes()  # where there was nothing to run
@@ -165,8 +166,13 @@ class _OutputClosedError(BaseException):
     """The reader of the output has gone. No exception of a hunt, which would be recorded as a failure of the hunt."""
 
 
-def _of_output(watch: Callable[[HuntStatus], None]) -> Callable[[HuntStatus], None]:
-    """Return a function that shows a status, and whose errors name the output instead of the directory of the hunt."""
+def _of_output(watch: Callable[[HuntStatus], None], descriptor: int) -> Callable[[HuntStatus], None]:
+    """Return a function that shows a status, and whose errors name the output instead of the directory of the hunt.
+
+    Args:
+        watch: shows a status.
+        descriptor: the file descriptor that it writes to.
+    """
 
     def show(status: HuntStatus) -> None:
         try:
@@ -174,8 +180,7 @@ def _of_output(watch: Callable[[HuntStatus], None]) -> Callable[[HuntStatus], No
         except BrokenPipeError as error:
             raise _OutputClosedError from error
         except OSError as error:
-            message = f"the output cannot be written: {error.strerror or error}"
-            raise CrashhuntError(message, fix="send it elsewhere, and run the same command again") from error
+            raise unwritable_output(error, descriptor) from error
 
     return show
 
@@ -201,7 +206,9 @@ def _start_wait_notice(options: argparse.Namespace) -> threading.Timer:
 
 def _leave_at_once(*, as_json: bool) -> NoReturn:
     error = CrashhuntError("interrupted before the hunt began")
+    with suppress(OSError):
+        os.write(2, f"crashhunt: {error}\n".encode())
     if as_json:
-        os.write(1, json.dumps(error.to_json()).encode() + b"\n")
-    os.write(2, f"crashhunt: {error}\n".encode())
+        with suppress(OSError):
+            os.write(1, json.dumps(error.to_json()).encode() + b"\n")
     _leave(INTERRUPTED)

@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from crashhunt.cli._common import unwritable_output
 from crashhunt.cli._run import _of_output, _OutputClosedError
 from crashhunt.errors import CrashhuntError
 
@@ -103,7 +104,7 @@ def test_unread_answer_is_neither_yes_nor_no(stream):
         (BrokenPipeError(errno.EPIPE, "Broken pipe"), None),
         (
             OSError(errno.ENOSPC, "No space left on device"),
-            "the output cannot be written: No space left on device; send",
+            r"standard error \(.+\) cannot be written: No space left on",
         ),
     ],
 )
@@ -111,7 +112,34 @@ def test_hunt_does_not_blame_its_directory_for_its_output(raised, wanted):
     def watch(_):
         raise raised
 
-    show = _of_output(watch)
+    show = _of_output(watch, 2)
     with pytest.raises(_OutputClosedError if wanted is None else CrashhuntError, match=wanted):
         show(None)
     assert not issubclass(_OutputClosedError, Exception)  # else the ledger of the hunt would call it its failure
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (errno.ENOSPC, "(/dev/full) cannot be written: No space left on device; free some space or redirect "),
+        (errno.EBADF, "(/dev/full) cannot be written: Bad file descriptor; redirect "),
+    ],
+)
+def test_error_of_output_names_the_file_behind_it(number, said):
+    with open("/dev/full", "w") as full:
+        kept = os.dup(2)
+        os.dup2(full.fileno(), 2)
+        try:
+            error = unwritable_output(OSError(number, os.strerror(number)), 2)
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+    assert str(error) == f"standard error {said}standard error to another file, and run the same command again"
+
+
+def test_interrupt_before_a_hunt_is_reported_even_if_the_disk_is_full():
+    script = "from crashhunt.cli._run import _leave_at_once\n_leave_at_once(as_json=True)"
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-c", script]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "crashhunt: interrupted before the hunt began\n")

@@ -213,7 +213,7 @@ def test_output_that_cannot_be_written_is_one_line(toy, words):
             check=False,
         )
     assert done.returncode == 2
-    assert "cannot be written: No space left on device" in done.stderr
+    assert "standard output (/dev/full) cannot be written: No space left on device; free some space or" in done.stderr
     assert done.stderr.count("\n") == 1
 
 
