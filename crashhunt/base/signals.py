@@ -59,9 +59,13 @@ def is_interrupt(error: BaseException | None) -> bool:
 
     Up to version 3.11, Python turns a Ctrl-C that comes while a class is created into a `RuntimeError`.
     """
-    while error is not None and not isinstance(error, KeyboardInterrupt):
+    seen: set[int] = set()  # because an error may be its own cause: raise error from error
+    while error is not None and id(error) not in seen:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        seen.add(id(error))
         error = error.__cause__
-    return error is not None
+    return False
 
 
 class _EndedError(BaseException):

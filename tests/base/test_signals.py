@@ -10,7 +10,7 @@ import pytest
 
 from crashhunt import __main__, cli
 from crashhunt.base import signals
-from crashhunt.base.signals import block_signals, blocked_signals, stop_requests
+from crashhunt.base.signals import block_signals, blocked_signals, is_interrupt, stop_requests
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -155,3 +155,12 @@ def test_a_ctrl_c_during_the_imports_of_a_command_ends_it_with_130(monkeypatch, 
     with pytest.raises(SystemExit) as caught:
         cli.main(["list"])
     assert caught.value.code == code
+
+
+@pytest.mark.parametrize("kind", [ValueError, KeyboardInterrupt])
+def test_error_that_is_its_own_cause_is_an_interrupt_only_by_its_class(kind):
+    error = kind()
+    error.__cause__ = error
+    caused = RuntimeError()
+    caused.__cause__ = error
+    assert is_interrupt(caused) is (kind is KeyboardInterrupt)
