@@ -133,6 +133,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     from crashhunt.dashboard import has_dashboard
     from crashhunt.report import Watcher, describe_hunt
 
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # after the hunt, "before it began" is wrong
     console = make_console(stderr=options.json)
     agents = ", ".join(setup.agent for setup in hunt.settings.agents.values())
     with Watcher(console, f"crashhunt: {hunt.scenario.name}, {agents}", hunt.scenario.notes) as watcher:

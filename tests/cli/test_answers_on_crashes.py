@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import signal
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -785,6 +786,21 @@ def test_run_ends_with_the_code_of_its_report(monkeypatch, capsys, words, report
     monkeypatch.setattr("crashhunt.report.describe_hunt", lambda report: "found")
     assert run("run", "h", "1", "5", "60", *words, "--json") == code
     assert capsys.readouterr() == ('"the report"\n', "found\n")
+
+
+def test_ctrl_c_after_a_hunt_does_not_say_that_the_hunt_has_not_begun(monkeypatch, capfd):
+    setup = SimpleNamespace(agents={"ego": SimpleNamespace(agent="keep-lane")})
+    hunt = SimpleNamespace(settings=setup, scenario=SimpleNamespace(name="toy", notes=()), run=lambda watcher: None)
+    monkeypatch.setattr("crashhunt.api.prepare", lambda *words, **options: hunt)
+    monkeypatch.setattr("crashhunt.report.describe_hunt", lambda report: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(importlib.import_module("crashhunt.cli._run"), "_leave", lambda code: None)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run("run", "h", "1", "5", "60", "--json")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(("ego", "starts"), [(None, True), ("", True), ("any", True), ("car.3", False)])
