@@ -6,7 +6,7 @@ import json
 import shutil
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from crashhunt.base import layout
 from crashhunt.base.codec import JsonObject, Serializable
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from crashhunt.ledger import Row
+    from crashhunt.ledger import Noted, Row
 
 
 __all__ = ["CheckFinding", "Checked", "check", "intact_snapshots", "salvage"]
@@ -480,21 +480,26 @@ def _copy_rows(found: Checked, settings: HuntSettings, to: Path) -> int:
     with closing(Ledger(to / layout.LEDGER, writable=True)) as ledger:
         count = 0
         source = found.dir / layout.LEDGER
-        replanned: bool | None = None
+        kept: Noted = {}
         if found.trials and has_begun(source):
             with closing(Ledger(source)) as old:
                 try:
-                    replanned = old.facts().get("replanned")
+                    kept = cast("Noted", {name: fact for name, fact in old.facts().items() if name in _KEPT_FACTS})
                 except HuntDirectoryError:
-                    replanned = True  # it is not known, and True forbids a p-value
+                    kept = {"replanned": True}  # it is not known, and True forbids a p-value
                 ledger.propose(old.intact_turns())
                 for _, row in _copied_rows(found, settings, old):
                     ledger.copy(row)
                     count += 1
-        ledger.enter(
-            "interrupted", _detail(found), planned=settings.trials, hunt_seed=settings.seed, replanned=replanned
-        )
+        ledger.note(**kept)
+        ledger.enter("interrupted", _detail(found), planned=settings.trials, hunt_seed=settings.seed)
     return count
+
+
+# How the copied trials were drawn, which their rows do not show. Without its sampler's version, a hunt cannot resume.
+_KEPT_FACTS = frozenset((
+    "crash_on", "disturb", "independent", "lag", "lag_grows", "origins", "plain_origin", "replanned", "sampler_version",
+))  # fmt: skip
 
 
 def _copied_rows(found: Checked, settings: HuntSettings, ledger: Ledger) -> Iterator[tuple[int, Row]]:

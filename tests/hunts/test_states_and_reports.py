@@ -425,6 +425,18 @@ def test_salvaged_hunt_keeps_that_its_number_of_trials_was_changed_or_is_not_kno
         assert ledger.facts()["replanned"] is True
 
 
+def test_salvaged_hunt_keeps_how_its_trials_were_drawn(hunt, tmp_path):
+    drawn = {"sampler_version": 5, "lag": 32, "lag_grows": True, "independent": False, "plain_origin": "random"}
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(**drawn, newest_kind=1.0)
+    (checked,) = check(hunt)
+    salvage(checked, tmp_path / "s")
+    with closing(Ledger(tmp_path / "s" / "ledger.sqlite")) as ledger:
+        facts = ledger.facts()
+    assert {name: facts.get(name) for name in drawn} == drawn
+    assert not facts.keys() & {"newest_kind", "began", "owner", "done_before"}  # of a run that the copy has not had
+
+
 def test_salvage_refuses_a_directory_that_has_something_and_names_what_cannot_be_copied(hunt, tmp_path, monkeypatch):
     (hunt / "crashes" / "000000-collision" / "log.mcap").write_bytes(b"")
     (checked,) = check(hunt)
