@@ -80,7 +80,7 @@ class Confirmation:
         self._over = threading.Event()
         self._thread: threading.Thread | None = None
         self._known: set[str] = set()
-        self._is_judging = False
+        self._to_judge: Bundle | None = None
 
     def look(self, progress: Progress) -> None:
         """Start the confirmation of new crashes, and collect crashes that have been confirmed or judged."""
@@ -96,11 +96,12 @@ class Confirmation:
                 progress.replace([found if found.id == crash.id else crash for crash in progress.crashes])
         with suppress(queue.Empty):
             judged = self._judged.get_nowait()
-            self._is_judging = False
+            self._to_judge = None
             progress.kinds.settle(judged)
-        if not self._is_judging and not self._over.is_set() and (wanted := progress.kinds.next_to_judge()) is not None:
-            self._is_judging = True
-            self._request_run(_JUDGE, wanted)
+        if self._to_judge is None and not self._over.is_set():
+            self._to_judge = progress.kinds.next_to_judge()
+            if self._to_judge is not None:
+                self._request_run(_JUDGE, self._to_judge)
 
     def close(self, progress: Progress) -> None:
         """Cancel the running confirmation, so that the hunt can stop at once."""
@@ -109,6 +110,9 @@ class Confirmation:
             self._request_run(_END, None)
             self._thread.join()
         self.look(progress)
+        if self._to_judge is not None and progress.kinds is not None:  # the thread has ended before it began
+            progress.kinds.settle(Judged(self._to_judge, is_stopped=True))
+            self._to_judge = None
 
     def _request_run(self, what: int, bundle: Bundle | None) -> None:
         self._asked.put((what, next(self._order), bundle))

@@ -615,6 +615,29 @@ def test_crashes_are_confirmed_while_the_hunt_runs():
     assert runs.asked.empty()
 
 
+def test_crash_whose_cause_was_not_searched_for_before_the_end_of_the_hunt_is_chosen_again():
+    settled, judged = [], []
+    begun = threading.Event()
+
+    def confirm(bundle, stopped):
+        begun.set()
+        while not stopped():
+            time.sleep(0.001)
+        return bundle
+
+    wanted = [None, Bundle("a")]
+    progress = SimpleNamespace(crashes=[Bundle("a")], replace=lambda crashes: None)
+    progress.kinds = SimpleNamespace(settle=settled.append, next_to_judge=lambda: wanted.pop(0))
+    runs = SimpleNamespace(confirm_one=confirm, judge_one=lambda bundle, stopped: judged.append(bundle))
+    confirmation = Confirmation(runs, None)
+    confirmation.look(progress)
+    assert begun.wait(20)
+    confirmation.look(progress)  # the search waits for the end of the confirmation
+    confirmation.close(progress)
+    assert judged == []
+    assert settled == [Judged(Bundle("a"), is_stopped=True)]
+
+
 def test_hunt_is_hopeless_once_enough_trials_could_not_be_set_up():
     def hopeless(invalid, survived=0, trials=900, parallel=2):
         settings = replace(SETTINGS, trials=trials, run=RunSettings(parallel=parallel))
