@@ -589,6 +589,8 @@ class HuntDirectory:
         for name in (*_OWN_FILES, *more):
             if (self.path / name).is_dir():
                 shutil.rmtree(self.path / name, ignore_errors=True)
+                with suppress(OSError):
+                    (self.path / name).rmdir()  # because rmtree opens the folder, which ``ulimit -n`` may refuse
             else:
                 (self.path / name).unlink(missing_ok=True)
 

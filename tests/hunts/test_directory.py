@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.errors import BusyError, HuntDirectoryError
-from crashhunt.hunts import HuntDirectory
+from crashhunt.hunts import HuntDirectory, _state
 from crashhunt.plans import HuntSettings
 
 SETTINGS = HuntSettings(scenario="loop", scenario_digest="x", trials=1, max_steps=1, seed=1)
@@ -106,6 +106,15 @@ def test_directory_of_a_hunt_that_cannot_begin_is_removed_if_it_was_made_for_it(
             _fail(place, begins=name == "begun")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["begun", "own"]
     assert (tmp_path / "begun" / "hunt.toml").exists()
+
+
+def test_directory_is_removed_even_if_no_folder_can_be_opened(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        _state, "shutil", SimpleNamespace(rmtree=lambda *_, **__: None)
+    )  # as with a low limit on open files
+    with pytest.raises(ValueError, match="no snapshot"):
+        _fail(HuntDirectory(tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
 
 
 def test_file_of_the_user_in_a_directory_that_is_removed_stays(tmp_path):
