@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import errno
+import os
 import resource
+import threading
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-__all__ = ["FREE", "free_memory", "limit_behind"]
+__all__ = ["FREE", "error_of_next_files", "error_of_next_thread", "free_memory", "is_no_thread", "limit_behind"]
 
 
 _MEBIBYTE = 1 << 20
@@ -26,20 +28,56 @@ def limit_behind(error: BaseException) -> str:
 
     A limit on memory (``RLIMIT_AS``) can cause many errors: in Python, in a thread, or in a library that does not load.
     A limit on the size of files (``RLIMIT_FSIZE``) causes an `OSError`, because Python ignores its signal. A limit on
-    processes (``RLIMIT_NPROC``) also counts threads.
+    processes (``RLIMIT_NPROC``) also counts threads. If a thread does not start, the text also names
+    a limit on memory, because Python does not report which of the two was reached.
     """
+    limits = []
+    if is_no_thread(error) and (limit := _soft_limit(resource.RLIMIT_NPROC)) is not None:
+        limits.append(
+            f"the limit on processes and threads is {limit}: raise it with ulimit -u, or that of the container"
+        )
     if _is_no_memory(error) and (limit := _soft_limit(resource.RLIMIT_AS)) is not None:
-        return f"the limit on memory is {limit / _MEBIBYTE:.4g} MiB: raise it with ulimit -v"
-    if (
-        isinstance(error, OSError)
-        and error.errno == errno.EFBIG
-        and (limit := _soft_limit(resource.RLIMIT_FSIZE)) is not None
-    ):
-        return f"the limit on the size of a file is {limit / _MEBIBYTE:.4g} MiB: raise it with ulimit -f"
-    is_thread = isinstance(error, RuntimeError) and str(error) in _NO_THREAD_MESSAGES
-    if is_thread and (limit := _soft_limit(resource.RLIMIT_NPROC)) is not None:
-        return f"the limit on processes and threads is {limit}: raise it with ulimit -u, or that of the container"
-    return ""
+        limits.append(f"the limit on memory is {limit / _MEBIBYTE:.4g} MiB: raise it with ulimit -v")
+    number = error.errno if isinstance(error, OSError) else None
+    if number == errno.EFBIG and (limit := _soft_limit(resource.RLIMIT_FSIZE)) is not None:
+        limits.append(f"the limit on the size of a file is {limit / _MEBIBYTE:.4g} MiB: raise it with ulimit -f")
+    if number == errno.EMFILE and (limit := _soft_limit(resource.RLIMIT_NOFILE)) is not None:
+        limits.append(f"the limit on open files is {limit}: raise it with ulimit -n")
+    return "; ".join(limits)
+
+
+def is_no_thread(error: BaseException) -> bool:
+    """Return whether an error reports that no thread could be started."""
+    return isinstance(error, RuntimeError) and str(error) in _NO_THREAD_MESSAGES
+
+
+def error_of_next_thread() -> RuntimeError | None:
+    """Return the error that starting a thread raises now; None if a thread starts.
+
+    OpenBLAS raises SIGINT if it cannot start its threads while NumPy is imported, which looks like a Ctrl-C.
+    """
+    try:
+        threading.Thread(target=int, daemon=True).start()
+    except RuntimeError as error:
+        return error
+    return None
+
+
+def error_of_next_files(count: int) -> OSError | None:
+    """Return the error that opening a number of files raises now; None if they can be opened.
+
+    SQLite reports every reason for which a file cannot be opened in the same words.
+    """
+    opened: list[int] = []
+    try:
+        for _ in range(count):
+            opened.append(os.open(os.devnull, os.O_RDONLY))  # noqa: PERF401 - closes those before an error as well
+    except OSError as error:
+        return error
+    finally:
+        for descriptor in opened:
+            os.close(descriptor)
+    return None
 
 
 def _is_no_memory(error: BaseException) -> bool:

@@ -18,7 +18,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import DISK, CrashhuntError, InternalError, UsageError, remedy
-from crashhunt.base.resources import limit_behind
+from crashhunt.base.resources import error_of_next_thread, is_no_thread, limit_behind
 from crashhunt.base.signals import ended_by_signals, is_interrupt
 from crashhunt.base.temporary import remove_leftovers
 from crashhunt.base.text import one_line
@@ -102,10 +102,20 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         else:
             code = _report(_explained(error), as_json="--json" in words)
     except KeyboardInterrupt:
-        code = INTERRUPTED
+        code = _interrupted(words)
     except Exception as error:
-        code = INTERRUPTED if is_interrupt(error) else _report(_explained(error), as_json="--json" in words)
+        code = _interrupted(words) if is_interrupt(error) else _report(_explained(error), as_json="--json" in words)
     sys.exit(code)
+
+
+def _interrupted(words: Sequence[str]) -> int:
+    """Return the exit code after a Ctrl-C.
+
+    If no thread can be started, report that instead, because OpenBLAS then raises the signal of a Ctrl-C.
+    """
+    if (error := error_of_next_thread()) is None:
+        return INTERRUPTED
+    return _report(_explained(error), as_json="--json" in words)
 
 
 def _open_standard_streams() -> None:
@@ -174,7 +184,7 @@ def _explained(error: Exception) -> CrashhuntError:
         if fix := remedy(error):
             return CrashhuntError(str(error.strerror or error), fix=fix, where=str(error.filename or ""))
     if limit := limit_behind(error):
-        what = "no thread could be started" if "ulimit -u" in limit else "the memory does not suffice"
+        what = "no thread could be started" if is_no_thread(error) else "the memory does not suffice"
         return CrashhuntError(f"{what}: {type(error).__name__}", fix=limit)
     from crashhunt.base.exceptions import in_words
 

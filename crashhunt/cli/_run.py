@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import OWN_THREAD
+from crashhunt.base.resources import error_of_next_thread, limit_behind
 from crashhunt.base.text import command_line
 from crashhunt.cli._common import add_json, add_options, chosen_options, integer, make_console, unwritable_output
-from crashhunt.cli._exit_codes import DONE, INTERRUPTED, NO_ANSWER, NO_VALID_TRIAL, THE_ANSWER_IS_NO
+from crashhunt.cli._exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_ANSWER, NO_VALID_TRIAL, THE_ANSWER_IS_NO
 from crashhunt.cli._rate import exit_code_of
 from crashhunt.plans import hunt_options
 
@@ -206,10 +207,12 @@ def _start_wait_notice(options: argparse.Namespace) -> threading.Timer:
 
 
 def _leave_at_once(*, as_json: bool) -> NoReturn:
-    error = CrashhuntError("interrupted before the hunt began")
+    error, code = CrashhuntError("interrupted before the hunt began"), INTERRUPTED
+    if no_thread := error_of_next_thread():  # OpenBLAS raises SIGINT
+        error, code = CrashhuntError("no thread could be started", fix=limit_behind(no_thread)), BAD_INPUT
     with suppress(OSError):
         os.write(2, f"crashhunt: {error}\n".encode())
     if as_json:
         with suppress(OSError):
             os.write(1, json.dumps(error.to_json()).encode() + b"\n")
-    _leave(INTERRUPTED)
+    _leave(code)

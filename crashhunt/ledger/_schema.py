@@ -11,10 +11,10 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from crashhunt.base.errors import HuntDirectoryError
+from crashhunt.base.errors import HuntDirectoryError, remedy
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.base.resources import limit_behind
+from crashhunt.base.resources import error_of_next_files, limit_behind
 from crashhunt.base.text import command_line
 from crashhunt.trial import check_plain
 
@@ -57,6 +57,7 @@ __all__ = [
 
 VERSION = 5  # of the tables, as PRAGMA user_version
 _MIN_READER_VERSION = 3  # the least version of a crashhunt that reads what this one writes
+_FILES_OF_LEDGER = 3  # that SQLite opens: the ledger, its write-ahead log and its shared memory
 _FIRST_VERSION_WITH_DIGESTS = 2  # the first version in which every row has a digest of its content
 _FIRST_VERSION_WITH_PROPOSALS = 3  # the first version that has proposals
 SEAL, _READER_FACT = "seal", "reader"
@@ -349,6 +350,9 @@ def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
             f"another program keeps it busy ({text})", fix="close what has it open, and try again", where=where
         )
     if "unable to open" in text or "readonly" in text:
+        if no_file := error_of_next_files(_FILES_OF_LEDGER):
+            message = f"cannot be opened ({no_file.strerror})"
+            return HuntDirectoryError(message, fix=limit_behind(no_file) or remedy(no_file), where=where)
         if os.path.isdir(path):  # noqa: PTH112
             return damaged(path, "a folder is where the file should be")
         there = os.path.exists(path.parent)  # noqa: PTH110

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import errno
+import os
 import resource
+import sys
+import threading
 
 import pytest
 
+from crashhunt import cli
 from crashhunt.base.errors import remedy
-from crashhunt.base.resources import limit_behind
+from crashhunt.base.resources import error_of_next_files, limit_behind
 from crashhunt.cli import _explained
+from crashhunt.cli._run import _leave_at_once
 from crashhunt.episode._blame import internal_error
 from crashhunt.episode._failures import failure_of
 
@@ -58,6 +63,80 @@ def test_limit_on_processes_is_named_if_no_thread_can_be_started(limits, message
     assert str(_explained(RuntimeError(message))) == f"no thread could be started: RuntimeError; {said}"
     assert internal_error(RuntimeError(message), 3).fix == said
     assert limit_behind(ValueError(message)) == ""
+    assert limit_behind(RuntimeError("failed to map segment")) == ""
+
+
+def test_both_limits_that_prevent_threads_are_named(limits):
+    limits |= {resource.RLIMIT_NPROC: 10, resource.RLIMIT_AS: 1500 << 20}
+    said = str(_explained(RuntimeError("can't start new thread")))
+    assert said.startswith("no thread could be started: RuntimeError; the limit on processes and threads is 10: ")
+    assert said.endswith("; the limit on memory is 1500 MiB: raise it with ulimit -v")
+    assert str(_explained(MemoryError())).startswith("the memory does not suffice: MemoryError; the limit on memory")
+
+
+@pytest.fixture
+def no_threads(monkeypatch):
+    def start(_):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+
+
+def interrupt(_):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("arguments", [["show"], ["run", "--json"]])
+def test_interrupt_of_a_library_that_starts_no_thread_is_not_taken_for_ctrl_c(
+    arguments, limits, no_threads, monkeypatch, capfd
+):
+    limits[resource.RLIMIT_NPROC] = 10
+    monkeypatch.setattr(cli, "_run", interrupt)
+    monkeypatch.setitem(_leave_at_once.__globals__, "_leave", sys.exit)
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(arguments) if "show" in arguments else _leave_at_once(as_json=True)
+    out, err = capfd.readouterr()
+    assert err.startswith("crashhunt: no thread could be started")
+    assert err.endswith(
+        "; the limit on processes and threads is 10: raise it with ulimit -u, or that of the container\n"
+    )
+    assert ('"no thread could be started"' in out) == ("--json" in arguments)
+
+
+def test_ctrl_c_stays_one_if_threads_start(monkeypatch, capfd):
+    monkeypatch.setattr(cli, "_run", interrupt)
+    monkeypatch.setitem(_leave_at_once.__globals__, "_leave", sys.exit)
+    with pytest.raises(SystemExit, match="130"):
+        cli.main(["show"])
+    with pytest.raises(SystemExit, match="130"):
+        _leave_at_once(as_json=False)
+    assert capfd.readouterr().err == "crashhunt: interrupted before the hunt began\n"
+
+
+def test_limit_on_open_files_is_named_where_there_is_one(limits):
+    error = OSError(errno.EMFILE, "Too many open files")
+    assert limit_behind(error) == ""
+    limits[resource.RLIMIT_NOFILE] = 16
+    assert limit_behind(error) == "the limit on open files is 16: raise it with ulimit -n"
+    assert limit_behind(OSError(errno.ENFILE, "Too many open files in system")) == ""
+
+
+def test_error_of_next_files_closes_what_it_opens(monkeypatch):
+    opened = []
+
+    def open_two(path, flags):
+        if len(opened) == 2:
+            raise OSError(errno.EMFILE, "Too many open files")
+        opened.append(os.dup(1))
+        return opened[-1]
+
+    monkeypatch.setattr(os, "open", open_two)
+    assert error_of_next_files(2) is None
+    opened.clear()
+    assert error_of_next_files(3).errno == errno.EMFILE
+    for descriptor in opened:
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            os.fstat(descriptor)
 
 
 def test_limit_on_files_is_named_where_there_is_one(limits):

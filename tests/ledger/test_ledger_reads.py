@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import resource
@@ -513,6 +514,14 @@ def test_limit_on_the_size_of_files_is_not_taken_for_a_full_disk(path, monkeypat
     found = _schema.explained(path, sqlite3.OperationalError("disk I/O error"))
     assert "cannot be written (disk I/O error), because the limit on the size of a file is 1 MiB" in found.message
     assert found.fix == "raise it with ulimit -f"
+
+
+def test_limit_on_open_files_is_not_taken_for_a_folder_that_is_not_writable(path, monkeypatch):
+    monkeypatch.setattr(_schema, "error_of_next_files", lambda count: OSError(errno.EMFILE, "Too many open files"))
+    monkeypatch.setattr(resource, "getrlimit", lambda which: (7, 7))
+    found = _schema.explained(path, sqlite3.OperationalError("unable to open database file"))
+    assert found.message == "cannot be opened (Too many open files)"
+    assert found.fix == "the limit on open files is 7: raise it with ulimit -n"
 
 
 def test_file_that_cannot_be_opened_is_a_folder_or_forbidden_or_has_no_folder(path, monkeypatch):
