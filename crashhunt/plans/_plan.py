@@ -507,6 +507,12 @@ def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str]
     if not settings.splitting and not parse_rates(settings.disturb):
         fix = "give rates, such as --disturb brake=0.02,cut_in=0.02"
         raise UsageError("--rare needs disturbances with rates, but the hunt has none", fix=fix)
+    backend = backend_of(scenario.simulator)
+    if settings.splitting and backend is not None and not backend.shows_actors:
+        message = (
+            f"--rare splitting needs vehicles ahead, but scenes of the simulator {scenario.simulator!r} contain none"
+        )
+        raise UsageError(message, fix="omit --rare")
     agents = tuple(settings.agents)
     if not settings.splitting and (fixed := parse_fixed(settings.disturb, agents)):
         begun = word_of(fixed[0], agents)

@@ -506,6 +506,8 @@ class Backend:
             refused.
         right_of_way: function that returns which vehicles must yield at the junctions of the map; None if this is
             unknown.
+        shows_actors: whether scenes may contain actors. If this value is False, modes that compare the distances of
+            actors are refused before the first trial.
         plays_paths: whether the simulator can move other actors along recorded paths.
         one_per_process: whether a process can run only one simulation at a time.
         forkable: whether a process can safely fork after creating the simulator, because the simulator starts no
@@ -540,6 +542,7 @@ class Backend:
     explained: Callable[[str, str, Scenario], ScenarioError | None] | None = None
     side_effect: Callable[[Scenario, Mapping[str, Value], Iterable[str]], str] | None = None
     right_of_way: Callable[[Scenario], RightOfWay | None] | None = None
+    shows_actors: bool = True
     plays_paths: bool = False
     one_per_process: bool = False
     forkable: bool = False

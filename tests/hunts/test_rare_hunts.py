@@ -78,6 +78,16 @@ def test_rare_mode_refuses_what_it_has_no_law_for(tmp_path, options, says):
     assert refused.value.fix
 
 
+def test_splitting_is_refused_before_any_trial_if_scenes_contain_no_actors(tmp_path):
+    gym = tmp_path / "gym.toml"
+    gym.write_text(
+        'title = "A pole"\nschema = 1\nsimulator = "gym"\n[gym]\nid = "CartPole-v1"\n[agents.ego]\nagent = "random"\n'
+    )
+    with pytest.raises(UsageError, match="scenes of the simulator 'gym' contain none; omit --rare"):
+        crashhunt.prepare(tmp_path / "h", 1, 400, 20, **(OPTIONS | {"scenario": gym, "splitting": True}))
+    assert not (tmp_path / "h").exists()
+
+
 def test_rare_mode_keeps_going_so_it_may_keep_a_few_bundles_of_each_type(tmp_path):
     hunt = crashhunt.prepare(tmp_path / "h", 1, 8, 20, **OPTIONS, disturb=["stop=0.01"], keep=2)
     assert (hunt.settings.run.keep, hunt.settings.run.keep_going) == (2, True)

@@ -114,4 +114,5 @@ BACKEND = Backend(
     reported_events=(),
     disturbances=(),
     side_effect=_side_effect,
+    shows_actors=False,
 )
