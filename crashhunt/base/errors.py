@@ -28,6 +28,8 @@ from __future__ import annotations
 import errno
 from typing import TYPE_CHECKING
 
+from crashhunt.base.text import command_line, one_line
+
 if TYPE_CHECKING:
     from crashhunt.base.json_types import ErrorData
 
@@ -85,7 +87,9 @@ class CrashhuntError(Exception):
 
     def __str__(self) -> str:
         """Return the whole error as one line: ``where: message; fix``."""
-        text = f"{self.where}: {self.message}" if self.where else self.message
+        # A path with a line break is quoted, because it would be another path if the line break became a space.
+        where = self.where if one_line(self.where) == self.where else command_line(self.where)
+        text = f"{where}: {self.message}" if where else self.message
         return f"{text}; {self.fix}" if self.fix else text
 
     def __reduce__(self) -> tuple[object, ...]:

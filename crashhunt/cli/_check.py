@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
-from crashhunt.base.text import count_of
+from crashhunt.base.text import command_line, count_of
 from crashhunt.cli._common import add_json, say
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def _check(options: argparse.Namespace, _words: list[str]) -> int:
         saved = salvage(found[0], options.salvage)
         counts = f"{saved['trials']} trials and {saved['crashes']} crashes"
         say(
-            f"{counts} are in {options.salvage}; resume the hunt there with crashhunt run",
+            f"{counts} are in {command_line(options.salvage)}; resume the hunt there with crashhunt run",
             as_json=options.json,
         )
     fine = all(each.fine for each in found)
@@ -73,7 +73,7 @@ def _describe(found: Checked) -> str:
     parts.append(f"{crashes} crash{'' if crashes == 1 else 'es'}")
     parts += [f"{minimized} minimized crash{'' if minimized == 1 else 'es'}"] if minimized else []
     listed = " and ".join(", ".join(parts).rsplit(", ", 1))
-    lines = [f"{found.dir}: {listed} {'are' if found.kind == 'hunt' else 'is'} intact"]
+    lines = [f"{command_line(found.dir)}: {listed} {'are' if found.kind == 'hunt' else 'is'} intact"]
     if not found.fine:
         bad = [
             f"{len(numbers)} {name}"

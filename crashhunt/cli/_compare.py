@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.text import command_line
 from crashhunt.cli._common import add_json, say
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def _compare(options: argparse.Namespace, _words: list[str]) -> int:
             if hunt == directory or (hunt / layout.HUNT).exists():
                 hunts.append(hunt)
             else:
-                say(f"{hunt} has not begun, and is excluded", as_json=True)
+                say(f"{command_line(hunt)} has not begun, and is excluded", as_json=True)
     found = compare(*hunts)
     if options.csv:
         found.write_csv(sys.stdout)
@@ -55,7 +56,7 @@ def _compare(options: argparse.Namespace, _words: list[str]) -> int:
         say(describe_comparison(found), as_json=options.json)
     if options.html is not None:
         comparison_page(found, options.html)
-        say(f"{options.html} has the plots", as_json=options.json or options.csv)
+        say(f"{command_line(options.html)} has the plots", as_json=options.json or options.csv)
     if options.json:
         print(json.dumps(found.to_json()))
     return 0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
-from crashhunt.base.text import in_lines
+from crashhunt.base.text import command_line, in_lines
 from crashhunt.cli._common import (
     add_ci_options,
     add_json,
@@ -119,7 +119,10 @@ def _add(options: argparse.Namespace, _words: list[str]) -> int:
                 say(in_lines([f"  expect is now {added.case.expect}{_note(added.case.note)}"]), as_json=options.json)
             others = 0 if archive is not None or (path / layout.CRASH).is_file() else len(list_bundles(path)) - 1
             if others > 0:
-                say(f"  one of {others + 1} crashes; to add all of them, give {path}/crashes/*", as_json=options.json)
+                say(
+                    f"  one of {others + 1} crashes; to add all of them, give {command_line(path)}/crashes/*",
+                    as_json=options.json,
+                )
             if bundle.confirmed is False:
                 say("  warning: it is flaky, so that it may be fixed by luck", as_json=options.json)
     if options.json:
@@ -129,7 +132,7 @@ def _add(options: argparse.Namespace, _words: list[str]) -> int:
 
 def _added(path: str, size: int, *, log: str, new: bool) -> str:
     said = f"{size / 1024:.0f} KiB" + {"whole": "", "compact": ", with a compact log"}.get(log, ", without a log")
-    return in_lines([f"{path} {'is new' if new else 'was there already'} ({said})"])
+    return in_lines([f"{command_line(path)} {'is new' if new else 'was there already'} ({said})"])
 
 
 def _note(note: str) -> str:
@@ -199,7 +202,7 @@ def _list(options: argparse.Namespace, _words: list[str]) -> int:
     cases = [read_case(path) for path in find_cases(options.places)]
     for case in cases:
         note = f"  ({case.note})" if case.note else ""
-        say(in_lines([f"{case.path}  {case.expect}  {case.crash}{note}"]), as_json=options.json)
+        say(in_lines([f"{command_line(case.path)}  {case.expect}  {case.crash}{note}"]), as_json=options.json)
     if options.json:
         print(json.dumps({"cases": [case.to_json() for case in cases]}))
     return 0

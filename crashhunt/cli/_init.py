@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
+from crashhunt.base.text import command_line
 from crashhunt.cli._common import add_json, say
 from crashhunt.cli._exit_codes import DONE
 
@@ -90,11 +91,11 @@ def _init(options: argparse.Namespace, _words: list[str]) -> int:
     except KeyboardInterrupt:
         tell("")
         if not (options.directory / layout.SCENARIO).exists():
-            print(f"crashhunt: interrupted; {options.directory} was not made", file=sys.stderr)
+            print(f"crashhunt: interrupted; {command_line(options.directory)} was not made", file=sys.stderr)
         raise
     finally:
         tell("")
-    lines = [f"made {options.directory}", "", *describe_place(made), "", "Next:"]
+    lines = [f"made {command_line(options.directory)}", "", *describe_place(made), "", "Next:"]
     say("\n".join([*lines, *(f"  {command}" for command in made.commands)]), as_json=options.json)
     if options.json:
         print(json.dumps(made.to_json()))

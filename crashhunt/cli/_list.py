@@ -67,7 +67,7 @@ def _scenarios(options: argparse.Namespace, _words: list[str]) -> int:
             entries = [entry for entry in list_scenarios() if entry.get("name") == name]
             return _print_listing("scenarios", entries, as_json=True)
         hunt = f"crashhunt run OUT 0 100 1000 {command_line('--scenario', folder)}"
-        print(visible(f"{folder} has the files of {name}. Hunt in it: {hunt}"))
+        print(visible(f"{command_line(folder)} has the files of {name}. Hunt in it: {hunt}"))
         return 0
     return _print_listing("scenarios", list_scenarios(), as_json=options.json)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
+from crashhunt.base.text import command_line
 from crashhunt.cli._common import GivenOnce, add_json, number, say
 from crashhunt.cli._exit_codes import DONE, NO_ANSWER, THE_ANSWER_IS_NO
 from crashhunt.plans import RATE_PERS
@@ -89,7 +90,7 @@ def _rate(options: argparse.Namespace, _words: list[str]) -> int:
         say(describe_rates(rates), as_json=options.json)
     if options.html is not None:
         rates_page(rates, options.html)
-        say(f"{options.html} has the page", as_json=options.json or options.csv)
+        say(f"{command_line(options.html)} has the page", as_json=options.json or options.csv)
     if options.json:
         print(json.dumps({"rates": [rate.to_json() for rate in rates]}))
     return DONE if bar is None else exit_code_of(rate.verdict for rate in rates)

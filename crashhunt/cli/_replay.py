@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.base.temporary import temporary_folder
+from crashhunt.base.text import command_line
 from crashhunt.cli._common import (
     WordsWithCommas,
     add_crash,
@@ -347,7 +348,7 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
             good = good and set(report.verdicts) == {options.expect}
     written = write_films(options, shots, film) if film is not None else {}
     for path, count in written.items():
-        say(f"{path} has {count} pictures", as_json=options.json)
+        say(f"{command_line(path)} has {count} pictures", as_json=options.json)
     if options.json:
         data: dict[str, object] = dict(answers[0]) if len(answers) == 1 else {"crashes": answers}
         print(json.dumps(data | ({"written": written} if film is not None else {})))

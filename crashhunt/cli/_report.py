@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
+from crashhunt.base.text import command_line
 from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, say, shown_progress
 
 if TYPE_CHECKING:
@@ -73,7 +74,10 @@ def _report(options: argparse.Namespace, _words: list[str]) -> int:
             )
     also = f", and the {len(near)} most critical of {len(near_misses)} near misses" if near else ""
     count = f"{len(shown)} of {found.tally.found} crashes"
-    say(f"{target} ({size / 1e6:.1f} MB) shows {count}{_shown_crashes(found, shown)}{also}", as_json=options.json)
+    say(
+        f"{command_line(target)} ({size / 1e6:.1f} MB) shows {count}{_shown_crashes(found, shown)}{also}",
+        as_json=options.json,
+    )
     if options.json:
         data: dict[str, object] = {
             "file": str(target),

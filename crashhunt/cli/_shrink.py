@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.base.text import in_lines
+from crashhunt.base.text import command_line, in_lines
 from crashhunt.cli._common import (
     add_crash,
     add_json,
@@ -127,7 +127,7 @@ def _summary_of(found: Shrunk) -> str:
         *(f"  {name} was {left} and is {right}" for name, (left, right) in found.changed.items()),
         f"  {found.trials} trials"
         + (f"; stopped early: {found.why or found.ended}" if _interruption_words(found) else ""),
-        f"  saved in {small.path}",
+        f"  saved in {command_line(small.path)}",
         _confirmation_words(small),
         *(f"  note: {note}" for note in found.notes),
     ]

@@ -151,7 +151,7 @@ def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
     finally:
         finish()
     for place in replaced:
-        say(f"replaced: {place}", as_json=options.json)
+        say(f"replaced: {command_line(place)}", as_json=options.json)
     return _print_states(states, options.to or options.directory, as_json=options.json, replaced=replaced)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.base.text import one_of, visible
+from crashhunt.base.text import command_line, one_of, visible
 from crashhunt.cli._common import WordsWithCommas
 
 if TYPE_CHECKING:
@@ -74,5 +74,5 @@ def _trials(options: argparse.Namespace, _words: list[str]) -> int:
     else:
         with whole_file(options.out) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
             count = write_text(hunt, file, options.format, outcomes=outcomes)
-    print(f"{options.out} has {count} trials", file=sys.stderr)
+    print(f"{command_line(options.out)} has {count} trials", file=sys.stderr)
     return 0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, HuntDirectoryError, UsageError
-from crashhunt.base.text import near_path
+from crashhunt.base.text import command_line, near_path
 from crashhunt.cli._common import add_json, say
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def _trust_place(place: Path) -> list[TrustedOrigin]:
 
 
 def _line(origin: TrustedOrigin) -> str:
-    return f"{origin.id}  {origin.trusted_at}  {origin.path}: {origin.runs}"
+    return f"{origin.id}  {origin.trusted_at}  {command_line(origin.path)}: {origin.runs}"
 
 
 def _data(origin: TrustedOrigin) -> dict[str, str]:

@@ -187,7 +187,7 @@ def _near_misses(report: HuntReport, program: str) -> list[str]:
     """Return the saved near misses as text, one line each."""
     if not report.near_misses:
         return []
-    lines = ["", f"Near misses, saved in {report.directory / layout.NEAR_MISSES}:"]
+    lines = ["", f"Near misses, saved in {command_line(report.directory / layout.NEAR_MISSES)}:"]
     for bundle in report.near_misses[:_MAX_SHOWN]:
         result = bundle.result
         lines.append(f"  {bundle.id}  danger {result.danger or 0.0:.2f}  {format_arguments(result)}")
@@ -215,7 +215,7 @@ def describe_replay(report: ReplayReport) -> str:
     drivers = {
         "log": "the recorded actions",
         "current": "today's code",
-        "snapshot": f"the code in {rerun.snapshot.path}",
+        "snapshot": f"the code in {command_line(rerun.snapshot.path)}",
     }
     was = bundle.result
     lines = [
@@ -309,7 +309,7 @@ def _describe_crash(bundle: Bundle) -> list[str]:
         f"  {format_inputs(result)}",
     ]
     lines += [f"  {line}" for line in (*_evidence(result), *list_disturbances(result))]
-    lines.append(f"  saved in {bundle.path}")
+    lines.append(f"  saved in {command_line(bundle.path)}")
     if bundle.confirmed is not None:
         first: Plain = bundle.divergence or {}
         diverged = f"first difference at step {first.get('step')}, {first.get('agent')} {first.get('field')}"

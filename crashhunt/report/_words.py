@@ -6,6 +6,8 @@ import math
 import statistics
 from typing import TYPE_CHECKING
 
+from crashhunt.base.text import command_line
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
@@ -580,7 +582,7 @@ def describe_probes(report: HuntReport) -> list[str]:
             f"{found.run_again}{_not_finished(found.not_finished)}:"
         )
     for bundle, by in zip(found.crashes, found.by, strict=True):
-        lines.append(f"  {bundle.path}: {bundle.result.summary}, {by.words}")
+        lines.append(f"  {command_line(bundle.path)}: {bundle.result.summary}, {by.words}")
     return lines
 
 
@@ -605,7 +607,7 @@ def describe_branches(report: HuntReport) -> list[str]:
     for bundle in found.crashes:
         likely = bundle.result.log_likelihood
         said = f", log-likelihood {likely:.2f}" if likely is not None else ""
-        lines.append(f"  {bundle.path}: {bundle.result.summary}{said}")
+        lines.append(f"  {command_line(bundle.path)}: {bundle.result.summary}{said}")
     return lines
 
 

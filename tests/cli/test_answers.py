@@ -264,6 +264,7 @@ def test_words_are_spelled_out_for_argparse(words, found):
     [
         (None, 0, ""),
         (UsageError("x is 3", fix="give 2"), 2, "crashhunt: x is 3; give 2\n"),
+        (UsageError("is full", fix="free it", where="my\nhunt"), 2, "crashhunt: $'my\\x0ahunt': is full; free it\n"),
         (KeyboardInterrupt(), 130, ""),
         (ValueError("odd"), 2, "crashhunt: "),
         (OSError(28, "No space left on device", "file"), 2, "crashhunt: "),
@@ -386,6 +387,8 @@ def test_table_of_trials_goes_to_its_file_or_to_the_output(monkeypatch, capsys, 
     assert asked == [(Path("h"), "json", ["hang", "collision"]), (Path("h"), "csv", [])]
     assert (tmp_path / "t.csv").read_text() == "number\n"
     assert capsys.readouterr() == ("number\n", f"{tmp_path / 't.csv'} has 7 trials\nt.parquet has 8 trials\n")
+    run("trials", "h", "--out", "my\ntable", "--format", "parquet")
+    assert capsys.readouterr().err == "$'my\\x0atable' has 8 trials\n"
     with pytest.raises(UsageError, match="--format parquet cannot be printed on a terminal; give --out FILE"):
         run("trials", "h", "--format", "parquet")
     with pytest.raises(UsageError, match="--outcome: there is no outcome 'hangs'; did you mean 'hang'"):

@@ -491,6 +491,8 @@ def test_minimized_crash_is_described():
         "confirmed: bit-identical when replayed in a new process",
         "note: n",
     ]
+    odd = crash(path=Path("a\nb/crashes/3"), confirmed=True)
+    assert "\n  saved in $'a\\x0ab/crashes/3'\n" in _shrink._summary_of(shrunk(small=odd))
     plain = _shrink._summary_of(shrunk(small=small, ended="budget")).splitlines()
     assert len(plain) == 6
     assert plain[3].strip() == "40 trials; stopped early: budget"

@@ -95,6 +95,17 @@ def test_types_that_were_hunted_for_are_counted(monkeypatch, more, says):
     assert says in describe_hunt(report).splitlines()
 
 
+def test_printed_paths_can_be_copied_into_a_shell():
+    near = SimpleNamespace(id="7-near-miss", result=replace(FINE, danger=0.5))
+    crash = SimpleNamespace(id="4", path=Path("my\nhunt/4"), result=CRASH, confirmed=None, why_unconfirmed="")
+    report = replace(REPORT, directory=Path("my\nhunt"), near_misses=(near,), crashes=(crash,))
+    text = describe_hunt(report)
+    assert "  saved in $'my\\x0ahunt/4'" in text.splitlines()
+    assert "Near misses, saved in $'my\\x0ahunt/near-misses':" in text.splitlines()
+    spaced = describe_hunt(replace(report, directory=Path("my hunt")))
+    assert "Near misses, saved in 'my hunt/near-misses':" in spaced.splitlines()
+
+
 HIT = Collision("ego", "collider", "ego", "x", ("overlap",), "overlap", 1.0, 2.0, "a_0", 9.0, 3.0)
 CRASH = TrialResult(
     TrialSpec(4, 1, {"ego": {"speed": 8.5}}, {"gap": 3}, 90), Outcome.COLLISION, steps=30, collision=HIT
