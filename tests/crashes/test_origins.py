@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 from conftest import Shell, add_toy
+from repositories import git
 
 from crashhunt.base.integrity import describe_files, digest_of_data
 from crashhunt.cli import main
@@ -338,11 +338,6 @@ def test_damaged_entries_are_not_listed(place):
     (folder / f"{'cd' * 32}.json").write_text((folder / f"{'ab' * 32}.json").read_text())
     (folder / "list.json").write_text("[]")
     assert list_trusted() == [entry]
-
-
-def git(folder, *words):
-    identity = ("-c", "user.name=x", "-c", "user.email=x@example.com")
-    subprocess.run(["git", "-C", str(folder), *identity, *words], check=True, capture_output=True)
 
 
 def test_what_the_repository_of_the_current_folder_tracks_is_trusted(place, monkeypatch):

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
 from types import SimpleNamespace
 
 import pytest
+from repositories import git
 from test_corpus import BROKEN, DRIVER, MENDED
 
 from crashhunt.base.errors import UsageError
 from crashhunt.corpus import _bisect
-
-
-def git(folder, *words):
-    who = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
-    return subprocess.run(["git", *who, *words], cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
 @pytest.fixture

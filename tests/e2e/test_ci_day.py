@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from test_bisect import git
+from repositories import git
 from test_github_actions import Runner
 
 GUIDE = resources.files("crashhunt") / "guide"

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import signal
 import sqlite3
-import subprocess
 import time
 import xml.etree.ElementTree as ET
 from contextlib import closing
 
 import pytest
+from repositories import git
 
 DRIVERS = """
 class Calm:
@@ -35,11 +35,6 @@ class Twin(Calm):
 TOY = ("--scenario", "toy", "--set", "gap_m=20:30", "--max-steps", "99", "--parallel", "2")
 CALM, WILD, TWIN = "drivers:Calm", "drivers:Wild", "drivers:Twin"
 SEED = ("--seed", "4")
-
-
-def git(folder, *words):
-    who = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
-    return subprocess.run(["git", *who, *words], cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from golden import compare_golden, compare_golden_json, need_python, need_versions, normalised, read_golden
-from test_bisect import git
+from repositories import git
 from test_corpus import BROKEN, DRIVER, MENDED
 from test_stops import rows, wait_for
 

@@ -22,7 +22,7 @@ from types import SimpleNamespace
 
 import pytest
 from conftest import keeps_going, mostly_nightly
-from test_bisect import git
+from repositories import git
 from test_corpus import DRIVER, MENDED
 
 from crashhunt.base.git import run_to_end

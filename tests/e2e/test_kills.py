@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from conftest import FAULTY, Shell, add_toy
-from test_bisect import git
+from repositories import git
 from test_corpus import DRIVER, MENDED
 from test_killed import AGENT, SUITE, facts, processes_of, rows_by_digest, wait_for
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
 
 import numpy as np
 import pytest
+from repositories import git, make_repository
 
 AGENT = """
 from pathlib import Path
@@ -35,11 +35,6 @@ class Planner:
 RUN = ("run", "../out", "1", "1", "80", "--agent", "planner.agents:Planner", "--scenario", "../toy", "--seed", "1")
 
 
-def git(folder, *words: str) -> str:
-    command = ["git", "-c", "user.name=T", "-c", "user.email=t@example.org", "-c", "init.defaultBranch=main", *words]
-    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
-
-
 @pytest.fixture
 def project(toy):
     """A git work tree: src layout, a dirty file, an untracked one, an ignored one, links, an old hunt."""
@@ -55,9 +50,7 @@ def project(toy):
     (package / "linked.py").symlink_to("real.py")
     (tree / "outside").symlink_to("/etc")
     (tree / ".gitignore").write_text("*.secret\nbuild/\n")
-    git(tree, "init", "-q")
-    git(tree, "add", ".")
-    git(tree, "commit", "-qm", "first")
+    make_repository(tree)
     (package / "tuning.py").write_text("LAST = 20\n")  # dirty
     (package / "untracked.py").write_text("")
     (package / "deleted.py").unlink()
@@ -244,9 +237,7 @@ def test_a_submodule_comes_along(project):
     other = project.folder.parent / "library"
     other.mkdir()
     (other / "inside.py").write_text("VALUE = 1\n")
-    git(other, "init", "-q")
-    git(other, "add", ".")
-    git(other, "commit", "-qm", "first")
+    make_repository(other)
     git(project.folder, "-c", "protocol.file.allow=always", "submodule", "add", "-q", str(other), "libs/library")
     project.crashhunt(*RUN)
     (snapshot,) = snapshots(project)

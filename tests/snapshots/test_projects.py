@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
 
 import pytest
+from repositories import git, make_repository
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, SnapshotError
@@ -16,11 +16,6 @@ from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.snapshots import SnapshotOptions, take_snapshot
 
 BASE = "code/@my project"
-
-
-def git(folder, *words: str) -> str:
-    command = ["git", "-c", "user.name=T", "-c", "user.email=t@example.org", "-c", "init.defaultBranch=main", *words]
-    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +32,7 @@ def original(tmp_path_factory):
     (package / "linked.py").symlink_to("real.py")
     (tree / "outside").symlink_to("/etc")
     (tree / ".gitignore").write_text("*.secret\nbuild/\n")
-    git(tree, "init", "-q")
-    git(tree, "add", ".")
-    git(tree, "commit", "-qm", "first")
+    make_repository(tree)
     (package / "tuning.py").write_text("LAST = 20\n")
     (package / "untracked.py").write_text("")
     (package / "deleted.py").unlink()
@@ -120,9 +113,7 @@ def test_submodules_and_roots_are_taken_in(project, take, tmp_path):
     other = tmp_path / "library"
     other.mkdir()
     (other / "inside.py").write_text("VALUE = 1\n")
-    git(other, "init", "-q")
-    git(other, "add", ".")
-    git(other, "commit", "-qm", "first")
+    make_repository(other)
     git(project, "-c", "protocol.file.allow=always", "submodule", "add", "-q", str(other), "libs/library")
     (tmp_path / "extra").mkdir()
     (tmp_path / "extra" / "notes.txt").write_text("read me")
