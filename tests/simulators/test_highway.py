@@ -25,6 +25,7 @@ from crashhunt.scenario import (
 from crashhunt.scenario.backends.highway import HighwaySetup
 from crashhunt.simulators.highway import HighwaySimulator
 from crashhunt.testing import SimulatorContract
+from crashhunt.world import corners
 
 # isort: split
 
@@ -210,6 +211,10 @@ def test_a_crash_states_who_drove_into_which_and_how_fast(tmp_path):
     assert simulator.agents == []
     finding = merge_findings(ReportedCollision().check(scene, ("agent-0",)))
     assert (finding.outcome, finding.collision.role) == ("collision", "collider")
+    # The two are apart, because highway-env has pushed and braked them since. Its own polygons are there as well.
+    things = simulator._objects()
+    shown = [np.sort(corners(scene, row), axis=0) for row in range(len(things))]
+    assert shown == [pytest.approx(np.sort(thing.polygon()[:4] * (1, -1), axis=0), abs=1e-9) for thing in things]
 
 
 def test_an_obstacle_is_hit_and_never_drives(tmp_path):
