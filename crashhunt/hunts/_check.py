@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, cast
 
 from crashhunt.base import layout
 from crashhunt.base.codec import JsonObject, Serializable
-from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError
+from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError, remedy
 from crashhunt.base.files import cannot_write, is_empty_folder, sync_folder, sync_tree
+from crashhunt.base.resources import error_of_next_files, limit_behind
 from crashhunt.base.temporary import has_ended, new_folder, owner_in
 from crashhunt.crashes import Bundle, read_bundle, read_params
 from crashhunt.hunts._state import find_hunts, hunt_state, is_hunt
@@ -31,6 +32,7 @@ __all__ = ["CheckFinding", "Checked", "check", "intact_snapshots", "salvage"]
 
 
 _MAX_SHOWN = 5
+_MAX_OPEN_FILES = 4  # at a time: a folder, and the ledger with its write-ahead log and shared memory
 _SCRATCH = ".scratch"  # of a hunt, which does not run where its leftovers are looked for
 
 
@@ -104,7 +106,11 @@ def check(directory: Path) -> list[Checked]:
 
     Raises:
         HuntDirectoryError: the directory or file is none of these.
+        CrashhuntError: the limit on open files is too low. A file that cannot be opened would count as damaged.
     """
+    if no_file := error_of_next_files(_MAX_OPEN_FILES):
+        fix = limit_behind(no_file) or remedy(no_file)
+        raise CrashhuntError(f"the check cannot open files: {no_file.strerror}", fix=fix, where=str(directory))
     if directory.is_file():
         return [_check_file(directory)]
     if (directory / layout.CRASH).exists():

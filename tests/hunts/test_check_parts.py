@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import sqlite3
@@ -16,7 +17,7 @@ from columns import FEWER_COLUMNS
 from crashhunt.base.integrity import digest_of_data
 from crashhunt.base.temporary import this_process
 from crashhunt.crashes import export_crash, find_bundle
-from crashhunt.errors import HuntDirectoryError
+from crashhunt.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.hunts import check, salvage
 from crashhunt.hunts._check import intact_snapshots
 from crashhunt.hunts._state import ledger_owner
@@ -71,6 +72,14 @@ def test_what_is_whole_is_fine(hunt):
     assert (one.kind, one.crashes, one.fine) == ("crash", [CRASH], True)
     with pytest.raises(HuntDirectoryError):
         check(hunt.parent / "nowhere")
+
+
+def test_a_low_limit_on_open_files_is_not_taken_for_damage(hunt, monkeypatch):
+    error = OSError(errno.EMFILE, "Too many open files")
+    monkeypatch.setattr("crashhunt.hunts._check.error_of_next_files", lambda count: error)
+    monkeypatch.setattr("resource.getrlimit", lambda which: (5, 5))
+    with pytest.raises(CrashhuntError, match="cannot open files: Too many open files; the limit on open files is 5: "):
+        check(hunt)
 
 
 def test_a_row_that_has_changed_is_a_damaged_trial(hunt):
