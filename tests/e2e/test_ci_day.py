@@ -135,14 +135,14 @@ def test_every_command_of_the_corpus_page_and_the_workflows_of_the_ci_page(proje
     shown = commands_of("howto/corpus.md")
     assert [command.split()[:3] for command in shown] == [
         ["crashhunt", "corpus", "add"], ["crashhunt", "corpus", "run"], ["crashhunt", "corpus", "run"],
-        ["crashhunt", "show", "out/000003-collision-aaa01d"], ["pytest", "crashes"],
-        ["crashhunt", "bisect", "crashes/000003-collision-aaa01d"],
+        ["crashhunt", "show", "out/000003-collision-aaa010"], ["pytest", "crashes"],
+        ["crashhunt", "bisect", "crashes/000003-collision-aaa010"],
     ]  # fmt: skip
     case, results = None, []
     for command in shown:
         command = command.replace("crash/crashes/000003-collision", str(bundle))
         if case is not None:
-            command = command.replace("000003-collision-aaa01d", case)
+            command = command.replace("000003-collision-aaa010", case)
         words = shlex.split(command)
         if words[0] == "pytest":
             done = subprocess.run(
