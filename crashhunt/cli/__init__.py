@@ -71,7 +71,8 @@ examples:
   crashhunt show crash
       describe the crash in words and numbers
 
-exit codes: 0 done, 1 negative result, 2 wrong usage or input, 3 no valid trial or undecided, 130 interrupted
+exit codes: 0 done, 1 negative result, 2 wrong usage or input, 3 no valid trial or undecided, 130 interrupted,
+  141 the reader of the output has gone
 """
 
 
