@@ -140,15 +140,22 @@ class Hunt:
                 self._fail(ledger, f"{type(error).__name__}: {error}")
                 raise
             finally:
-                with suppress(CrashhuntError):
-                    ledger.note(owner=None, heartbeat=time.time())
+                if self._place.has_begun:
+                    with suppress(CrashhuntError):
+                        ledger.note(owner=None, heartbeat=time.time())
                 ledger.close()
                 remove_scratch(self._place.scratch)  # while requests to stop are only collected
 
     def _fail(self, ledger: Ledger, why: str) -> None:
-        """Record why the hunt ends, if the ledger can still be written."""
+        """Record why the hunt ends, if the ledger can still be written.
+
+        If this run has not begun, the state of an earlier run stays, because `rerun` would repeat a failed hunt.
+        """
         remove_scratch(self._place.scratch)  # on a disk that is full, this makes room for a line
         with suppress(CrashhuntError):
+            if not self._place.has_begun and "state" in ledger.facts():
+                ledger.remark(encodable(why))
+                return
             last: Noted = self._progress.noted(now=True) if self._progress is not None else {}
             ledger.enter("error", encodable(why), **last)
 
@@ -195,6 +202,8 @@ class Hunt:
             forcings=forcings_of(settings, ledger, self._disturber),
         )
         progress.rare = rare_watch(settings, ledger, self._disturber)
+        if not progress.is_done:
+            trials.require_same_version()
         ledger.enter(
             "running",
             owner=ledger_owner(),

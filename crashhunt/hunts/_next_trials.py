@@ -186,6 +186,15 @@ class Trials:
             self._ledger.note(origins=True)  # so that tables of trials have columns for them
         return found
 
+    def require_same_version(self) -> None:
+        """Refuse a hunt whose next trial would be proposed by another version of the sampler, before the hunt begins.
+
+        Raises:
+            HuntDirectoryError: the hunt began with another version.
+        """
+        if self._sampler.learns and self._next is not None and self._next not in self._proposed:
+            self._refuse_other_version()
+
     def ended(self, result: TrialResult) -> None:
         """Register the result of a trial, which is already in the ledger or will be written next."""
         number = result.spec.number

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.codec import OMIT_DEFAULT, Serializable, written_if
-from crashhunt.base.errors import BusyError, HuntDirectoryError
+from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError
+from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import changed_file
 from crashhunt.base.temporary import remove_ended, remove_scratch, temporary_beside, this_process
 from crashhunt.base.text import command_line, near_path
@@ -523,12 +524,14 @@ class HuntDirectory:
         path: path of the directory; the directory itself is created if it does not exist.
 
     Attributes:
-        has_begun: whether the hunt has begun. Before that, an error deletes a directory that was created for the hunt.
+        has_begun: whether the hunt has begun. Before that, an error deletes a directory that was created for the hunt,
+            and restores the settings of a hunt that was to resume.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.has_begun = False
+        self._settings_before: bytes | None = None
 
     @property
     def scratch(self) -> Path:
@@ -574,6 +577,9 @@ class HuntDirectory:
                     self._remove_own(".lock")
                     with suppress(OSError):
                         self.path.rmdir()
+                elif self._settings_before is not None and not self.has_begun:
+                    with suppress(CrashhuntError, OSError), whole_file(self.path / layout.HUNT) as temporary:
+                        temporary.write_bytes(self._settings_before)
                 raise
 
     def _make(self) -> bool:
@@ -627,6 +633,7 @@ class HuntDirectory:
         for folder in (self.path, *(self.path / name for name in (layout.CRASHES, *layout.BESIDE))):
             remove_ended(folder)
         try:
+            self._settings_before = file.read_bytes() if file.exists() else None
             self.scratch.mkdir()
             write_settings(file, settings, command)
         except OSError as error:

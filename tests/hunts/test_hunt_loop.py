@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 import crashhunt
-from crashhunt.errors import CrashhuntError, ScenarioError
+from crashhunt.errors import CrashhuntError, HuntDirectoryError, ScenarioError
 from crashhunt.hunts import _hunt as hunt_module, _next_trials
 from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace
@@ -200,6 +200,22 @@ def test_ledger_has_the_lag_and_the_version_of_a_sampler_that_learns(run, sample
     ]
 
 
+def test_refused_resumption_changes_neither_state_nor_settings_of_a_hunt(run):
+    found = run(3, sampler="mutation")
+    settings = (found.path / "hunt.toml").read_bytes()
+    with closing(Ledger(found.path / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(sampler_version=1)
+        before = ledger.facts()
+    with pytest.raises(HuntDirectoryError, match="the hunt began with version 1 of the sampler"):
+        run(9, sampler="mutation")
+    assert (found.path / "hunt.toml").read_bytes() == settings
+    with closing(Ledger(found.path / "ledger.sqlite")) as ledger:
+        assert ledger.facts() == before
+        assert ledger.events()[-1][1] == "remark"
+    again = run(3, sampler="mutation")  # which needs no proposal
+    assert (again.report.stopped_because, again.facts["state"]) == ("all_trials", "all_trials")
+
+
 def test_ledger_has_the_settings_of_the_hunt_and_of_this_run(run, monkeypatch):
     entered = []
     enter = Ledger.enter
@@ -381,6 +397,17 @@ def test_first_crash_ends_a_hunt(run, bundles, deterministic):
     assert found.executor.cancelled == [3 if deterministic else -1, -1]
     assert found.facts["state"] == "crash"
     assert (found.report.unanswered, found.report.unconfirmed) == (0, 0)
+
+
+def test_hunt_that_has_found_its_crash_ends_with_any_version_of_its_sampler(run, bundles, monkeypatch):
+    run(30, crashes_from(3), sampler="mutation")
+    with closing(Ledger(Path("h/ledger.sqlite"), writable=True)) as ledger:
+        ledger.note(sampler_version=1)
+    bundle = SimpleNamespace(
+        result=crashes_from(3)(TrialSpec(3, 1, {}, {}, 60)), id="000003-collision", confirmed=True, snapshot=""
+    )
+    monkeypatch.setattr(hunt_module, "list_bundles", lambda directory: [bundle])
+    assert run(30, sampler="mutation").report.stopped_because == "crash"
 
 
 def test_deterministic_hunt_waits_for_trials_below_its_crash(run, bundles, monkeypatch):

@@ -160,6 +160,7 @@ def test_ledger_that_was_removed_is_written_again_with_a_note(hunt):
 
 def test_hunt_that_fails_records_why(hunt, monkeypatch):
     found, ledger, removed = hunt(), Notes(), []
+    found._place.has_begun = True
     monkeypatch.setattr(_hunt, "remove_scratch", removed.append)
     found._fail(ledger, "no disk")
     assert ledger.entered == [("error", "no disk", {})]
@@ -197,7 +198,9 @@ def test_error_of_a_hunt_is_in_its_ledger(hunt, monkeypatch, error, raised, why)
         yield ()
 
     ledger = SimpleNamespace(note=lambda **facts: noted.append(facts), close=lambda: noted.append("closed"))
-    found._place = SimpleNamespace(locked=locked, claim=lambda *given, **more: SETTINGS, scratch="scratch")
+    found._place = SimpleNamespace(
+        locked=locked, claim=lambda *given, **more: SETTINGS, scratch="scratch", has_begun=True
+    )
     monkeypatch.setattr(_hunt, "stop_requests", stops)
     monkeypatch.setattr(_hunt, "Ledger", lambda path, *, writable: ledger if writable else None)
     monkeypatch.setattr(_hunt, "remove_scratch", removed.append)
