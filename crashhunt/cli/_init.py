@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["add_init"]
 
-_KIND_BY_OPTION = {"osm": "osm", "opendrive": "opendrive", "net": "net"}
-
 
 def add_init(commands: Commands) -> None:
     """Add the command ``init`` to the parser."""
