@@ -7,6 +7,8 @@ import os
 import pty
 import re
 import subprocess
+import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -166,6 +168,19 @@ def test_every_file_that_the_architecture_names_is_there():
     for name in re.findall(r"`((?:\w+/)+\w+\.(?:py|html))`", text):
         if "NAME" not in name:
             assert (top / name).is_file() or (top.parent / name).is_file(), name
+
+
+def test_table_of_packages_has_all_of_them_in_the_order_of_their_imports():
+    top = Path(crashhunt.__file__).parent
+    text = find_page("architecture").file.read_text()
+    table = text.partition("## The packages")[2].partition("\n\n`crashhunt`, ")[0]
+    rows = [re.findall(r"`(\w+)`", line.split("|")[2]) for line in table.splitlines() if line.startswith("|")]
+    contracts = tomllib.loads((top.parent / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    (layers,) = (one["layers"] for one in contracts if one["type"] == "layers" and "crashhunt.cli" in one["layers"])
+    place = {name.split(".")[1]: at for at, layer in enumerate(layers) for name in layer.split(" | ")}
+    assert {name for row in rows for name in row} == place.keys()
+    places = [[place[name] for name in row] for row in rows if row]
+    assert all(max(row) < min(below) for row, below in pairwise(places))
 
 
 def test_a_topic_that_is_none_is_refused_from_python_too():
