@@ -254,7 +254,13 @@ class Ledger(LedgerReader):
 
     @contextmanager
     def _lasting(self) -> Iterator[None]:
-        """Return a context whose commit waits for the disk, which also makes all earlier commits durable."""
+        """Return a context whose commit waits for the disk, which also makes all earlier commits durable.
+
+        Inside `together`, its records are committed first, because SQLite refuses a transaction within a transaction.
+        """
+        is_together = self._database.in_transaction
+        if is_together:
+            self._database.execute("COMMIT")
         self._database.execute("PRAGMA synchronous = FULL")
         try:
             with self._database:
@@ -262,6 +268,9 @@ class Ledger(LedgerReader):
                 yield
         finally:
             self._database.execute("PRAGMA synchronous = NORMAL")
+            if is_together:
+                self._database.execute("BEGIN")
+                self._together_since = time.monotonic()
 
     def _begin_to_write(self) -> None:
         """Check that the existing contents are intact before the first write, and migrate them to this version.

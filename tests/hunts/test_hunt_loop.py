@@ -19,7 +19,7 @@ from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace
 from crashhunt.hunts._state import ledger_owner
 from crashhunt.ledger import Ledger
-from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import Branches, Failure, Outcome, TrialResult, TrialSpec
 
 TOY = """
 title = "A toy"
@@ -503,6 +503,20 @@ def test_parts_of_a_hunt_are_closed_at_its_end(run, monkeypatch):
         run(3, fails, overwrite=True)
     assert closed == ["Audit", "Confirmation", "SharedExecutors"]
     assert list(found.path.glob(".scratch*")) == []
+
+
+def test_trial_that_is_another_one_when_it_runs_again_does_not_end_the_hunt(run):
+    found = run(3)
+    asked_again = Branches(unanswered=1, may_be_asked_again=True)
+    with closing(Ledger(found.path / "ledger.sqlite", writable=True)) as ledger:
+        ledger.record(replace(ledger.result(1), branches=asked_again, digest="f" * 32), snapshot="")
+        ledger.note(copies=["branches"])
+    again = run(3)
+    assert [spec.number for spec in again.executor.submitted] == [1]
+    assert again.report.stopped_because == "all_trials"
+    (note,) = [note for note in again.report.notes if note != "a note"]
+    assert note.startswith("trial 1 was run again for the answers of its copies, and is another one")
+    assert ("remark", note) in again.events
 
 
 def test_bundle_whose_row_is_missing_is_recorded_when_a_hunt_resumes(run, monkeypatch):

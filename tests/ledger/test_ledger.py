@@ -73,6 +73,20 @@ def test_what_is_recorded_together_is_there_at_once_and_whatever_happens(tmp_pat
         assert reader.facts()["heartbeat"] == 1.0
 
 
+def test_remark_among_what_is_recorded_together_comes_after_the_records_before_it(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    with closing(Ledger(path, writable=True)) as writer, closing(Ledger(path)) as reader:
+        with writer.together():
+            writer.record(result(1), snapshot="")
+            writer.remark("odd")
+            writer.note(origins=True)
+            assert (reader.finished(), reader.facts()["origins"]) == ({1}, True)
+            writer.record(result(2), snapshot="")
+            assert reader.finished() == {1}
+        assert reader.finished() == {1, 2}
+        assert [event[1:] for event in reader.events()] == [("remark", "odd")]
+
+
 def test_what_is_recorded_together_is_not_kept_back_while_trials_are_waited_for(tmp_path, monkeypatch):
     path = tmp_path / "ledger.sqlite"
     now = 100.0
