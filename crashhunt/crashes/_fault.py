@@ -36,24 +36,24 @@ __all__ = ["RULES", "Blame", "Fault", "FaultFinding", "Verdict", "fault_in", "fa
 
 Blame = Literal["ego", "other", "both"]
 
-_RESPONSE_S = 1.0  # RSS: response time
-_RSS_MAX_ACCELERATION_MPS2 = 3.5  # m/s², RSS: at most, until then
-_RSS_MIN_BRAKING_MPS2 = 4.0  # m/s², RSS: at least, from then on
-_RSS_MAX_BRAKING_MPS2 = 8.0  # m/s², RSS: at most, who is ahead
-_MAX_MERGE_ANGLE_RAD = math.radians(30)  # who meets at a smaller angle follows, or changes lanes
-_IMPOSSIBLE_BRAKING_MPS2 = 10.0  # m/s²; who stops faster has not braked
-_FOLLOWS_S = 3.5  # who has been ahead for so long has not just come there
-_CHANGE_S = 3.0  # a lane change that began longer ago is over
-_AT_ONCE_S = 1.5  # an event that begins less than this before the contact is too late for a driver behind
-_TOGETHER_S = 0.5  # of each other: neither was there first
-_STANDS_S = 1.0
-_STEP_M = 1.0  # lateral distance from a car's side; a nearer person walks in its way
-_OFF_M = 2.5  # lateral distance from a car's axis; a nearer person may be on the road
-_WALKING_SPEED_MPS = 3.0  # m/s; a slower vehicle can stop for any actor
-_CLEARS_S = 3.0
-_INSERTED_S = 1.0  # what happens sooner after the start is due to where vehicles were inserted
+_RESPONSE_S = 1.0  # s, RSS: response time of the rear vehicle
+_RSS_MAX_ACCELERATION_MPS2 = 3.5  # m/s², RSS: maximum acceleration of the rear vehicle in its response time
+_RSS_MIN_BRAKING_MPS2 = 4.0  # m/s², RSS: minimum braking of the rear vehicle after its response time
+_RSS_MAX_BRAKING_MPS2 = 8.0  # m/s², RSS: maximum braking of the front vehicle
+_MAX_MERGE_ANGLE_RAD = math.radians(30)  # at a smaller angle, a vehicle follows the other or changes lanes
+_IMPOSSIBLE_BRAKING_MPS2 = 10.0  # m/s²: no brake decelerates more, so the vehicle hit something or was stopped
+_FOLLOWS_S = 3.5  # s: a vehicle that was ahead for longer did not just enter the path
+_CHANGE_S = 3.0  # s: a lane change that began earlier is complete
+_AT_ONCE_S = 1.5  # s before the contact: a driver behind cannot react to a later event
+_TOGETHER_S = 0.5  # s: if two vehicles move within this time, neither was there first
+_STANDS_S = 1.0  # s: an actor that stood for less time may only have paused
+_STEP_M = 1.0  # m from the side of a car: a nearer person walks in the path of the car
+_OFF_M = 2.5  # m from the axis of a car: a nearer person may already be on the road
+_WALKING_SPEED_MPS = 3.0  # m/s: a slower vehicle can stop for any actor
+_CLEARS_S = 3.0  # s before the contact: a vehicle that stood or was inside a junction for so long could be seen
+_INSERTED_S = 1.0  # s after the start: earlier crashes result from the places where vehicles were inserted
 _SOURCES = {"red_light": "Vienna, article 23; StVO § 37", "wrong_way": "Vienna, article 10; StVO § 2"}
-_RED_S = 8.0  # after a red light, a junction is left by then
+_RED_S = 8.0  # s: a vehicle that ran a red light has left the junction after this time
 
 
 @dataclass(frozen=True, slots=True)
