@@ -252,10 +252,7 @@ class TrialReruns:
             if note not in self.notes:  # the end of the hunt asks again
                 self.notes.append(note)
             return bundle
-        if found is None or not bundle.path.is_dir():  # a hunt with --keep may have given it up meanwhile
-            return bundle
-        found.write()
-        return found
+        return bundle if found is None or not _is_written(found, bundle.path) else found
 
     def judge_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Judged:
         """Find the cause of a crash by runs, and write the result into its bundle.
@@ -278,8 +275,8 @@ class TrialReruns:
             return Judged(bundle)
         if is_stopped():
             return Judged(bundle, is_stopped=True)
-        if found is not bundle and bundle.path.is_dir():
-            found.write()
+        if found is not bundle:
+            _is_written(found, bundle.path)
         return Judged(found, cause)
 
     def judge(self, progress: Progress) -> None:
@@ -295,6 +292,19 @@ class TrialReruns:
     def _is_made_now(self, bundle: Bundle) -> bool | None:
         """Return whether a bundle has the snapshot that this process has just taken, whose files need no check."""
         return True if bundle.snapshot == self.taken and is_bundle_made_here(bundle) else None
+
+
+def _is_written(found: Bundle, folder: Path) -> bool:
+    """Write a bundle into its folder; return False if a hunt with ``--keep`` has deleted it, maybe at this moment."""
+    if not folder.is_dir():
+        return False
+    try:
+        found.write()
+    except CrashhuntError:
+        if folder.is_dir():
+            raise
+        return False
+    return True
 
 
 def is_settled(bundle: Bundle) -> bool:

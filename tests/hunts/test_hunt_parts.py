@@ -482,6 +482,32 @@ def test_crash_is_confirmed_once_and_written_if_it_is_still_there(tmp_path, monk
     assert again.notes == ["a was not confirmed: it is not yours; trust it"]
 
 
+def test_crash_that_is_deleted_while_it_is_written_stays_unconfirmed(tmp_path, monkeypatch):
+    class Deleted(Bundle):
+        def write(self):
+            if not kept:
+                self.path.rmdir()
+            raise HuntDirectoryError("cannot be written", fix="x")
+
+    kept, bundle = False, Deleted("a", tmp_path / "a")
+    monkeypatch.setattr(_verification, "confirm", lambda given, *_, **__: replace(given, confirmed=True))
+    monkeypatch.setattr(_verification, "find_cause", lambda given, *_, **__: ("cause", replace(given, confirmed=True)))
+    monkeypatch.setattr(_verification, "is_bundle_made_here", lambda given: True)
+    again = reruns(tmp_path)
+    for run, wanted in (
+        (again.confirm_one, bundle),
+        (again.judge_one, Judged(replace(bundle, confirmed=True), "cause")),
+    ):
+        kept = False
+        bundle.path.mkdir()
+        assert run(bundle) == wanted
+        kept = True
+        bundle.path.mkdir()
+        with pytest.raises(HuntDirectoryError):
+            run(bundle)
+        bundle.path.rmdir()
+
+
 def test_crashes_are_confirmed_in_a_phase_and_stay_in_order(tmp_path):
     began = []
     phases = SimpleNamespace(
