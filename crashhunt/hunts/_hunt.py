@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, ScenarioError, remedy
 from crashhunt.base.signals import stop_requests
-from crashhunt.base.temporary import release_shared_memory, remove_scratch
+from crashhunt.base.temporary import release_shared_memory, remove_at_once, remove_scratch
 from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import internal_error, scratch_of
@@ -106,6 +106,7 @@ class Hunt:
         self._imported = imported
         self._pace = Pace(partner) if partner is not None else None
         self._stops: Sequence[int] = ()
+        self._new_snapshot: Path | None = None  # that this run has added
         self._progress: Progress | None = None  # once the ledger says that the hunt runs
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
@@ -155,15 +156,18 @@ class Hunt:
         with suppress(CrashhuntError):
             if not self._place.has_begun and "state" in ledger.facts():
                 ledger.remark(encodable(why))
+                if self._new_snapshot is not None:  # no trial ran from it, and its training record would count
+                    remove_at_once(self._new_snapshot)
                 return
             last: Noted = self._progress.noted(now=True) if self._progress is not None else {}
             ledger.enter("error", encodable(why), **last)
 
     def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
         settings = self.settings
-        snapshot = take_snapshot(
-            self.directory / layout.SNAPSHOTS, self.scenario, settings, self._snapshot_options, imported=self._imported
-        )
+        snapshots = self.directory / layout.SNAPSHOTS
+        known = {path.name for path in snapshots.glob(layout.SHOWN)}
+        snapshot = take_snapshot(snapshots, self.scenario, settings, self._snapshot_options, imported=self._imported)
+        self._new_snapshot = snapshot.path if snapshot.path.name not in known else None
         sampler = sampler_of(settings)
         self._disturber = disturber_apart(self.scenario, settings)
         progress = Progress()

@@ -203,12 +203,15 @@ def test_ledger_has_the_lag_and_the_version_of_a_sampler_that_learns(run, sample
 def test_refused_resumption_changes_neither_state_nor_settings_of_a_hunt(run):
     found = run(3, sampler="mutation")
     settings = (found.path / "hunt.toml").read_bytes()
+    (snapshot,) = (found.path / "snapshots").iterdir()
+    snapshot.rename(snapshot.with_name("earlier"))
     with closing(Ledger(found.path / "ledger.sqlite", writable=True)) as ledger:
         ledger.note(sampler_version=1)
         before = ledger.facts()
     with pytest.raises(HuntDirectoryError, match="the hunt began with version 1 of the sampler"):
         run(9, sampler="mutation")
     assert (found.path / "hunt.toml").read_bytes() == settings
+    assert [path.name for path in (found.path / "snapshots").iterdir()] == ["earlier"]
     with closing(Ledger(found.path / "ledger.sqlite")) as ledger:
         assert ledger.facts() == before
         assert ledger.events()[-1][1] == "remark"
