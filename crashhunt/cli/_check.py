@@ -55,7 +55,8 @@ def _check(options: argparse.Namespace, _words: list[str]) -> int:
     saved = None
     if options.salvage is not None:
         saved = salvage(found[0], options.salvage)
-        counts = f"{saved['trials']} trials and {saved['crashes']} crashes"
+        crashes = f"{saved['crashes']} crash{'' if saved['crashes'] == 1 else 'es'}"
+        counts = f"{count_of(saved['trials'], 'trial')} and {crashes}"
         say(
             f"{counts} are in {command_line(options.salvage)}; resume the hunt there with crashhunt run",
             as_json=options.json,

@@ -482,7 +482,7 @@ def _settings(hunt: Path) -> HuntSettings:
 
 
 def _copy_rows(found: Checked, settings: HuntSettings, to: Path) -> int:
-    """Copy the intact rows of trials, except those of crashes without a bundle."""
+    """Copy the intact rows of trials, except those of crashes whose bundle is missing or damaged."""
     with closing(Ledger(to / layout.LEDGER, writable=True)) as ledger:
         count = 0
         source = found.dir / layout.LEDGER
@@ -490,7 +490,8 @@ def _copy_rows(found: Checked, settings: HuntSettings, to: Path) -> int:
         if found.trials and has_begun(source):
             with closing(Ledger(source)) as old:
                 try:
-                    kept = cast("Noted", {name: fact for name, fact in old.facts().items() if name in _KEPT_FACTS})
+                    names = _KEPT_FACTS | _DROPPED_FACTS if found.dropped else _KEPT_FACTS
+                    kept = cast("Noted", {name: fact for name, fact in old.facts().items() if name in names})
                 except HuntDirectoryError:
                     kept = {"replanned": True}  # it is not known, and True forbids a p-value
                 ledger.propose(old.intact_turns())
@@ -506,13 +507,14 @@ def _copy_rows(found: Checked, settings: HuntSettings, to: Path) -> int:
 _KEPT_FACTS = frozenset((
     "crash_on", "disturb", "independent", "lag", "lag_grows", "origins", "plain_origin", "replanned", "sampler_version",
 ))  # fmt: skip
+_DROPPED_FACTS = frozenset(("dropped", "dropped_at_fault", "dropped_judged"))  # about crashes without a bundle
 
 
 def _copied_rows(found: Checked, settings: HuntSettings, ledger: Ledger) -> Iterator[tuple[int, Row]]:
     """Yield the number and the row of each trial that is copied."""
     bundles = {int(name.partition("-")[0]) for name in found.crashes if name.partition("-")[0].isdecimal()}
     for number, row in ledger.intact_rows(sorted(found.trials)):
-        if row is not None and (row[2] not in settings.crash_on or number in bundles):
+        if row is not None and (row[2] not in settings.crash_on or number in bundles or number in found.dropped):
             yield number, row
 
 

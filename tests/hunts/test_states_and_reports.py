@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import socket
+import sqlite3
 import time
 from contextlib import closing
 from dataclasses import replace
@@ -435,6 +436,23 @@ def test_salvaged_hunt_keeps_how_its_trials_were_drawn(hunt, tmp_path):
         facts = ledger.facts()
     assert {name: facts.get(name) for name in drawn} == drawn
     assert not facts.keys() & {"newest_kind", "began", "owner", "done_before"}  # of a run that the copy has not had
+
+
+def test_salvaged_hunt_keeps_the_crashes_whose_bundles_were_deleted(hunt, tmp_path):
+    shutil.rmtree(hunt / "crashes" / "000000-collision")
+    note(hunt, dropped={"rear end": [0]}, dropped_at_fault=[0])
+    (checked,) = check(hunt)
+    assert checked.fine
+    assert salvage(checked, tmp_path / "s") == {"trials": 4, "crashes": 1}
+    (again,) = check(tmp_path / "s")
+    assert (again.fine, again.dropped, again.trials) == (True, {0}, {0, 1, 2, 3})
+    assert hunt_state(tmp_path / "s").crashes == 2
+    with closing(sqlite3.connect(hunt / "ledger.sqlite")) as database, database:
+        database.execute("UPDATE trials SET seed = 99 WHERE number = 1")  # then the deleted bundles are not known
+    (checked,) = check(hunt)
+    assert salvage(checked, tmp_path / "part") == {"trials": 2, "crashes": 1}
+    with closing(Ledger(tmp_path / "part" / "ledger.sqlite")) as ledger:
+        assert not ledger.facts().keys() & {"dropped", "dropped_at_fault"}
 
 
 def test_salvage_refuses_a_directory_that_has_something_and_names_what_cannot_be_copied(hunt, tmp_path, monkeypatch):
