@@ -131,7 +131,7 @@ def _unjudged(options: argparse.Namespace) -> list[Bundle]:
 def _judge_one(
     options: argparse.Namespace, bundle: Bundle, stops: list[int], trusted: bool | None, *, write: bool
 ) -> dict[str, object]:
-    from crashhunt.crashes import judgement_of, with_judgement
+    from crashhunt.crashes import as_stored, judgement_of, with_judgement
     from crashhunt.replays import ReplayOptions
     from crashhunt.report import Story
     from crashhunt.whatif import judge
@@ -153,7 +153,7 @@ def _judge_one(
         found = replace(found, why=known.why)
     if found.reference is None and known is not None:
         found = replace(found, reference=known.reference)
-    bundle = with_judgement(bundle, found)
+    bundle = with_judgement(as_stored(bundle) if write else bundle, found)
     if write and ran and (not stops or known is None):  # half an answer does not replace a whole one
         bundle.write()
     story = Story(bundle)

@@ -3,6 +3,7 @@ from ._bundle import (
     Bundle as Bundle,
     CrashData as CrashData,
     CrashSummary as CrashSummary,
+    as_stored as as_stored,
     authenticate_bundle as authenticate_bundle,
     crash_folders as crash_folders,
     files_of as files_of,

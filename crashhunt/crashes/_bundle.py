@@ -57,6 +57,7 @@ __all__ = [
     "CrashData",
     "CrashSummary",
     "Protected",
+    "as_stored",
     "authenticate_bundle",
     "collect_output",
     "crash_folders",
@@ -454,6 +455,19 @@ def read_bundle(path: Path) -> Bundle:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
         raise BundleError(f"crash.json is damaged: {reason}", fix=_DAMAGE_FIX, where=str(file)) from None
+
+
+def as_stored(bundle: Bundle) -> Bundle:
+    """Return a bundle as it is on the disk now; the given bundle if it cannot be read, or contains another crash.
+
+    A hunt that runs may confirm a crash while a command judges it. Each of the two writes the whole ``crash.json``.
+    """
+    try:
+        stored = read_bundle(bundle.path)
+    except BundleError:
+        return bundle
+    is_same = (stored.id, stored.result.digest) == (bundle.id, bundle.result.digest)
+    return stored if is_same else bundle
 
 
 def _bundle(path: Path, data: CrashData) -> Bundle:

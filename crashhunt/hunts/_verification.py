@@ -14,7 +14,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError
 from crashhunt.base.temporary import remove_at_once, remove_scratch
 from crashhunt.base.text import command_line
-from crashhunt.crashes import is_bundle_made_here, is_snapshot_trusted, write_bundle
+from crashhunt.crashes import as_stored, is_bundle_made_here, is_snapshot_trusted, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import (
     FreshProcessExecutor,
@@ -298,6 +298,9 @@ def _is_written(found: Bundle, folder: Path) -> bool:
     """Write a bundle into its folder; return False if a hunt with ``--keep`` has deleted it, maybe at this moment."""
     if not folder.is_dir():
         return False
+    stored = as_stored(found)
+    if stored is not found:  # a command may have judged it in the meantime
+        found = replace(found, added={**stored.added, **found.added})
     try:
         found.write()
     except CrashhuntError:

@@ -12,6 +12,7 @@ from crashhunt.crashes import (
     CauseGroup,
     Division,
     Judgement,
+    as_stored,
     cause_of,
     features_of,
     judgement_of,
@@ -108,7 +109,8 @@ def divide_by_cause(
             break  # what was interrupted says nothing
         division.settle(place, cause)
         if write and judged is not bundles[place]:
-            judged.write()
+            stored, judgement = as_stored(judged), judgement_of(judged)
+            (judged if judgement is None else with_judgement(stored, judgement)).write()
     members: dict[Cause, list[int]] = {}
     for place, cause in division.causes().items():
         members.setdefault(cause, []).append(place)

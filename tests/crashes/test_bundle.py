@@ -15,15 +15,20 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.integrity import digest_of_data
 from crashhunt.crashes import (
+    Judgement,
+    as_stored,
     files_of,
     find_bundle,
+    judgement_of,
     list_bundles,
     list_near_misses,
     read_bundle,
     read_params,
+    with_judgement,
     write_bundle,
     write_trial,
 )
+from crashhunt.hunts import _verification
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.trial import Collision, Escape, Failure, Outcome, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach, Event, Lane
@@ -117,6 +122,27 @@ def test_a_crash_that_is_confirmed_or_not_states_so(tmp_path):
     assert (found.confirmed, found.divergence, found.files) == (False, {"step": 3}, bundle.files)
     again = made(tmp_path)  # the same trial once more
     assert read_bundle(again.path).confirmed is None
+
+
+def test_judgement_and_confirmation_of_two_processes_are_both_kept(bundle):
+    judgement = Judgement(why_not="it was interrupted")
+    dataclasses.replace(bundle, confirmed=True).write()
+    with_judgement(as_stored(bundle), judgement).write()  # the judgement began before the confirmation
+    assert (read_bundle(bundle.path).confirmed, judgement_of(read_bundle(bundle.path))) == (True, judgement)
+    bundle.write()
+    with_judgement(bundle, judgement).write()
+    assert _verification._is_written(dataclasses.replace(bundle, confirmed=True), bundle.path)  # the other way round
+    assert (read_bundle(bundle.path).confirmed, judgement_of(read_bundle(bundle.path))) == (True, judgement)
+
+
+def test_bundle_that_is_gone_damaged_or_of_another_crash_is_not_taken_from_the_disk(bundle):
+    assert as_stored(bundle) is not bundle
+    other = dataclasses.replace(bundle, result=dataclasses.replace(bundle.result, digest="0" * 32))
+    assert as_stored(other) is other
+    (bundle.path / layout.CRASH).write_text("{")
+    assert as_stored(bundle) is bundle
+    shutil.rmtree(bundle.path)
+    assert as_stored(bundle) is bundle
 
 
 def test_a_fault_comes_with_what_was_said(tmp_path):
