@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
-from crashhunt.base.temporary import remove_at_once, temporary_folder
+from crashhunt.base.files import put_in_place, sync_folder
+from crashhunt.base.temporary import temporary_beside, temporary_folder
 from crashhunt.crashes import is_bundle_made_here, signature_of, write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import read_map, run_alone
@@ -20,6 +21,7 @@ from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.progress import Watch
@@ -224,37 +226,36 @@ def _write_smallest(rerun: Rerun, search: Minimizer, signature: Signature) -> Bu
     """Run the smallest candidate in a new process, and write its bundle, which another process then confirms.
 
     If a candidate does not reproduce, the next larger candidate is run. The result is None if no candidate reproduces.
+    Until the confirmation has ended, the bundle has a temporary name: the bundle of an earlier minimization stays.
     """
     bundle = rerun.bundle
+    final = bundle.hunt / layout.CRASHES / shrunk_name(bundle.id)
     tries = _MAX_CONFIRMATIONS if bundle.confirmed is False else 1
     for spec in (spec for spec in reversed(search.smaller) for _ in range(tries)):
         search.best = spec
-        small = _run_fresh(rerun, search.best)
-        if is_same(signature_of(small), signature, spec):
-            shrunk: dict[str, object] = {"of": bundle.id, "removed": list(search.removed()), "changed": _plain(search)}
-            if search.steps_cut:
-                shrunk["steps_cut"] = search.steps_cut
-            return _confirm_smallest(replace(small, added={**small.added, "shrunk": shrunk}))
-        remove_at_once(small.path)
+        with temporary_beside(final) as building:
+            small = _run_fresh(rerun, search.best, building.name)
+            if is_same(signature_of(small), signature, spec):
+                shrunk: dict[str, object] = {
+                    "of": bundle.id, "removed": list(search.removed()), "changed": _plain(search),
+                }  # fmt: skip
+                if search.steps_cut:
+                    shrunk["steps_cut"] = search.steps_cut
+                return _confirm_smallest(replace(small, added={**small.added, "shrunk": shrunk}), final)
     return None
 
 
-def _confirm_smallest(small: Bundle) -> Bundle:
-    """Confirm the minimized crash.
-
-    The bundle of this crash is already written, because the confirmation may take a minute.
-    """
-    try:
-        small.write()
-        small = confirm(small, trusted=True) or small  # it runs what the whole crash was trusted to run
-        small.write()
-    except BaseException:  # an unconfirmed bundle would look like a crash of the hunt
-        remove_at_once(small.path)
-        raise
-    return small
+def _confirm_smallest(small: Bundle, final: Path) -> Bundle:
+    """Confirm the minimized crash, then move its bundle to its final path."""
+    confirmed = confirm(small, trusted=True) or small  # it runs what the whole crash was trusted to run
+    placed = replace(confirmed, path=final)
+    placed.write(into=small.path)
+    put_in_place(small.path, final)
+    sync_folder(final.parent)
+    return placed
 
 
-def _run_fresh(rerun: Rerun, spec: TrialSpec) -> Bundle:
+def _run_fresh(rerun: Rerun, spec: TrialSpec, name: str) -> Bundle:
     bundle = rerun.bundle
     with temporary_folder("shrink") as scratch:
         result = run_alone(replace(rerun.worker, scratch=scratch), spec)
@@ -264,7 +265,7 @@ def _run_fresh(rerun: Rerun, spec: TrialSpec) -> Bundle:
         trial = scratch_of(scratch, spec.number)
         return write_bundle(
             bundle.hunt, result, trial, hunt_seed=bundle.hunt_seed, snapshot=bundle.snapshot,
-            lanes=read_map(scratch, trial), name=shrunk_name(bundle.id), authenticate=is_bundle_made_here(bundle),
+            lanes=read_map(scratch, trial), name=name, authenticate=is_bundle_made_here(bundle),
         )  # fmt: skip
 
 

@@ -120,14 +120,16 @@ def test_processes_end_where_the_search_raises(crash, monkeypatch):
 
 
 @pytest.mark.parametrize(("confirmed", "tries"), [(True, 1), (False, 3)])
-def test_of_what_does_not_come_again_the_next_larger_is_taken(crash, tmp_path, monkeypatch, confirmed, tries):
+def test_of_what_does_not_come_again_the_next_larger_is_taken(crash, monkeypatch, confirmed, tries):
     crash = replace(crash, confirmed=confirmed)
+    earlier = crash.path.with_name("000000-collision.small")
+    shutil.copytree(crash.path, earlier)
     specs = [replace(crash.result.spec, number=number) for number in range(3)]
     ran = []
 
-    def run_fresh(rerun, spec):
+    def run_fresh(rerun, spec, name):
         ran.append(spec.number)
-        path = tmp_path / f"small-{len(ran)}"
+        path = crash.path.with_name(name)
         path.mkdir()
         return replace(crash, path=path, result=replace(crash.result, spec=spec))
 
@@ -135,39 +137,44 @@ def test_of_what_does_not_come_again_the_next_larger_is_taken(crash, tmp_path, m
         smaller=specs, best=None, removed=lambda: ("a",), changed=lambda: {"ego.speed": (1.0, 2.0)}, steps_cut=7
     )
     monkeypatch.setattr(_shrink, "_run_fresh", run_fresh)
-    monkeypatch.setattr(_shrink, "_confirm_smallest", lambda small: small)
+    monkeypatch.setattr(_shrink, "_confirm_smallest", lambda small, final: small)
     monkeypatch.setattr(_shrink, "is_same", lambda found, wanted, spec: spec.number == 1)
     monkeypatch.setattr(_shrink, "signature_of", lambda bundle: None)
     small = _shrink._write_smallest(SimpleNamespace(bundle=crash), search, None)
     assert ran == [2] * tries + [1]
     assert search.best is specs[1]
-    assert [path.name for path in sorted(tmp_path.glob("small-*"))] == [f"small-{tries + 1}"]
     assert small.added["shrunk"] == {
         "of": crash.id, "removed": ["a"], "changed": {"ego.speed": [1.0, 2.0]}, "steps_cut": 7,
     }  # fmt: skip
     monkeypatch.setattr(_shrink, "is_same", lambda found, wanted, spec: False)
     assert _shrink._write_smallest(SimpleNamespace(bundle=crash), search, None) is None
+    assert sorted(path.name for path in crash.path.parent.glob("*000000*")) == [crash.id, earlier.name]
 
 
-def test_what_cannot_be_confirmed_leaves_nothing(crash, tmp_path, monkeypatch):
-    path = Path(shutil.copytree(crash.path, tmp_path / "small"))
-    small = replace(crash, path=path)
-    written = []
-    monkeypatch.setattr(type(crash), "write", lambda self: written.append(self.confirmed))
-    monkeypatch.setattr(_shrink, "confirm", lambda bundle, *, trusted: replace(bundle, confirmed=False))
-    assert _shrink._confirm_smallest(replace(small, confirmed=None)).confirmed is False
-    assert written == [None, False]
-    monkeypatch.setattr(_shrink, "confirm", lambda bundle, *, trusted: None)
-    assert _shrink._confirm_smallest(small) is small
-    assert path.exists()
+def test_earlier_minimized_crash_stays_until_the_next_one_is_confirmed(crash, monkeypatch):
+    final = crash.path.with_name("000000-collision.small")
+    shutil.copytree(crash.path, final)
+    (final / "earlier").touch()
+
+    def small():
+        return replace(crash, path=Path(shutil.copytree(crash.path, crash.path.with_name(".building"))))
 
     def stops(bundle, *, trusted):
         raise KeyboardInterrupt
 
+    building = small()
     monkeypatch.setattr(_shrink, "confirm", stops)
     with pytest.raises(KeyboardInterrupt):
-        _shrink._confirm_smallest(small)
-    assert not path.exists()
+        _shrink._confirm_smallest(building, final)
+    assert (final / "earlier").exists()
+    monkeypatch.setattr(_shrink, "confirm", lambda bundle, *, trusted: replace(bundle, confirmed=False))
+    assert _shrink._confirm_smallest(building, final).path == final
+    assert not (final / "earlier").exists()
+    assert find_bundle(crash.hunt, final.name).confirmed is False
+    shutil.rmtree(crash.path.with_name(".building"))  # the earlier one, which `_write_smallest` removes
+    monkeypatch.setattr(_shrink, "confirm", lambda bundle, *, trusted: None)
+    assert _shrink._confirm_smallest(replace(small(), confirmed=None), final).confirmed is None
+    assert find_bundle(crash.hunt, final.name).confirmed is None
 
 
 def test_a_crash_that_does_not_come_again_is_reported(crash, monkeypatch):
