@@ -123,7 +123,8 @@ def run_cases(
     Args:
         cases: The folders of the cases.
         parallel: Number of cases at a time; 0 for one per core.
-        keep: A folder for the crashes. For each crash, a hunt's directory with the name of the case is created.
+        keep: A folder for the crashes. For each crash, a hunt's directory with the name of the case is created. If
+            several cases have this name, the others get a number: ``NAME-2``.
         watch: Function called with the number of completed cases and the number of all cases.
         stopped: Function that returns whether to stop; called repeatedly.
         trusted: Whether to run the cases without a check of trust; otherwise all cases must be trusted before the first
@@ -139,6 +140,7 @@ def run_cases(
     if not trusted:
         _refuse_untrusted_cases(cases)
     reports: dict[Path, CaseReport] = {}
+    kept = {} if keep is None else _folders_of_kept(cases, keep)
     waiting, running = deque(cases), dict[Path, _Running]()
     with ExitStack() as stack:
         while (waiting or running) and not stopped():
@@ -150,7 +152,7 @@ def run_cases(
                 else:
                     running[path] = began
             for path, run in list(running.items()):
-                report = run.look(keep)
+                report = run.look(kept.get(path))
                 if report is not None:
                     reports[path] = report
                     del running[path]
@@ -158,6 +160,18 @@ def run_cases(
             if watch is not None:
                 watch(len(reports), len(cases))
     return [reports[path] for path in cases if path in reports]
+
+
+def _folders_of_kept(cases: Sequence[Path], keep: Path) -> dict[Path, Path]:
+    """Return for each case a folder of its own: cases of two corpora may have the same name."""
+    folders: dict[Path, Path] = {}  # case by folder
+    for path in cases:
+        folder, number = keep / path.name, 1
+        while folder in folders:
+            number += 1
+            folder = keep / f"{path.name}-{number}"
+        folders[folder] = path
+    return {path: folder for folder, path in folders.items()}
 
 
 def _refuse_untrusted_cases(cases: Sequence[Path]) -> None:
@@ -242,9 +256,7 @@ class _Running:
         got: Got = "fixed" if result.outcome in _HARMLESS_OUTCOMES else "cannot_run"
         kept = None
         if result.outcome not in (*_HARMLESS_OUTCOMES, Outcome.INVALID):
-            kept = self._keep(
-                result, keep / case.name if keep is not None else self._scratch / "kept", whole=bool(keep)
-            )
+            kept = self._keep(result, keep or self._scratch / "kept", whole=keep is not None)
             now = signature_of(kept).to_json()
             got = "still" if all(now.get(name, value) == value for name, value in case.signature.items()) else "changed"
         found = CaseReport(

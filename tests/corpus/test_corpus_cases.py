@@ -376,6 +376,17 @@ def test_crash_is_kept_only_where_a_folder_is_given(run, tmp_path):
     assert found.kept is None
 
 
+def test_kept_crashes_of_cases_with_the_same_name_have_their_own_folders(run, tmp_path, monkeypatch):
+    run()
+    monkeypatch.setattr(Executor, "results", [Outcome.COLLISION] * 3)
+    names = ("a/case", "b/case", "b/case-2")
+    cases = [Path(shutil.copytree(FROZEN, tmp_path / name)) for name in names]
+    found = run_cases(cases, trusted=True, parallel=1, keep=tmp_path / "out")
+    assert [one.kept.relative_to(tmp_path / "out") for one in found] == [
+        Path("case"), Path("case-2"), Path("case-2-2"),
+    ]  # fmt: skip
+
+
 def test_case_that_is_not_trusted_runs_nothing(run, tmp_path, monkeypatch):
     run()
     shutil.copytree(FROZEN, tmp_path / "0")
