@@ -202,7 +202,8 @@ def _print_states(
         print(json.dumps({"hunts": [state.to_json() for state in states], **extra}))
     console = states_console(stderr=as_json)
     show_states(states, console)
-    errors = [state for state in states if state.state == "error"]
+    # After Ctrl-C, a hunt has no reason; a hunt that could not resume has one.
+    errors = [state for state in states if state.state == "error" or (state.failed and state.detail)]
     if errors:
         some = f"{len(errors)} hunt{'s' if len(errors) > 1 else ''} could not run"
         logs = command_line("crashhunt", "logs", directory, "--errors-only")

@@ -358,7 +358,7 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
     return HuntState(
         dir=str(directory),
         state=state,
-        detail="its process is gone" if state == "killed" else str(facts.get("detail") or ""),
+        detail=str(facts.get("detail") or ("its process is gone" if state == "killed" else "")),
         trials_planned=planned,
         trials_run=run,
         outcomes=outcomes,

@@ -324,12 +324,20 @@ def _planned(folder: Path, request: Request, machine: Given) -> tuple[Scenario, 
 
 
 def _fail(folder: Path, message: str, trace: str) -> None:
-    """Write the reason why a hunt could not run to its folder."""
+    """Write the reason why a hunt could not run to its folder.
+
+    A hunt that had begun before stays resumable, because `rerun` starts over what ended in an error.
+    """
     with suppress(CrashhuntError, OSError), HuntDirectory(folder).locked():  # where another runs, that one has the word
         (folder / layout.ERROR_LOG).write_text(f"{message}\n{trace}", encoding="utf-8", errors="replace")
         with closing(Ledger(folder / layout.LEDGER, writable=True)) as ledger:
-            if ledger.facts().get("state") != "error":
-                ledger.enter("error", message)
+            before = ledger.facts().get("state")
+            if before == "error":
+                return
+            ledger.enter("error", message)  # also for the gate, which reports the last event
+            if before not in (None, "queued", "no_valid_trial"):
+                # A resumed hunt looks for audits that were not noted if its last process was killed.
+                ledger.note(state="running" if before == "running" else "interrupted")
 
 
 if __name__ == "__main__":

@@ -197,7 +197,8 @@ def test_judge_analyses_each_crash_once(monkeypatch, capsys, stopped):
 
 def test_states_of_a_suite_end_it_with_1_after_an_error(capsys):
     good, bad = HuntState(dir="g", state="crashed"), HuntState(dir="h", state="error", detail="no map")
-    assert _suite._print_states([good], Path("s"), as_json=False) == 0
+    stopped, refused = HuntState(dir="i", state="interrupted"), HuntState(dir="k", state="interrupted", detail="full")
+    assert _suite._print_states([good, stopped], Path("s"), as_json=False) == 0
     assert "could not run" not in capsys.readouterr().out
     assert _suite._print_states([good, bad], Path("s"), as_json=True, replaced=[Path("old")]) == 1
     out, err = capsys.readouterr()
@@ -205,7 +206,7 @@ def test_states_of_a_suite_end_it_with_1_after_an_error(capsys):
     assert [one["dir"] for one in data["hunts"]] == ["g", "h"]
     assert data["replaced"] == ["old"]
     assert "1 hunt could not run; see crashhunt logs s --errors-only, then crashhunt rerun s" in err
-    assert _suite._print_states([bad, bad], Path("s"), as_json=False) == 1
+    assert _suite._print_states([bad, refused], Path("s"), as_json=False) == 1
     assert "2 hunts could not run" in capsys.readouterr().out
 
 

@@ -76,7 +76,9 @@ def test_how_a_hunt_ended_is_its_state(hunt, said, state):
     note(hunt, state=said, detail="why", owner=None)
     found = hunt_state(hunt)
     assert found.state == state
-    assert found.detail == ("its process is gone" if state == "killed" else "why")
+    assert found.detail == "why"
+    note(hunt, state=said, detail=None)
+    assert hunt_state(hunt).detail == ("its process is gone" if state == "killed" else "")
     assert found.failed is (state in ("error", "interrupted", "killed"))
     assert (found.trials_planned, found.trials_run, found.crashes, found.errors) == (4, 4, 2, 0)
     shutil.rmtree(hunt / "crashes")

@@ -102,7 +102,7 @@ def test_rate_of_a_hunt_that_has_ended_is_up_to_its_last_trial():
     assert (queued.state, queued.trials_planned, queued.trials_run, queued.rate_per_s) == ("queued", 0, 0, 0.0)
     assert state({"began": 0.0, "state": "time"}, {"survived": 3}, 6.0).rate_per_s == 0.5
     assert state({"done_before": 0, "state": "interrupted"}, {"survived": 3}, 6.0).rate_per_s == 0.0  # a salvaged copy
-    killed = state(running(owner=None, detail="x"))
+    killed = state(running(owner=None))
     assert (killed.state, killed.detail, killed.owner_alive, killed.seconds_left) == (
         "killed", "its process is gone", False, None,
     )  # fmt: skip

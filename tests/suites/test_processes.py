@@ -8,12 +8,14 @@ import re
 import signal
 import subprocess
 import sys
+from contextlib import closing
 
 import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.hunts import hunt_state
+from crashhunt.ledger import Ledger
 from crashhunt.plans import Request, RunSettings, SnapshotChoices, plan
 from crashhunt.suites import RunRequest, Suite, SuiteEntry, _processes, _rerun, rerun, run_all
 from crashhunt.suites._processes import REQUEST, check_machine, set_aside, write_request
@@ -113,6 +115,30 @@ def test_the_process_of_a_hunt_records_why_it_could_not_run(folders, monkeypatch
     log = (folders[0] / layout.ERROR_LOG).read_text()
     assert log.startswith(detail)
     assert ("Traceback" in log) == trace
+
+
+@pytest.mark.parametrize(
+    ("before", "state", "fact"),
+    [
+        ("interrupted", "interrupted", "interrupted"), ("running", "killed", "running"),
+        ("all_trials", "interrupted", "interrupted"), ("no_valid_trial", "error", "error"), ("queued", "error", "error"),
+    ],
+)  # fmt: skip
+def test_hunt_that_cannot_resume_keeps_its_trials_when_it_runs_again(folders, started, before, state, fact):
+    calls, sleeps = started
+    with closing(Ledger(folders[0] / layout.LEDGER, writable=True)) as ledger:
+        ledger.enter(before)
+    sleeps.update(a=HuntDirectoryError("another version of the sampler"))
+    run_all(folders[:1], 1)
+    found = hunt_state(folders[0])
+    assert (found.state, found.detail, found.failed) == (state, "another version of the sampler", True)
+    with closing(Ledger(folders[0] / layout.LEDGER)) as ledger:
+        assert ledger.facts()["state"] == fact
+        assert ledger.events()[-1][1:] == ("error", "another version of the sampler")
+    sleeps.clear()
+    _, replaced = rerun(folders[:1], trusted=True)
+    assert [name for name, *_ in calls] == ["a"]
+    assert bool(replaced) == (state == "error")
 
 
 def test_a_process_of_its_own_begins_with_the_folder_the_options_and_its_parent(folders):
