@@ -121,7 +121,8 @@ def test_the_process_of_a_hunt_records_why_it_could_not_run(folders, monkeypatch
     ("before", "state", "fact"),
     [
         ("interrupted", "interrupted", "interrupted"), ("running", "killed", "running"),
-        ("all_trials", "interrupted", "interrupted"), ("no_valid_trial", "error", "error"), ("queued", "error", "error"),
+        ("all_trials", "interrupted", "interrupted"), ("no_valid_trial", "error", "error"),
+        ("queued", "error", "error"),
     ],
 )  # fmt: skip
 def test_hunt_that_cannot_resume_keeps_its_trials_when_it_runs_again(folders, started, before, state, fact):
