@@ -136,8 +136,8 @@ class Confirmation:
                     self._confirmed.put(found)
                 if judged is not None:
                     self._judged.put(judged)
-            except Exception:  # the end of the hunt does the same, and reports it
-                return
+            except Exception:  # the end of the hunt does the same, and reports it; other crashes need not wait for it
+                continue
             finally:
                 self._hold_back(0)
 

@@ -19,6 +19,7 @@ from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError,
 from crashhunt.executors import PoolExecutor
 from crashhunt.hunts import HuntReport, _hunt, _preflight, _results, _state, _verification
 from crashhunt.hunts._hunt import Hunt
+from crashhunt.hunts._progress import PhaseClock
 from crashhunt.hunts._reports import BranchReport, Difference, ProbeReport, RareReport, kind_data
 from crashhunt.hunts._state import HuntDirectory, LogReader
 from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReruns, is_settled
@@ -642,6 +643,27 @@ def test_crashes_are_confirmed_while_the_hunt_runs():
     assert not confirmation._thread.is_alive()
     assert executor.held_back == 0
     assert runs.asked.empty()
+
+
+def test_error_in_the_confirmation_of_a_crash_leaves_it_to_the_end_of_the_hunt_and_not_the_others():
+    asked = queue.SimpleQueue()
+
+    def confirm(bundle, stopped=lambda: False):
+        asked.put(bundle.id)
+        if bundle.id == "a":
+            raise RuntimeError("a defect")
+        return replace(bundle, confirmed=True)
+
+    progress = SimpleNamespace(crashes=[Bundle("a"), Bundle("b")])
+    progress.kinds = SimpleNamespace(next_to_judge=lambda: None)
+    progress.replace = lambda crashes: setattr(progress, "crashes", crashes)
+    confirmation = Confirmation(SimpleNamespace(confirm_one=confirm), None)
+    confirmation.look(progress)
+    assert [asked.get(timeout=5) for _ in range(2)] == ["a", "b"]
+    confirmation.close(progress)
+    assert [one.confirmed for one in progress.crashes] == [None, True]
+    with pytest.raises(RuntimeError, match="a defect"):  # the end of the hunt confirms it again, and reports the error
+        PhaseClock(lambda _: None, 1).run(confirm, progress.crashes[:1])
 
 
 def test_crash_whose_cause_was_not_searched_for_before_the_end_of_the_hunt_is_chosen_again():
