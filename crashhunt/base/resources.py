@@ -28,8 +28,8 @@ def limit_behind(error: BaseException) -> str:
 
     A limit on memory (``RLIMIT_AS``) can cause many errors: in Python, in a thread, or in a library that does not load.
     A limit on the size of files (``RLIMIT_FSIZE``) causes an `OSError`, because Python ignores its signal. A limit on
-    processes (``RLIMIT_NPROC``) also counts threads. If a thread does not start, the text also names
-    a limit on memory, because Python does not report which of the two was reached.
+    processes (``RLIMIT_NPROC``) also counts threads. If a thread does not start, the text also names a limit
+    on memory, because Python does not report which of the two was reached.
     """
     limits = []
     if is_no_thread(error) and (limit := _soft_limit(resource.RLIMIT_NPROC)) is not None:

@@ -360,10 +360,8 @@ def unwritable_output(error: OSError, descriptor: int) -> CrashhuntError:
         descriptor: 1 for standard output, 2 for standard error.
     """
     stream = {1: "standard output", 2: "standard error"}[descriptor]
-    try:
-        file = command_line(
-            Path(f"/proc/self/fd/{descriptor}").readlink()
-        )  # because Python has only the name "<stdout>"
+    try:  # Linux knows the file; Python has only the name "<stdout>"
+        file = command_line(Path(f"/proc/self/fd/{descriptor}").readlink())
     except OSError:
         file = "closed"
     fix = f"{'free some space or ' if error.errno in FULL else ''}redirect {stream} to another file"

@@ -314,9 +314,8 @@ def _share(hunt: HuntResults, rate: CrashRate) -> float:
         return rate.estimate
     run = hunt.settings.run
     is_whole = hunt.state.state in ("finished", "crashed") and run.keep_going and not run.distinct
-    if (
-        rate.certain is None and is_whole and not hunt.settings.rare and rate.trials
-    ):  # a grid has a share as well, but no interval
+    # A grid has a share as well, but no interval.
+    if rate.certain is None and is_whole and not hunt.settings.rare and rate.trials:
         return rate.crashes / rate.trials
     return math.nan
 

@@ -252,7 +252,7 @@ class TrialReruns:
             if note not in self.notes:  # the end of the hunt asks again
                 self.notes.append(note)
             return bundle
-        return bundle if found is None or not _is_written(found, bundle.path) else found
+        return bundle if found is None or not _write_if_kept(found, bundle.path) else found
 
     def judge_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Judged:
         """Find the cause of a crash by runs, and write the result into its bundle.
@@ -276,7 +276,7 @@ class TrialReruns:
         if is_stopped():
             return Judged(bundle, is_stopped=True)
         if found is not bundle:
-            _is_written(found, bundle.path)
+            _write_if_kept(found, bundle.path)
         return Judged(found, cause)
 
     def judge(self, progress: Progress) -> None:
@@ -294,8 +294,8 @@ class TrialReruns:
         return True if bundle.snapshot == self.taken and is_bundle_made_here(bundle) else None
 
 
-def _is_written(found: Bundle, folder: Path) -> bool:
-    """Write a bundle into its folder; return False if a hunt with ``--keep`` has deleted it, maybe at this moment."""
+def _write_if_kept(found: Bundle, folder: Path) -> bool:
+    """Write a bundle into its folder; return whether it is there: a hunt with ``--keep`` may delete it meanwhile."""
     if not folder.is_dir():
         return False
     stored = as_stored(found)

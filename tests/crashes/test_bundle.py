@@ -131,7 +131,7 @@ def test_judgement_and_confirmation_of_two_processes_are_both_kept(bundle):
     assert (read_bundle(bundle.path).confirmed, judgement_of(read_bundle(bundle.path))) == (True, judgement)
     bundle.write()
     with_judgement(bundle, judgement).write()
-    assert _verification._is_written(dataclasses.replace(bundle, confirmed=True), bundle.path)  # the other way round
+    assert _verification._write_if_kept(dataclasses.replace(bundle, confirmed=True), bundle.path)  # the other way round
     assert (read_bundle(bundle.path).confirmed, judgement_of(read_bundle(bundle.path))) == (True, judgement)
 
 
