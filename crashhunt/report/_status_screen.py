@@ -326,7 +326,7 @@ def _line(status: HuntStatus) -> str:
         line += f"; {describe_kinds(status)}"
     if status.phase == "hunting" and status.nodes is not None:
         line += f"; connected nodes: {len(status.nodes)}" if status.nodes else "; no node is connected"
-    if status.rate is not None:
+    if status.rate is not None and status.done:
         line += f"; {describe_running(status.rate)}"
     return line
 

@@ -296,6 +296,7 @@ def test_running_rate_is_on_the_screen_and_in_the_line(rate, words):
     assert describe_running(rate) == words
     found = replace(status(2), rate=rate)
     assert _line(found).endswith(f"; {words}")
+    assert words not in _line(replace(found, done=0))  # before the first result, it says nothing
     console = Console(width=160, height=12, force_terminal=True, color_system=None)
     with console.capture() as shown:
         console.print(Watcher(console, TITLE)._screen(found))
