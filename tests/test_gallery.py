@@ -1,4 +1,4 @@
-"""The gallery of crashes, `scripts/gallery.py`, and what it has written."""
+"""The gallery of crashes, `scripts/tools/gallery.py`, and what it has written."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "gallery.py"
+SCRIPT = Path(__file__).parents[1] / "scripts" / "tools" / "gallery.py"
 spec = importlib.util.spec_from_file_location("gallery_script", SCRIPT)
 assert spec is not None
 assert spec.loader is not None

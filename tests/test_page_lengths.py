@@ -1,4 +1,4 @@
-"""The check of pages, `scripts/pages.py`."""
+"""The check of pages, `scripts/tools/pages.py`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "pages.py"
+SCRIPT = Path(__file__).parents[1] / "scripts" / "tools" / "pages.py"
 spec = importlib.util.spec_from_file_location("pages_check", SCRIPT)
 assert spec is not None
 assert spec.loader is not None

@@ -1,4 +1,4 @@
-"""The check of banned words, `scripts/words.py`."""
+"""The check of banned words, `scripts/tools/words.py`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "words.py"
+SCRIPT = Path(__file__).parents[1] / "scripts" / "tools" / "words.py"
 spec = importlib.util.spec_from_file_location("words", SCRIPT)
 assert spec is not None
 assert spec.loader is not None
@@ -19,14 +19,14 @@ spec.loader.exec_module(words)
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """A project of one module with one allowed finding."""
-    (tmp_path / "scripts").mkdir()
+    (tmp_path / "scripts" / "tools").mkdir(parents=True)
     (tmp_path / "README.md").write_text("Clear.\n")
     package = tmp_path / "crashhunt"
     package.mkdir()
     (package / "m.py").write_text('"""Somebody drives."""\n')
-    (tmp_path / "scripts" / "words.json").write_text('{"crashhunt/m.py": 1}')
+    (tmp_path / "scripts" / "tools" / "words.json").write_text('{"crashhunt/m.py": 1}')
     monkeypatch.setattr(words, "ROOT", tmp_path)
-    monkeypatch.setattr(words, "LIMITS", tmp_path / "scripts" / "words.json")
+    monkeypatch.setattr(words, "LIMITS", tmp_path / "scripts" / "tools" / "words.json")
     return tmp_path
 
 
@@ -50,7 +50,7 @@ def test_file_that_is_not_listed_may_have_no_finding(project):
 
 
 def test_write_lowers_the_numbers_and_never_raises_them(project):
-    limits = project / "scripts" / "words.json"
+    limits = project / "scripts" / "tools" / "words.json"
     (project / "crashhunt" / "m.py").write_text("# told\n# told\n")
     words.main(["--write"])
     assert json.loads(limits.read_text()) == {"crashhunt/m.py": 1}
@@ -64,7 +64,7 @@ def test_write_lowers_the_numbers_and_never_raises_them(project):
 
 
 def test_deleted_list_allows_nothing(project):
-    (project / "scripts" / "words.json").unlink()
+    (project / "scripts" / "tools" / "words.json").unlink()
     assert words.main([]) == 1
 
 

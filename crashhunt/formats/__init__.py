@@ -1,6 +1,6 @@
 """Export of a recorded crash as a scenario for other tools.
 
-The files are written as plain XML with Python's standard library. ``scripts/readers`` tests that the formats' own
+The files are written as plain XML with Python's standard library. ``scripts/tools/readers`` tests that the formats' own
 libraries read back the recorded values. These libraries are not needed for writing.
 """
 

@@ -18,7 +18,7 @@ from its posterior, and so is that of unguided trials. The model does not search
 types only.
 
 Sources: nearest-better clustering (Preuss 2010), Thompson sampling (1933), Halton's sequence (1960); payoffs and shares
-are our own, measured with `scripts/search`. Cost: about a millisecond per trial, the model included.
+are our own, measured with `scripts/studies/run search`. Cost: about a millisecond per trial, the model included.
 """
 
 from __future__ import annotations

@@ -59,7 +59,9 @@ def test_listed_agents_can_be_hunted_by_name(shell):
 
 
 def test_networks_are_what_their_sources_say():
-    done = subprocess.run([ROOT / "scripts" / "networks", "--check"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [ROOT / "scripts" / "tools" / "networks", "--check"], capture_output=True, text=True, check=False
+    )
     if "netconvert is missing" in done.stderr:
         pytest.skip("netconvert is not installed")
     assert (done.returncode, done.stderr) == (0, "")

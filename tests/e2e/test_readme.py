@@ -118,7 +118,8 @@ def test_links_lead_somewhere(file):  # those of the guide are checked where it 
 
 def test_every_option_that_is_mentioned_exists(shell):
     option = re.compile(r"(?<![\w-])--[a-z][a-z-]*(?!\w)")  # those of other programs have underscores
-    scripts = [file.read_text(encoding="utf-8") for file in (ROOT / "scripts").iterdir() if file.is_file()]
+    files = [file for file in (ROOT / "scripts").rglob("*") if file.suffix in ("", ".py") and file.is_file()]
+    scripts = [file.read_text(encoding="utf-8") for file in files]
     known = {"--help", "--help-all", "--upgrade"}
     known = known.union(*map(option.findall, [shell.crashhunt("guide", "commands").out, *scripts]))
     others = re.compile(r"^#SBATCH|\bsrun\b|\bray start\b|\bpytest-xdist\b")  # programs

@@ -19,7 +19,9 @@ from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Lane, paths_of
 
 _INTERPRETER = os.environ.get("CRASHHUNT_READERS", "")
-readers = pytest.mark.skipif(not _INTERPRETER, reason="scripts/readers runs it, with the libraries of the formats")
+readers = pytest.mark.skipif(
+    not _INTERPRETER, reason="scripts/tools/readers runs it, with the libraries of the formats"
+)
 AGENTS = ["ego", 'odd name/§ #1 <&"--->', "日本"]
 LANES = [
     Lane("in_0", 3.0, ((-90.0, 0.0), (0.0, 0.0), (0.0, 0.0), (30.0, 5.0))),

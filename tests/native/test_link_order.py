@@ -303,8 +303,10 @@ def test_hunt_states_where_the_order_is_not_fixed(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def heap_orders():
-    """Return scripts/heap_orders.py as a module."""
-    specification = importlib.util.spec_from_file_location("heap_orders", ROOT / "scripts" / "heap_orders.py")
+    """Return scripts/studies/link_order/heap_orders.py as a module."""
+    specification = importlib.util.spec_from_file_location(
+        "heap_orders", ROOT / "scripts" / "studies" / "link_order" / "heap_orders.py"
+    )
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
     return module

@@ -14,7 +14,7 @@ from crashhunt.disturbances import first_forcing
 from crashhunt.rates import root_of
 from crashhunt.trial import CRASHES, Forcing
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts" / "studies" / "rates"))
 
 from markov_arrays import Arrays, run_roots
 

@@ -1,4 +1,4 @@
-"""Peers in the study of samplers, `scripts/search`: optional packages, and the limit for slow samplers."""
+"""Peers in the study of samplers, `scripts/studies/run search`: optional packages, and the limit for slow samplers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPTS = Path(__file__).parents[2] / "scripts"
+SCRIPTS = Path(__file__).parents[2] / "scripts" / "studies" / "search"
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,8 @@
-"""Environments of Gymnasium with planted faults, `scripts/search_faults.py`, and what guided hunts find in them."""
+"""Environments of Gymnasium with planted faults (`search_faults.py`), and what guided hunts find in them."""
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import sys
 from pathlib import Path
 
@@ -10,16 +10,16 @@ import pytest
 
 from crashhunt.trial import TrialSpec
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "search_faults.py"
+STUDY = Path(__file__).parents[2] / "scripts" / "studies" / "search"
 
 
 @pytest.fixture(scope="module")
 def study():
-    spec = importlib.util.spec_from_file_location("search_faults", SCRIPT)
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # dataclasses look it up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(STUDY))
+        yield importlib.import_module("search_faults")
+    for name in ("search_faults", "stored_hunts"):
+        del sys.modules[name]
 
 
 def test_guided_hunts_find_rare_faults_after_a_common_one(study):
