@@ -29,11 +29,9 @@ SECTIONS = {
 
 _PAGE_ORDER = [
     "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed", "how-often-does-it-crash",
-    "which-version-is-better", "cluster", "your-town", "from-a-map", "highway-env", "gymnasium", "learn-from-crashes",
-    "ci", "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
-    "kinds-of-crashes", "fault", "omissions", "judge", "causes", "what-if", "shrink", "film", "near-misses",
+    "which-version-is-better", "cluster", "your-town", "highway-env", "gymnasium", "ci", "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
+    "kinds-of-crashes", "fault", "judge", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
-    "train-on-crashes",
     "criticality", "at-fault", "determinism", "search", "counterfactuals", "crash-rates",
     "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "security",
     "disturbance-kinds", "forks", "fault-rules", "minimization", "export", "clusters",
@@ -41,7 +39,10 @@ _PAGE_ORDER = [
 ]  # fmt: skip
 """Topics in reading order; all other topics follow them."""
 
-_FORMER_PAGES = {"first-hunt": "find-a-crash"}
+_FORMER_PAGES = {
+    "first-hunt": "find-a-crash", "causes": "judge", "omissions": "judge", "what-if": "judge", "from-a-map": "map",
+    "train-on-crashes": "train", "learn-from-crashes": "train",
+}  # fmt: skip
 """Topics that were renamed, and their present names: `crashhunt guide` still takes them."""
 
 _GENERATED_MARK = re.compile(r"^<!-- made from the code: (\w+) -->\n", re.MULTILINE)

@@ -15,8 +15,8 @@ ROOTS = [topic for topic in PAGES if not Page(topic).before and Page(topic).comm
 # The dearest pages; what they show is asked by day elsewhere, without their words.
 AT_NIGHT = (
     "agent", "api", "ci", "compare", "disturbances", "executor", "film", "files", "find-a-crash", "gymnasium",
-    "hand-over", "highway-env", "how-often-does-it-crash", "learn-from-crashes", "look-into-a-crash", "oracle",
-    "prove-that-it-is-fixed", "sampler", "scenario", "simulator", "suites", "train-on-crashes", "watch-and-see-why",
+    "hand-over", "highway-env", "how-often-does-it-crash", "look-into-a-crash", "oracle",
+    "prove-that-it-is-fixed", "sampler", "scenario", "simulator", "suites", "train", "watch-and-see-why",
     "which-version-is-better", "your-town",
 )  # fmt: skip
 BY_DAY = [root for root in ROOTS if root not in AT_NIGHT]
