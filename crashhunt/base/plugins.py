@@ -203,13 +203,16 @@ def load_attribute(target: str, *, shown: str = "") -> Any:
     module = import_module(module_name, shown=name)
     found: object = module
     for part in attribute.split("."):
-        if not hasattr(found, part):
+        try:
+            found = getattr(found, part)
+        except AttributeError:
             public = [name for name in vars(found) if not name.startswith("_")] if hasattr(found, "__dict__") else []
             raise PluginError(
                 f"{name!r}: {module_name} has no attribute {attribute!r}",
                 fix=did_you_mean(part, public) or "correct the name",
-            )
-        found = getattr(found, part)
+            ) from None
+        except Exception as error:  # of a lazy module, which imports what is asked of it
+            raise _not_imported(module_name, name, error) from error
     return found
 
 
@@ -233,6 +236,10 @@ def import_module(name: str, *, shown: str = "") -> types.ModuleType:
         raise _not_imported(name, shown or name, error) from error
 
 
+_LIBRARIES_OF_SUMO = ("libGL.so.1", "libX11.so.6", "libXext.so.6", "libXrender.so.1", "libatomic.so.1")
+"""System libraries that libsumo's wheel needs and servers and containers often lack."""
+
+
 def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
     """Return the error for a failed import: either the module does not exist, or its code raised an exception."""
     said = in_words(error)
@@ -244,6 +251,9 @@ def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
         fix = f"{hint} run from the folder that holds the module, install it, or correct the name".lstrip()
         return PluginError(f"{shown!r} cannot be imported: No module named {missing!r}", fix=fix)
     fix = f"install {missing.partition('.')[0]!r}, or correct the import" if missing else "correct the module"
+    if library := re.search(r"(\S+\.so[.\d]*): cannot open shared object file", said):
+        on_debian = " (apt install libgl1 libxext6 libxrender1 libatomic1)" if library[1] in _LIBRARIES_OF_SUMO else ""
+        fix = f"install the system library {library[1]}{on_debian}"
     return PluginError(f"{said}, which keeps {shown!r} from being imported", fix=fix, where=place_of(error))
 
 

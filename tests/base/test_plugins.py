@@ -134,6 +134,19 @@ def test_what_leads_nowhere_states_why(tmp_path, monkeypatch, content, name, say
         ("", "brokn:Agent", "", "No module named 'brokn'; did you mean 'broken'?"),
         ("", "broken.inner:Agent", "", "No module named 'broken.inner'"),
         ("x\0y", "broken:Agent", "", "null bytes"),
+        ("def __getattr__(name):\n  import not_there", "broken:Agent", "broken.py, line 2", "install 'not_there'"),
+        (
+            "def __getattr__(name):\n  raise ImportError('libGL.so.1: cannot open shared object file: No such file')",
+            "broken:Agent",
+            "broken.py, line 2",
+            "install the system library libGL.so.1 (apt install libgl1 ",
+        ),
+        (
+            "raise ImportError('libmine.so: cannot open shared object file: No such file')",
+            "broken:Agent",
+            "broken.py, line 1",
+            "install the system library libmine.so",
+        ),
     ],
 )
 def test_an_import_that_fails_states_where(tmp_path, monkeypatch, content, name, where, says):
