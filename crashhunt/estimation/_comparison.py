@@ -20,6 +20,7 @@ from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.json_types import finite_values
+from crashhunt.base.text import count_of
 from crashhunt.estimation._hunt_rate import measure_rates
 from crashhunt.hunts import HuntResults, counting_rule
 from crashhunt.ledger import Ledger
@@ -117,7 +118,11 @@ class Pair:
             number has not ended, or if the trial is invalid in one hunt. A trial on whose traffic an agent was trained
             does not count either.
         answer: the hunt that certainly crashes less, ``first`` or ``second``; ``undecided`` if neither does; empty if
-            no answer is possible.
+            no answer is possible. The answer follows from ``difference``: it is undecided if this interval contains 0.
+        not_started: number of trials of the first hunt and of the second that count as crashes, because the agent does
+            not start, although it starts in the same trial of the other hunt.
+        without_result: number of pairs in which a trial was killed from outside or could not be set up in one hunt
+            only. The answer is valid for any result of these pairs.
     """
 
     first: str
@@ -136,6 +141,8 @@ class Pair:
     units: int = 0
     excluded: int = 0
     answer: str = ""
+    not_started: tuple[int, int] = (0, 0)
+    without_result: int = 0
 
     @property
     def verdict(self) -> str:
@@ -153,30 +160,28 @@ class Pair:
                 f"of {self.trials} trials with the same seeds, {self.only_first} crash only in {self.first}, "
                 f"{self.only_second} only in {self.second}, {self.both} in both"
             )
-        exact = "" if self.p_value is None else f"; McNemar's exact test: p = {self.p_value:.2g}"
         decides = f"; {1 / _ALPHA:g} decides" if self.answer == "undecided" else ""
-        return f"{self._answer}: {what} (evidence {self.evidence:.3g}{decides}{exact}){self._difference}"
+        return f"{self._answer}: {what} (evidence {self.evidence:.3g}{decides}){self._difference}"
 
     @property
     def _answer(self) -> str:
         if self.answer in ("first", "second"):
             return f"{self.first if self.answer == 'first' else self.second} crashes less"
-        return "undecided, because chance may explain the difference"
+        return "undecided, because the difference may be 0"
 
     @property
     def _difference(self) -> str:
         if self.difference is None:
             return ""
-        low, high = self.difference
-        return f"; difference: {low:+.2%} to {high:+.2%} crashes per trial ({self.second} minus {self.first}, 95 %)"
+        found = self.difference.as_difference()
+        return f"; difference: {found} crashes per trial ({self.second} minus {self.first}, 95 %)"
 
     def _unpaired(self) -> str:
         reason = f"{self.first} and {self.second}{self.why_unpaired.removeprefix('they')}"
         if not self.test:
             return reason
         a, trials_a, b, trials_b = self.counts
-        exact = "" if self.p_value is None else f" (Fisher's exact test, unpaired: p = {self.p_value:.2g})"
-        counts = f"{a} of {trials_a} trials crash in {self.first}, {b} of {trials_b} in {self.second}{exact}"
+        counts = f"{a} of {trials_a} trials crash in {self.first}, {b} of {trials_b} in {self.second}"
         return f"{reason}; {self._answer}: {counts}{self._difference}"
 
 
@@ -387,9 +392,7 @@ def _by_pairs(
 ) -> Pair:
     first, second = one.hunt, two.hunt
     log_evidence = test.log_evidence
-    answer = "undecided"
-    if log_evidence >= -math.log(_ALPHA):
-        answer = "first" if test.second_crashes_more else "second"
+    answer = {"second": "first", "first": "second", "": "undecided"}[test.verdict(_ALPHA)]
     p_value = None
     if _is_fixed_ahead(one) and _is_fixed_ahead(two):
         from scipy.stats import binomtest
@@ -404,14 +407,30 @@ def _by_pairs(
         only_second=test.only_second,
         both=test.both,
         p_value=p_value,
-        caution=_caution(first, second),
+        caution="; ".join(filter(None, (_caution(first, second), _invalid_pairs(one, two, test)))),
         counts=counts,
         evidence=math.exp(min(log_evidence, 700.0)),  # a float ends soon after
         difference=test.difference(_ALPHA),
         units=test.pairs,
         excluded=sequence.excluded + 2 * sequence.invalid,
         answer=answer,
+        not_started=(test.side(0).not_started, test.side(1).not_started),
+        without_result=test.unknown,
     )
+
+
+def _invalid_pairs(one: _Side, two: _Side, test: PairTest) -> str:
+    """Return what the trials that are invalid in one hunt only mean for the answer; empty if there are none."""
+    found = []
+    for number, side in enumerate((one, two)):
+        counts, name = test.side(number), side.hunt.directory
+        if counts.not_started:
+            found.append(f"{name} does not start in {counts.not_started} of the pairs, which count as crashes "
+                         f"({counts.example})")  # fmt: skip
+        if counts.lost:
+            found.append(f"{count_of(counts.lost, 'more pair')} without a result: {name} was killed from outside or "
+                         "could not be set up; the answer is valid for any result")  # fmt: skip
+    return "; ".join(found)
 
 
 def _only_held_out(trained_on: int, counted: int) -> str:

@@ -10,21 +10,23 @@ from __future__ import annotations
 import math
 import time
 from contextlib import closing
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, cast
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.json_types import finite_values
 from crashhunt.estimation._comparison import why_unpaired
+from crashhunt.estimation._hunt_rate import crash_types
 from crashhunt.hunts import counting_rule
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
-from crashhunt.rates import PairSequence, PairTest, facts_of_plain
+from crashhunt.rates import PairSequence, PairTest, SideCounts, facts_of_plain
 from crashhunt.training import HeldOutTraffics, held_out_traffics
+from crashhunt.trial import KILLED
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
@@ -33,6 +35,8 @@ if TYPE_CHECKING:
 __all__ = ["GateCase", "GateReport", "PairedHunts", "ScenarioCounts"]
 
 _FAILED_STATES = ("no_valid_trial", "error")
+_KILLED_SIGN = f'"kind": "{KILLED}"'
+_NEW_SQL = "number >= ? AND (ended_at >= ? OR outcome != 'invalid' OR instr(result, ?) = 0)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,10 +68,12 @@ class ScenarioCounts:
     Args:
         name: name of the hunt: its id and run in the suite, or the name of the scenario.
         pairs: number of pairs on which the verdict is based.
-        only_base: number of the pairs in which only BASE crashes.
-        only_head: number of pairs in which only HEAD crashes.
-        both: number of pairs in which both crash.
-        invalid: number of pairs with an invalid trial, which are excluded for both versions.
+        only_base: number of the pairs in which only BASE crashes or does not start.
+        only_head: number of pairs in which only HEAD crashes or does not start.
+        both: number of pairs in which both fail.
+        invalid: number of pairs whose trials are invalid for both versions; they do not count.
+        sides: the trials of BASE and of HEAD that are invalid in one version only.
+        types: for each crash type, the number of crashes of BASE and of HEAD in the pairs.
     """
 
     name: str
@@ -76,13 +82,24 @@ class ScenarioCounts:
     only_head: int
     both: int
     invalid: int = 0
+    sides: tuple[SideCounts, SideCounts] = (SideCounts(), SideCounts())
+    types: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def to_json(self) -> JsonObject:
         """Return the counts as JSON-compatible data."""
         return {
             "name": self.name, "pairs": self.pairs, "only_base": self.only_base, "only_head": self.only_head,
-            "both": self.both, "invalid": self.invalid,
+            "both": self.both, **_uncounted(self.invalid, self.sides),
         }  # fmt: skip
+
+
+def _uncounted(invalid: int, sides: tuple[SideCounts, SideCounts]) -> JsonObject:
+    """Return the pairs that are invalid as JSON-compatible data."""
+    counts = {
+        name: {"base": getattr(sides[0], name), "head": getattr(sides[1], name)}
+        for name in ("not_started", "killed", "unknown")
+    }
+    return {"invalid": invalid, **counts}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,11 +111,12 @@ class GateReport:
         base: the version BASE: a commit or an agent.
         head: the version HEAD: a commit or an agent.
         pairs: number of pairs on which the verdict is based.
-        only_base: number of the pairs in which only BASE crashes.
-        only_head: number of pairs in which only HEAD crashes.
-        both: number of pairs in which both versions crash.
+        only_base: number of the pairs in which only BASE crashes or does not start.
+        only_head: number of pairs in which only HEAD crashes or does not start.
+        both: number of pairs in which both versions fail.
         evidence: e-value against the hypothesis that both versions crash equally often.
-        difference: interval of the difference in crashes per trial, HEAD minus BASE; None without a pair.
+        difference: interval of the difference in failures per trial, HEAD minus BASE, from which the verdict follows;
+            None without a pair.
         margin: the greatest difference that counts as no difference; 0 to disable this verdict.
         confidence: confidence in percent, of the verdict and of the interval.
         seed: seed of the hunts.
@@ -133,6 +151,31 @@ class GateReport:
     trained_on: int = 0
 
     @property
+    def sides(self) -> tuple[SideCounts, SideCounts]:
+        """The trials of BASE and of HEAD that are invalid in one version only."""
+        base, head = zip(*(one.sides for one in self.scenarios), strict=True) if self.scenarios else ((), ())
+        return sum(base, SideCounts()), sum(head, SideCounts())
+
+    @property
+    def invalid(self) -> int:
+        """The number of pairs whose trials are invalid for both versions."""
+        return sum(one.invalid for one in self.scenarios)
+
+    @property
+    def types(self) -> dict[str, tuple[int, int]]:
+        """For each crash type, the number of crashes of BASE and of HEAD in the pairs."""
+        names = dict.fromkeys(name for one in self.scenarios for name in one.types)
+        found = {
+            name: tuple(sum(one.types.get(name, (0, 0))[side] for one in self.scenarios) for side in (0, 1))
+            for name in names
+        }
+        return cast("dict[str, tuple[int, int]]", found)
+
+    def new_types(self, side: int) -> dict[str, int]:
+        """Return the crash types of BASE (0) or HEAD (1) that the other version does not have, with their counts."""
+        return {name: counts[side] for name, counts in self.types.items() if not counts[1 - side]}
+
+    @property
     def back(self) -> tuple[GateCase, ...]:
         """The cases that had to stay fixed, but crash with HEAD."""
         return tuple(case for case in self.corpus or () if case.has_come_back)
@@ -164,6 +207,10 @@ class GateReport:
             "confidence": self.confidence,
             "seed": self.seed,
             "scenarios": [one.to_json() for one in self.scenarios],
+            **_uncounted(self.invalid, self.sides),
+            "crash_types": [
+                {"type": name, "base": base, "head": head} for name, (base, head) in sorted(self.types.items())
+            ],
             "why": self.why,
             "interrupted": self.is_interrupted,
             "dir": self.dir or None,
@@ -191,18 +238,23 @@ class PairedHunts:
         self._sequence: PairSequence | None = None
         self._crash_on: tuple[str, ...] = ()
         self._test = PairTest()
-        self._began = time.time()  # as ledgers have it
+        self._crashed: tuple[list[int], list[int]] = ([], [])
+        self._began = self._killed_after = time.time()  # as ledgers have it
 
-    def take(self, watch: PairWatch, *, may_end: bool = True) -> None:
+    def take(self, watch: PairWatch, *, may_end: bool = True, has_ended: bool = False) -> None:
         """Pass the pairs that are complete to a watch, until a pair decides.
 
         Args:
             watch: watch of all pairs of the gate.
             may_end: whether the verdicts *better* and *no difference* are allowed yet; *worse* is always allowed.
+            has_ended: whether the hunts have ended. Before, trials that were killed in an earlier run of the gate do
+                not count, because the hunts run them again.
 
         Raises:
             HuntDirectoryError: the two hunts do not have the same traffic, or a ledger is damaged.
         """
+        if has_ended:
+            self._killed_after = 0.0
         sequence = self._sequence = self._sequence or self._pair_sequence()
         if sequence is None:
             return
@@ -221,13 +273,18 @@ class PairedHunts:
                 continue
             self._test.add(pair)
             watch.test.add(pair)
+            for both in pair:
+                for one, crashed in zip(both, self._crashed, strict=True):
+                    if one.crashed:
+                        crashed.append(one.number)
             if not self.why_not:
                 watch.decide(may_end=may_end)
 
     @property
     def counts(self) -> ScenarioCounts:
-        """Return the counts of the pairs until now."""
+        """Return the counts of the pairs until now, without crash types."""
         test, sequence = self._test, self._sequence
+        base, head = (test.side(side) for side in (0, 1))
         return ScenarioCounts(
             name=self.name,
             pairs=test.pairs,
@@ -235,7 +292,18 @@ class PairedHunts:
             only_head=test.only_second,
             both=test.both,
             invalid=0 if sequence is None else sequence.invalid,
+            sides=(base, head),
         )
+
+    def crash_types(self) -> dict[str, tuple[int, int]]:
+        """Return the number of crashes of BASE and of HEAD in the pairs for each crash type; bundles are read."""
+        counts: dict[str, list[int]] = {}
+        for side, (folder, numbers) in enumerate(zip(self.folders, self._crashed, strict=True)):
+            known = crash_types(folder) if numbers else {}
+            for number in numbers:
+                if number in known:
+                    counts.setdefault(known[number], [0, 0])[side] += 1
+        return {name: (base, head) for name, (base, head) in counts.items()}
 
     @property
     def is_complete(self) -> bool:
@@ -256,6 +324,16 @@ class PairedHunts:
         Without any valid pair, the result is False, because the hunt itself then ends and reports the reason.
         """
         return self._sequence is not None and self._sequence.valid > 0 and self._sequence.is_hopeless
+
+    @property
+    def cannot_continue(self) -> bool:
+        """Whether a hunt failed, and no trial of this hunt waits for its partner."""
+        failure = self.failure()
+        if failure is None:
+            return False
+        side, state, _ = failure
+        waits = self._sequence is not None and self._sequence.waiting(("base", "head").index(side))
+        return state == "error" or not waits
 
     def failure(self) -> tuple[str, str, str] | None:
         """Return which hunt failed (``base`` or ``head``), its state, and the reason; None if both can run.
@@ -284,7 +362,7 @@ class PairedHunts:
     def _read(self, sequence: PairSequence) -> Iterator[Pair]:
         for side, folder in enumerate(self.folders):
             with closing(Ledger(folder / layout.LEDGER)) as ledger:
-                for data in ledger.plain_results_where("number >= ?", sequence.position):
+                for data in ledger.plain_results_where(_NEW_SQL, sequence.position, self._killed_after, _KILLED_SIGN):
                     tags = (str(data["spec"]["seed"]),)
                     yield from sequence.add(side, facts_of_plain(data, self._crash_on, tags))
 

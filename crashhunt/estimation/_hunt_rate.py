@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from crashhunt.training import HeldOutTraffics
     from crashhunt.trial import Distribution, Value
 
-__all__ = ["counts_suffice", "measure_rates", "rate_of_counts", "rate_of_trials"]
+__all__ = ["counts_suffice", "crash_types", "measure_rates", "rate_of_counts", "rate_of_trials"]
 
 _DEFAULT_BINS = 4
 _MAX_BINS = 50
@@ -241,6 +241,12 @@ def _division(by: str, hunt: HuntResults, settings: HuntSettings, facts: Facts) 
 def _first_disturbance(data: JsonObject) -> str:
     found = data.get("disturbances") or ()
     return str(found[0]["what"]) if found else _UNDISTURBED
+
+
+def crash_types(directory: Path) -> dict[int, str]:
+    """Return the type of each crash of a hunt, by the number of the trial."""
+    with closing(Ledger(directory / layout.LEDGER)) as ledger:
+        return _of_bundles(HuntResults(directory), ledger.facts(), "kind")
 
 
 def _of_bundles(hunt: HuntResults, facts: Facts, by: str) -> dict[int, str]:

@@ -468,7 +468,7 @@ class LedgerReader:
         """Yield the trials whose rows satisfy an SQL condition, in the order of their numbers."""
         return map(self._result, self.plain_results_where(condition, *values))
 
-    def plain_results_where(self, condition: str, *values: float) -> Iterator[JsonObject]:
+    def plain_results_where(self, condition: str, *values: float | str) -> Iterator[JsonObject]:
         """Yield the trials whose rows satisfy an SQL condition, as JSON data."""
         rows = self._select(f"{self._shape.select('trials')} WHERE {condition} ORDER BY number", values)
         return map(self._plain, rows)

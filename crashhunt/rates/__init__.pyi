@@ -2,7 +2,6 @@ from ._anytime_interval import (
     Bets as Bets,
     Interval as Interval,
     RateTest as RateTest,
-    discordance_evidence as discordance_evidence,
 )
 from ._paired_test import (
     Pair as Pair,
@@ -10,6 +9,7 @@ from ._paired_test import (
     PairTest as PairTest,
     PairVerdict as PairVerdict,
     PairWatch as PairWatch,
+    SideCounts as SideCounts,
 )
 from ._rare import (
     BLOCK as BLOCK,

@@ -1,4 +1,4 @@
-"""Intervals for a rate that are valid at any time, and a test whether two rates differ.
+"""Intervals for a rate that are valid at any time.
 
 Each unit has Y events (0 to b) and an exposure D (above 0, at most Dmax). The rate is E[Y] / E[D]. For each possible
 rate r, the module computes the capital of bets against r. The interval consists of the rates whose capital is below 1
@@ -23,7 +23,6 @@ either side of that rate, a component that exceeds 1 keeps growing. The sum over
 to both sides, and bisection finds the rate at which the sum crosses 1 / alpha. The sum is smaller than E, so the
 interval stays valid.
 
-Sources:
 Sources: Ville, Étude critique de la notion de collectif (1939). Robbins, Statistical methods related to the law of the
 iterated logarithm (1970), for mixtures. Waudby-Smith and Ramdas, Estimating means of bounded random variables by
 betting, JRSS B 86(1), 2024, for the bets. Grünwald, de Heide and Koolen, Safe testing, JRSS B 86(5), 2024, for
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["Bets", "Interval", "RateTest", "discordance_evidence"]
+__all__ = ["Bets", "Interval", "RateTest"]
 
 _WEIGHT_OF_ZERO = 0.535
 _LEAST_RATE, _GREATEST_RATE = 1e-7, 0.98  # of the grid, in events per greatest exposure
@@ -59,7 +58,6 @@ _RATES = (1e-7, 6.3e-5, 1.26e-4, 0.063, 0.158, 0.98, 1e3)
 _WEIGHTS = (0.6, 1.0, 6.0, 6.0, 2.0, 2.0, 0.5)
 _SHARE_AT_STAKE = 0.999  # of the capital in one bet, at most
 _PRECISION = 1e-9  # relative, of both ends
-_BIASED_COIN = 0.75  # share of one side in discordant pairs: between rates of 0.02 and 0.005 it is 0.8
 _MAX_EXPOSURES = 512  # different ones; more are spread over the grid
 _MAX_EVENTS = 8  # different numbers of events where exposures are spread
 _GRID_PARTS = 256  # parts of the greatest exposure
@@ -75,6 +73,23 @@ class Interval(NamedTuple):
 
     low: float
     high: float
+
+    def as_difference(self, *, percent: bool = True) -> str:
+        """Return the interval of a difference as text; an end that is not 0 has a digit that is not 0.
+
+        >>> Interval(-0.0174, 0.1942).as_difference()
+        '-1.74% to +19.42%'
+        >>> Interval(0.0000042, 3.25).as_difference()
+        '+0.0004% to +325.00%'
+        """
+        return " to ".join(_signed(end, percent=percent) for end in self)
+
+
+def _signed(value: float, *, percent: bool) -> str:
+    if not percent or not math.isfinite(value):
+        return f"{value:+.3g}" if math.isfinite(value) else "any number"
+    text = f"{value:+.2%}"
+    return text if float(text.rstrip("%")) or not value else f"{100 * value:+.1g}%"
 
 
 class Bets:
@@ -245,29 +260,3 @@ class RateTest:
         if self.exposure <= 0 or self.log_evidence(bar) < -math.log(alpha):
             return "undecided"
         return "below" if self.events < bar * self.exposure else "above"
-
-
-def discordance_evidence(only_first: int, only_second: int) -> float:
-    """Return the logarithm of the evidence that events are not equally frequent in two paired runs.
-
-    Only discordant pairs count, as in McNemar's test (1947): without a difference each is a fair coin. The evidence is
-    the capital of a mixture of bets on that coin. Half of the mixture has the weights of Krichevsky and Trofimov
-    (1981), which detect any bias eventually. The other half bets that one side occurs three times as often as the
-    other. Most changes of interest have such a bias, and this half detects them sooner. Each half is a martingale that
-    begins at 1, and so is the mixture. You may look at the evidence after every pair, and 1 / evidence is a p-value at
-    any time.
-
-    >>> round(discordance_evidence(0, 0), 9)
-    0.0
-    """
-    a, b = only_first, only_second
-    beta = math.lgamma(a + 0.5) + math.lgamma(b + 0.5) - math.lgamma(a + b + 1.0)
-    any_bias = beta - math.log(math.pi)
-    often, seldom = math.log(_BIASED_COIN), math.log(1 - _BIASED_COIN)
-    biased = _log_mean(a * often + b * seldom, a * seldom + b * often)
-    return _log_mean(any_bias, biased) + (a + b) * math.log(2.0)
-
-
-def _log_mean(first: float, second: float) -> float:
-    """Return the logarithm of the mean of two numbers, given the logarithms of the numbers."""
-    return max(first, second) + math.log1p(math.exp(-abs(first - second))) - math.log(2.0)

@@ -4,22 +4,32 @@ A pair is one trial of each agent with the same number, seed and traffic. Pairs 
 to the first number whose trials have not both ended. A crash ends a trial early, so the finished pairs are not a fair
 sample, but the first k pairs are. With `--seeds`, a pair consists of all trials of a traffic seed.
 
-The difference of a pair is Z = (crashes of the second - crashes of the first) / trials, from -1 to 1. The
-interval of E[Z] has two ends, each with half of the error probability. For the upper end, each component bets
-that E[Z] is less than d, with a share s of its maximum stake:
+The difference of a pair is Z = (failures of the second - failures of the first) / trials, from -1 to 1. A trial fails
+if it crashes, or if the agent's own code prevents its start. For each possible difference d, the evidence against d is
 
-    E(d) = sum_j w_j / 2 prod_i (1 - s_j (Z_i - d) / (1 - d)).
+    E(d) = 1/2 sum_j w_j prod_i (1 - s_j (Z_i - d) / (1 - d)) + 1/2 sum_j w_j prod_i (1 + s_j (Z_i - d) / (1 + d)).
 
-Invariant: at the true difference each factor is positive and has mean 1 given the past. The sum is therefore a
-non-negative martingale that begins at 1 / 2. By Ville's inequality, the probability that the sum ever reaches 1 / alpha
-is at most alpha / 2. Each factor grows with d for every Z. The differences that are not rejected are therefore an
-interval, and bisection finds its end. The lower end is the upper end of -Z.
+The first sum bets that E[Z] is less than d, the second that it is greater, each with a share s_j of the maximum stake.
+The interval consists of the differences with less evidence against them than 1 / alpha. The verdict follows from the
+interval: one agent is worse if the interval excludes 0. Therefore interval and verdict never contradict each other.
 
-The evidence of a difference is that of discordant pairs. With several trials in a pair, it is E(0) of Z plus that of
--Z.
+Invariant: at the true difference each factor is positive and has mean 1 given the past. So E is a non-negative
+martingale that begins at 1. By Ville's inequality, the probability that E ever reaches 1 / alpha is at most alpha. Each
+factor is a positive, convex function of d, the factors of a sum are monotone in the same direction, and so E is convex.
+At the observed mean, E is at most 1. The differences that are not rejected are therefore an interval around the mean,
+and bisection finds its ends.
 
-Sources: those of `_anytime_interval`, which computes the evidence of discordant pairs. The bets on Z are those of
-Waudby-Smith and Ramdas (2024), with a mixture over fixed shares.
+If the result of a trial is unknown, its pair counts with the greatest possible Z in the first sum, and with the least
+in the second. Both sums only become smaller. An interval and a verdict are therefore valid whatever the results are.
+
+At d = 0, the factors of concordant pairs are 1, and E is the evidence of McNemar's discordant pairs (1947), each of
+which is a fair coin without a difference. Half of the weight is on the shares of Krichevsky and Trofimov (1981), which
+detect any bias eventually: s = 2 q - 1, where q has the distribution Beta(1/2, 1/2), here at the nodes of Gauss and
+Chebyshev. The other half bets that one side occurs three times as often as the other. Most changes of interest have
+such a bias, and this half detects them sooner.
+
+Sources: those of `_anytime_interval`. The bets on Z are those of Waudby-Smith and Ramdas (2024), with a mixture over
+fixed shares.
 
 Cost: a pair increments a counter. The bisection for one end of the interval evaluates E(d) 50 times. Each evaluation
 computes one logarithm for every component j and every different value of Z.
@@ -29,11 +39,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from crashhunt.rates._anytime_interval import Interval, discordance_evidence
+from crashhunt.rates._anytime_interval import Interval
 from crashhunt.rates._units import MAX_INVALID_SHARE, has_too_many_invalid
 
 if TYPE_CHECKING:
@@ -43,33 +54,27 @@ if TYPE_CHECKING:
 
     from crashhunt.rates._units import CountingRule, TrialFacts
 
-__all__ = ["Pair", "PairSequence", "PairTest", "PairVerdict", "PairWatch"]
+__all__ = ["Pair", "PairSequence", "PairTest", "PairVerdict", "PairWatch", "SideCounts"]
 
 PairVerdict = Literal["better", "worse", "no_difference", "undecided"]
-"""What pairs say of the second agent, compared with the first."""
+"""The verdict of pairs on the second agent, compared with the first."""
 
-_WEIGHT_OF_GREATEST = 0.25
-_GREATEST_SHARE, _SECOND_SHARE, _LEAST_SHARE = 0.999, 0.9, 0.003  # of the most that a bet may stake
-_COMPONENTS = 12  # from the second to the least, evenly spaced in the logarithm
-_SHARES: NDArray[np.float64] = np.concatenate(
-    ([_GREATEST_SHARE], np.geomspace(_SECOND_SHARE, _LEAST_SHARE, _COMPONENTS))
-)
-_LOG_WEIGHTS: NDArray[np.float64] = np.log(
-    np.concatenate(
-        ([_WEIGHT_OF_GREATEST], np.full(_COMPONENTS, (1 - _WEIGHT_OF_GREATEST) / _COMPONENTS)),
-    )
-    / 2
-)
+_NODES = 256  # of the shares from 0 to 1; the mixture is exact up to 1,023 discordant pairs
+_BIASED_SHARE = 0.5  # 2 q - 1 for a coin with q = 3/4
+_SHARES: NDArray[np.float64] = np.append(np.cos(np.pi * (np.arange(_NODES) + 0.5) / (2 * _NODES)), _BIASED_SHARE)
+_LOG_WEIGHTS: NDArray[np.float64] = np.log(np.append(np.full(_NODES, 0.5 / _NODES), 0.5) / 2)
 _PRECISION = 1e-9  # of both ends
 
 Pair = tuple[tuple["TrialFacts", "TrialFacts"], ...]
-"""The trials of a pair that are valid for both agents, each as first and second: one, or those of a traffic."""
+"""The trials of a pair that count, each as first and second: one, or those of a traffic."""
 
 
 class PairSequence:
     """Combines trials of two agents, which end in any order, to pairs in the order of their numbers.
 
-    A trial that is invalid for one agent is excluded for both. Trials that are not drawn at random do not count.
+    A trial that is invalid for both agents is excluded, and so is a trial that was not drawn at random. A trial that is
+    invalid for one agent only counts: it has failed if the agent's own code prevents its start. Otherwise, and if its
+    process was killed from outside, its result is unknown.
 
     Args:
         rules: counting rules for the trials of the first agent and of the second agent.
@@ -78,6 +83,7 @@ class PairSequence:
 
     Attributes:
         rounds: number of trials in each pair.
+        invalid: number of pairs of trials that are invalid for both agents.
     """
 
     def __init__(
@@ -100,7 +106,7 @@ class PairSequence:
             side: 0 for a trial of the first agent, 1 for a trial of the second agent.
             trial: trial of any number; a trial that was added before is ignored.
         """
-        if not trial.has_ended or self._has(trial.number) or not self._is_wanted(trial.number):
+        if self._has(trial.number) or not self._is_wanted(trial.number):
             return
         self._waiting[side][trial.number] = trial
         while (numbers := self._numbers(self._next)) and all(
@@ -134,7 +140,7 @@ class PairSequence:
                 self.not_random += 1
             elif not self._is_same(*both):
                 self.not_same += 1
-            elif not (both[0].valid and both[1].valid):
+            elif all(one.has_ended and not one.valid for one in both):
                 self.invalid += 1
             else:
                 self.valid += 1
@@ -150,6 +156,10 @@ class PairSequence:
     def excluded(self) -> int:
         """The number of trials that have ended, but do not belong to a complete pair yet."""
         return sum(map(len, self._waiting))
+
+    def waiting(self, side: int) -> bool:
+        """Return whether trials of an agent have ended for which the same trials of the other agent have not."""
+        return any(number not in self._waiting[1 - side] for number in self._waiting[side])
 
     @property
     def invalid_share(self) -> float:
@@ -170,119 +180,197 @@ class PairSequence:
         return f"{many}, more than {MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SideCounts:
+    """The trials of one agent that are invalid, although the same trials of the other agent are not.
+
+    Args:
+        not_started: number of trials that count as failures, because the user's code prevented their start.
+        killed: number of trials whose processes were killed from outside.
+        unknown: number of trials that are invalid for any other reason.
+        example: number of one of these trials, and the reason why it is invalid; empty if there is none.
+    """
+
+    not_started: int = 0
+    killed: int = 0
+    unknown: int = 0
+    example: str = ""
+
+    @property
+    def lost(self) -> int:
+        """The number of trials whose result is unknown."""
+        return self.killed + self.unknown
+
+    def __add__(self, other: SideCounts) -> SideCounts:
+        return SideCounts(
+            not_started=self.not_started + other.not_started, killed=self.killed + other.killed,
+            unknown=self.unknown + other.unknown, example=self.example or other.example,
+        )  # fmt: skip
+
+
 class PairTest:
     """Counts pairs, and returns at any time the difference that is compatible with them.
 
     Attributes:
-        pairs: number of added pairs with at least one trial that is valid for both agents.
-        only_first: number of pairs in which the first agent crashes and the second does not. If a pair has several
-            trials, number of pairs in which the first agent crashes more often.
+        pairs: number of added pairs with known results.
+        unknown: number of added pairs in which the result of a trial is unknown.
+        only_first: number of pairs in which the first agent fails and the second does not. If a pair has several
+            trials, number of pairs in which the first agent fails more often.
         only_second: like ``only_first``, with the two agents exchanged.
-        both: number of pairs in which both agents crash, equally often.
-        crashes: number of crashes of the first agent and of the second agent.
+        both: number of pairs in which both agents fail, equally often.
+        failures: number of failures of the first agent and of the second agent.
         trials: number of trials of each agent in the pairs that ``pairs`` counts.
+        unstarted: trials of the first agent and of the second agent that failed because the agent did not start.
+        lost: trials of the first agent and of the second agent whose result is unknown.
     """
 
     def __init__(self, rounds: int = 1) -> None:
         self._rounds = max(1, rounds)
-        self.pairs = self.only_first = self.only_second = self.both = self.trials = 0
-        self.crashes = (0, 0)
-        self._differences: Counter[float] = Counter()
+        self.pairs = self.only_first = self.only_second = self.both = self.trials = self.unknown = 0
+        self.failures = (0, 0)
+        self.unstarted: tuple[list[TrialFacts], list[TrialFacts]] = ([], [])
+        self.lost: tuple[list[TrialFacts], list[TrialFacts]] = ([], [])
+        self._differences: Counter[tuple[float, float]] = Counter()  # the least and the greatest of each pair
 
     def add(self, pair: Pair) -> None:
         """Add a pair; a pair without a trial that counts is ignored."""
         if not pair:
             return
-        first, second = (sum(both[side].crashed for both in pair) for side in (0, 1))
+        for both in pair:
+            for one, unstarted, lost in zip(both, self.unstarted, self.lost, strict=True):
+                if not one.valid:
+                    (unstarted if all(_failures(one)) else lost).append(one)
+        least, most = ([sum(_failures(both[side])[end] for both in pair) for side in (0, 1)] for end in (0, 1))
+        self._differences[(least[1] - most[0]) / self._rounds, (most[1] - least[0]) / self._rounds] += 1
+        if least != most:
+            self.unknown += 1
+            return
+        first, second = least
         self.pairs += 1
         self.trials += len(pair)
-        self.crashes = (self.crashes[0] + first, self.crashes[1] + second)
+        self.failures = (self.failures[0] + first, self.failures[1] + second)
         self.only_first += first > second
         self.only_second += second > first
         self.both += first == second > 0
-        self._differences[(second - first) / self._rounds] += 1
 
     def add_counts(self, only_first: int, only_second: int, alike: int) -> None:
         """Add the counts of pairs that have one trial per agent.
 
         Args:
-            only_first: number of pairs in which only the first agent crashes.
-            only_second: number of pairs in which only the second agent crashes.
-            alike: number of pairs in which no agent crashes, or both do.
+            only_first: number of pairs in which only the first agent fails.
+            only_second: number of pairs in which only the second agent fails.
+            alike: number of pairs in which no agent fails, or both do.
         """
         self.pairs += only_first + only_second + alike
         self.trials += only_first + only_second + alike
         self.only_first += only_first
         self.only_second += only_second
-        self.crashes = (self.crashes[0] + only_first, self.crashes[1] + only_second)
-        self._differences.update({-1.0: only_first, 1.0: only_second, 0.0: alike})
+        self.failures = (self.failures[0] + only_first, self.failures[1] + only_second)
+        self._differences.update({(-1.0, -1.0): only_first, (1.0, 1.0): only_second, (0.0, 0.0): alike})
+
+    def side(self, side: int) -> SideCounts:
+        """Return the trials of the first agent (0) or of the second (1) that are invalid for this agent only."""
+        unstarted, lost = self.unstarted[side], self.lost[side]
+        killed = sum(not one.has_ended for one in lost)
+        example = next((f"trial {one.number}: {_reason_of(one)}" for one in (*unstarted, *lost)), "")
+        return SideCounts(not_started=len(unstarted), killed=killed, unknown=len(lost) - killed, example=example)
 
     @property
     def log_evidence(self) -> float:
-        """The logarithm of the evidence that the two agents do not crash equally often."""
-        if self._rounds == 1:
-            return discordance_evidence(self.only_first, self.only_second)
-        # With several trials, an agent that crashes in more pairs may crash less often, so the sign is no fair coin.
-        ends = [self._log_evidence_below(0.0, sign) for sign in (1, -1)]
-        return max(ends) + math.log1p(math.exp(-abs(ends[0] - ends[1])))
-
-    @property
-    def second_crashes_more(self) -> bool:
-        """Whether the second agent crashed more often in the pairs."""
-        return self.crashes[1] > self.crashes[0]
+        """The logarithm of the evidence that the two agents do not fail equally often."""
+        return self._log_evidence_against(0.0)
 
     def difference(self, alpha: float = 0.05) -> Interval | None:
-        """Return the interval of the difference in crashes per trial, second minus first agent; None without a pair.
+        """Return the interval of the difference in failures per trial, second minus first agent; None without a pair.
 
         The probability that the interval ever excludes the true difference, after any number of pairs, is at most
         `alpha`.
         """
-        if not self.pairs:
+        if not self._differences.total():
             return None
-        return Interval(-self._upper_end(-1, alpha), self._upper_end(1, alpha))
+        least, greatest = (
+            sum(ends[end] * times for ends, times in self._differences.items()) / self._differences.total()
+            for end in (0, 1)
+        )
+        return Interval(self._end(least, -1.0, alpha), self._end(greatest, 1.0, alpha))
+
+    def verdict(self, alpha: float = 0.05) -> Literal["first", "second", ""]:
+        """Return which agent fails more often, on which side of 0 the interval lies; empty if it contains 0."""
+        if self.log_evidence < -math.log(alpha):
+            return ""
+        return "second" if self._total > 0 else "first"
 
     def excludes(self, difference: float, alpha: float = 0.05) -> bool:
         """Return whether the interval excludes the given difference."""
-        threshold = -math.log(alpha)
-        return max(self._log_evidence_below(sign * difference, sign) for sign in (1, -1)) >= threshold
+        return self._log_evidence_against(difference) >= -math.log(alpha)
 
     def is_within(self, margin: float, alpha: float = 0.05) -> bool:
         """Return whether the interval of the difference lies between -margin and margin."""
-        threshold = -math.log(alpha)
-        return self.pairs > 0 and all(self._log_evidence_below(margin, sign) >= threshold for sign in (1, -1))
+        if not self._differences.total() or not all(self.excludes(end, alpha) for end in (-margin, margin)):
+            return False
+        return abs(self._total) < margin * self._differences.total()
 
-    def _log_evidence_below(self, difference: float, sign: int) -> float:
-        """Return the logarithm of the evidence that ``sign`` times the mean difference of pairs is below a value."""
-        values = sign * np.array(list(self._differences), float)
+    @property
+    def _total(self) -> float:
+        """The sum of the differences of all pairs; the middle of its bounds if results are unknown."""
+        return sum((least + most) / 2 * times for (least, most), times in self._differences.items())
+
+    def _log_evidence_against(self, difference: float) -> float:
+        """Return the logarithm of the evidence that the mean difference of pairs is not the given one."""
+        ends = np.array(list(self._differences), float).reshape(-1, 2)
         times = np.array(list(self._differences.values()), float)
-        stakes = _SHARES / (1 - difference)
-        logs = np.log1p(-np.outer(stakes, values - difference)) @ times + _LOG_WEIGHTS
+        logs = np.concatenate([
+            np.log1p(-np.outer(_SHARES, side - sign * difference) / (1 - sign * difference)) @ times + _LOG_WEIGHTS
+            for sign, side in ((1, ends[:, 1]), (-1, -ends[:, 0]))
+        ])  # fmt: skip
         top = float(logs.max())
         return top + math.log(float(np.exp(logs - top).sum()))
 
-    def _upper_end(self, sign: int, alpha: float) -> float:
-        threshold = -math.log(alpha)
-        low, high = -1.0, 1.0 - _PRECISION
-        if self._log_evidence_below(high, sign) < threshold:
-            return 1.0
-        while high - low > _PRECISION:
-            middle = (low + high) / 2
-            if self._log_evidence_below(middle, sign) < threshold:
-                low = middle
+    def _end(self, inside: float, outside: float, alpha: float) -> float:
+        """Return the end of the interval between the observed mean and the greatest or the least difference."""
+        if abs(inside - outside) <= _PRECISION:
+            return outside
+        outside -= math.copysign(_PRECISION, outside)
+        if not self.excludes(outside, alpha):
+            return math.copysign(1.0, outside)
+        if inside * outside < 0:  # so that interval and verdict agree on 0, whatever is rounded
+            inside, outside = (inside, 0.0) if self.excludes(0.0, alpha) else (0.0, outside)
+        while abs(outside - inside) > _PRECISION:
+            middle = (inside + outside) / 2
+            if self.excludes(middle, alpha):
+                outside = middle
             else:
-                high = middle
-        return high
+                inside = middle
+        return inside
+
+
+def _failures(trial: TrialFacts) -> tuple[bool, bool]:
+    """Return whether a trial has certainly failed, and whether it may have failed."""
+    if trial.valid:
+        return trial.crashed, trial.crashed
+    return trial.has_ended and trial.failure is not None and trial.failure.is_of_users_code, True
+
+
+def _reason_of(trial: TrialFacts) -> str:
+    """Return the reason why a trial is invalid, in one line."""
+    failure = trial.failure
+    if failure is None:
+        return "invalid"
+    if failure.exit_code is not None or not failure.traceback:
+        return failure.message
+    place = f" ({failure.agent or failure.party}, {failure.place})" if failure.place else ""
+    return f"{failure.kind}: {failure.message}{place}"
 
 
 class PairWatch:
-    """Watches two agents until one agent certainly crashes more often, or both certainly crash about equally often.
+    """Watches two agents until one agent certainly fails more often, or both certainly fail about equally often.
 
     The pairs are evaluated in order, one after another. After a decision, later pairs do not count, so the verdict does
     not depend on the number of workers. The probability of each wrong verdict is at most `alpha`: *better* or *worse*
-    if both agents crash equally often, and *no difference* if the difference is above the margin.
+    if both agents fail equally often, and *no difference* if the difference is above the margin.
 
     Args:
-        margin: the greatest difference in crashes per trial that counts as no difference; 0 to disable this verdict.
+        margin: the greatest difference in failures per trial that counts as no difference; 0 to disable this verdict.
         alpha: maximum probability of a wrong verdict.
         rounds: number of trials in each pair.
     """
@@ -307,11 +395,10 @@ class PairWatch:
 
     def decide(self, *, may_end: bool = True) -> PairVerdict:
         """Return the verdict on the pairs that were added; the first verdict is final."""
-        test = self.test
-        if self.verdict == "undecided" and test.log_evidence >= -math.log(self.alpha):
-            is_worse = test.second_crashes_more
-            if is_worse or may_end:
-                self.verdict = "worse" if is_worse else "better"
-        elif self.verdict == "undecided" and may_end and self.margin and test.is_within(self.margin, self.alpha):
-            self.verdict = "no_difference"
+        if self.verdict == "undecided":
+            worse = self.test.verdict(self.alpha)
+            if worse == "second" or (worse and may_end):
+                self.verdict = "worse" if worse == "second" else "better"
+            elif not worse and may_end and self.margin and self.test.is_within(self.margin, self.alpha):
+                self.verdict = "no_difference"
         return self.verdict

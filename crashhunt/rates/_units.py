@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from crashhunt.plans import RATE_PERS, RatePer
 from crashhunt.rates._anytime_interval import Bets, Interval, RateTest
-from crashhunt.trial import KILLED, Outcome
+from crashhunt.trial import KILLED, Failure, Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -71,6 +71,7 @@ class TrialFacts(NamedTuple):
         origin: the strategy that proposed the trial; empty if there was none.
         tags: the groups to which the trial belongs, such as the bin of an argument; used for parts of a rate.
         seed: seed of the trial's traffic.
+        failure: the reason why the trial is invalid, where a ledger was read; None if the trial is valid.
     """
 
     number: int
@@ -84,6 +85,7 @@ class TrialFacts(NamedTuple):
     origin: str
     tags: tuple[str, ...] = ()
     seed: int = 0
+    failure: Failure | None = None
 
 
 Unit: TypeAlias = tuple[TrialFacts, ...]
@@ -108,11 +110,11 @@ def facts_of(result: TrialResult, crash_on: Sequence[str]) -> TrialFacts:
 
 def facts_of_plain(data: Mapping[str, Any], crash_on: Sequence[str], tags: tuple[str, ...] = ()) -> TrialFacts:
     """Return the facts about a trial that a rate needs, from its data in a ledger."""
-    spec, failure = data["spec"], data.get("failure") or {}
+    spec, failure, valid = data["spec"], data.get("failure") or {}, data["outcome"] != Outcome.INVALID
     return TrialFacts(
         number=spec["number"],
         has_ended=failure.get("kind") != KILLED,
-        valid=data["outcome"] != Outcome.INVALID,
+        valid=valid,
         crashed=data["outcome"] in crash_on,
         steps=data["steps"],
         driven_s=data.get("driven_s"),
@@ -121,6 +123,7 @@ def facts_of_plain(data: Mapping[str, Any], crash_on: Sequence[str], tags: tuple
         origin=spec.get("origin", ""),
         tags=tags,
         seed=spec["seed"],
+        failure=None if valid else Failure.from_json(failure),
     )
 
 

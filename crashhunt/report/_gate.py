@@ -14,11 +14,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.estimation import GateReport
-    from crashhunt.rates import CrashRate
+    from crashhunt.rates import CrashRate, SideCounts
 
 __all__ = ["describe_gate", "gate_annotations", "gate_summary", "write_gate_junit"]
 
 _MARKDOWN_SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|~])")
+_MAX_TYPES = 3  # named of each version
 _ICONS = {"better": "✅", "no_difference": "✅", "worse": "❌", "undecided": "❔"}
 
 
@@ -27,7 +28,7 @@ def describe_gate(found: GateReport) -> str:
     lines = [_answer(found)]
     if found.why:
         lines.append(f"  {found.why}")
-    lines += [f"  {line}" for line in _evidence(found)]
+    lines += [f"  {line}" for line in (*_evidence(found), *_invalid_pairs(found), *_new_types(found))]
     if found.trained_on:
         lines.append(f"  {_training_pairs(found)}")
     if found.rates is not None:
@@ -47,18 +48,28 @@ def _answer(found: GateReport) -> str:
     if found.verdict == "worse":
         if found.back:
             return f"worse: {head}"
-        return f"worse: {head} crashes more often than {base}"
+        return f"worse: {head} {_verb(found)} more often than {base}"
     if found.verdict == "better":
-        return f"better: {head} crashes less often than {base}"
+        return f"better: {head} {_verb(found)} less often than {base}"
     if found.verdict == "no_difference":
-        return f"no difference above {found.margin:.3g} crashes per trial: {head}, {base}"
+        return f"no difference above {found.margin:.3g} {_events(found)} per trial: {head}, {base}"
     return f"undecided: {head}, {base}"
+
+
+def _events(found: GateReport) -> str:
+    """Return the name of the counted failures: trials that do not start count if there are any."""
+    return "failures" if any(side.not_started for side in found.sides) else "crashes"
+
+
+def _verb(found: GateReport) -> str:
+    return "fails" if _events(found) == "failures" else "crashes"
 
 
 def _evidence(found: GateReport) -> list[str]:
     if not found.pairs:
         return ["no pair of trials has ended"]
-    counts = f"{found.only_base} crash only with BASE, {found.only_head} only with HEAD, {found.both} with both"
+    verb = "fail" if _events(found) == "failures" else "crash"
+    counts = f"{found.only_base} {verb} only with BASE, {found.only_head} only with HEAD, {found.both} with both"
     needed = 1 / (1 - found.confidence / 100)
     confidence = f"{found.confidence:g} %, valid whenever you look"
     lines = [
@@ -66,9 +77,56 @@ def _evidence(found: GateReport) -> list[str]:
         f"evidence: {found.evidence:.3g}; {needed:.3g} decides ({confidence})",
     ]
     if found.difference is not None:
-        low, high = found.difference
-        lines.append(f"difference: {low:+.2%} to {high:+.2%} crashes per trial (HEAD minus BASE)")
+        lines.append(f"difference: {found.difference.as_difference()} {_events(found)} per trial (HEAD minus BASE)")
     return lines
+
+
+def _invalid_pairs(found: GateReport) -> list[str]:
+    """Return the pairs with invalid trials as text: those that count as failures, those without a result, the rest."""
+    sides = tuple(zip(("BASE", "HEAD"), found.sides, strict=True))
+    lines = [
+        f"{name} does not start in {side.not_started} of these pairs, which count as failures ({side.example})"
+        for name, side in sides
+        if side.not_started
+    ]
+    lines += [_lost(name, side, found.verdict) for name, side in sides if side.lost]
+    if found.invalid:
+        lines.append(f"{_pairs(found.invalid)} not counted: the trial is invalid with both versions")
+    return lines
+
+
+def _lost(name: str, side: SideCounts, verdict: str) -> str:
+    """Return why pairs have no result because of one version, and what this means for the verdict."""
+    reasons = [
+        f"{name} {what} in {count}"
+        for what, count in (("was killed from outside", side.killed), ("could not be set up", side.unknown))
+        if count
+    ]
+    example = "" if side.not_started else f" ({side.example})"
+    effect = "must hold" if verdict == "undecided" else "holds"
+    return (
+        f"{_pairs(side.lost)} without a result: {' and '.join(reasons)}{example}; the verdict {effect} for any result"
+    )
+
+
+def _new_types(found: GateReport) -> list[str]:
+    """Return the crash types that only one of the versions has, as text."""
+    lines = []
+    for side, name in ((1, "HEAD"), (0, "BASE")):
+        types = sorted(found.new_types(side).items(), key=lambda one: (-one[1], one[0]))
+        if types:
+            words = ", ".join(f"{what} ({_count_of(count)})" for what, count in types[:_MAX_TYPES])
+            more = f" and {len(types) - _MAX_TYPES} more" if len(types) > _MAX_TYPES else ""
+            lines.append(f"crash {'type' if len(types) == 1 else 'types'} only with {name}: {words}{more}")
+    return lines
+
+
+def _pairs(count: int) -> str:
+    return f"{count:,} {'pair' if count == 1 else 'pairs'}"
+
+
+def _count_of(crashes: int) -> str:
+    return f"{crashes:,} {'crash' if crashes == 1 else 'crashes'}"
 
 
 def _training_pairs(found: GateReport) -> str:
@@ -76,7 +134,9 @@ def _training_pairs(found: GateReport) -> str:
 
 
 def _rate(rate: CrashRate) -> str:
-    crashes = f"{rate.crashes} {'crash' if rate.crashes == 1 else 'crashes'} in {rate.trials:,} trials"
+    crashes = f"{_count_of(rate.crashes)} in {rate.trials:,} trials"
+    if invalid := rate.excluded.get("invalid"):
+        crashes += f" and {invalid:,} invalid"
     if trained_on := rate.excluded.get("trained_on"):
         crashes += f" ({count_training_trials(trained_on)})"
     if rate.certain is None:
@@ -86,7 +146,7 @@ def _rate(rate: CrashRate) -> str:
 
 def _scenarios(found: GateReport) -> list[str]:
     return [
-        f"{one.name}: {one.pairs:,} pairs, {one.only_base} crash only with BASE, {one.only_head} only with HEAD, "
+        f"{one.name}: {_pairs(one.pairs)}, {one.only_base} crash only with BASE, {one.only_head} only with HEAD, "
         f"{one.both} with both"
         for one in found.scenarios
     ]
@@ -108,14 +168,17 @@ def gate_summary(found: GateReport) -> str:
     if found.why:
         lines += [f"{_plain(found.why)}.", ""]
     if found.pairs:
-        lines += [_row("pairs of trials", "crash only with BASE", "only with HEAD", "with both", "evidence")]
+        verb = "fail" if _events(found) == "failures" else "crash"
+        lines += [_row("pairs of trials", f"{verb} only with BASE", "only with HEAD", "with both", "evidence")]
         lines += [_row(*["---:"] * 5)]
         counts = (found.pairs, found.only_base, found.only_head, found.both)
         lines += [_row(*(f"{count:,}" for count in counts), f"{found.evidence:.3g}"), ""]
     if found.difference is not None:
-        low, high = found.difference
         confidence = f"{found.confidence:g} %, valid whenever you look"
-        lines += [f"Difference: **{low:+.2%} to {high:+.2%}** crashes per trial (HEAD minus BASE, {confidence}).", ""]
+        difference = f"**{found.difference.as_difference()}** {_events(found)} per trial"
+        lines += [f"Difference: {difference} (HEAD minus BASE, {confidence}).", ""]
+    if other := [*_invalid_pairs(found), *_new_types(found)]:
+        lines += [*(f"- {_plain(line)}" for line in other), ""]
     if found.trained_on:
         lines += [f"{_training_pairs(found)}.", ""]
     if found.rates is not None:

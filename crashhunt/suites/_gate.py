@@ -16,7 +16,7 @@ import os
 import secrets
 import sys
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -32,6 +32,7 @@ from crashhunt.base.temporary import temporary_folder
 from crashhunt.corpus import find_cases
 from crashhunt.estimation import GateCase, GateReport, PairedHunts, measure_rates
 from crashhunt.hunts import HuntDirectory, hunt_state, is_hunt
+from crashhunt.ledger import Ledger
 from crashhunt.plans import read_settings
 from crashhunt.rates import PairWatch, check_confidence
 from crashhunt.scenario import load_scenario
@@ -468,7 +469,7 @@ class _Run:
                     is_enough=lambda: self._is_enough(paired), environments=environments,  # noqa: B023
                     partners=dict(zip(paired.folders, reversed(paired.folders), strict=True)),
                 )  # fmt: skip
-                self._count_pairs(paired, is_last=is_last)
+                self._count_pairs(paired, is_last=is_last, has_ended=True)
             if self._refuse_failed(paired) or self._pairs.verdict != "undecided" or time.monotonic() > self._until:
                 break
         if self._pairs.verdict == "undecided" and not self._why:
@@ -476,12 +477,15 @@ class _Run:
 
     @staticmethod
     def _is_done(folder: Path, most: int) -> bool:
-        """Return whether a hunt has run all its trials."""
+        """Return whether a hunt has run all its trials, and none of them was killed from outside."""
         state = hunt_state(folder)
-        return state.state in ("finished", "crashed") and state.trials_run >= most
+        if state.state not in ("finished", "crashed") or state.trials_run < most:
+            return False
+        with closing(Ledger(folder / layout.LEDGER)) as ledger:
+            return not ledger.killed_numbers()
 
-    def _count_pairs(self, paired: PairedHunts, *, is_last: bool) -> None:
-        paired.take(self._pairs, may_end=is_last)
+    def _count_pairs(self, paired: PairedHunts, *, is_last: bool, has_ended: bool = False) -> None:
+        paired.take(self._pairs, may_end=is_last, has_ended=has_ended)
         if self._watch is not None:
             test = self._pairs.test
             done = sum(one.counts.pairs for one in self._hunts)
@@ -503,11 +507,13 @@ class _Run:
             or paired.is_complete
             or paired.is_hopeless
             or time.monotonic() > self._until
-            or paired.failure() is not None
+            or paired.cannot_continue
         )
 
     def _refuse_failed(self, paired: PairedHunts) -> bool:
         """Raise the error of a hunt that could not run; return whether the gate must start no more hunts.
+
+        If HEAD starts in no trial and BASE does, the pairs usually decide before.
 
         Raises:
             NoValidTrialError: no trial of the hunt was valid.
@@ -516,8 +522,10 @@ class _Run:
         if paired.is_hopeless:
             self._why = f"{paired.name}: {paired.why_not}"
             return True
-        failure = paired.failure()
-        if failure is None:
+        counts, failure = paired.counts, paired.failure()
+        if 0 < counts.pairs == counts.sides[0].not_started:
+            failure = BASE, "no_valid_trial", counts.sides[0].example
+        elif failure is None or self._pairs.verdict != "undecided":
             return False
         side, state, why = failure
         where = f"{side.upper()} ({self._versions[side]})"
@@ -538,7 +546,9 @@ class _Run:
                 f"an agent was trained on all {trained_on} traffics of this gate",
                 fix="give another --seed, or train with a test share",
             )
-        return f"all {self._gate.most} pairs have ended; give more with --most, or a greater --margin"
+        lost = sum(side.lost for one in self._hunts for side in one.counts.sides)
+        without = f", of which {lost} have no result; find out why" if lost else ""
+        return f"all {self._gate.most} pairs have ended{without}; give more with --most, or a greater --margin"
 
     # What came of it.
 
@@ -564,7 +574,7 @@ class _Run:
             margin=gate.margin,
             confidence=gate.confidence,
             seed=self._seed,
-            scenarios=tuple(one.counts for one in self._hunts),
+            scenarios=tuple(replace(one.counts, types=one.crash_types()) for one in self._hunts),
             rates=self._rates(),
             corpus=self._corpus,
             why=why,

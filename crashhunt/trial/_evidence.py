@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import re
 from dataclasses import dataclass, field
 from typing import Final
 
 from crashhunt.base.codec import OMIT_DEFAULT, Serializable, null_is
+from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.base.text import encodable
 
 __all__ = ["KILLED", "Collision", "Escape", "Failure"]
 
 KILLED: Final = "killed from outside"
 """Kind of the failure of a trial whose processes were killed from outside until no attempt was left."""
+_OF_SURROUNDINGS: Final = frozenset({
+    errno.EAGAIN, errno.ECONNREFUSED, errno.ECONNRESET, errno.EDQUOT, errno.EHOSTUNREACH, errno.EIO, errno.EMFILE,
+    errno.ENETUNREACH, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EROFS, errno.ESTALE, errno.ETIMEDOUT,
+})  # fmt: skip
+_ERROR_NUMBER: Final = re.compile(r"\[Errno (\d+)\]")
+_USERS: Final = ("agent", "environment", "oracle")
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,3 +122,15 @@ class Failure(Serializable):
         # The texts are written to JSON, logs and terminals, but an exception's message may contain invalid characters.
         for name in ("kind", "message", "traceback", "last_output"):
             object.__setattr__(self, name, encodable(getattr(self, name)))
+
+    @property
+    def is_of_users_code(self) -> bool:
+        """Whether code of the user certainly failed, and not its surroundings: memory, disk, network or a signal.
+
+        A failure of the simulator itself is not certain either: what the user asked of it may be the cause.
+        """
+        if self.exit_code is not None:
+            return self.exit_code >= 0 or not is_sent_from_outside(self.exit_code)
+        number = _ERROR_NUMBER.search(self.message)
+        lacks = self.kind.endswith("MemoryError") or (number is not None and int(number[1]) in _OF_SURROUNDINGS)
+        return not lacks and (bool(self.agent) or self.party in _USERS)

@@ -11,9 +11,9 @@ import pytest
 import crashhunt
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, write_settings
-from crashhunt.rates import discordance_evidence
+from crashhunt.rates import PairTest
 from crashhunt.report import describe_comparison
-from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
 
 def hunt(
@@ -64,7 +64,8 @@ def hunt(
 
 
 def test_same_seeds_are_pairs_only_in_the_same_traffic(tmp_path):
-    first = hunt(tmp_path / "first", 20)
+    first, discordant = hunt(tmp_path / "first", 20), PairTest()
+    discordant.add_counts(18, 0, 22)
     for name, options, says in (
         ("same", {}, ""),
         ("elsewhere", {"digest": "b"}, "are of two scenarios, in which the same seed is another traffic"),
@@ -79,7 +80,7 @@ def test_same_seeds_are_pairs_only_in_the_same_traffic(tmp_path):
             assert (pair.trials, pair.only_first, pair.both, pair.test) == (40, 18, 2, "pairs"), name
             assert not pair.why_unpaired
             assert (pair.p_value is None) == (name == "own draws")
-            assert pair.evidence == pytest.approx(math.exp(discordance_evidence(18, 0)))
+            assert pair.evidence == pytest.approx(math.exp(discordant.log_evidence))
             assert pair.difference.low < -18 / 40 < pair.difference.high < 0
             assert "crashes less: of 40 trials with the same seeds" in pair.verdict
             continue
@@ -145,23 +146,38 @@ def test_hunts_that_were_killed_or_stopped_are_compared_up_to_the_first_trial_th
     assert pair.answer == "second"
 
 
-def test_trials_that_are_invalid_for_one_agent_leave_both_sides(tmp_path):
+def test_trials_that_are_invalid_for_both_agents_leave_both_sides(tmp_path):
     few, many = hunt(tmp_path / "few", 20, trials=100), hunt(tmp_path / "many", 2, trials=100)
     invalidate(few, 0)
+    invalidate(many, 0)
     (pair,) = crashhunt.compare(few, many).pairs
     assert (pair.trials, pair.only_first, pair.both, pair.excluded) == (99, 18, 1, 2)
-    invalidate(many, 30, 31, 32, 33, 34)
+    for folder in (few, many):
+        invalidate(folder, 30, 31, 32, 33, 34)
     (pair,) = crashhunt.compare(few, many).pairs
     assert (pair.trials, pair.evidence) == (0, None)
     assert "6 of 100 pairs have an invalid trial, more than 5%" in pair.verdict
 
 
-def invalidate(folder, *numbers):
+def test_trials_that_are_invalid_for_one_agent_only_count_against_it_or_have_no_result(tmp_path):
+    few, many = hunt(tmp_path / "few", 2, trials=100), hunt(tmp_path / "many", 2, trials=100)
+    invalidate(many, *range(30, 40), failure=Failure("KeyError", "'x'", "Traceback", "ego", party="agent"))
+    (pair,) = crashhunt.compare(few, many).pairs
+    assert (pair.trials, pair.only_second, pair.answer, pair.not_started) == (100, 10, "first", (0, 10))
+    assert pair.difference.low > 0
+    assert "many does not start in 10 of the pairs, which count as crashes (trial 30: KeyError: 'x')" in pair.caution
+    invalidate(many, *range(30, 40), failure=Failure(KILLED, "killed from outside 3 times"))
+    (pair,) = crashhunt.compare(few, many).pairs
+    assert (pair.trials, pair.only_second, pair.answer, pair.without_result) == (90, 0, "undecided", 10)
+    assert "10 more pairs without a result: " in pair.caution
+
+
+def invalidate(folder, *numbers, failure=None):
     with closing(Ledger(folder / "ledger.sqlite", writable=True)) as ledger:
         before = [ledger.result(number) for number in numbers]
         ledger.replace(numbers)
         for result in before:
-            ledger.record(replace(result, outcome=Outcome.INVALID), snapshot="")
+            ledger.record(replace(result, outcome=Outcome.INVALID, failure=failure), snapshot="")
 
 
 def test_hunts_in_rare_mode_are_not_paired(tmp_path):

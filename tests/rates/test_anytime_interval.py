@@ -7,9 +7,9 @@ from itertools import pairwise, product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
-from crashhunt.rates import Bets, Interval, RateTest, discordance_evidence
+from crashhunt.rates import Bets, Interval, RateTest
 
 COUNTS = st.integers(0, 3000).flatmap(lambda count: st.tuples(st.integers(0, count), st.just(count)))
 UNITS = st.lists(st.tuples(st.sampled_from([0.0, 1.0]), st.floats(0.01, 1.0)), min_size=1, max_size=25)
@@ -271,24 +271,6 @@ def test_clusters_count_as_one_unit():
     assert together.observed == alone.observed
     assert together.interval().high >= alone.interval().high * 0.9
     assert together.interval().low <= alone.interval().low * 1.1
-
-
-@settings(max_examples=30)
-@given(st.integers(0, 60), st.integers(0, 60))
-def test_evidence_of_discordant_pairs_is_symmetric_and_grows_with_the_difference(first, second):
-    found = discordance_evidence(first, second)
-    assert found == pytest.approx(discordance_evidence(second, first))
-    if first >= second:
-        assert discordance_evidence(first + 1, second) > found - math.log(2)
-    assert discordance_evidence(first + second, 0) >= found - 1e-9
-
-
-def test_evidence_of_discordant_pairs_is_a_fair_bet():
-    """The mean over the next fair coin is the evidence so far."""
-    for first, second in product(range(12), repeat=2):
-        up, down = discordance_evidence(first + 1, second), discordance_evidence(first, second + 1)
-        mean = (math.exp(up) + math.exp(down)) / 2
-        assert mean == pytest.approx(math.exp(discordance_evidence(first, second)))
 
 
 def test_many_different_exposures_are_spread_and_never_make_the_interval_narrower():

@@ -14,10 +14,13 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, NoValidTrialError, UsageError
+from crashhunt.estimation import ScenarioCounts
 from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings, Request, RunSettings, write_settings
+from crashhunt.rates import SideCounts
 from crashhunt.suites import Gate, GateVersion, RunRequest, _gate
 from crashhunt.suites._processes import REQUEST, write_request
+from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
 
 def request(folder, **more):
@@ -301,8 +304,9 @@ def ended(folder, state, detail="", *, trials=4):
 
 
 def paired(**given):
+    counts = ScenarioCounts(name="loop", pairs=9, only_base=0, only_head=0, both=0)
     plain = {"name": "loop", "is_hopeless": False, "failure": lambda: None, "why_not": "", "is_complete": True,
-             "trained_on": 0}  # fmt: skip
+             "trained_on": 0, "counts": counts}  # fmt: skip
     return SimpleNamespace(**plain | given)
 
 
@@ -319,6 +323,19 @@ def test_failed_hunt_is_an_error_of_its_version(tmp_path):
     assert caught.value.where == "HEAD (mine:New)"
 
 
+def test_version_that_never_starts_is_worse_as_head_and_an_error_as_base(tmp_path):
+    run = started(gate(tmp_path), tmp_path / "g")
+    never = SideCounts(not_started=9, example="trial 0: ValueError: no weights")
+    counts = ScenarioCounts(name="loop", pairs=9, only_base=9, only_head=0, both=0, sides=(never, SideCounts()))
+    with pytest.raises(NoValidTrialError, match="no trial can be set up: trial 0: ValueError: no weights") as caught:
+        run._refuse_failed(paired(counts=counts))
+    assert caught.value.where == "BASE (mine:Old)"
+    run._pairs.verdict = "worse"
+    failure = ("head", "no_valid_trial", "no weights")
+    counts = replace(counts, sides=counts.sides[::-1])
+    assert not run._refuse_failed(paired(counts=counts, failure=lambda: failure))
+
+
 def test_gate_without_a_verdict_has_a_reason(tmp_path):
     run = started(gate(tmp_path), tmp_path / "g")
     (real,) = run._hunts
@@ -331,6 +348,8 @@ def test_gate_without_a_verdict_has_a_reason(tmp_path):
     assert why(paired(), paired(name="b", why_not="too many")) == "b: too many"
     assert why(paired(), until=0.0).startswith("the time is up; give --for more")
     assert why(paired()) == "all 4 pairs have ended; give more with --most, or a greater --margin"
+    lost = ScenarioCounts(name="loop", pairs=1, only_base=0, only_head=0, both=0, sides=(SideCounts(killed=3),) * 2)
+    assert why(paired(counts=lost)).startswith("all 4 pairs have ended, of which 6 have no result; find out why")
     with pytest.raises(UsageError, match="an agent was trained on all 7 traffics of this gate"):
         why(paired(trained_on=3), paired(trained_on=4))
     for folder in real.folders:
@@ -343,6 +362,7 @@ def test_gate_without_a_verdict_has_a_reason(tmp_path):
 
 
 def test_hunt_is_done_once_all_its_trials_have_ended(tmp_path, monkeypatch):
+    ended(tmp_path, "all_trials")
     for state, trials, done in (
         ("finished", 4, True), ("crashed", 5, True), ("finished", 3, False), ("interrupted", 4, False),
     ):  # fmt: skip
@@ -352,6 +372,11 @@ def test_hunt_is_done_once_all_its_trials_have_ended(tmp_path, monkeypatch):
             lambda folder, given=(state, trials): SimpleNamespace(state=given[0], trials_run=given[1]),
         )
         assert _gate._Run._is_done(tmp_path, 4) is done
+    monkeypatch.setattr(_gate, "hunt_state", lambda folder: SimpleNamespace(state="finished", trials_run=4))
+    with closing(Ledger(tmp_path / layout.LEDGER, writable=True)) as ledger:
+        killed = Failure(KILLED, "killed from outside 3 times")
+        ledger.record(TrialResult(TrialSpec(0, 0, {}, {}, 9), Outcome.INVALID, failure=killed), snapshot="0")
+    assert not _gate._Run._is_done(tmp_path, 4)  # the hunt runs it again
 
 
 def test_gate_waits_for_a_hunt_whose_gate_was_killed(tmp_path, monkeypatch):
