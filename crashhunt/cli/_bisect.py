@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import json
+import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
-from crashhunt.cli._common import add_crash, add_json, add_trust, check_trust, opened_crash, run_trusted, say
+from crashhunt.cli._common import (
+    add_build,
+    add_crash,
+    add_json,
+    add_trust,
+    build_limit_s,
+    check_trust,
+    opened_crash,
+    run_trusted,
+    say,
+)
 
 if TYPE_CHECKING:
     import argparse
@@ -38,6 +49,7 @@ def add_bisect(commands: Commands) -> None:
         "--from", metavar="FOLDER", type=Path, dest="folder",
         help="folder in the repository from which Python imports the agent; default: the current folder",
     )  # fmt: skip
+    add_build(bisect, "each revision")
     add_trust(bisect)
     add_json(bisect)
     bisect.set_defaults(command=_bisect)
@@ -46,12 +58,18 @@ def add_bisect(commands: Commands) -> None:
 def _bisect(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.corpus import bisect
 
-    def tell(revision: str, got: Got) -> None:
-        say(f"{revision[:12]}  {got.replace('_', ' ')}", as_json=options.json)
+    def show(revision: str, got: Got, why: str) -> None:
+        say(in_lines([f"{revision[:12]}  {got.replace('_', ' ')}{f': {why}' if why else ''}"]), as_json=options.json)
+
+    def tell(caution: str) -> None:
+        print(f"crashhunt: {caution}", file=sys.stderr, flush=True)
 
     with opened_crash(options.directory, options.crash) as (bundle, archive):
         run_trusted(partial(check_trust, bundle), bundle, archive, options)
-        found = bisect(bundle, options.good, bad=options.bad, folder=options.folder, watch=tell)
+        found = bisect(
+            bundle, options.good, bad=options.bad, folder=options.folder, watch=show, tell=tell, build=options.build,
+            build_limit_s=build_limit_s(options),
+        )  # fmt: skip
     if found.commit:
         say(in_lines([f"{found.commit[:12]} is the first in which it crashes: {found.subject}"]), as_json=options.json)
     else:

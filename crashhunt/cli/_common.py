@@ -34,6 +34,7 @@ __all__ = [
     "GivenOnce",
     "Parser",
     "WordsWithCommas",
+    "add_build",
     "add_ci_options",
     "add_crash",
     "add_json",
@@ -41,6 +42,7 @@ __all__ = [
     "add_options_of_machine",
     "add_trust",
     "ask_to_trust",
+    "build_limit_s",
     "check_trust",
     "chosen_of_machine",
     "chosen_options",
@@ -273,6 +275,35 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
         help="run the code of a hunt or crash from another machine without asking; crashhunt trust DIR trusts this "
         "code permanently",
     )  # fmt: skip
+
+
+_BUILD_TIMEOUT = "1h"
+
+
+def add_build(parser: argparse._ActionsContainer, what: str) -> None:
+    """Add the options ``--build`` and ``--build-timeout``, for commands that check out commits."""
+    parser.add_argument(
+        "--build", metavar="COMMAND", default="",
+        help=f"run this shell command in the work tree of {what} before its trials, such as 'make'; it runs in the "
+        "folder that corresponds to the current folder",
+    )  # fmt: skip
+    parser.add_argument(
+        "--build-timeout", metavar="TIME", default=_BUILD_TIMEOUT,
+        help=f"the longest time of a build, such as 10m; default: {_BUILD_TIMEOUT}",
+    )  # fmt: skip
+
+
+def build_limit_s(options: argparse.Namespace) -> float:
+    """Return the value of ``--build-timeout``, in s.
+
+    Raises:
+        UsageError: the value is not a time.
+    """
+    from crashhunt.plans import check_duration, seconds_of
+
+    if fix := check_duration(options.build_timeout) or ("" if options.build_timeout else "give a time, such as 10m"):
+        raise UsageError(f"--build-timeout is {options.build_timeout!r}", fix=fix)
+    return seconds_of(options.build_timeout)
 
 
 def run_trusted(

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.cli._common import (
+    add_build,
     add_ci_options,
     add_json,
     add_options,
     add_trust,
+    build_limit_s,
     chosen_options,
     integer,
     make_console,
@@ -103,6 +105,7 @@ def add_gate(commands: Commands) -> None:
         help="keep the hunts of BASE and HEAD in this folder, for crashhunt compare, rate and report; the same command "
         "resumes the gate",
     )  # fmt: skip
+    add_build(what, "each commit")
     add_options(defaultdict(lambda: how, what=what), _HUNT_OPTIONS)
     add_trust(gate)
     gate.add_argument("--markdown", metavar="FILE", type=Path, help="write the verdict as Markdown, for a pull request")
@@ -135,12 +138,17 @@ def _gate(options: argparse.Namespace, words: list[str]) -> int:
         is_suite=options.suite is not None,
         trusted=options.trust,
         machine={"executor": options.executor} if options.suite is None or "--executor" in _flags(words) else None,
+        build=options.build,
+        build_limit_s=build_limit_s(options),
     )
-    cautions = list(gate.cautions())
+
+    def tell_user(note: str) -> None:
+        print(f"crashhunt: {note}", file=sys.stderr, flush=True)
+
+    for caution in gate.cautions():
+        tell_user(caution)
     with _watched(as_json=options.json) as watch:
-        found = gate.run(options.keep, watch)
-    for caution in cautions:
-        print(f"crashhunt: {caution}", file=sys.stderr)
+        found = gate.run(options.keep, watch, tell_user)
     say(describe_gate(found), as_json=options.json)
     summary = gate_summary(found)
     if options.markdown is not None:

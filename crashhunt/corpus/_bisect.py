@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import sys
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.builds import BuildError, clean_tree, files_outside, run_build
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.git import checked_out, commit_of, git, import_environment, run_to_end, top_of
@@ -53,7 +55,10 @@ def bisect(
     *,
     bad: str = "HEAD",
     folder: Path | None = None,
-    watch: Callable[[str, Got], None] = lambda _revision, _got: None,
+    watch: Callable[[str, Got, str], None] = lambda _revision, _got, _why: None,
+    tell: Callable[[str], None] = lambda _: None,
+    build: str = "",
+    build_limit_s: float = math.inf,
 ) -> Bisected:
     """Find the commit of the agent's repository that introduced a crash.
 
@@ -64,7 +69,10 @@ def bisect(
         good: A revision without the crash.
         bad: A revision with the crash.
         folder: The folder inside the agent's repository from which the agent is imported; by default the current one.
-        watch: Called with each tried revision and the status of the crash.
+        watch: Called with each tried revision, the status of the crash, and the reason why it cannot run.
+        tell: Called with each warning.
+        build: Command line that builds each revision in its work tree; empty for no build.
+        build_limit_s: Maximum wall time of a build, in s.
 
     Raises:
         UsageError: A revision does not exist or has the wrong status, or the code does not come from the work tree.
@@ -73,24 +81,37 @@ def bisect(
     folder = (folder or Path.cwd()).resolve()
     top = top_of(folder)
     ends = [commit_of(folder, name) for name in (good, bad)]
+    settings = read_settings(bundle.hunt / layout.HUNT)
     modules = {
-        agent.agent.partition(":")[0]
-        for agent in read_settings(bundle.hunt / layout.HUNT).agents.values()
-        if not agent.agent.startswith("crashhunt.")
+        agent.agent.partition(":")[0] for agent in settings.agents.values() if not agent.agent.startswith("crashhunt.")
     }
     tried: dict[str, Got] = {}
     with temporary_folder("bisect") as scratch, checked_out(top, ends[1], purpose="bisect") as tree:
         case = add_case(bundle, scratch / "corpus").case.path.resolve()
 
+        inside, why = tree / folder.relative_to(top), ""
+        for name, values in settings.texts.items():
+            for path in files_outside(values, (inside, scratch)):
+                tell(f"every revision uses the same file: {path} ({name}), which the work tree does not contain")
+
         def run() -> Got:
-            revision = git(tree, "rev-parse", "HEAD")
-            tried[revision] = got = _run(case, tree / folder.relative_to(top), tree, modules)
-            watch(revision, got)
+            nonlocal why
+            revision, why = git(tree, "rev-parse", "HEAD"), ""
+            try:
+                if build:
+                    run_build(build, inside, None, limit_s=build_limit_s, name=revision[:12])
+                got, why = _run(case, inside, tree, modules)
+            except BuildError as error:
+                got, why = "cannot_run", str(error)
+            tried[revision] = got
+            if build:
+                clean_tree(tree)
+            watch(revision, got, why)
             return got
 
-        _require_status(run(), "still", bad, "--bad")
+        _require_status(run(), "still", bad, "--bad", why, has_build=bool(build))
         git(tree, "checkout", "--quiet", "--detach", ends[0])
-        _require_status(run(), "fixed", good, "--good")
+        _require_status(run(), "fixed", good, "--good", why, has_build=bool(build))
         said = git(tree, "bisect", "start", ends[1], ends[0])
         judged = set()
         while not (found := _FIRST_BAD_COMMIT.search(said)) and "only 'skip'ped commits left" not in said:
@@ -120,14 +141,17 @@ def _no_way(good: str, bad: str, parts: str) -> UsageError:
     return UsageError(message, fix="give a --good revision before that ancestor")
 
 
-def _require_status(got: Got, expected: Got, revision: str, option: str) -> None:
+def _require_status(got: Got, expected: Got, revision: str, option: str, why: str, *, has_build: bool) -> None:
+    if why:
+        fix = "" if has_build else ", or --build COMMAND if the agent needs files that Git does not track"
+        raise UsageError(f"{option} {revision} cannot run: {why}", fix=f"give another revision{fix}")
     if got != expected:
         message = f"{option} {revision}: there, the crash is {got.replace('_', ' ')}, and not {expected}"
         raise UsageError(message, fix="give another revision")
 
 
-def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
-    """Run a case with the code of a work tree, in a new process."""
+def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> tuple[Got, str]:
+    """Run a case with the code of a work tree, in a new process; return its status, and why it cannot run."""
     environment = import_environment(folder, tree)
     for module in sorted(modules):
         place = [sys.executable, "-c", _ORIGIN_SCRIPT, module]
@@ -139,14 +163,16 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
                 fix="give --from FOLDER, the folder of the repository that contains the module",
             )
         if found.returncode != 0:
-            return "cannot_run"
+            last = next(iter(found.stderr.strip().splitlines()[-1:]), "")
+            return "cannot_run", f"{module!r} cannot be imported: {last}"
     command = [sys.executable, "-m", "crashhunt", "corpus", "run", str(case), "--json"]
     done = run_to_end(command, folder, environment)
     try:
-        got: Got = json.loads(done.stdout)["cases"][0]["got"]
+        report = json.loads(done.stdout)["cases"][0]
+        got: Got = report["got"]
     except (ValueError, KeyError, IndexError):
         raise CrashhuntError(
             f"the corpus case could not be run: {done.stderr.strip()[-300:]}",
             fix="run crashhunt corpus run to see the whole error",
         ) from None
-    return got
+    return got, str(report.get("now", "")) if got == "cannot_run" else ""

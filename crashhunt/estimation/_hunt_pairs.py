@@ -128,6 +128,7 @@ class GateReport:
         is_interrupted: whether the gate was interrupted before its end.
         dir: directory of the hunts; empty if they are not kept.
         trained_on: number of pairs that do not count, because an agent was trained on their traffic.
+        cautions: facts because of which the verdict may not be about the two versions.
     """
 
     verdict: PairVerdict
@@ -149,6 +150,7 @@ class GateReport:
     is_interrupted: bool = False
     dir: str = ""
     trained_on: int = 0
+    cautions: tuple[str, ...] = ()
 
     @property
     def sides(self) -> tuple[SideCounts, SideCounts]:
@@ -215,6 +217,7 @@ class GateReport:
             "interrupted": self.is_interrupted,
             "dir": self.dir or None,
             "trained_on": self.trained_on,
+            "cautions": list(self.cautions),
         }
 
 

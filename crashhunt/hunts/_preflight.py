@@ -107,10 +107,11 @@ class Preflight:
         message, trace = self._refusal_as_requested(failure.message), self._refusal_as_requested(failure.traceback)
         kind = "" if failure.kind in ("ValueError", "invalid") else f"{failure.kind}: "
         given = result.spec.arguments.get(failure.agent, {})
-        names = ", ".join(f"--arg {name}={value}" for name, value in given.items() if isinstance(value, str))
+        # The user may have given an argument or not, so name no option.
+        names = ", ".join(f"{name}={value}" for name, value in given.items() if isinstance(value, str))
         frames = re.findall(r'^  File "([^"]+)", line (\d+)', trace, re.MULTILINE)
         places = [frame for frame in frames if not frame[0].startswith(f"{layout.PACKAGE}/")]
-        fix = f"correct {names or 'the agent'}"
+        fix = f"correct the agent or its arguments {names}" if names else "correct the agent"
         if "pip install" in message:
             fix = "install the package"
         elif "of this scenario" in message:  # a policy that was trained elsewhere; see agents/_policies.py

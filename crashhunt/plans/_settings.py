@@ -161,6 +161,17 @@ class HuntSettings(TrialOptions):
             found |= {(agent, name): spec.distribution for name, spec in settings.arguments.items()}
         return found
 
+    @property
+    def texts(self) -> dict[str, list[str]]:
+        """The texts that each argument may have, and the words of each agent's command, by name."""
+        found = {
+            ".".join(filter(None, key)): [value for value in distribution.grid(1) if isinstance(value, str)]
+            for key, distribution in self.space.items()
+        }
+        for name, chosen in self.agents.items():
+            found[f"--agent {name}"] = chosen.agent.partition(":")[2].split()
+        return {name: values for name, values in found.items() if values}
+
     def differences(self, other: HuntSettings) -> list[str]:
         """Return the differences between the settings that determine trials, as texts; ``[run]`` is ignored."""
         mine, theirs = _flat(asdict(self)), _flat(asdict(other))

@@ -35,7 +35,7 @@ def describe_gate(found: GateReport) -> str:
         lines += [f"  {name}: {_rate(rate)}" for name, rate in zip(("BASE", "HEAD"), found.rates, strict=True)]
     if len(found.scenarios) > 1:
         lines += [f"  {line}" for line in _scenarios(found)]
-    lines += [f"  {line}" for line in _corpus(found)]
+    lines += [f"  {line}" for line in (*_corpus(found), *(f"but {caution}" for caution in found.cautions))]
     if found.seed is not None:
         lines.append(f"  seed of the hunts: {found.seed}")
     if found.dir:
@@ -177,7 +177,7 @@ def gate_summary(found: GateReport) -> str:
         confidence = f"{found.confidence:g} %, valid whenever you look"
         difference = f"**{found.difference.as_difference()}** {_events(found)} per trial"
         lines += [f"Difference: {difference} (HEAD minus BASE, {confidence}).", ""]
-    if other := [*_invalid_pairs(found), *_new_types(found)]:
+    if other := [*found.cautions, *_invalid_pairs(found), *_new_types(found)]:
         lines += [*(f"- {_plain(line)}" for line in other), ""]
     if found.trained_on:
         lines += [f"{_training_pairs(found)}.", ""]

@@ -1,8 +1,9 @@
 """A gate: compares two versions by hunts in the same traffic, and returns a verdict on the change.
 
-BASE and HEAD are two commits of a Git repository, each imported from a temporary work tree, or two agents. Their hunts
-run at the same time, each in its own process, with the same seed. The traffic and the disturbances of a trial follow
-from the seed and the number of the trial, not from the agent's actions. The hunts end as soon as `PairWatch` decides.
+BASE and HEAD are two commits of a Git repository, each built and imported in a temporary work tree, or two agents.
+Their hunts run at the same time, each in its own process, with the same seed. The traffic and the disturbances of a
+trial follow from the seed and the number of the trial, not from the agent's actions. The hunts end as soon as
+`PairWatch` decides.
 
 The hunts of a suite run one pair after another, because the order of all pairs must not depend on results.
 """
@@ -14,6 +15,7 @@ import json
 import math
 import os
 import secrets
+import shutil
 import sys
 import time
 from contextlib import ExitStack, closing, contextmanager
@@ -24,11 +26,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crashhunt.base import layout
+from crashhunt.base.builds import copy_built, files_outside, run_build, track_built
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, NoValidTrialError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.git import checked_out, commit_of, git, import_environment, run_to_end, top_of
 from crashhunt.base.plugins import registered
-from crashhunt.base.temporary import temporary_folder
+from crashhunt.base.temporary import temporary_beside, temporary_folder
 from crashhunt.corpus import find_cases
 from crashhunt.estimation import GateCase, GateReport, PairedHunts, measure_rates
 from crashhunt.hunts import HuntDirectory, hunt_state, is_hunt
@@ -57,6 +60,8 @@ __all__ = ["Gate", "GateProgress", "GateVersion"]
 GATE: Final = "gate.json"
 """What a gate compares, in the folder with its hunts."""
 _LOCK = ".lock"
+_BUILT: Final = "built"
+"""The files that --build has made for each version, in the folder of a kept gate."""
 BASE, HEAD = "base", "head"
 _BUNDLES_PER_TYPE = 3  # kept of each crash type: a gate counts crashes, and shows some
 _DEFAULT_CORPUS = "crashes"  # as in the action `corpus`
@@ -146,6 +151,8 @@ class Gate:
             last hunt.
         trusted: whether existing hunts and the corpus may run even if they are not trusted.
         machine: execution options, such as ``executor``, that apply to all hunts.
+        build: command line that builds each commit in its work tree; empty for no build.
+        build_limit_s: maximum wall time of a build, in s.
     """
 
     base: GateVersion
@@ -161,14 +168,22 @@ class Gate:
     is_suite: bool = False
     trusted: bool = False
     machine: Given | None = None
+    build: str = ""
+    build_limit_s: float = math.inf
 
-    def run(self, directory: Path | None = None, watch: Callable[[GateProgress], None] | None = None) -> GateReport:
+    def run(
+        self,
+        directory: Path | None = None,
+        watch: Callable[[GateProgress], None] | None = None,
+        tell: Callable[[str], None] = lambda _: None,
+    ) -> GateReport:
         """Compare the two versions until the verdict is certain, the pairs or the time are used up, or an interrupt.
 
         Args:
             directory: folder of the hunts; finished trials in this folder are not run again. If the folder is None, a
                 temporary folder is used.
             watch: function called about once a second with the progress.
+            tell: function called with each note, such as the beginning of a build.
 
         Raises:
             UsageError: an agent was trained on all traffic seeds, or an option is out of range.
@@ -178,7 +193,7 @@ class Gate:
         with ExitStack() as stack:
             place = directory if directory is not None else stack.enter_context(temporary_folder("gate"))
             stack.enter_context(_locked(place))
-            return _Run(self, place, stack, watch, is_kept=directory is not None).report()
+            return _Run(self, place, stack, watch, is_kept=directory is not None, tell=tell).report()
 
     def cautions(self) -> Iterator[str]:
         """Yield warnings on facts about the two commits that the user may not expect."""
@@ -192,6 +207,8 @@ class Gate:
         if bool(self.base.commit) != bool(self.head.commit):
             kinds = [f"{one.word!r} is {'a commit' if one.commit else 'an agent'}" for one in (self.base, self.head)]
             raise UsageError(" and ".join(kinds), fix="give two commits, or two agents")
+        if self.build and not self.base.commit:
+            raise UsageError("--build is given, but BASE and HEAD are agents", fix="omit it, or give two commits")
         if self.most < 1:
             raise UsageError(f"--most is {self.most}", fix="give at least 1")
         if self.most < len(self.hunts):
@@ -250,9 +267,11 @@ class _Run:
     """One run of a gate in its directory."""
 
     def __init__(
-        self, gate: Gate, place: Path, stack: ExitStack, watch: Callable[[GateProgress], None] | None, *, is_kept: bool
-    ) -> None:
-        self._gate, self._place, self._watch, self._is_kept = gate, place, watch, is_kept
+        self, gate: Gate, place: Path, stack: ExitStack, watch: Callable[[GateProgress], None] | None, *, is_kept: bool,
+        tell: Callable[[str], None] = lambda _: None,
+    ) -> None:  # fmt: skip
+        self._gate, self._place, self._watch, self._is_kept, self._tell = gate, place, watch, is_kept, tell
+        self._cautions: tuple[str, ...] | None = None
         self._until = time.monotonic() + gate.duration_s
         self._pairs = PairWatch(gate.margin, 1 - gate.confidence / 100)
         self._seed = self._begin()
@@ -264,6 +283,9 @@ class _Run:
                 tree = checked_out(top, version.commit, purpose="gate", name=side)
                 self._trees[side] = stack.enter_context(tree)
             self._top = top.resolve()
+            if gate.build:
+                for side in self._trees:
+                    self._build(side)
             self._check_origins()
         self._hunts = list(self._planned())
         self._corpus: tuple[GateCase, ...] | None = None
@@ -295,15 +317,16 @@ class _Run:
         given = next(iter(gate.hunts.values())).request.seed
         asked = {
             side: version.commit or dict(version.agents) for side, version in self._versions.items()
-        } | {"hunts": list(gate.hunts)}  # fmt: skip
+        } | {"hunts": list(gate.hunts)} | ({"build": gate.build} if gate.build else {})  # fmt: skip
         try:
             before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
             is_other = before is not None and (
-                any(before.get(name) != value for name, value in asked.items()) or given not in (None, before["seed"])
+                any(before.get(name) != value for name, value in {"build": None, **asked}.items())
+                or given not in (None, before["seed"])
             )
             if is_other:
                 raise HuntDirectoryError(
-                    "the directory contains a gate with other versions, hunts or seeds",
+                    "the directory contains a gate with other versions, hunts or seeds, or with another --build",
                     fix="give --keep another directory", where=str(self._place),
                 )  # fmt: skip
             seed = before["seed"] if before is not None and given is None else given
@@ -385,6 +408,40 @@ class _Run:
             raise HuntDirectoryError(
                 f"cannot be created: {error.strerror}", fix="choose another directory", where=str(place)
             ) from error
+
+    def _build(self, side: str) -> None:
+        """Build the commit of a version, or copy the files of an earlier build of the same gate.
+
+        A second build may differ in single bytes, and a hunt continues only with the code with which it began.
+        """
+        gate, tree, kept = self._gate, self._trees[side], self._place / _BUILT / side
+        if kept.is_dir():
+            shutil.copytree(kept, tree, symlinks=True, dirs_exist_ok=True)
+        else:
+            name = f"{side.upper()} ({self._versions[side]})"
+            self._tell(f"building {name}: {gate.build}")
+            log = self._place / f"build-{side}.log" if self._is_kept else None
+            run_build(gate.build, self._folder_of(side, gate.folder), log, limit_s=gate.build_limit_s, name=name)
+            if self._is_kept:
+                kept.parent.mkdir(exist_ok=True)
+                with temporary_beside(kept) as building:
+                    copy_built(tree, building)
+                    building.rename(kept)
+        track_built(tree)
+
+    def _find_same_files(self, paired: PairedHunts) -> None:
+        """Tell which arguments name one file for both commits, as soon as the settings of both hunts are known."""
+        if self._cautions is not None or not all((folder / layout.HUNT).exists() for folder in paired.folders):
+            return
+        folders = [self._folder_of(side, self._gate.folder) for side in self._trees]
+        self._cautions = tuple(
+            f"BASE and HEAD use the same file: {path} ({name}); give a path relative to the current folder, to a file "
+            "that each commit contains or builds"
+            for name, values in read_settings(paired.folders[1] / layout.HUNT).texts.items()
+            for path in (files_outside(values, folders) if folders else ())
+        )
+        for caution in self._cautions:
+            self._tell(caution)
 
     def _check_origins(self) -> None:
         """Check that the agents are imported from the work trees.
@@ -485,6 +542,7 @@ class _Run:
             return not ledger.killed_numbers()
 
     def _count_pairs(self, paired: PairedHunts, *, is_last: bool, has_ended: bool = False) -> None:
+        self._find_same_files(paired)
         paired.take(self._pairs, may_end=is_last, has_ended=has_ended)
         if self._watch is not None:
             test = self._pairs.test
@@ -531,7 +589,9 @@ class _Run:
         where = f"{side.upper()} ({self._versions[side]})"
         if state == "no_valid_trial":
             raise NoValidTrialError(f"no trial can be set up: {why}", where=where)
-        raise HuntDirectoryError(f"the hunt cannot run: {why}", where=where)
+        needs = "if the agent needs files that Git does not track, give --build COMMAND"
+        fix = needs if self._trees and not self._gate.build else ""
+        raise HuntDirectoryError(f"the hunt cannot run: {why}", fix=fix, where=where)
 
     def _why_undecided(self) -> str:
         invalid = next((f"{one.name}: {one.why_not}" for one in self._hunts if one.why_not), "")
@@ -581,6 +641,7 @@ class _Run:
             is_interrupted=self._is_interrupted,
             dir=str(self._place) if self._is_kept else "",
             trained_on=sum(one.trained_on for one in self._hunts),
+            cautions=self._cautions or (),
         )
         self._write(report)
         return report

@@ -35,11 +35,13 @@ def repository(tmp_path, monkeypatch):
     top = tmp_path / "project"
     (top / "agents").mkdir(parents=True)
     git(top, "init", "-q", "-b", "main")
+    texts = {"ego.policy": [str(tmp_path / "policy.zip"), "status"]}
+    (tmp_path / "policy.zip").touch()
     runs, settings = [], {"ego": "agents.driver:Driver", "second": "crashhunt.agents:KeepLaneWithSpeed"}
 
     def run(case, folder, tree, modules):
         runs.append((case, folder.relative_to(tree), modules))
-        return (folder / "status").read_text()
+        return (folder / "status").read_text(), ""
 
     def add_case(bundle, corpus):
         assert bundle.hunt == tmp_path / "hunt"
@@ -47,7 +49,8 @@ def repository(tmp_path, monkeypatch):
 
     def read_settings(path):
         assert path == tmp_path / "hunt" / "hunt.toml"
-        return SimpleNamespace(agents={name: SimpleNamespace(agent=word) for name, word in settings.items()})
+        agents = {name: SimpleNamespace(agent=word) for name, word in settings.items()}
+        return SimpleNamespace(agents=agents, texts=texts)
 
     monkeypatch.setattr(_bisect, "_run", run)
     monkeypatch.setattr(_bisect, "add_case", add_case)
@@ -70,7 +73,7 @@ def repository(tmp_path, monkeypatch):
 def test_first_commit_with_the_crash_is_found(repository, first):
     seen = []
     found, commits, runs = repository(
-        *["fixed"] * first, *["still"] * (4 - first), watch=lambda revision, got: seen.append((revision, got))
+        *["fixed"] * first, *["still"] * (4 - first), watch=lambda revision, got, why: seen.append((revision, got))
     )
     assert (found.commit, found.subject, found.candidates) == (commits[first], f"change {first}", ())
     assert [revision for revision, _ in seen[:2]] == [commits[3], commits[0]]
@@ -102,6 +105,30 @@ def test_ends_without_the_expected_status_are_refused(repository, statuses, good
     assert str(caught.value) == f"{message}; give another revision"
 
 
+def test_each_revision_is_built_and_one_that_cannot_be_built_is_skipped(repository):
+    command = "test ! -e made && ! grep broken status && cp status made && echo changed > status && cp made status"
+    seen = []
+    found, commits, runs = repository(
+        "fixed", "broken", "still", build=command, watch=lambda *words: seen.append(words), tell=seen.append
+    )
+    assert (found.commit, {*found.candidates}) == (None, {*commits[1:]})
+    assert len(runs) == 2  # nothing ran without its build
+    assert found.tried[commits[1]] == "cannot_run"
+    assert "every revision uses the same file: " in seen[0]
+    assert "policy.zip (ego.policy)" in seen[0]
+    assert [got for _, got, _ in seen[1:]] == ["still", "fixed", "cannot_run"]
+    assert seen[3][2].startswith(f"{commits[1][:12]}: --build 'test ! -e made ")
+    assert [why for *_, why in seen[1:3]] == ["", ""]
+
+
+def test_end_that_cannot_be_built_is_refused_with_the_output_of_the_build(repository):
+    with pytest.raises(
+        UsageError, match=r"--bad HEAD cannot run: \w+: --build 'echo no & .*' exited with 7: no; "
+    ) as caught:
+        repository("fixed", "still", build="echo no & wait; exit 7")
+    assert caught.value.fix == "give another revision"
+
+
 def test_good_revision_on_another_branch_names_the_common_ancestor(repository, tmp_path):
     with pytest.raises(UsageError) as caught:
         repository("still", "still", mended=("fixed",), good="mended", bad="main")
@@ -131,7 +158,8 @@ def judge(monkeypatch, tmp_path):
 
         monkeypatch.setattr(_bisect, "run_to_end", run_to_end)
         monkeypatch.setattr(_bisect, "import_environment", lambda folder, tree: {"PATHS": f"{folder} {tree}"})
-        got = _bisect._run(tmp_path / "case", tmp_path / "agents", tmp_path, {"z", "agents.driver"})
+        got, why = _bisect._run(tmp_path / "case", tmp_path / "agents", tmp_path, {"z", "agents.driver"})
+        assert bool(why) == (got == "cannot_run")
         return got, ran
 
     return judge_it

@@ -142,7 +142,7 @@ def test_refusal_names_arguments_that_are_texts_and_what_to_install():
         return caught.value
 
     assert refused("no", {"speed": 15.0, "policy": "p.zip", "mode": "fast"}).fix == (
-        "correct --arg policy=p.zip, --arg mode=fast"
+        "correct the agent or its arguments policy=p.zip, mode=fast"
     )
     assert refused("no", {"speed": 15.0}).fix == "correct the agent"
     assert refused("it needs torch: pip install torch", {}).fix == "install the package"

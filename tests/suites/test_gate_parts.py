@@ -16,7 +16,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, NoValidTrialError, UsageError
 from crashhunt.estimation import ScenarioCounts
 from crashhunt.ledger import Ledger
-from crashhunt.plans import HuntSettings, Request, RunSettings, write_settings
+from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, RunSettings, write_settings
 from crashhunt.rates import SideCounts
 from crashhunt.suites import Gate, GateVersion, RunRequest, _gate
 from crashhunt.suites._processes import REQUEST, write_request
@@ -96,6 +96,47 @@ def test_commits_are_imported_from_their_work_trees(work, tmp_path):
     assert {name: description[name] for name in ("base", "head", "hunts", "seed")} == {
         "base": "aaaa", "head": "bbbb", "hunts": ["loop"], "seed": 4,
     }  # fmt: skip
+
+
+def test_each_commit_is_built_once_in_the_folder_of_the_command(work, tmp_path, monkeypatch):
+    built, tracked = [], []
+    monkeypatch.setattr(_gate, "run_build", lambda *words, **more: built.append((*words, more)))
+    monkeypatch.setattr(_gate, "copy_built", lambda tree, place: (place.mkdir(), (place / "planner").touch()))
+    monkeypatch.setattr(_gate, "track_built", tracked.append)
+    asked = of_commits(work, build="make", build_limit_s=7.0)
+    started(asked, tmp_path / "g")
+    log = tmp_path / "g/build-base.log"
+    assert built[0] == ("make", work.trees["base"] / "sub", log, {"limit_s": 7.0, "name": "BASE (mine:Old (aaaa))"})
+    assert [folder for _, folder, *_ in built] == [work.trees[side] / "sub" for side in ("base", "head")]
+    assert tracked == list(work.trees.values())
+    started(asked, tmp_path / "g")  # the same command again: with the same files, and not with those of a second build
+    assert len(built) == 2
+    assert (work.trees["head"] / "planner").exists()
+    with pytest.raises(HuntDirectoryError, match="with other versions, hunts or seeds, or with another --build"):
+        started(of_commits(work, build="make -j2"), tmp_path / "g")
+    with pytest.raises(HuntDirectoryError, match="with other versions, hunts or seeds, or with another --build"):
+        started(of_commits(work), tmp_path / "g")
+    with pytest.raises(UsageError, match="--build is given, but BASE and HEAD are agents"):
+        gate(tmp_path, build="make").run(tmp_path / "h")
+
+
+def test_file_that_both_commits_share_is_told_and_reported(work, tmp_path):
+    told = []
+    run = started(of_commits(work), tmp_path / "g")
+    run._tell = told.append
+    (real,) = run._hunts
+    (tmp_path / "planner").touch()
+    arguments = {"binary": ArgumentSpec(spec=str(tmp_path / "planner")), "mode": ArgumentSpec(spec="fast")}
+    for folder in real.folders:
+        run._find_same_files(real)
+        assert told == []
+        ended(folder, "all_trials", agents={"ego": AgentSettings(agent="mine:Driver", arguments=arguments)})
+    run._find_same_files(real)
+    run._find_same_files(real)
+    (caution,) = told
+    assert caution.startswith(f"BASE and HEAD use the same file: {tmp_path / 'planner'} (ego.binary); give a path")
+    run._write = lambda report: None
+    assert run._gate_report().cautions == (caution,)
 
 
 def test_agent_from_elsewhere_than_the_commit_is_refused(work, tmp_path):
@@ -295,9 +336,11 @@ def test_gate_whose_corpus_cannot_run_is_undecided(corpus, tmp_path):
     assert run._gate_report(verdict="better").verdict == "better"
 
 
-def ended(folder, state, detail="", *, trials=4):
+def ended(folder, state, detail="", *, trials=4, **more):
     """Write a hunt that has ended."""
-    settings = HuntSettings(scenario="loop", scenario_digest="0", trials=trials, max_steps=9, seed=4, run=RunSettings())
+    settings = HuntSettings(
+        scenario="loop", scenario_digest="0", trials=trials, max_steps=9, seed=4, run=RunSettings(), **more
+    )
     write_settings(folder / layout.HUNT, settings, ["crashhunt", "gate"])
     with closing(Ledger(folder / layout.LEDGER, writable=True)) as ledger:
         ledger.enter(state, detail, planned=trials)
