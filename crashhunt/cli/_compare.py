@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.text import command_line
 from crashhunt.cli._common import add_json, say
+from crashhunt.plans import RATE_PERS
 
 if TYPE_CHECKING:
     import argparse
@@ -31,6 +32,10 @@ def add_compare(commands: Commands) -> None:
     compare.add_argument(
         "directories", metavar="DIR", type=Path, nargs="+", help="directories of at least two hunts, or of suites"
     )
+    compare.add_argument(
+        "--per", choices=RATE_PERS, default="trial",
+        help="the unit of the crash rates and of their difference: trial, hour or 1000km; default: trial",
+    )  # fmt: skip
     compare.add_argument("--csv", action="store_true", help="print the table as CSV, with a line for each hunt")
     compare.add_argument("--html", metavar="FILE", type=Path, help="write an HTML page with plots")
     add_json(compare)
@@ -49,7 +54,7 @@ def _compare(options: argparse.Namespace, _words: list[str]) -> int:
                 hunts.append(hunt)
             else:
                 say(f"{command_line(hunt)} has not begun, and is excluded", as_json=True)
-    found = compare(*hunts)
+    found = compare(*hunts, per=options.per)
     if options.csv:
         found.write_csv(sys.stdout)
     else:

@@ -20,11 +20,20 @@ from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.json_types import finite_values
-from crashhunt.base.text import count_of
+from crashhunt.base.text import count_of, one_of
 from crashhunt.estimation._hunt_rate import measure_rates
 from crashhunt.hunts import HuntResults, counting_rule
 from crashhunt.ledger import Ledger
-from crashhunt.rates import CountingRule, Interval, PairSequence, PairTest, facts_of_plain
+from crashhunt.rates import (
+    PER_WORDS,
+    PERS,
+    CountingRule,
+    Interval,
+    PairSequence,
+    PairTest,
+    difference_of_rates,
+    facts_of_plain,
+)
 from crashhunt.training import held_out_traffics
 from crashhunt.trial import Constant, Outcome
 
@@ -35,7 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.plans import HuntSettings
-    from crashhunt.rates import CrashRate, TrialFacts
+    from crashhunt.rates import CrashRate, Pair as TrialPair, Per, TrialFacts
     from crashhunt.training import HeldOutTraffics
 
 __all__ = ["Comparison", "HuntFigures", "Pair", "compare", "held_out_of", "why_unpaired"]
@@ -54,8 +63,8 @@ class HuntFigures:
         agents: agent of each controlled vehicle.
         trials: number of valid trials, up to the first trial that has not ended.
         crashes: number of crashes in the trials that ``trials`` counts.
-        crash_rate: crash rate of the trials that ``trials`` counts, from 0 to 1; NaN if the rate would be biased, or if
-            there is no trial.
+        crash_rate: crash rate of the trials that ``trials`` counts, in the unit ``per``; NaN if the rate would be
+            biased, or if there is no trial.
         interval: interval of the crash rate with 95 % confidence, valid at any time; None if the trials do not allow an
             interval.
         why_not: reason why the interval or the rate is missing.
@@ -69,6 +78,7 @@ class HuntFigures:
         excluded: number of trials that do not count, because a trial with a lower number has not ended.
         exclusions: number of trials that do not count, by reason. Reason ``trained_on``: an agent of this hunt, or of a
             compared hunt with the same seed, was trained on the traffic of these trials.
+        per: the unit to which rate and interval refer: ``trial``, ``hour`` or ``1000km``.
     """
 
     dir: str
@@ -86,6 +96,7 @@ class HuntFigures:
     disturbed: int | None = None
     excluded: int = 0
     exclusions: dict[str, int] = field(default_factory=dict)
+    per: Per = "trial"
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,15 +115,17 @@ class Pair:
         only_second: pairs in which only the second hunt crashed; with ``--seeds``, traffic seeds in which it crashed
             more often.
         both: pairs in which both hunts crashed; with ``--seeds``, traffic seeds in which both crashed equally often.
-        p_value: *p* value of McNemar's or Fisher's exact test; None if the number of trials was not fixed in advance.
+        p_value: *p* value of McNemar's or Fisher's exact test on the crashes per trial; None if the number of trials
+            was not fixed in advance. It decides nothing.
         caution: a warning that limits the meaning of the answer; empty if there is none.
         test: basis of the verdict: ``pairs``, the evidence of pairs; ``intervals``, the certain intervals of
             both hunts; empty if there is none.
         why_unpaired: reason why there are no pairs; empty if there are pairs.
         counts: numbers of crashes and of valid trials, of the first hunt and of the second.
-        evidence: e-value against the hypothesis that both hunts crash equally often; 20 or more means 95 % confidence.
-            None without pairs.
-        difference: interval of the difference in crashes per trial, second minus first; None if there is none.
+        evidence: e-value against the hypothesis that both hunts crash equally often per trial; 20 or more means 95 %
+            confidence. None without pairs, and for rates per hour or per 1,000 km.
+        difference: interval of the difference of the crash rates in the unit ``per``, second minus first; None if there
+            is none.
         units: number of independent pairs, of trials or of traffic seeds.
         excluded: number of trials of both hunts that do not count. A trial does not count if a trial with a lower
             number has not ended, or if the trial is invalid in one hunt. A trial on whose traffic an agent was trained
@@ -123,6 +136,7 @@ class Pair:
             not start, although it starts in the same trial of the other hunt.
         without_result: number of pairs in which a trial was killed from outside or could not be set up in one hunt
             only. The answer is valid for any result of these pairs.
+        per: the unit to which answer and difference refer: ``trial``, ``hour`` or ``1000km``.
     """
 
     first: str
@@ -143,13 +157,13 @@ class Pair:
     answer: str = ""
     not_started: tuple[int, int] = (0, 0)
     without_result: int = 0
+    per: Per = "trial"
 
     @property
     def verdict(self) -> str:
         """Return the answer as text."""
         if self.test != "pairs":
             return self._unpaired()
-        assert self.evidence is not None
         if self.units != self.trials:
             what = (
                 f"of {self.units} traffics with {self.trials} trials each way, {self.first} crashes more often in "
@@ -160,11 +174,16 @@ class Pair:
                 f"of {self.trials} trials with the same seeds, {self.only_first} crash only in {self.first}, "
                 f"{self.only_second} only in {self.second}, {self.both} in both"
             )
-        decides = f"; {1 / _ALPHA:g} decides" if self.answer == "undecided" else ""
-        return f"{self._answer}: {what} (evidence {self.evidence:.3g}{decides}){self._difference}"
+        if self.evidence is not None:
+            what += (
+                f" (evidence {self.evidence:.3g}{f'; {1 / _ALPHA:g} decides' if self.answer == 'undecided' else ''})"
+            )
+        return f"{self._answer}: {what}{self._difference}"
 
     @property
     def _answer(self) -> str:
+        if not self.answer:
+            return f"no answer {PER_WORDS[self.per]}"
         if self.answer in ("first", "second"):
             return f"{self.first if self.answer == 'first' else self.second} crashes less"
         return "undecided, because the difference may be 0"
@@ -173,8 +192,8 @@ class Pair:
     def _difference(self) -> str:
         if self.difference is None:
             return ""
-        found = self.difference.as_difference()
-        return f"; difference: {found} crashes per trial ({self.second} minus {self.first}, 95 %)"
+        found = self.difference.as_difference(percent=self.per == "trial")
+        return f"; difference: {found} crashes {PER_WORDS[self.per]} ({self.second} minus {self.first}, 95 %)"
 
     def _unpaired(self) -> str:
         reason = f"{self.first} and {self.second}{self.why_unpaired.removeprefix('they')}"
@@ -197,6 +216,11 @@ class Comparison:
     hunts: tuple[HuntFigures, ...]
     pairs: tuple[Pair, ...]
 
+    @property
+    def per(self) -> Per:
+        """The unit of all rates: ``trial``, ``hour`` or ``1000km``."""
+        return self.hunts[0].per
+
     def to_json(self) -> dict[str, object]:
         """Return the comparison in the form that ``compare --json`` prints; numbers that are not finite are null."""
         return {
@@ -207,7 +231,7 @@ class Comparison:
     def write_csv(self, out: TextIO) -> None:
         """Write one CSV line for each hunt."""
         names = ("dir", "state", "trials", "crashes", "crash_rate", "rate_low", "rate_high", "why_not",
-                 "median_steps_to_crash", "median_time_to_collision_s", *map(str, Outcome))  # fmt: skip
+                 "median_steps_to_crash", "median_time_to_collision_s", *map(str, Outcome), "per")  # fmt: skip
         writer = csv.DictWriter(out, names)
         writer.writeheader()
         for hunt in self.hunts:
@@ -228,25 +252,31 @@ def _plain_figures(hunt: HuntFigures) -> dict[str, object]:
 
 
 def _plain(pair: Pair) -> dict[str, object]:
-    difference = None if pair.difference is None else pair.difference._asdict()
+    difference = None if pair.difference is None else finite_values(pair.difference._asdict())
     return {**finite_values(asdict(pair)), "difference": difference, "verdict": pair.verdict}
 
 
 @clear_calls()
-def compare(*directories: Path | str) -> Comparison:
+def compare(*directories: Path | str, per: Per = "trial") -> Comparison:
     """Compare the crash rates of hunts; for trials with equal seeds, report whether one hunt crashes less.
 
+    Args:
+        directories: directories of at least two hunts.
+        per: the unit of the rates and of their difference: ``trial``, ``hour`` or ``1000km``.
+
     Raises:
-        UsageError: fewer than two directories are given.
+        UsageError: fewer than two directories are given, or the unit does not exist.
         HuntDirectoryError: a directory contains no hunt, or its ledger is damaged.
     """
     if len(directories) < 2:
         raise UsageError("a single hunt cannot be compared", fix="give the directories of at least two hunts")
+    if per not in PERS:
+        raise UsageError(f"per is {per!r}", fix=one_of(str(per), PERS))
     hunts = [HuntResults(directory) for directory in directories]
     for hunt in hunts:
         if hunt.state.damaged:
             raise HuntDirectoryError(hunt.state.detail)
-    sides = [_Side(hunt, held_out_of(hunt, hunts)) for hunt in hunts]
+    sides = [_Side(hunt, held_out_of(hunt, hunts), per) for hunt in hunts]
     figures = [_figures(side) for side in sides]
     pairs = tuple(
         _pair(sides[0], figures[0], side, figure) for side, figure in zip(sides[1:], figures[1:], strict=True)
@@ -272,14 +302,16 @@ class _Side:
     Args:
         hunt: the hunt.
         held_out: rule that selects the trials that count.
+        per: the unit of its rate.
     """
 
     hunt: HuntResults
     held_out: HeldOutTraffics
+    per: Per
 
     def rate(self, confidence: float = 100 * _CONFIDENCE) -> CrashRate:
-        """Return the crash rate per trial."""
-        found = measure_rates(self.hunt.directory, per="trial", confidence=confidence, held_out=self.held_out)
+        """Return the crash rate."""
+        found = measure_rates(self.hunt.directory, per=self.per, confidence=confidence, held_out=self.held_out)
         return found[0]
 
 
@@ -307,6 +339,7 @@ def _figures(side: _Side) -> HuntFigures:
         disturbed=_disturbed(hunt, set(crashed["number"].tolist())) if hunt.settings.disturb else None,
         excluded=rate.excluded.get("after_unfinished", 0),
         exclusions=rate.excluded,
+        per=side.per,
     )
 
 
@@ -320,7 +353,7 @@ def _share(hunt: HuntResults, rate: CrashRate) -> float:
     run = hunt.settings.run
     is_whole = hunt.state.state in ("finished", "crashed") and run.keep_going and not run.distinct
     # A grid has a share as well, but no interval.
-    if rate.certain is None and is_whole and not hunt.settings.rare and rate.trials:
+    if rate.certain is None and is_whole and not hunt.settings.rare and rate.trials and rate.per == "trial":
         return rate.crashes / rate.trials
     return math.nan
 
@@ -359,12 +392,16 @@ def _pair(one: _Side, figures: HuntFigures, two: _Side, other: HuntFigures) -> P
     counts = (figures.crashes, figures.trials, other.crashes, other.trials)
     why_not = why_unpaired(first.settings, second.settings)
     if not why_not:
-        sequence, test, trained_on = _paired(first, second)
+        sequence, test, trained_on, pairs = _paired(first, second)
         if test.pairs and not sequence.why_not:
-            found = _by_pairs(one, two, sequence, test, counts)
+            found = _by_pairs(one, two, sequence, test, counts, pairs)
             return replace(
                 found,
-                caution="; ".join(filter(None, (found.caution, _only_held_out(trained_on, test.trials)))),
+                caution="; ".join(
+                    filter(
+                        None, (found.caution, _only_held_out(trained_on, test.trials), _overlap(found, figures, other))
+                    )
+                ),
                 excluded=found.excluded + 2 * trained_on,
             )
         if trained_on and not test.pairs:
@@ -388,11 +425,19 @@ def _pair(one: _Side, figures: HuntFigures, two: _Side, other: HuntFigures) -> P
 
 
 def _by_pairs(
-    one: _Side, two: _Side, sequence: PairSequence, test: PairTest, counts: tuple[int, int, int, int]
+    one: _Side,
+    two: _Side,
+    sequence: PairSequence,
+    test: PairTest,
+    counts: tuple[int, int, int, int],
+    pairs: Sequence[TrialPair],
 ) -> Pair:
     first, second = one.hunt, two.hunt
-    log_evidence = test.log_evidence
-    answer = {"second": "first", "first": "second", "": "undecided"}[test.verdict(_ALPHA)]
+    evidence: float | None = math.exp(min(test.log_evidence, 700.0))  # a float ends soon after
+    difference, why_none = test.difference(_ALPHA), ""
+    if one.per != "trial":
+        evidence, in_unit = None, difference_of_rates(pairs, (_rule(first), _rule(second)), one.per, _ALPHA)
+        difference, why_none = (None, in_unit) if isinstance(in_unit, str) else (in_unit, "")
     p_value = None
     if _is_fixed_ahead(one) and _is_fixed_ahead(two):
         from scipy.stats import binomtest
@@ -407,16 +452,24 @@ def _by_pairs(
         only_second=test.only_second,
         both=test.both,
         p_value=p_value,
-        caution="; ".join(filter(None, (_caution(first, second), _invalid_pairs(one, two, test)))),
+        caution="; ".join(filter(None, (why_none, _caution(first, second), _invalid_pairs(one, two, test)))),
         counts=counts,
-        evidence=math.exp(min(log_evidence, 700.0)),  # a float ends soon after
-        difference=test.difference(_ALPHA),
+        evidence=evidence,
+        difference=difference,
         units=test.pairs,
         excluded=sequence.excluded + 2 * sequence.invalid,
-        answer=answer,
+        answer=_answer_of(difference),
+        per=one.per,
         not_started=(test.side(0).not_started, test.side(1).not_started),
         without_result=test.unknown,
     )
+
+
+def _answer_of(difference: Interval | None) -> str:
+    """Return which hunt crashes less, from the interval of the difference; the only place that decides."""
+    if difference is None:
+        return ""
+    return "first" if difference.low > 0 else "second" if difference.high < 0 else "undecided"
 
 
 def _invalid_pairs(one: _Side, two: _Side, test: PairTest) -> str:
@@ -433,6 +486,15 @@ def _invalid_pairs(one: _Side, two: _Side, test: PairTest) -> str:
     return "; ".join(found)
 
 
+def _overlap(found: Pair, one: HuntFigures, two: HuntFigures) -> str:
+    """Return why hunts with overlapping intervals may differ all the same; empty if there is nothing to explain."""
+    if found.answer not in ("first", "second") or not one.interval or not two.interval:
+        return ""
+    if one.interval[1] < two.interval[0] or two.interval[1] < one.interval[0]:
+        return ""
+    return "the intervals of the two hunts overlap: the difference of trials in the same traffic decides"
+
+
 def _only_held_out(trained_on: int, counted: int) -> str:
     if not trained_on:
         return ""
@@ -447,10 +509,9 @@ def _by_intervals(one: _Side, two: _Side, why_not: str, counts: tuple[int, int, 
         if rate.certain is None and rate.excluded.get("trained_on"):
             why_not += f"; {rate.dir} has no rate: {rate.why_not}"
     a, b = (rate.certain for rate in rates)
-    p_value, difference, answer = None, None, ""
+    p_value, difference = None, None
     if a is not None and b is not None:
         difference = Interval(b.low - a.high, b.high - a.low)
-        answer = "first" if difference.low > 0 else "second" if difference.high < 0 else "undecided"
         if _is_fixed_ahead(one) and _is_fixed_ahead(two):
             from scipy.stats import fisher_exact
 
@@ -465,11 +526,12 @@ def _by_intervals(one: _Side, two: _Side, why_not: str, counts: tuple[int, int, 
         both=0,
         p_value=p_value,
         caution=_caution(first, second),
-        test="intervals" if answer else "",
+        test="intervals" if difference is not None else "",
         why_unpaired=why_not,
         counts=counts,
         difference=difference,
-        answer=answer,
+        answer=_answer_of(difference),
+        per=one.per,
     )
 
 
@@ -481,23 +543,24 @@ def _is_fixed_ahead(side: _Side) -> bool:
     return not (settings.seeds or settings.run.until_rate or replanned) and side.rate().estimate is not None
 
 
-def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, PairTest, int]:
-    """Return the pairs, their evidence, and how many trials are excluded because of training traffic."""
+def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, PairTest, int, list[TrialPair]]:
+    """Return the pairs, their evidence, how many trials training traffic excludes, and the pairs that count."""
     hunts = first, second
     held_out = held_out_traffics(first.settings, [hunt.directory for hunt in hunts])
     trained_on = 0
     rules = _rule(first), _rule(second)
     with_arguments = not _same_draws(first, second)
     sequence = PairSequence(rules, lambda one, other: one.tags == other.tags)
-    test = PairTest(sequence.rounds)
+    test, pairs = PairTest(sequence.rounds), []
     for side in (0, 1):
         for trial in _trials(hunts[side], with_arguments=with_arguments):
             for pair in sequence.add(side, trial):
                 if all(held_out.has(int(one.tags[0])) for one, _ in pair):
                     test.add(pair)
+                    pairs += [pair] if pair else []
                 else:
                     trained_on += len(pair)
-    return sequence, test, trained_on
+    return sequence, test, trained_on, pairs
 
 
 def _rule(hunt: HuntResults) -> CountingRule:

@@ -3,6 +3,9 @@ from ._anytime_interval import (
     Interval as Interval,
     RateTest as RateTest,
 )
+from ._paired_rates import (
+    difference_of_rates as difference_of_rates,
+)
 from ._paired_test import (
     Pair as Pair,
     PairSequence as PairSequence,
@@ -44,6 +47,7 @@ from ._splitting import (
 )
 from ._units import (
     MAX_INVALID_SHARE as MAX_INVALID_SHARE,
+    PER_WORDS as PER_WORDS,
     PERS as PERS,
     CountingRule as CountingRule,
     Per as Per,

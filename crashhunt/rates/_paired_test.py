@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
     from crashhunt.rates._units import CountingRule, TrialFacts
 
-__all__ = ["Pair", "PairSequence", "PairTest", "PairVerdict", "PairWatch", "SideCounts"]
+__all__ = ["Pair", "PairSequence", "PairTest", "PairVerdict", "PairWatch", "SideCounts", "failures_of"]
 
 PairVerdict = Literal["better", "worse", "no_difference", "undecided"]
 """The verdict of pairs on the second agent, compared with the first."""
@@ -239,8 +239,8 @@ class PairTest:
         for both in pair:
             for one, unstarted, lost in zip(both, self.unstarted, self.lost, strict=True):
                 if not one.valid:
-                    (unstarted if all(_failures(one)) else lost).append(one)
-        least, most = ([sum(_failures(both[side])[end] for both in pair) for side in (0, 1)] for end in (0, 1))
+                    (unstarted if all(failures_of(one)) else lost).append(one)
+        least, most = ([sum(failures_of(both[side])[end] for both in pair) for side in (0, 1)] for end in (0, 1))
         self._differences[(least[1] - most[0]) / self._rounds, (most[1] - least[0]) / self._rounds] += 1
         if least != most:
             self.unknown += 1
@@ -344,7 +344,7 @@ class PairTest:
         return inside
 
 
-def _failures(trial: TrialFacts) -> tuple[bool, bool]:
+def failures_of(trial: TrialFacts) -> tuple[bool, bool]:
     """Return whether a trial has certainly failed, and whether it may have failed."""
     if trial.valid:
         return trial.crashed, trial.crashed

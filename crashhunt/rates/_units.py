@@ -33,12 +33,14 @@ if TYPE_CHECKING:
 __all__ = [
     "MAX_INVALID_SHARE",
     "PERS",
+    "PER_WORDS",
     "CountingRule",
     "Per",
     "RateCounter",
     "TrialFacts",
     "Unit",
     "UnitSequence",
+    "exposure_of",
     "facts_of",
     "facts_of_plain",
     "has_too_many_invalid",
@@ -48,6 +50,7 @@ Per: TypeAlias = RatePer
 """What a rate is per."""
 
 PERS: tuple[Per, ...] = RATE_PERS
+PER_WORDS: dict[Per, str] = {"trial": "per trial", "hour": "per hour", "1000km": "per 1,000 km"}
 MAX_INVALID_SHARE = 0.05  # of the trials that have ended
 _SURELY_INVALID_SHARE = 0.04  # against 5 % itself, a share of just 5 % would never be decided
 MAX_SPEED_MPS = 100.0  # 360 km/h: no trial's vehicle is faster, so the exposure in km has a bound before it begins
@@ -271,6 +274,16 @@ def has_too_many_invalid(invalid: int, valid: int) -> bool:
     return test.verdict(_SURELY_INVALID_SHARE) == "above"
 
 
+def exposure_of(trial: TrialFacts, per: Per) -> float | None:
+    """Return the exposure of a trial, in trials, hours or 1,000 km; None if it is unknown."""
+    if per == "trial":
+        return 1.0
+    driven = trial.driven_s if per == "hour" else trial.driven_m
+    if driven is None:
+        return 0.0 if trial.crashed else None  # a crash whose recording is damaged counts with exposure 0
+    return driven / (_S_PER_HOUR if per == "hour" else _M_PER_1000KM)
+
+
 class RateCounter:
     """Counts units for one measure of exposure, either of all trials or of a part of the trials.
 
@@ -342,13 +355,12 @@ class RateCounter:
     def _exposure(self, trial: TrialFacts) -> float:
         if self._per == "trial":
             return 1.0
-        driven = trial.driven_s if self._per == "hour" else trial.driven_m
+        driven = exposure_of(trial, self._per)
         if driven is None:
-            if not trial.crashed:  # a crash whose recording is damaged counts with exposure 0
-                self.why_not = self.why_not or f"trial {trial.number} has no driven distance and time"
+            self.why_not = self.why_not or f"trial {trial.number} has no driven distance and time"
             return 0.0
-        self.is_measured = True
-        return driven / (_S_PER_HOUR if self._per == "hour" else _M_PER_1000KM)
+        self.is_measured = self.is_measured or trial.driven_s is not None
+        return driven
 
     def interval(self, alpha: float) -> Interval | None:
         """Return the interval that is valid at any time; None if there is no unit, or if an exposure is unknown."""

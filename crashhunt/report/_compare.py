@@ -12,7 +12,8 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.text import in_lines
 from crashhunt.estimation import held_out_of
 from crashhunt.hunts import FACTS, HuntResults, columns_of
-from crashhunt.report._rate import count_training_trials
+from crashhunt.rates import PER_WORDS
+from crashhunt.report._rate import count_training_trials, format_rate
 from crashhunt.report._table import aligned, argument_units
 from crashhunt.trial import Outcome, in_order
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
     from crashhunt.estimation import Comparison, HuntFigures
     from crashhunt.hunts import Cell
+    from crashhunt.rates import Per
     from crashhunt.training import HeldOutTraffics
 
 __all__ = ["comparison_page", "describe_comparison"]
@@ -55,14 +57,15 @@ svg .axis { stroke: var(--line); fill: none; }
 
 def describe_comparison(found: Comparison) -> str:
     """Return a comparison of hunts as text."""
-    header = ("hunt", "trials", "crashes", "crash rate", "95 % interval", "median step", "median TTC")
+    per = _unit(found.per)
+    header = ("hunt", "trials", "crashes", f"crash rate{per}", "95 % interval", "median step", "median TTC")
     rows = [
         (
             hunt.dir,
             str(hunt.trials),
             f"{hunt.crashes} ({hunt.disturbed} disturbed)" if hunt.disturbed is not None else str(hunt.crashes),
-            f"{hunt.crash_rate:.2%}" if np.isfinite(hunt.crash_rate) else "-",
-            f"{hunt.interval[0]:.2%} to {hunt.interval[1]:.2%}" if hunt.interval else "-",
+            _number(hunt, hunt.crash_rate) if np.isfinite(hunt.crash_rate) else "-",
+            f"{_number(hunt, hunt.interval[0])} to {_number(hunt, hunt.interval[1])}" if hunt.interval else "-",
             f"{hunt.median_steps_to_crash:g}" if np.isfinite(hunt.median_steps_to_crash) else "-",
             f"{hunt.median_time_to_collision_s:.2f} s" if np.isfinite(hunt.median_time_to_collision_s) else "-",
         )
@@ -87,6 +90,16 @@ def describe_comparison(found: Comparison) -> str:
         if pair.caution:
             lines.append(f"  but {pair.caution}")
     return in_lines(lines)
+
+
+def _number(hunt: HuntFigures, rate: float) -> str:
+    """Return a crash rate as text: in percent if it is per trial."""
+    return f"{rate:.2%}" if hunt.per == "trial" else format_rate(rate)
+
+
+def _unit(per: Per) -> str:
+    """Return the unit of a rate as text; empty for rates per trial, which are shown in percent."""
+    return "" if per == "trial" else f" {PER_WORDS[per]}"
 
 
 def comparison_page(found: Comparison, path: Path) -> None:
@@ -119,11 +132,12 @@ def comparison_page(found: Comparison, path: Path) -> None:
 
 def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
     """Return a bar with its interval for each hunt as HTML; lengths are in percent of the width of the page."""
-    most = max([hunt.interval[1] if hunt.interval else _drawn_rate(hunt) for hunt in hunts] or [1.0])
+    ends = [hunt.interval[1] if hunt.interval else _drawn_rate(hunt) for hunt in hunts]
+    most = max([end for end in ends if np.isfinite(end)] or [1.0])
     scale, parts = 100 / max(most, 1e-9), []
     for hunt in hunts:
         rate = _drawn_rate(hunt)
-        share = f"{rate:.2%} ({hunt.crashes} of {hunt.trials})"
+        share = f"{_number(hunt, rate)}{_unit(hunt.per)} ({hunt.crashes} of {hunt.trials})"
         said = share if np.isfinite(hunt.crash_rate) else f"{hunt.crashes} of {hunt.trials}"
         if hunt.disturbed is not None:
             said += f", {hunt.disturbed} of them disturbed"
@@ -134,7 +148,8 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
             said += f", only trials of origin {html.escape(hunt.counted)} count, because the search guided all others"
         if hunt.interval:
             low, high = hunt.interval
-            said += f", 95 % interval {low:.2%} to {high:.2%}"
+            said += f", 95 % interval {_number(hunt, low)} to {_number(hunt, high)}"
+            high = min(high, most)
             bar += f'<span class="interval" style="left:{low * scale:.2f}%;width:{(high - low) * scale:.2f}%"></span>'
         name = f'<span class="name">{html.escape(hunt.dir)}</span>'
         parts.append(f'<div>{name} <span class="faint">{said}</span><div class="rate">{bar}</div></div>')

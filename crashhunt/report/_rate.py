@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from crashhunt.base.files import whole_file
 from crashhunt.base.text import in_lines
-from crashhunt.rates import Interval
+from crashhunt.rates import PER_WORDS, Interval
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,7 +29,6 @@ __all__ = [
     "write_rates_csv",
 ]
 
-_PER_WORDS = {"trial": "per trial", "hour": "per hour", "1000km": "per 1,000 km"}
 _TRAINED_ON = "trained_on"
 _REASONS = {
     "invalid": "invalid",
@@ -80,7 +79,7 @@ def describe_running(rate: RunningRate) -> str:
     if rate["method"] == "rare":
         return _describe_rare(rate)
     bar = (
-        f"; bar {format_rate(rate['bar'])} {_PER_WORDS[rate['per']]}: {rate['verdict']}"
+        f"; bar {format_rate(rate['bar'])} {PER_WORDS[rate['per']]}: {rate['verdict']}"
         if rate["bar"] is not None
         else ""
     )
@@ -90,9 +89,7 @@ def describe_running(rate: RunningRate) -> str:
     trials = f"{_count(rate['crashes'], 'crash', 'crashes')} in {_count(rate['trials'], kind, f'{kind}s')}"
     if trained_on := rate.get("trained_on"):
         bar += f"; {count_training_trials(trained_on)}"
-    return (
-        f"crash rate: {_certain(rate['certain'])} {_PER_WORDS[rate['per']]} ({trials}, {rate['confidence']:g} %){bar}"
-    )
+    return f"crash rate: {_certain(rate['certain'])} {PER_WORDS[rate['per']]} ({trials}, {rate['confidence']:g} %){bar}"
 
 
 def _describe_rare(rate: RunningRate) -> str:
@@ -131,18 +128,16 @@ def _of_hunt(rates: list[CrashRate]) -> list[str]:
     known = [rate for rate in rates if rate.certain is not None]
     lines: list[str]
     if known and not first.crashes:
-        each = [
-            f"{format_rate(rate.certain.high)} {_PER_WORDS[rate.per]}" for rate in known if rate.certain is not None
-        ]
+        each = [f"{format_rate(rate.certain.high)} {PER_WORDS[rate.per]}" for rate in known if rate.certain is not None]
         lines = [f"{head}: at most {', '.join(each)} {confidence}"]
     elif known:
-        lines = [f"{head} {confidence}", *(f"  {_PER_WORDS[rate.per]}: {_answer(rate)}" for rate in known)]
+        lines = [f"{head} {confidence}", *(f"  {PER_WORDS[rate.per]}: {_answer(rate)}" for rate in known)]
     else:
         lines = [head]
     for why in dict.fromkeys(rate.why_not for rate in rates if rate.why_not):
         concerned = [rate for rate in rates if rate.why_not == why]
         missing = "no rate" if concerned[0].certain is None else "no estimate"
-        which = "" if len(concerned) == len(rates) else f" {' and '.join(_PER_WORDS[rate.per] for rate in concerned)}"
+        which = "" if len(concerned) == len(rates) else f" {' and '.join(PER_WORDS[rate.per] for rate in concerned)}"
         lines.append(f"  {missing}{which}: {why}")
     if trained_on := first.excluded.get(_TRAINED_ON):
         lines.append(f"  {count_training_trials(trained_on)}")
@@ -155,7 +150,7 @@ def _of_hunt(rates: list[CrashRate]) -> list[str]:
 
 
 def _verdict(rate: CrashRate, bar: float) -> str:
-    shown = f"the bar of {format_rate(bar)} {_PER_WORDS[rate.per]}"
+    shown = f"the bar of {format_rate(bar)} {PER_WORDS[rate.per]}"
     if rate.verdict != "undecided":
         return f"certainly {rate.verdict} {shown}"
     if rate.why_undecided:
@@ -178,7 +173,7 @@ def _part_lines(rate: CrashRate) -> list[str]:
     parts = len(rate.parts)
     together = f"{rate.confidence:g} % for all {parts} intervals together" if parts > 1 else f"{rate.confidence:g} %"
     return [
-        f"  {_PER_WORDS[rate.per]}, by {rate.parts[0].by} ({together}):",
+        f"  {PER_WORDS[rate.per]}, by {rate.parts[0].by} ({together}):",
         *(f"    {part.name}: {part.crashes} of {part.trials:,} trials, {_answer(part)}" for part in rate.parts),
     ]
 
@@ -224,10 +219,10 @@ def rates_page(rates: Sequence[CrashRate], path: Path) -> None:
         exposure = f"{rate.trials:,} trials, {rate.driven_s / 3600:,.2f} h, {rate.driven_m / 1000:,.1f} km"
         trained_on = rate.excluded.get(_TRAINED_ON)
         remarks = filter(None, (rate.why_not, count_training_trials(trained_on) if trained_on else ""))
-        rows.append((rate.dir, _PER_WORDS[rate.per], str(rate.crashes), exposure, *_numbers(rate), "; ".join(remarks)))
+        rows.append((rate.dir, PER_WORDS[rate.per], str(rate.crashes), exposure, *_numbers(rate), "; ".join(remarks)))
         for part in rate.parts:
             name = f"{part.by} {part.name}" if part.by != part.name else part.name
-            rows.append((rate.dir, f"{_PER_WORDS[rate.per]}, {name}", str(part.crashes), f"{part.trials:,} trials",
+            rows.append((rate.dir, f"{PER_WORDS[rate.per]}, {name}", str(part.crashes), f"{part.trials:,} trials",
                          *_numbers(part), ""))  # fmt: skip
     header = ("hunt", "rate", "crashes", "in", "estimate", "at least", "at most", "remarks")
     head = "".join(f"<th>{name}</th>" for name in header)

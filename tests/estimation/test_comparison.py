@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 import crashhunt
+from crashhunt.base.errors import UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, write_settings
 from crashhunt.rates import PairTest
@@ -31,6 +32,7 @@ def hunt(
     plain=None,
     seeds=0,
     rare=False,
+    drive=None,
     **run,
 ):
     """A hunt whose trials below ``crashes`` crash, without running it."""
@@ -57,7 +59,8 @@ def hunt(
             place = number % seeds if seeds else number
             spec = TrialSpec(number, seed + place, {"ego": {"speed": 4.0}}, {"gap_m": gap_m}, 9, origin=origin)
             outcome = Outcome.COLLISION if number < crashes else Outcome.SURVIVED
-            ledger.record(TrialResult(spec, outcome, steps=9), snapshot="")
+            driven = {"driven_s": drive(number), "driven_m": 40 * drive(number), "step_length_s": 1.0} if drive else {}
+            ledger.record(TrialResult(spec, outcome, steps=9, **driven), snapshot="")
         facts = {} if plain is None else {"independent": False, "plain_origin": "random", "origins": True}
         ledger.enter("all_trials", planned=trials, hunt_seed=seed, **facts)
     return path
@@ -94,6 +97,41 @@ def test_same_seeds_are_pairs_only_in_the_same_traffic(tmp_path):
             assert pair.difference.high < 0
             assert pair.p_value == pytest.approx(8.334e-06, rel=1e-3)  # Fisher's test of 20/40 and 2/40
             assert f"{name} crashes less: 20 of 40 trials crash in" in pair.verdict
+
+
+def test_difference_is_in_the_requested_unit_and_decides_although_the_intervals_overlap(tmp_path):
+    few = hunt(tmp_path / "few", 4, trials=120, drive=lambda n: 4.0 if n < 4 else 9.0)
+    many = hunt(tmp_path / "many", 17, trials=120, drive=lambda n: 4.0 if n < 17 else 9.0)
+    for per, low, unit in (("trial", 0.02, "per trial"), ("hour", 5.0, "per hour"), ("1000km", 100.0, "per 1,000 km")):
+        found = crashhunt.compare(few, many, per=per)
+        (pair,) = found.pairs
+        one, other = found.hunts
+        assert one.interval[1] > other.interval[0]
+        assert (pair.answer, pair.per, one.per) == ("first", per, per)
+        assert pair.difference.low > 0
+        assert pair.difference.low < other.crash_rate - one.crash_rate < pair.difference.high
+        assert pair.difference.high > low
+        assert f"crashes {unit} (" in pair.verdict
+        assert "the intervals of the two hunts overlap: the difference of trials" in pair.caution
+        assert (pair.evidence is None) == (per != "trial")
+        assert describe_comparison(found)
+    (pair,) = crashhunt.compare(many, few, per="hour").pairs
+    assert (pair.answer, pair.difference.high < 0) == ("second", True)
+    (pair,) = crashhunt.compare(hunt(tmp_path / "a", 2), hunt(tmp_path / "b", 9), per="hour").pairs
+    assert (pair.difference, pair.answer) == (None, "")
+    assert "no trial has a driven distance and time" in pair.caution
+    with pytest.raises(UsageError, match="per is 'mile'; "):
+        crashhunt.compare(few, many, per="mile")
+
+
+def test_answer_is_that_of_the_interval_and_not_of_a_test_at_the_end(tmp_path):
+    """A test that is made once has p = 0.039, and the interval that is valid at any time still contains 0."""
+    (pair,) = crashhunt.compare(hunt(tmp_path / "a", 10), hunt(tmp_path / "b", 3)).pairs
+    assert pair.p_value < 0.05
+    assert pair.answer == "undecided"
+    assert pair.difference.low < 0 < pair.difference.high
+    assert pair.verdict.startswith("undecided, because the difference may be 0: of 40 trials")
+    assert "p =" not in pair.verdict
 
 
 def test_traffics_are_the_pairs_of_hunts_that_share_traffics(tmp_path):

@@ -18,13 +18,13 @@ def figures(name="a", **given):
     hunt = {
         "dir": name, "trials": 40, "crashes": 10, "disturbed": None, "crash_rate": 0.25, "interval": (0.125, 0.5),
         "median_steps_to_crash": 12.0, "median_time_to_collision_s": 1.234, "counted": "", "why_not": "",
-        "exclusions": {}, "excluded": 0, "outcomes": {"collision": 10, "survived": 30, "hang": 0},
+        "exclusions": {}, "excluded": 0, "per": "trial", "outcomes": {"collision": 10, "survived": 30, "hang": 0},
     }  # fmt: skip
     return SimpleNamespace(**hunt | given)
 
 
 def lines_of(*hunts, pairs=()):
-    return describe_comparison(SimpleNamespace(hunts=hunts, pairs=pairs)).splitlines()
+    return describe_comparison(SimpleNamespace(hunts=hunts, pairs=pairs, per=hunts[0].per)).splitlines()
 
 
 def test_row_has_the_rate_with_its_interval():
@@ -33,6 +33,17 @@ def test_row_has_the_rate_with_its_interval():
         "hunt", "trials", "crashes", "crash rate", "95 % interval", "median step", "median TTC"
     ]  # fmt: skip
     assert re.split(r"  +", row.strip()) == ["a", "40", "10", "25.00%", "12.50% to 50.00%", "12", "1.23 s"]
+
+
+def test_rates_in_another_unit_are_numbers():
+    hunts = [figures(per="hour", crash_rate=2.345, interval=(0.51, 1200.4)), figures("b", per="hour", interval=None)]
+    header, row, _ = lines_of(*hunts)
+    assert "crash rate per hour" in header
+    assert re.split(r"  +", row.strip())[3:5] == ["2.3", "0.51 to 1,200"]
+    text = _rates([figures(per="hour", crash_rate=2.345, interval=(0.51, math.inf))], COLORS)
+    assert "2.3 per hour (10 of 40), 95 % interval 0.51 to any number" in text
+    assert "inf" not in text
+    assert "nan" not in text
 
 
 def test_unknown_figures_are_dashes_with_the_reason():
