@@ -128,14 +128,14 @@ class Pair:
             is none.
         units: number of independent pairs, of trials or of traffic seeds.
         excluded: number of trials of both hunts that do not count. A trial does not count if a trial with a lower
-            number has not ended, or if the trial is invalid in one hunt. A trial on whose traffic an agent was trained
-            does not count either.
+            number has not ended, or if the trial is invalid in both hunts. A trial on whose traffic an agent was
+            trained does not count either.
         answer: the hunt that certainly crashes less, ``first`` or ``second``; ``undecided`` if neither does; empty if
             no answer is possible. The answer follows from ``difference``: it is undecided if this interval contains 0.
-        not_started: number of trials of the first hunt and of the second that count as crashes, because the agent does
-            not start, although it starts in the same trial of the other hunt.
-        without_result: number of pairs in which a trial was killed from outside or could not be set up in one hunt
-            only. The answer is valid for any result of these pairs.
+        not_started: number of trials of the first hunt and of the second that count as crashes. The agent does not
+            start in these trials, and it starts in the same trials of the other hunt.
+        without_result: number of pairs with an unknown result. A trial was killed from outside or could not be set up,
+            in one hunt only. The answer is valid for any result of these pairs.
         per: the unit to which answer and difference refer: ``trial``, ``hour`` or ``1000km``.
     """
 
@@ -487,7 +487,7 @@ def _invalid_pairs(one: _Side, two: _Side, test: PairTest) -> str:
 
 
 def _overlap(found: Pair, one: HuntFigures, two: HuntFigures) -> str:
-    """Return why hunts with overlapping intervals may differ all the same; empty if there is nothing to explain."""
+    """Return why the hunts differ although their intervals overlap; empty if there is nothing to explain."""
     if found.answer not in ("first", "second") or not one.interval or not two.interval:
         return ""
     if one.interval[1] < two.interval[0] or two.interval[1] < one.interval[0]:

@@ -579,7 +579,7 @@ class ComparedHunt(CountedTrials):
     trials: int
     crashes: int
     crash_rate: float | None
-    interval: tuple[float, float] | None
+    interval: tuple[float, float | None] | None
     why_not: str
     median_steps_to_crash: float | None
     median_time_to_collision_s: float | None
@@ -587,6 +587,7 @@ class ComparedHunt(CountedTrials):
     counted: str
     disturbed: int | None
     excluded: int
+    per: Literal["trial", "hour", "1000km"]
 
 
 class ComparedPair(TypedDict):
@@ -608,6 +609,9 @@ class ComparedPair(TypedDict):
     units: int
     excluded: int
     answer: Literal["first", "second", "undecided", ""]
+    not_started: tuple[int, int]
+    without_result: int
+    per: Literal["trial", "hour", "1000km"]
     verdict: str
 
 
@@ -618,7 +622,23 @@ class CompareData(TypedDict):
     pairs: list[ComparedPair]
 
 
-class ScenarioPairs(TypedDict):
+class OfBoth(TypedDict):
+    """A number for each of the versions that a gate compares."""
+
+    base: int
+    head: int
+
+
+class InvalidPairs(TypedDict):
+    """Pairs that are invalid for both versions, and trials that only one version cannot start or finish."""
+
+    invalid: int
+    not_started: OfBoth
+    killed: OfBoth
+    unknown: OfBoth
+
+
+class ScenarioPairs(InvalidPairs):
     """The pairs of trials in one scenario."""
 
     name: str
@@ -626,7 +646,12 @@ class ScenarioPairs(TypedDict):
     only_base: int
     only_head: int
     both: int
-    invalid: int
+
+
+class GateCrashType(OfBoth):
+    """The number of crashes of a type in the pairs."""
+
+    type: str
 
 
 class GateCorpus(TypedDict):
@@ -645,7 +670,7 @@ class Compared(TypedDict):
     head: str
 
 
-class GateData(TypedDict):
+class GateData(InvalidPairs):
     """``crashhunt gate``."""
 
     verdict: PairVerdict
@@ -663,6 +688,8 @@ class GateData(TypedDict):
     confidence: float
     seed: int | None
     scenarios: list[ScenarioPairs]
+    crash_types: list[GateCrashType]
+    cautions: list[str]
     why: str
     interrupted: bool
     dir: str | None

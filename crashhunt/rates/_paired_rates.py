@@ -10,7 +10,7 @@ has a mean below 0, with a share of its maximum stake:
     E(r, x) = sum_j w_j prod_i (1 - s_j Z_i / (m + r D)),    with at most m events and exposure D in a unit.
 
 Each factor is positive, has mean 1 at the true r and x, and grows with x. The rate r itself is unknown. An interval of
-r from the units of the first agent has a fourth of the error probability, the bets have another fourth, and the upper
+r from the units of the first agent has a fourth of the error probability, and the bets have another fourth. The upper
 end is the greatest over the interval of r. The lower end is the upper end with the agents exchanged, and has the other
 half. Where both agents drive equally far in a unit, r has no influence, and the pairs are as sharp as pairs of trials.
 

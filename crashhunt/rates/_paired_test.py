@@ -4,28 +4,31 @@ A pair is one trial of each agent with the same number, seed and traffic. Pairs 
 to the first number whose trials have not both ended. A crash ends a trial early, so the finished pairs are not a fair
 sample, but the first k pairs are. With `--seeds`, a pair consists of all trials of a traffic seed.
 
-The difference of a pair is Z = (failures of the second - failures of the first) / trials, from -1 to 1. A trial fails
-if it crashes, or if the agent's own code prevents its start. For each possible difference d, the evidence against d is
+The difference Z of a pair is the failures of the second agent minus those of the first, divided by the number of
+trials. A trial fails if it crashes, or if the agent's own code prevents its start. Two sums bet on each difference d:
 
-    E(d) = 1/2 sum_j w_j prod_i (1 - s_j (Z_i - d) / (1 - d)) + 1/2 sum_j w_j prod_i (1 + s_j (Z_i - d) / (1 + d)).
+    below(d) = sum_j w_j prod_i (1 - s_j (Z_i - d) / (1 - d))
 
-The first sum bets that E[Z] is less than d, the second that it is greater, each with a share s_j of the maximum stake.
+    above(d) = sum_j w_j prod_i (1 + s_j (Z_i - d) / (1 + d))
+
+The first sum bets that E[Z] is less than d, and the second that it is greater. Component j bets a share s_j of the
+maximum stake. The evidence E(d) against d is the mean of both sums.
 The interval consists of the differences with less evidence against them than 1 / alpha. The verdict follows from the
 interval: one agent is worse if the interval excludes 0. Therefore interval and verdict never contradict each other.
 
 Invariant: at the true difference each factor is positive and has mean 1 given the past. So E is a non-negative
-martingale that begins at 1. By Ville's inequality, the probability that E ever reaches 1 / alpha is at most alpha. Each
-factor is a positive, convex function of d, the factors of a sum are monotone in the same direction, and so E is convex.
-At the observed mean, E is at most 1. The differences that are not rejected are therefore an interval around the mean,
-and bisection finds its ends.
+martingale that begins at 1. By Ville's inequality, the probability that E ever reaches 1 / alpha is at most alpha.
+Each factor is a positive, convex function of d. The factors of a sum are monotone in the same direction, so E is
+convex. At the observed mean, E is at most 1. The differences that are not rejected are therefore an interval around
+the mean, and bisection finds its ends.
 
 If the result of a trial is unknown, its pair counts with the greatest possible Z in the first sum, and with the least
 in the second. Both sums only become smaller. An interval and a verdict are therefore valid whatever the results are.
 
-At d = 0, the factors of concordant pairs are 1, and E is the evidence of McNemar's discordant pairs (1947), each of
-which is a fair coin without a difference. Half of the weight is on the shares of Krichevsky and Trofimov (1981), which
-detect any bias eventually: s = 2 q - 1, where q has the distribution Beta(1/2, 1/2), here at the nodes of Gauss and
-Chebyshev. The other half bets that one side occurs three times as often as the other. Most changes of interest have
+At d = 0, the factors of concordant pairs are 1, and E is the evidence of McNemar's discordant pairs (1947). Without a
+difference, each of these is a fair coin. Half of the weight is on the shares of Krichevsky and Trofimov (1981), which
+detect any bias eventually: s = 2 q - 1, where q has the distribution Beta(1/2, 1/2). The sum uses the nodes of Gauss
+and Chebyshev. The other half bets that one side occurs three times as often as the other. Most changes of interest have
 such a bias, and this half detects them sooner.
 
 Sources: those of `_anytime_interval`. The bets on Z are those of Waudby-Smith and Ramdas (2024), with a mixture over

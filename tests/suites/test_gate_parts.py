@@ -120,7 +120,7 @@ def test_each_commit_is_built_once_in_the_folder_of_the_command(work, tmp_path, 
         gate(tmp_path, build="make").run(tmp_path / "h")
 
 
-def test_file_that_both_commits_share_is_told_and_reported(work, tmp_path):
+def test_file_that_both_commits_share_is_a_warning(work, tmp_path):
     told = []
     run = started(of_commits(work), tmp_path / "g")
     run._tell = told.append
