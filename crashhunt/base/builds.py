@@ -22,10 +22,11 @@ from crashhunt.base.processes import die_with
 from crashhunt.base.signals import describe_death
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
 __all__ = ["BuildError", "clean_tree", "copy_built", "files_outside", "run_build", "track_built"]
 
+_QUIET_S = 3.0  # before the user is told what takes so long
 _MAX_LINES, _MAX_CHARACTERS = 3, 300  # of the output in an error
 
 
@@ -33,7 +34,15 @@ class BuildError(CrashhuntError):
     """The build of a commit failed."""
 
 
-def run_build(command: str, folder: Path, log: Path | None, *, limit_s: float, name: str) -> None:
+def run_build(
+    command: str,
+    folder: Path,
+    log: Path | None,
+    *,
+    limit_s: float,
+    name: str,
+    tell: Callable[[str], None] = lambda _: None,
+) -> None:
     """Run the command that builds a commit; Ctrl-C and the time limit end all its processes.
 
     Args:
@@ -41,7 +50,8 @@ def run_build(command: str, folder: Path, log: Path | None, *, limit_s: float, n
         folder: folder of the work tree in which the command runs.
         log: file for the output; None for a temporary file, which stays only if the build fails.
         limit_s: time limit, in s.
-        name: name of the built version, for the error message.
+        name: name of the built version, for messages.
+        tell: function called with a note if the build takes more than some seconds.
 
     Raises:
         BuildError: the command failed, or took too long.
@@ -59,7 +69,11 @@ def run_build(command: str, folder: Path, log: Path | None, *, limit_s: float, n
         )  # fmt: skip
         how = ""
         try:
-            if code := process.wait(limit_s):
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(min(_QUIET_S, limit_s))
+            if process.returncode is None and limit_s > _QUIET_S:
+                tell(f"building {name}: {command}")
+            if code := process.wait(max(0.0, limit_s - _QUIET_S)):
                 how = describe_death(code)
         except subprocess.TimeoutExpired:
             how = f"still ran after {limit_s:g} s"

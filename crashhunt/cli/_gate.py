@@ -145,8 +145,6 @@ def _gate(options: argparse.Namespace, words: list[str]) -> int:
     def tell_user(note: str) -> None:
         print(f"crashhunt: {note}", file=sys.stderr, flush=True)
 
-    for caution in gate.cautions():
-        tell_user(caution)
     with _watched(as_json=options.json) as watch:
         found = gate.run(options.keep, watch, tell_user)
     say(describe_gate(found), as_json=options.json)

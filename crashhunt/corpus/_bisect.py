@@ -99,7 +99,7 @@ def bisect(
             revision, why = git(tree, "rev-parse", "HEAD"), ""
             try:
                 if build:
-                    run_build(build, inside, None, limit_s=build_limit_s, name=revision[:12])
+                    run_build(build, inside, None, limit_s=build_limit_s, name=revision[:12], tell=tell)
                 got, why = _run(case, inside, tree, modules)
             except BuildError as error:
                 got, why = "cannot_run", str(error)

@@ -193,7 +193,10 @@ class Gate:
         with ExitStack() as stack:
             place = directory if directory is not None else stack.enter_context(temporary_folder("gate"))
             stack.enter_context(_locked(place))
-            return _Run(self, place, stack, watch, is_kept=directory is not None, tell=tell).report()
+            run = _Run(self, place, stack, watch, is_kept=directory is not None, tell=tell)
+            for caution in self.cautions():
+                tell(caution)
+            return run.report()
 
     def cautions(self) -> Iterator[str]:
         """Yield warnings on facts about the two commits that the user may not expect."""
@@ -419,9 +422,15 @@ class _Run:
             shutil.copytree(kept, tree, symlinks=True, dirs_exist_ok=True)
         else:
             name = f"{side.upper()} ({self._versions[side]})"
-            self._tell(f"building {name}: {gate.build}")
             log = self._place / f"build-{side}.log" if self._is_kept else None
-            run_build(gate.build, self._folder_of(side, gate.folder), log, limit_s=gate.build_limit_s, name=name)
+            run_build(
+                gate.build,
+                self._folder_of(side, gate.folder),
+                log,
+                limit_s=gate.build_limit_s,
+                name=name,
+                tell=self._tell,
+            )
             if self._is_kept:
                 kept.parent.mkdir(exist_ok=True)
                 with temporary_beside(kept) as building:

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from crashhunt.base import builds
 from crashhunt.base.builds import BuildError, clean_tree, copy_built, files_outside, run_build, track_built
 from crashhunt.snapshots import _take
 
 
-def build(command, folder, log=None, limit_s=math.inf):
-    run_build(command, folder, log, limit_s=limit_s, name="HEAD (abc)")
+def build(command, folder, log=None, limit_s=math.inf, **more):
+    run_build(command, folder, log, limit_s=limit_s, name="HEAD (abc)", **more)
 
 
 @pytest.fixture(autouse=True)
@@ -42,6 +43,15 @@ def test_failed_build_is_one_line_with_the_end_of_its_output_and_keeps_its_log(t
         build("kill -9 $$", tmp_path, tmp_path / "kept.log")
 
 
+def test_long_build_is_announced_once(tmp_path, monkeypatch):
+    said = []
+    build("true", tmp_path, tell=said.append)
+    assert said == []
+    monkeypatch.setattr(builds, "_QUIET_S", 0.0)
+    build("sleep 0.2", tmp_path, tell=said.append)
+    assert said == ["building HEAD (abc): sleep 0.2"]
+
+
 @pytest.mark.parametrize("why", ["too long", "interrupted"])
 def test_build_that_is_ended_leaves_no_process(tmp_path, temporary, monkeypatch, why):
     wait = subprocess.Popen.wait
@@ -55,6 +65,7 @@ def test_build_that_is_ended_leaves_no_process(tmp_path, temporary, monkeypatch,
             raise KeyboardInterrupt
         raise subprocess.TimeoutExpired("sleep", timeout)
 
+    monkeypatch.setattr(builds, "_QUIET_S", 9.0)
     monkeypatch.setattr(subprocess.Popen, "wait", interrupted)
     error = KeyboardInterrupt if why == "interrupted" else BuildError
     with pytest.raises(error, match="^$" if why == "interrupted" else "still ran after 9 s: begun"):

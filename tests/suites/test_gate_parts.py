@@ -106,7 +106,11 @@ def test_each_commit_is_built_once_in_the_folder_of_the_command(work, tmp_path, 
     asked = of_commits(work, build="make", build_limit_s=7.0)
     started(asked, tmp_path / "g")
     log = tmp_path / "g/build-base.log"
-    assert built[0] == ("make", work.trees["base"] / "sub", log, {"limit_s": 7.0, "name": "BASE (mine:Old (aaaa))"})
+    assert built[0][:3] == ("make", work.trees["base"] / "sub", log)
+    assert {name: built[0][3][name] for name in ("limit_s", "name")} == {
+        "limit_s": 7.0,
+        "name": "BASE (mine:Old (aaaa))",
+    }
     assert [folder for _, folder, *_ in built] == [work.trees[side] / "sub" for side in ("base", "head")]
     assert tracked == list(work.trees.values())
     started(asked, tmp_path / "g")  # the same command again: with the same files, and not with those of a second build
