@@ -65,10 +65,14 @@ def _verb(found: GateReport) -> str:
     return "fails" if _events(found) == "failures" else "crashes"
 
 
+def _plural(found: GateReport) -> str:
+    return "fail" if _events(found) == "failures" else "crash"
+
+
 def _evidence(found: GateReport) -> list[str]:
     if not found.pairs:
         return ["no pair of trials has ended"]
-    verb = "fail" if _events(found) == "failures" else "crash"
+    verb = _plural(found)
     counts = f"{found.only_base} {verb} only with BASE, {found.only_head} only with HEAD, {found.both} with both"
     needed = 1 / (1 - found.confidence / 100)
     confidence = f"{found.confidence:g} %, valid whenever you look"
@@ -98,15 +102,13 @@ def _invalid_pairs(found: GateReport) -> list[str]:
 def _lost(name: str, side: SideCounts, verdict: str) -> str:
     """Return why pairs have no result because of one version, and what this means for the verdict."""
     reasons = [
-        f"{name} {what} in {count}"
+        f"{what} in {count}"
         for what, count in (("was killed from outside", side.killed), ("could not be set up", side.unknown))
         if count
     ]
     example = "" if side.not_started else f" ({side.example})"
     effect = "must hold" if verdict == "undecided" else "holds"
-    return (
-        f"{_pairs(side.lost)} without a result: {' and '.join(reasons)}{example}; the verdict {effect} for any result"
-    )
+    return f"{_pairs(side.lost)} without a result: {name} {' and '.join(reasons)}{example}; the verdict {effect} for any result"
 
 
 def _new_types(found: GateReport) -> list[str]:
@@ -146,7 +148,7 @@ def _rate(rate: CrashRate) -> str:
 
 def _scenarios(found: GateReport) -> list[str]:
     return [
-        f"{one.name}: {_pairs(one.pairs)}, {one.only_base} crash only with BASE, {one.only_head} only with HEAD, "
+        f"{one.name}: {_pairs(one.pairs)}, {one.only_base} {_plural(found)} only with BASE, {one.only_head} only with HEAD, "
         f"{one.both} with both"
         for one in found.scenarios
     ]
@@ -168,7 +170,7 @@ def gate_summary(found: GateReport) -> str:
     if found.why:
         lines += [f"{_plain(found.why)}.", ""]
     if found.pairs:
-        verb = "fail" if _events(found) == "failures" else "crash"
+        verb = _plural(found)
         lines += [_row("pairs of trials", f"{verb} only with BASE", "only with HEAD", "with both", "evidence")]
         lines += [_row(*["---:"] * 5)]
         counts = (found.pairs, found.only_base, found.only_head, found.both)

@@ -64,7 +64,7 @@ def test_compare_prints_a_text_a_table_or_json(monkeypatch, capsys, tmp_path):
     asked, pages = [], []
     found = SimpleNamespace(to_json=lambda: {"hunts": 2}, write_csv=lambda file: file.write("dir\n"))
     monkeypatch.setattr("crashhunt.hunts.find_searches", lambda directory: hunts[str(directory)])
-    monkeypatch.setattr("crashhunt.estimation.compare", lambda *words: asked.append(words) or found)
+    monkeypatch.setattr("crashhunt.estimation.compare", lambda *words, per: asked.append((*words, per)) or found)
     monkeypatch.setattr("crashhunt.report.describe_comparison", lambda comparison: "better")
     monkeypatch.setattr("crashhunt.report.comparison_page", lambda *words: pages.append(words))
     excluded = f"{tmp_path / 'later'} has not begun, and is excluded\n"
@@ -76,7 +76,9 @@ def test_compare_prints_a_text_a_table_or_json(monkeypatch, capsys, tmp_path):
     assert capsys.readouterr() == ("dir\n", f"{excluded}p.html has the plots\n")
     assert run("compare", "hunt", "suite", "--html", "p.html") == 0
     assert capsys.readouterr() == ("better\np.html has the plots\n", excluded)
-    assert asked == [(Path("hunt"), tmp_path / "begun")] * 4
+    assert run("compare", "hunt", "suite", "--per", "1000km") == 0
+    capsys.readouterr()
+    assert asked == [*[(Path("hunt"), tmp_path / "begun", "trial")] * 4, (Path("hunt"), tmp_path / "begun", "1000km")]
     assert pages == [(found, Path("p.html"))] * 2
 
 
@@ -522,7 +524,8 @@ def test_bisect_ends_with_1_where_it_stays_open(opened, monkeypatch, capsys, com
     asked = []
 
     def bisect(bundle, good, **more):
-        more.pop("watch")("f" * 40, "cannot_run")
+        more.pop("watch")("f" * 40, "cannot_run", "no weights")
+        more.pop("tell")("every revision uses the same file")
         asked.append((bundle, good, more))
         return found
 
@@ -530,11 +533,14 @@ def test_bisect_ends_with_1_where_it_stays_open(opened, monkeypatch, capsys, com
     monkeypatch.setattr(_bisect, "check_trust", lambda *words: asked.append(words))
     bundle = crash()
     opened(bundle, _bisect)
+    no_build = {"build": "", "build_limit_s": 3600.0}
     assert run("bisect", "h", "--good", "v1", "--bad", "v2", "--from", "f") == int(commit is None)
-    assert asked == [(bundle, "trusted"), (bundle, "v1", {"bad": "v2", "folder": Path("f")})]
-    assert capsys.readouterr() == (f"ffffffffffff  cannot run\n{line}\n", "")
-    run("bisect", "h", "--good", "v1", "--json")
-    assert asked[3][2] == {"bad": "HEAD", "folder": None}
+    assert asked == [(bundle, "trusted"), (bundle, "v1", {"bad": "v2", "folder": Path("f"), **no_build})]
+    said = capsys.readouterr()
+    assert said.out == f"ffffffffffff  cannot run: no weights\n{line}\n"
+    assert said.err == "crashhunt: every revision uses the same file\n"
+    run("bisect", "h", "--good", "v1", "--json", "--build", "make -j4", "--build-timeout", "2m")
+    assert asked[3][2] == {"bad": "HEAD", "folder": None, "build": "make -j4", "build_limit_s": 120.0}
     assert capsys.readouterr().out == json.dumps({"commit": commit}) + "\n"
 
 
