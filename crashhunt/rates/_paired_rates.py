@@ -9,10 +9,10 @@ has a mean below 0, with a share of its maximum stake:
 
     E(r, x) = sum_j w_j prod_i (1 - s_j Z_i / (m + r D)),    with at most m events and exposure D in a unit.
 
-Each factor is positive, has mean 1 at the true r and x, and grows with x. The rate r itself is unknown. An interval of
-r from the units of the first agent has a fourth of the error probability, and the bets have another fourth. The upper
-end is the greatest over the interval of r. The lower end is the upper end with the agents exchanged, and has the other
-half. Where both agents drive equally far in a unit, r has no influence, and the pairs are as sharp as pairs of trials.
+Each factor is positive, has mean 1 at the true r and x, and grows with x. The rate r itself is unknown. Each end has
+half of the error probability. An interval of r, from the units of the first agent, has a tenth of that half, because r
+has little influence. The bets have the rest. The upper end is the greatest over the interval of r. The lower end is the
+upper end with the agents exchanged. Where both agents drive equally far in a unit, r has no influence.
 
 If the result of a trial is unknown, each sum counts its unit at the worst possible Z.
 
@@ -48,6 +48,7 @@ _NODES = 16  # of the shares from 0 to 1
 _SHARES: NDArray[np.float64] = np.append(np.cos(np.pi * (np.arange(_NODES) + 0.5) / (2 * _NODES)), 0.5)
 _LOG_WEIGHTS: NDArray[np.float64] = np.log(np.append(np.full(_NODES, 0.5 / _NODES), 0.5))
 _GRID = 5  # rates of the first agent, over their interval
+_SHARE_OF_RATE = 0.1  # of the error probability
 _PRECISION = 1e-6  # relative to the greatest rate
 
 
@@ -103,18 +104,19 @@ def difference_of_rates(
             )
         )
     first, second = sides
-    return Interval(-_upper_end(second, first, alpha / 4), _upper_end(first, second, alpha / 4))
+    return Interval(-_upper_end(second, first, alpha / 2), _upper_end(first, second, alpha / 2))
 
 
 def _upper_end(first: _Side, second: _Side, alpha: float) -> float:
-    """Return the greatest difference of the rates, second minus first; the error probability is twice `alpha`."""
+    """Return the greatest difference of the rates, second minus first; the error probability is `alpha`."""
     if not second.exposure.sum() > 0:
         return math.inf
-    rates = first.interval(alpha)
+    rates = first.interval(_SHARE_OF_RATE * alpha)
     if not math.isfinite(rates.high):
         return math.inf
     least = max(rates.low, 1e-3 * rates.high)
-    return max(_end_at(rate, first, second, alpha) for rate in (rates.low, *np.geomspace(least, rates.high, _GRID)))
+    rest = (1 - _SHARE_OF_RATE) * alpha
+    return max(_end_at(rate, first, second, rest) for rate in (rates.low, *np.geomspace(least, rates.high, _GRID)))
 
 
 def _end_at(rate: float, first: _Side, second: _Side, alpha: float) -> float:

@@ -32,7 +32,7 @@ def describe_gate(found: GateReport) -> str:
     if found.trained_on:
         lines.append(f"  {_training_pairs(found)}")
     if found.rates is not None:
-        lines += [f"  {name}: {_rate(rate)}" for name, rate in zip(("BASE", "HEAD"), found.rates, strict=True)]
+        lines += [f"  {line}" for line in _rates(found)]
     if len(found.scenarios) > 1:
         lines += [f"  {line}" for line in _scenarios(found)]
     lines += [f"  {line}" for line in (*_corpus(found), *(f"but {caution}" for caution in found.cautions))]
@@ -108,7 +108,8 @@ def _lost(name: str, side: SideCounts, verdict: str) -> str:
     ]
     example = "" if side.not_started else f" ({side.example})"
     effect = "must hold" if verdict == "undecided" else "holds"
-    return f"{_pairs(side.lost)} without a result: {name} {' and '.join(reasons)}{example}; the verdict {effect} for any result"
+    words = f"{name} {' and '.join(reasons)}{example}"
+    return f"{_pairs(side.lost)} without a result: {words}; the verdict {effect} for any result"
 
 
 def _new_types(found: GateReport) -> list[str]:
@@ -135,6 +136,15 @@ def _training_pairs(found: GateReport) -> str:
     return f"{found.trained_on:,} pairs do not count: an agent was trained on traffics of this part"
 
 
+def _rates(found: GateReport) -> list[str]:
+    """Return the rates of both versions; a rate counts only the trials before the first trial that was killed."""
+    lines = []
+    for name, rate, side in zip(("BASE", "HEAD"), found.rates or (), found.sides, strict=True):
+        after = rate.excluded.get("after_unfinished") if side.killed else 0
+        lines.append(f"{name}: {_rate(rate)}{f'; {after:,} trials after a killed one do not count' if after else ''}")
+    return lines
+
+
 def _rate(rate: CrashRate) -> str:
     crashes = f"{_count_of(rate.crashes)} in {rate.trials:,} trials"
     if invalid := rate.excluded.get("invalid"):
@@ -148,8 +158,8 @@ def _rate(rate: CrashRate) -> str:
 
 def _scenarios(found: GateReport) -> list[str]:
     return [
-        f"{one.name}: {_pairs(one.pairs)}, {one.only_base} {_plural(found)} only with BASE, {one.only_head} only with HEAD, "
-        f"{one.both} with both"
+        f"{one.name}: {_pairs(one.pairs)}, {one.only_base} {_plural(found)} only with BASE, "
+        f"{one.only_head} only with HEAD, {one.both} with both"
         for one in found.scenarios
     ]
 
@@ -184,7 +194,7 @@ def gate_summary(found: GateReport) -> str:
     if found.trained_on:
         lines += [f"{_training_pairs(found)}.", ""]
     if found.rates is not None:
-        lines += [f"- {name}: {_rate(rate)}" for name, rate in zip(("BASE", "HEAD"), found.rates, strict=True)]
+        lines += [f"- {line}" for line in _rates(found)]
         lines.append("")
     if len(found.scenarios) > 1:
         lines += [_row("hunt", "pairs", "only BASE", "only HEAD", "both"), _row("---", *["---:"] * 4)]

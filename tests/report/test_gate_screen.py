@@ -32,6 +32,19 @@ def test_rate_of_a_side_has_its_interval_or_the_reason_why_not():
     assert found.endswith(", no rate: no trial is valid")
 
 
+def test_rate_of_a_killed_version_excludes_later_trials():
+    rate = {"crashes": 1, "trials": 13, "certain": Interval(0.001, 0.02), "why_not": ""}
+    rates = (
+        SimpleNamespace(**rate, excluded={"after_unfinished": 1}),
+        SimpleNamespace(**rate, excluded={"after_unfinished": 140, "invalid": 2}),
+    )
+    text = describe_gate(report(head=SideCounts(killed=3), rates=rates))
+    assert "BASE: 1 crash in 13 trials, at least 1.0e-3, at most 0.020 per trial\n" in text
+    assert (
+        "HEAD: 1 crash in 13 trials and 2 invalid, at least 1.0e-3, at most 0.020 per trial; 140 trials after a" in text
+    )
+
+
 def report(verdict="worse", *, base=None, head=None, invalid=0, types=None, **more):
     """Return a gate's report on two hunts, with the given sides in the second."""
     counts = {"pairs": 60, "only_base": 0, "only_head": 8, "both": 1}
