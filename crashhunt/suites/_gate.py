@@ -596,10 +596,10 @@ class _Run:
             return False
         side, state, why = failure
         where = f"{side.upper()} ({self._versions[side]})"
-        if state == "no_valid_trial":
-            raise NoValidTrialError(f"no trial can be set up: {why}", where=where)
         needs = "if the agent needs files that Git does not track, give --build COMMAND"
         fix = needs if self._trees and not self._gate.build else ""
+        if state == "no_valid_trial":
+            raise NoValidTrialError(f"no trial can be set up: {why}", fix=fix, where=where)
         raise HuntDirectoryError(f"the hunt cannot run: {why}", fix=fix, where=where)
 
     def _why_undecided(self) -> str:

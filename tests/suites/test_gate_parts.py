@@ -370,6 +370,19 @@ def test_failed_hunt_is_an_error_of_its_version(tmp_path):
     assert caught.value.where == "HEAD (mine:New)"
 
 
+@pytest.mark.parametrize(
+    ("build", "fix"), [("", "if the agent needs files that Git does not track, give --build COMMAND"), ("make", "")]
+)
+def test_commit_that_cannot_run_without_a_build_is_offered_one(work, tmp_path, monkeypatch, build, fix):
+    for name in ("run_build", "track_built", "copy_built"):
+        monkeypatch.setattr(_gate, name, lambda *words, **more: words[1].mkdir() if len(words) == 2 else None)
+    run = started(of_commits(work, build=build), tmp_path / "g")
+    for state in ("error", "no_valid_trial"):
+        with pytest.raises(CrashhuntError, match="no such file") as caught:
+            run._refuse_failed(paired(failure=lambda state=state: ("head", state, "no such file: build/planner")))
+        assert caught.value.fix == fix
+
+
 def test_version_that_never_starts_is_worse_as_head_and_an_error_as_base(tmp_path):
     run = started(gate(tmp_path), tmp_path / "g")
     never = SideCounts(not_started=9, example="trial 0: ValueError: no weights")
