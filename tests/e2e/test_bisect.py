@@ -76,11 +76,11 @@ def test_a_revision_on_another_branch_that_mended_it_is_reported(tmp_path, monke
         git(tmp_path, "commit", "-qm", code)
 
     def ran(case, folder, tree, modules):
-        return "still" if (tree / "code").read_text().startswith("bad") else "fixed"
+        return "still" if (tree / "code").read_text().startswith("bad") else "fixed", ""
 
     monkeypatch.setattr(_bisect, "_run", ran)
     monkeypatch.setattr(_bisect, "add_case", lambda bundle, to: SimpleNamespace(case=SimpleNamespace(path=to)))
-    monkeypatch.setattr(_bisect, "read_settings", lambda path: SimpleNamespace(agents={}))
+    monkeypatch.setattr(_bisect, "read_settings", lambda path: SimpleNamespace(agents={}, texts={}))
     parts = git(tmp_path, "rev-parse", "main~1")[:12]
     monkeypatch.setenv("GIT_DIR", str(tmp_path / ".git"))  # as in a hook; it goes before git's -C
     monkeypatch.setenv("GIT_INDEX_FILE", str(tmp_path / ".git" / "index"))

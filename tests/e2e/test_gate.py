@@ -155,6 +155,28 @@ def test_commits_are_compared_in_work_trees_of_their_own(repository):
     assert again["pairs"] == found["pairs"]  # the same commits, by another name
 
 
+@pytest.mark.nightly  # by day, suites/test_gate_parts.py and base/test_builds.py
+def test_commits_are_built_and_their_snapshots_contain_what_git_ignores(repository):
+    project, speed = repository.folder, "float((Path(__file__).parent / 'out' / 'speed').read_text())"
+    code = DRIVERS.replace("(self.speed, 0)", f"({speed}, 0)").replace(
+        "\nclass Calm", "\nfrom pathlib import Path\nclass Calm"
+    )
+    for name, metres in (("slow", 3), ("fast", 14)):
+        for file, text in (("drivers.py", code), ("speed.txt", f"{metres}"), (".gitignore", "out/\n")):
+            (project / file).write_text(text)
+        git(project, "add", ".")
+        git(project, "commit", "-qm", name)
+        git(project, "tag", name)
+    build = ("--build", "mkdir -p out && cp speed.txt out/speed")
+    words = (*IN_REPOSITORY, "--keep", "../kept", "--json")
+    found = repository.crashhunt("gate", "slow", "fast", *words, *build, expect=1).json
+    assert (found["verdict"], found["only_base"], found["only_head"]) == ("worse", 0, 8)
+    kept = repository.folder.parent / "kept"
+    assert [path.read_text() for path in sorted(kept.glob("*/snapshots/*/code/@*/out/speed"))] == ["3", "14"]
+    again = repository.crashhunt("gate", "slow", "fast", *words, *build, expect=1).json
+    assert again["pairs"] == found["pairs"]
+
+
 @pytest.mark.nightly
 def test_crash_that_comes_back_in_the_corpus_of_head_is_worse_without_any_trial(repository):
     words = ("--scenario", "../toy", "--agent", CALM, "--arg", "speed=14", "--seed", "1")
@@ -193,6 +215,15 @@ def test_crash_that_comes_back_in_the_corpus_of_head_is_worse_without_any_trial(
         (("drivers:Calm", "drivers:Wild", "--keep", "."), "the folder is not empty, and does not contain"),
         (("drivers:Calm", "drivers:Wild", "--corpus", "no"), "--corpus no is not a folder in HEAD"),
         (("drivers:Calm", "drivers:Wild", "--scenario", "nowhere"), "nowhere"),
+        (
+            ("drivers:Calm", "drivers:Wild", "--build", "make"),
+            "--build is given, but BASE and HEAD are agents; omit it",
+        ),
+        (
+            ("calm", "wild", "--build", "make", "--build-timeout", "soon"),
+            "--build-timeout is 'soon'; give a time above",
+        ),
+        (("calm", "wild", "--build", "echo no; exit 3"), "): --build 'echo no; exit 3' exited with 3: no; "),
         (("drivers:Calm", "drivers:Wild", "--suite", "s.toml"), "--suite and --scenario exclude each other"),
     ],
 )
