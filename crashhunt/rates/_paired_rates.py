@@ -97,10 +97,10 @@ def difference_of_rates(
             return f"trial {unknown.number} has no driven distance and time"
         sides.append(
             _Side(
-                np.array([sum(failures_of(one)[0] for one in unit) for unit in own], float),
-                np.array([math.fsum(exposure_of(one, per) or 0.0 for one in unit) for unit in own], float),
-                np.array([any(len({*failures_of(one)}) > 1 for one in unit) for unit in own], bool),
-                rule.bets(per, step_length_s),
+                events=np.array([sum(failures_of(one)[0] for one in unit) for unit in own], float),
+                exposure=np.array([math.fsum(exposure_of(one, per) or 0.0 for one in unit) for unit in own], float),
+                lost=np.array([any(len({*failures_of(one)}) > 1 for one in unit) for unit in own], bool),
+                bets=rule.bets(per, step_length_s),
             )
         )
     first, second = sides
