@@ -274,7 +274,9 @@ class PairTest:
     def side(self, side: int) -> SideCounts:
         """Return the trials of the first agent (0) or of the second (1) that are invalid for this agent only."""
         unstarted, lost = self.unstarted[side], self.lost[side]
-        killed = sum(not one.has_ended for one in lost)
+        killed = sum(
+            not one.has_ended or (one.failure is not None and one.failure.exit_code is not None) for one in lost
+        )
         example = next((f"trial {one.number}: {_reason_of(one)}" for one in (*unstarted, *lost)), "")
         return SideCounts(not_started=len(unstarted), killed=killed, unknown=len(lost) - killed, example=example)
 

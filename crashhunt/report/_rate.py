@@ -30,6 +30,7 @@ __all__ = [
 ]
 
 _TRAINED_ON = "trained_on"
+_MAX_DIGITS = 9  # of a rate next to a bar
 _REASONS = {
     "invalid": "invalid",
     "not_random": "not drawn at random",
@@ -44,8 +45,8 @@ th, td { text-align: left; padding: .4rem .7rem; border: 1px solid #ccc; }
 """
 
 
-def format_rate(rate: float) -> str:
-    """Return a rate as text with two significant digits: ``0.36``, ``1,200``, ``1.0e-3``.
+def format_rate(rate: float, digits: int = 2) -> str:
+    """Return a rate as text with significant digits, two unless given: ``0.36``, ``1,200``, ``1.0e-3``.
 
     >>> format_rate(0.0010014)
     '1.0e-3'
@@ -55,11 +56,11 @@ def format_rate(rate: float) -> str:
     if rate == 0:
         return "0"
     exponent = math.floor(math.log10(rate))
-    rounded = round(rate, 1 - exponent)
+    rounded = round(rate, digits - 1 - exponent)
     if 0.01 <= rounded < 1e6:
-        digits = max(0, 1 - math.floor(math.log10(rounded)))
-        return f"{rounded:,.{digits}f}"
-    mantissa, _, power = f"{rate:.1e}".partition("e")
+        places = max(0, digits - 1 - math.floor(math.log10(rounded)))
+        return f"{rounded:,.{places}f}"
+    mantissa, _, power = f"{rate:.{digits - 1}e}".partition("e")
     return f"{mantissa}e{int(power)}"
 
 
@@ -150,14 +151,35 @@ def _of_hunt(rates: list[CrashRate]) -> list[str]:
 
 
 def _verdict(rate: CrashRate, bar: float) -> str:
-    shown = f"the bar of {format_rate(bar)} {PER_WORDS[rate.per]}"
+    exact = (format_rate(bar, digits) for digits in range(2, _MAX_DIGITS))
+    text = next((text for text in exact if float(text.replace(",", "")) == bar), f"{bar:g}")
+    shown = f"the bar of {text} {PER_WORDS[rate.per]}"
     if rate.verdict != "undecided":
-        return f"certainly {rate.verdict} {shown}"
+        if rate.certain is None:
+            return f"certainly {rate.verdict} {shown}"
+        end, words = (rate.certain.high, "at most") if rate.verdict == "below" else (rate.certain.low, "at least")
+        return f"certainly {rate.verdict} {shown}: {words} {_format_distinct(end, bar)}"
     if rate.why_undecided:
         return f"undecided about {shown}: {rate.why_undecided}"
     if rate.certain is None:
         return f"undecided about {shown}: there is no rate"
-    return f"undecided: more trials are needed to compare with {shown}"
+    low, high = (_format_distinct(end, bar) for end in rate.certain)
+    return f"undecided, because the rate may be {low} to {high}: more trials are needed to compare with {shown}"
+
+
+def _format_distinct(rate: float, bar: float) -> str:
+    """Return a rate with enough digits to show on which side of a bar it lies.
+
+    >>> _format_distinct(0.00996, 0.01)
+    '9.96e-3'
+    >>> _format_distinct(0.012, 0.01)
+    '0.012'
+    """
+    for digits in range(2, _MAX_DIGITS):
+        text = format_rate(rate, digits)
+        if not math.isfinite(rate) or (float(text.replace(",", "")) - bar) * (rate - bar) > 0:
+            return text
+    return format_rate(rate)
 
 
 def _answer(rate: CrashRate | RatePart) -> str:

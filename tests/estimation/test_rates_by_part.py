@@ -158,7 +158,23 @@ def test_verdict_on_a_bar_is_a_line(tmp_path, crashes, bar, verdict, text):
     (rate,) = measure_rates(hunt(tmp_path / "h", crashes), per="trial", bar=bar)
     assert (rate.verdict, rate.crashes, rate.estimate) == (verdict, crashes, crashes / 40)
     assert (rate.certain.low >= bar) == (verdict == "above")
-    assert f"certainly {verdict} the bar of {text} per trial" in describe_rates([rate])
+    line = describe_rates([rate]).splitlines()[-1]
+    words = "at most" if verdict == "below" else "at least"
+    assert line.startswith(f"  certainly {verdict} the bar of {text} per trial: {words} ")
+    assert (float(line.split()[-1]) < bar) == (verdict == "below")
+
+
+def test_verdict_on_a_bar_and_its_interval_are_on_the_same_side_whatever_is_rounded(tmp_path):
+    (rate,) = measure_rates(hunt(tmp_path / "h", 10), per="trial")
+    for bar, end in ((rate.certain.high * 1.0004, "below"), (rate.certain.low * 0.9996, "above")):
+        (found,) = measure_rates(tmp_path / "h", per="trial", bar=bar)
+        line = describe_rates([found]).splitlines()[-1]
+        assert line.strip().startswith(f"certainly {end}")
+        assert (float(line.split()[-1]) < bar) == (end == "below")
+    (found,) = measure_rates(tmp_path / "h", per="trial", bar=rate.certain.high * 0.9996)
+    line = describe_rates([found]).splitlines()[-1].strip()
+    assert line.startswith("undecided, because the rate may be ")
+    assert float(line.split(" to ")[1].split(":")[0]) > rate.certain.high * 0.9996
 
 
 def test_rate_of_the_trials_up_to_the_decision_of_a_bar(tmp_path):
