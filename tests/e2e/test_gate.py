@@ -31,6 +31,12 @@ class Wild(Calm):
 
 class Twin(Calm):
     pass
+
+
+class Shy(Calm):
+    def reset(self, seed):
+        if seed % 2:
+            raise ValueError("no weights")
 """
 TOY = ("--scenario", "toy", "--set", "gap_m=20:30", "--max-steps", "99", "--parallel", "2")
 CALM, WILD, TWIN = "drivers:Calm", "drivers:Wild", "drivers:Twin"
@@ -82,6 +88,20 @@ def test_worse_agent_fails_the_gate_and_the_hunts_stay_for_compare(drivers):
     assert "the directory contains a gate with other versions, hunts or seeds" in refused.err
     refused = drivers.crashhunt("gate", CALM, WILD, *TOY, *SEED, "--keep", "kept", "--set", "gap_m=5", expect=2)
     assert "--set" in refused.err  # given twice
+
+
+@pytest.mark.nightly  # by day, rates/test_paired_test.py
+def test_agent_that_does_not_start_in_some_trials_is_worse(drivers):
+    done = drivers.crashhunt("gate", CALM, "drivers:Shy", *TOY, *SEED, "--keep", "kept", "--json", expect=1)
+    found = done.json
+    assert (found["verdict"], found["only_head"], found["invalid"]) == ("worse", 8, 0)
+    assert found["not_started"] == {"base": 0, "head": 8}
+    assert "ValueError: no weights" in done.err
+    assert found["difference"]["low"] > 0
+    (pair,) = drivers.crashhunt("compare", "kept", "--json").json["pairs"]
+    assert (pair["answer"], pair["not_started"][0]) == ("first", 0)
+    assert pair["not_started"][1] >= 8
+    assert drivers.crashhunt("gate", "drivers:Shy", CALM, *TOY, *SEED, "--json").json["verdict"] == "better"
 
 
 @pytest.mark.nightly
