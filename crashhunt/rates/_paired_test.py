@@ -361,7 +361,7 @@ def _reason_of(trial: TrialFacts) -> str:
     failure = trial.failure
     if failure is None:
         return "invalid"
-    if failure.exit_code is not None or not failure.traceback:
+    if failure.exit_code is not None or failure.kind == "timeout" or not failure.traceback:
         return failure.message
     place = f" ({failure.agent or failure.party}, {failure.place})" if failure.place else ""
     return f"{failure.kind}: {failure.message}{place}"
