@@ -12,7 +12,7 @@ from crashhunt.native import why_no_link_order, why_not
 version = metadata.version(sys.argv[1])
 if sys.argv[1] == "libsumo":
     reasons = [reason for reason in (why_not(version), why_no_link_order(version)) if reason]
-    todo = "check crashhunt/native against it, then add it to _CHECKED_VERSIONS in _core.py, _generators.py, _link_order.py"
+    todo = "test crashhunt/native with it, then add it to _CHECKED_VERSIONS in its three modules"
 else:
     done = crashhunt.accelerate()
     reasons = [] if done else [f"not accelerated: {done.reason}"]

@@ -236,8 +236,8 @@ def import_module(name: str, *, shown: str = "") -> types.ModuleType:
         raise _not_imported(name, shown or name, error) from error
 
 
-_LIBRARIES_OF_SUMO = ("libGL.so.1", "libX11.so.6", "libXext.so.6", "libXrender.so.1", "libatomic.so.1")
-"""System libraries that libsumo's wheel needs and servers and containers often lack."""
+_DESKTOP_LIBRARIES = ("libGL.so.1", "libX11.so.6", "libXext.so.6", "libXrender.so.1", "libatomic.so.1")
+"""System libraries that simulators with a window link to, and that servers and containers often lack."""
 
 
 def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
@@ -252,7 +252,7 @@ def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
         return PluginError(f"{shown!r} cannot be imported: No module named {missing!r}", fix=fix)
     fix = f"install {missing.partition('.')[0]!r}, or correct the import" if missing else "correct the module"
     if library := re.search(r"(\S+\.so[.\d]*): cannot open shared object file", said):
-        on_debian = " (apt install libgl1 libxext6 libxrender1 libatomic1)" if library[1] in _LIBRARIES_OF_SUMO else ""
+        on_debian = " (apt install libgl1 libxext6 libxrender1 libatomic1)" if library[1] in _DESKTOP_LIBRARIES else ""
         fix = f"install the system library {library[1]}{on_debian}"
     return PluginError(f"{said}, which keeps {shown!r} from being imported", fix=fix, where=place_of(error))
 

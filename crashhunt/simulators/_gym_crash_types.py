@@ -2,7 +2,8 @@
 
 A cell is the set of true flags and short texts of the last ``info``. Unlike the cells of Go-Explore (Ecoffet and
 others, 2021), a cell does not contain the last observation. With coarse levels of the observation, guided hunts found
-fewer planted faults on seven of nine problems, because one fault ended in several cells (`scripts/studies/run search --faults`).
+fewer planted faults on seven of nine problems, because one fault ended in several cells
+(`scripts/studies/run search --faults`).
 """
 
 from __future__ import annotations

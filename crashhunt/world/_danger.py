@@ -18,8 +18,8 @@ Extended time-to-collision measures for road traffic safety assessment, 2001). I
 over the agents counts.
 
 Reason for the integral: it ranks trials better than the maximum over steps, as measured by
-`scripts/studies/run criticality`. Reason for real paths: with constant velocities, every oncoming vehicle in a bend would be
-on a collision course.
+`scripts/studies/run criticality`. Reason for real paths: with constant velocities, every oncoming vehicle in a bend
+would be on a collision course.
 
 Invariant: actors that approach from behind on the same path do not count. The criticality of such actors is the rear
 criticality, a separate number (`followers_danger`).
