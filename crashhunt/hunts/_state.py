@@ -603,6 +603,8 @@ class HuntDirectory:
     def claim(self, settings: HuntSettings, command: list[str], *, overwrite: bool, seed_given: bool) -> HuntSettings:
         """Claim the directory for this hunt, or check that it already has this hunt; return the valid settings.
 
+        A hunt without the result of a trial is replaced.
+
         Args:
             settings: settings of the hunt.
             command: the command line, which is written to ``hunt.toml`` as a comment.
@@ -617,10 +619,13 @@ class HuntDirectory:
         file = self.path / layout.HUNT
         if file.exists():
             before = read_settings(file)
-            if not seed_given:
-                settings = replace(settings, seed=before.seed)
-            differences = before.differences(settings)
-            if differences:
+            resumed = settings if seed_given else replace(settings, seed=before.seed)
+            differences = before.differences(resumed)
+            if not differences:
+                settings = resumed
+            elif not self._has_results():  # the hunt ended before its first trial, often by a mistake in the scenario
+                self._remove_own()
+            else:
                 more = len(differences) - _DIFFERENCES_SHOWN
                 shown = "; ".join(differences[:_DIFFERENCES_SHOWN]) + (f"; and {more} more" if more > 0 else "")
                 raise HuntDirectoryError(
@@ -639,6 +644,19 @@ class HuntDirectory:
         except OSError as error:
             raise self._unusable(error) from error
         return settings
+
+    def _has_results(self) -> bool:
+        """Return whether the hunt in the directory has the result of a trial; a damaged ledger counts as results."""
+        folders = (layout.CRASHES, layout.TRIALS, *layout.BESIDE)
+        if any(path for folder in folders for path in (self.path / folder).glob(layout.SHOWN)):
+            return True
+        if not has_begun(self.path / layout.LEDGER):
+            return any((self.path / layout.SNAPSHOTS).glob(layout.SHOWN))  # which is taken after the ledger exists
+        try:
+            with closing(Ledger(self.path / layout.LEDGER)) as ledger:
+                return bool(ledger.outcomes())
+        except HuntDirectoryError:
+            return True
 
     def _refuse_foreign(self) -> None:
         try:

@@ -365,6 +365,7 @@ def test_directory_keeps_its_hunt_unless_it_is_overwritten(tmp_path):
             return place.claim(settings, ["crashhunt"], **{"overwrite": False, "seed_given": True} | options)
 
     claim(SETTINGS)
+    (tmp_path / "crashes/000001-collision").mkdir(parents=True)
     other = replace(SETTINGS, seed=5)
     with pytest.raises(HuntDirectoryError, match="the directory contains another hunt: seed"):
         claim(other)
@@ -376,12 +377,39 @@ def test_directory_keeps_its_hunt_unless_it_is_overwritten(tmp_path):
         claim(many)
     assert caught.value.message.count(";") == 4
     assert caught.value.message.endswith(" more")
-    (tmp_path / "crashes").mkdir()
     (tmp_path / "mine.txt").touch()
     (tmp_path / ".scratch-of-another").mkdir()
     assert claim(other, overwrite=True).seed == 5
     assert read_settings(tmp_path / layout.HUNT).seed == 5
     assert {path.name for path in tmp_path.iterdir()} == {".lock", layout.HUNT, "mine.txt"}
+
+
+@pytest.mark.parametrize("left", ["nothing", "snapshot", "crash", "kept trial", "row", "damaged ledger", "no ledger"])
+def test_hunt_that_ended_before_its_first_trial_does_not_block_its_directory(tmp_path, left):
+    place, other = HuntDirectory(tmp_path), replace(SETTINGS, max_steps=40)
+    with place.locked():
+        place.claim(SETTINGS, ["crashhunt"], overwrite=False, seed_given=True)
+        ledger = Ledger(tmp_path / layout.LEDGER, writable=True)
+        ledger.enter("error", "the environment does not exist")
+        if left == "row":
+            spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments={}, max_steps=20)
+            ledger.record(TrialResult(spec, Outcome.INVALID), snapshot="")
+        ledger.close()
+        place.has_begun = True
+    folder = {"crash": "crashes/000000-collision", "kept trial": "trials/000000"}.get(left, "snapshots/00")
+    (tmp_path / folder).mkdir(parents=True)
+    if left == "damaged ledger":
+        (tmp_path / layout.LEDGER).write_bytes(b"damaged" * 1000)
+    if left == "no ledger":  # its rows may have been lost with it
+        (tmp_path / layout.LEDGER).unlink()
+    with place.locked():
+        if left in ("nothing", "snapshot"):
+            assert place.claim(other, ["crashhunt"], overwrite=False, seed_given=False) == other
+            assert {path.name for path in tmp_path.iterdir()} == {".lock", layout.HUNT, place.scratch.name}
+        else:
+            with pytest.raises(HuntDirectoryError, match="the directory contains another hunt: max_steps"):
+                place.claim(other, ["crashhunt"], overwrite=False, seed_given=True)
+            assert (tmp_path / folder).exists()
 
 
 def test_logs_are_read_from_their_ends_with_their_titles(tmp_path, monkeypatch):
