@@ -12,10 +12,12 @@ import struct
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, cast
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, InternalError
+from crashhunt.base.exceptions import is_users
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import scratch_of
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, Tag, digest_of, read_black_box, read_header
@@ -24,7 +26,6 @@ from crashhunt.world import ClosestApproach, DangerMeter, DrivenMeter, Lane, clo
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.json_types import ErrorData
@@ -52,7 +53,7 @@ __all__ = [
 
 
 _TAIL_BYTES = 4000  # bytes
-_FRAME_LINE = re.compile(r'  File "(.*)", line \d+ in ')  # of a stack that faulthandler wrote
+_FRAME_LINE = re.compile(r'  File "(.*)", line (\d+) in (.*)')  # of a stack that faulthandler wrote
 _MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside
 
 
@@ -207,6 +208,7 @@ def _result(
             agent = recording.agents[header.agent] if header.agent < len(recording.agents) else ""
             message = f"{message} in {agent}'s constructor or reset()" if agent else message
         agent = agent or agent_in_stack(stack, agents or {})
+        message = f"{message}{_users_frame(stack)}" if outcome is Outcome.HANG else message
         outcome, message = Outcome.INVALID, f"{message} while the episode was being set up"
     elif recording is None:
         message = f"{message}, and its recording cannot be read"
@@ -230,7 +232,8 @@ def _result(
         else:
             agent = agent_in_stack(stack, agents or {})
             whose = f"{agent}'s code" if agent else "the simulator"
-            message = f"{message} in {whose} at step {steps + 1}"
+            where = _users_frame(stack) if outcome is Outcome.HANG else ""
+            message = f"{message} in {whose}{where} at step {steps + 1}"
     failure = Failure(kind=kind, message=message, traceback=stack, agent=agent, exit_code=exit_code, last_output=output)
     wall_s = time.monotonic() - header.started if header is not None else 0.0
     result = TrialResult(
@@ -279,6 +282,17 @@ def agent_in_stack(stack: str, agents: Mapping[str, str]) -> str:
         if named:
             return named[0] if len(named) == 1 else ""
     return ""
+
+
+def _users_frame(stack: str) -> str:
+    """Return the innermost function of the user in a stack as text in brackets; empty if there is none."""
+    frames = (
+        found
+        for line in stack.rpartition("(most recent call first):")[2].splitlines()
+        if (found := _FRAME_LINE.match(line))
+    )
+    frame = next((frame for frame in frames if is_users(frame[1])), None)
+    return "" if frame is None else f" ({Path(frame[1]).name}, line {frame[2]} in {frame[3]})"
 
 
 def read_map(scratch: Path, trial: Path) -> list[Lane]:

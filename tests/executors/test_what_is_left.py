@@ -90,6 +90,20 @@ def test_a_death_elsewhere_is_no_agents(begun, phase, at, words, agent):
     assert hung.failure.message.startswith("still running after 2.5 s ")
 
 
+def test_hang_names_the_function_of_the_user_that_does_not_return(begun, phase):
+    lines = ["Thread 0x1 (most recent call first):", '  File "/mine/other.py", line 1 in wait', "",
+             "Thread 0x2 (most recent call first):", f'  File "{json.__file__}", line 2 in sleep',
+             f'  File "{layout.PACKAGE}/base/text.py", line 3 in near', '  File "/mine/envs.py", line 4 in close',
+             '  File "/mine/envs.py", line 5 in step']  # fmt: skip
+    (scratch_of(begun, 7) / layout.STACK).write_text("\n".join(lines))
+    phase(Phase.SIMULATE)
+    message = _postmortem.hung(SPEC, begun, 2.5).failure.message
+    assert message == "still running after 2.5 s in the simulator (envs.py, line 4 in close) at step 13"
+    phase(Phase.SETUP)
+    message = _postmortem.hung(SPEC, begun, 2.5).failure.message
+    assert message == "still running after 2.5 s (envs.py, line 4 in close) while the episode was being set up"
+
+
 def test_before_the_first_step_it_is_no_crash(begun, tmp_path, phase):
     other = TrialSpec(8, 1, {"ego": {}}, {}, 99)
     nothing = _postmortem.died(other, tmp_path, 3)
