@@ -20,6 +20,7 @@
     └── EpisodeError               raised inside an episode; becomes the trial's outcome
         ├── InvalidEpisodeError    the episode could not be set up
         ├── ActionError            the agent returned something outside its action space
+        ├── UnusableValueError     a value of the user's code is neither a bool nor a number; ends the hunt
         └── SimulatorError         the simulator failed
 """
 
@@ -53,6 +54,7 @@ __all__ = [
     "SimulatorError",
     "SnapshotError",
     "UntrustedError",
+    "UnusableValueError",
     "UsageError",
     "WorkerError",
     "remedy",
@@ -200,6 +202,10 @@ class InvalidEpisodeError(EpisodeError):
 
 class ActionError(EpisodeError):
     """The agent returned something outside its action space."""
+
+
+class UnusableValueError(EpisodeError):
+    """A value of the user's code that crashhunt compares is neither a bool nor a number."""
 
 
 class SimulatorError(EpisodeError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
@@ -12,10 +13,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 __all__ = [
+    "InterruptedCodeError",
     "block_signals",
     "blocked_signals",
     "describe_death",
     "ended_by_signals",
+    "interrupted_after",
     "is_interrupt",
     "is_sent_from_outside",
     "remember_interrupts",
@@ -66,6 +69,43 @@ def is_interrupt(error: BaseException | None) -> bool:
         seen.add(id(error))
         error = error.__cause__
     return False
+
+
+@contextmanager
+def interrupted_after(seconds: float) -> Iterator[None]:
+    """Return a context whose code is interrupted by an `InterruptedCodeError` if it does not end in time.
+
+    In a thread that is not the main thread, signal handlers cannot be set, so the code is not interrupted.
+
+    Args:
+        seconds: wall time after which the code is interrupted; once a second from then on.
+
+    Raises:
+        InterruptedCodeError: the code did not end in time.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(_number: int, _frame: object) -> None:
+        raise _TimeIsUpError
+
+    handler, timer = signal.signal(signal.SIGALRM, interrupt), signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)
+    try:
+        yield
+    except _TimeIsUpError:
+        raise InterruptedCodeError from None
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, *timer)
+        signal.signal(signal.SIGALRM, handler if handler is not None else signal.SIG_DFL)
+
+
+class InterruptedCodeError(TimeoutError):
+    """The code in a context of `interrupted_after` did not end in time."""
+
+
+class _TimeIsUpError(BaseException):
+    """The code in a context of `interrupted_after` has run too long; code that catches `Exception` does not see it."""
 
 
 class _EndedError(BaseException):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import traceback
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -15,6 +16,7 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, InternalError
 from crashhunt.base.exceptions import format_error, in_words, is_users
 from crashhunt.base.resources import limit_behind
+from crashhunt.base.scalars import describe_value, number_of, truth_of
 from crashhunt.base.text import count_of
 from crashhunt.oracles import Finding
 from crashhunt.simulators import RunsForeignCode
@@ -43,6 +45,7 @@ __all__ = [
 _RESOURCE_ERRORS: Final = (OSError, MemoryError)
 _MAX_CAUSES: Final = 16
 _MAX_FRAMES: Final = 2_000
+_STEP_FIX: Final = "return one number or bool for each agent from step()"
 _REPORT_FIX: Final = "report it with the output of the same command with CRASHHUNT_TRACEBACK=1: {}"
 _ISSUES_URL: Final = "https://github.com/crashhunt/crashhunt/issues"
 
@@ -142,10 +145,12 @@ def guarded_step(step: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def checked(actions: object) -> tuple[object, ...]:
         observations, rewards, terminations, truncations, infos = step(actions)
         _arrays(observations)
-        for reward in rewards.values():
-            float(reward)
-        dict(terminations), dict(truncations)
-        return observations, rewards, terminations, truncations, infos
+        rewards = {name: number_of(value, f"rewards[{name!r}]", _STEP_FIX) for name, value in rewards.items()}
+        ended, cut = (
+            {name: truth_of(value, f"{what}[{name!r}]", _STEP_FIX) for name, value in flags.items()}
+            for what, flags in (("terminations", terminations), ("truncations", truncations))
+        )
+        return observations, rewards, ended, cut, infos
 
     return Boundary(Party.SIMULATOR, "step").around(checked)
 
@@ -166,7 +171,10 @@ def guarded_check(check: Callable[..., Any]) -> Callable[..., Sequence[Finding]]
     """Return the check of a user's oracle, wrapped so that its exceptions name their origin."""
 
     def checked(scene: Scene, agents: Sequence[str]) -> Sequence[Finding]:
-        found = list(check(scene, agents) or ())
+        given: Any = check(scene, agents)
+        if not isinstance(given, Iterable) and given not in (None, False):
+            raise TypeError(f"check() returned {describe_value(given)}; it must return a list of Finding")
+        found = list(given or ())
         for one in found:
             if not isinstance(one, Finding):
                 raise TypeError(f"check() returned a {type(one).__name__}; it must return a list of Finding")

@@ -13,13 +13,20 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.agents import Closes
 from crashhunt.base.boundaries import ForeignError, Party
 from crashhunt.base.capabilities import supports
-from crashhunt.base.errors import ActionError, EpisodeError, InvalidEpisodeError, RecorderError, SimulatorError
+from crashhunt.base.errors import (
+    ActionError,
+    EpisodeError,
+    InvalidEpisodeError,
+    RecorderError,
+    SimulatorError,
+    UnusableValueError,
+)
 from crashhunt.base.exceptions import class_name, format_error, is_users, message_of
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import blocked_signals
 from crashhunt.episode._blame import Blame, blame, internal_error, party_of_simulator
 from crashhunt.scenario import Scenario
-from crashhunt.trial import Failure, Outcome, TrialResult
+from crashhunt.trial import UNUSABLE_VALUE, Failure, Outcome, TrialResult
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -53,6 +60,7 @@ _MIN_RECURSION_LIMIT: Final = 1000
 _PARTY_BY_ERROR: tuple[tuple[type[BaseException], str], ...] = (
     (ActionError, "bad action"),
     (InvalidEpisodeError, "invalid"),
+    (UnusableValueError, UNUSABLE_VALUE),
     (SimulatorError, "simulator error"),
 )
 
@@ -69,7 +77,7 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str 
     """
     with blocked_signals(), _deep_enough():
         # crashhunt's own messages are complete, so they need no traceback.
-        text = "" if issubclass(type(error), InvalidEpisodeError) else format_error(error)
+        text = "" if issubclass(type(error), InvalidEpisodeError | UnusableValueError) else format_error(error)
         words = message_of_error(error)
         # A class of a user's may have a metaclass of any kind, so nothing is looked up by it.
         kind = next((kind for one, kind in _PARTY_BY_ERROR if type(error) is one), None) or class_name(error)

@@ -20,7 +20,7 @@ from crashhunt.executors import SharedExecutors, make_executor, read_map
 from crashhunt.hunts._crashes import prune_bundles, tally_crashes
 from crashhunt.hunts._fork_results import ForkCrashes, keep_near_misses, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace, Trials, Unanswered, settings_of_workers
-from crashhunt.hunts._preflight import Preflight, WorkerNotices, is_hopeless, why_invalid
+from crashhunt.hunts._preflight import Preflight, WorkerNotices, is_hopeless, unusable_value, why_invalid
 from crashhunt.hunts._progress import HuntStatus, PhaseClock, PhaseStatus, Progress, RemainingTime
 from crashhunt.hunts._rates import bar_watch, forcings_of, rare_watch, rate_watch, refuse_training_traffic
 from crashhunt.hunts._reports import HuntReport, StoppedBecause
@@ -378,6 +378,7 @@ class Hunt:
         in_flight: set[int] = set()
         confirmation = Confirmation(runs_again, executor)
         heartbeat = 0.0
+        unusable: ScenarioError | None = None
         progress.until = time.monotonic() + run.duration_s
         progress.remaining = RemainingTime(time.monotonic())
         try:
@@ -397,13 +398,14 @@ class Hunt:
                         in_flight.discard(result.spec.number)
                         for known in preflight.filter_setup_failures(audit.add(result)):
                             self._record_trial(known, ledger, snapshot, trials, progress)
+                            unusable = unusable or unusable_value(known)
                         if progress.last_wanted is not None:
                             in_flight = self._cancelled(executor, in_flight, progress.last_wanted)
                             if not run.deterministic:
                                 break
                 if self._copied.look(lambda: watch(self._status(progress, "confirming"))):
                     in_flight = self._cancelled(executor, in_flight, min(progress.copied))
-                if self._stops:
+                if self._stops or unusable is not None:
                     break
                 if not finished and is_hopeless(settings, progress.outcomes):
                     return "no_valid_trial"
@@ -422,6 +424,8 @@ class Hunt:
                 watch(self._status(progress, "saving"))
                 self._save(crash, ledger, snapshot, progress)
             executor.close()
+            if unusable is not None:  # the trial is recorded as a failure of the environment
+                raise unusable
             self._finish_audit(runs_again.phases, executor, audit, ledger, progress)
             if progress.last_wanted is not None:
                 return progress.why_stopped(keep_going=run.keep_going)

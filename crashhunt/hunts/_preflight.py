@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.errors import ArgumentError, CrashhuntError, SimulatorError, UsageError
+from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, SimulatorError, UsageError
 from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import is_sent_from_outside, stop_requests
 from crashhunt.base.temporary import temporary_folder
@@ -23,7 +23,7 @@ from crashhunt.executors import EXCLUDED_WORDS, worker_environment
 from crashhunt.plans import read_settings
 from crashhunt.scenario import as_plain_data, scenario_digest
 from crashhunt.snapshots import latest_snapshot
-from crashhunt.trial import Constant, Outcome
+from crashhunt.trial import UNUSABLE_VALUE, Constant, Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["Preflight", "TrafficSurveyor", "WorkerNotices", "is_hopeless", "why_invalid"]
+__all__ = ["Preflight", "TrafficSurveyor", "WorkerNotices", "is_hopeless", "unusable_value", "why_invalid"]
 
 
 _MAX_INVALID_AT_START = 10  # trials; if none of so many could begin, the setup is wrong, not the seed
@@ -73,7 +73,10 @@ class Preflight:
 
         Raises:
             ArgumentError: the agent does not start in any trial.
+            ScenarioError: the first trial has a value that crashhunt cannot compare.
         """
+        if not self._passed and (error := unusable_value(result)) is not None:
+            raise error
         if self._passed or not self._is_of_an_agent(result):
             if not self._passed:
                 self._listen()
@@ -175,6 +178,18 @@ class WorkerNotices:
         agents = ", ".join(dict.fromkeys(chosen.agent for chosen in self._settings.agents.values()))
         fix = f"correct {agents}, or omit {flags}"
         return UsageError(f"{flags}: trials with {agents} cannot be copied: {why}", fix=fix)
+
+
+def unusable_value(result: TrialResult) -> ScenarioError | None:
+    """Return the error about a value of the user's code that is neither a bool nor a number; None if there is none.
+
+    Whether such a trial has crashed is unknown, so the hunt ends and its crash rule has to be corrected.
+    """
+    failure = result.failure
+    if failure is None or failure.kind != UNUSABLE_VALUE or failure.agent:
+        return None
+    when = f"step {result.steps + 1} of trial {result.spec.number} (seed {result.spec.seed})"
+    return ScenarioError(f"{failure.message}", where=when)
 
 
 def is_hopeless(settings: HuntSettings, outcomes: Mapping[str, int]) -> bool:

@@ -364,6 +364,10 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
     for key in _INTERNAL_FIELDS:
         if key in data:
             raise ScenarioError(f"unknown key {key!r}", fix="remove it", where=str(path))
+    if kept:  # a snapshot of an earlier version means what this version did
+        for name, table in data.items():
+            if isinstance(table, dict) and (backend := backend_of(name)) is not None:
+                data[name] = {**backend.implied, **table}
     scenario = scenario_from_dict(data, where=str(path), folder=path.resolve().parent, tolerant=kept)
     scenario = replace(scenario, file=path.name)
     check_arguments(scenario, kept=kept)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -10,15 +9,15 @@ import numpy as np
 
 from crashhunt.base.boundaries import Boundary, Party
 from crashhunt.base.errors import ActionError
+from crashhunt.base.scalars import describe_value, is_masked
 
 if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-__all__ = ["META_ACTIONS", "MetaAction", "SpaceAction", "SpeedAndLaneChange", "cast", "describe_action", "is_masked"]
+__all__ = ["META_ACTIONS", "MetaAction", "SpaceAction", "SpeedAndLaneChange", "cast"]
 
 MAX_TARGET_SPEED = 100.0  # m/s; a Box space needs a finite bound, and no road vehicle is faster
-_MAX_ACTION_CHARACTERS = 200  # of an action in an error message
 _ACTION_BOUNDARY = Boundary(Party.ENVIRONMENT, "action conversion")
 META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 """The meta-actions in the order of highway-env's DiscreteMetaAction."""
@@ -58,7 +57,7 @@ class SpeedAndLaneChange:
         except Exception:  # the agent's object may raise anything when it is compared
             pass
         fix = f"return a speed within 0 and {MAX_TARGET_SPEED:g} m/s, and -1, 0 or 1"
-        raise ActionError(f"the action {describe_action(action)} is not (target_speed, lane_change)", fix=fix)
+        raise ActionError(f"the action {describe_value(action)} is not (target_speed, lane_change)", fix=fix)
 
 
 class SpaceAction:
@@ -84,7 +83,7 @@ class SpaceAction:
             array = cast(action, self._dtype)
         if array is None or not self._contains(array):
             raise ActionError(
-                f"the action {describe_action(action)} is not in {self.space}", fix="return an action in this space"
+                f"the action {describe_value(action)} is not in {self.space}", fix="return an action in this space"
             )
         return array
 
@@ -140,18 +139,3 @@ def cast(action: object, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
     if not np.all(same):
         raise ValueError("the data type of the action space cannot represent the value")
     return array
-
-
-def is_masked(action: object) -> bool:
-    """Return whether the value is an array with a masked element."""
-    ma = sys.modules.get("numpy.ma")  # NumPy imports this module on first use, so without it no masked array exists
-    return ma is not None and isinstance(action, ma.MaskedArray) and bool(ma.is_masked(action))
-
-
-def describe_action(action: object) -> str:
-    """Return the text of an agent's action for an error message: one line of at most 200 characters."""
-    try:
-        text = " ".join(repr(action).split())
-    except Exception as error:
-        text = f"of class {type(action).__name__}, whose repr raises {type(error).__name__},"
-    return text if len(text) <= _MAX_ACTION_CHARACTERS else f"{text[: _MAX_ACTION_CHARACTERS - 1]}…"

@@ -8,12 +8,14 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from gymnasium import Space, spaces
+from gymnasium import Env, Space, Wrapper, spaces
+from gymnasium.wrappers import TimeLimit
 
 from crashhunt.base.boundaries import Boundary, Party
 from crashhunt.base.errors import ActionError
+from crashhunt.base.scalars import describe_value, is_masked
 from crashhunt.recording import OPAQUE_SHAPE, decode_value, encode_value
-from crashhunt.simulators._actions import SpaceAction, cast, describe_action, is_masked
+from crashhunt.simulators._actions import SpaceAction, cast
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,9 +35,11 @@ __all__ = [
     "OpaqueSpace",
     "action_form",
     "as_tables",
+    "has_nan",
     "merge",
     "native",
     "reseed_in_place",
+    "time_limit_of",
 ]
 
 
@@ -110,8 +114,21 @@ class ObservationForm:
         flat = spaces.flatten(self.original, observation)
         # Outside the space, a number may become another one without an error: a Discrete -1 becomes the largest.
         if not self.original.contains(observation) and not _equal(spaces.unflatten(self.original, flat), observation):
-            raise ValueError(f"the observation {describe_action(observation)} does not have the form of its space")
+            raise ValueError(f"the observation {describe_value(observation)} does not have the form of its space")
         return flat
+
+
+def has_nan(observation: object) -> bool:
+    """Return whether an observation of any space contains NaN."""
+    if isinstance(observation, Mapping):
+        return any(map(has_nan, observation.values()))
+    if isinstance(observation, list | tuple):
+        return any(map(has_nan, observation))
+    return isinstance(observation, float | np.ndarray | np.generic) and _is_nan(np.asarray(observation))
+
+
+def _is_nan(array: NDArray[Any]) -> bool:
+    return array.dtype.kind in "fc" and bool(np.isnan(array).any())
 
 
 class OpaqueSpace(Space[Any]):
@@ -261,7 +278,7 @@ class FlatAction:
             inside = False
         if not inside:
             raise ActionError(
-                f"the action {describe_action(action)} is not in {self.space}", fix="return an action in this space"
+                f"the action {describe_value(action)} is not in {self.space}", fix="return an action in this space"
             )
         return array
 
@@ -291,7 +308,7 @@ class OpaqueAction:
             if self._contains(self._values.restore(given)):
                 return given
         raise ActionError(
-            f"the action {describe_action(action)} is not in {self.space}", fix="return an action in this space"
+            f"the action {describe_value(action)} is not in {self.space}", fix="return an action in this space"
         )
 
     def restore(self, array: NDArray[np.generic]) -> object:
@@ -359,3 +376,13 @@ def reseed_in_place(generator: np.random.Generator | np.random.RandomState, seed
         generator.seed(seed)
         return
     generator.bit_generator.state = type(generator.bit_generator)(seed).state
+
+
+def time_limit_of(env: Env[Any, Any]) -> int | None:
+    """Return the number of steps after which a wrapper of an environment truncates its episodes; None without it."""
+    limits = []
+    while isinstance(env, Wrapper):
+        if isinstance(env, TimeLimit):
+            limits.append(env._max_episode_steps)
+        env = env.env
+    return min(limits, default=None)

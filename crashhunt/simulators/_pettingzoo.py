@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol, TypeGuard
 
 import gymnasium
 import numpy as np
 
 from crashhunt.base.capabilities import members, supports
+from crashhunt.base.scalars import truth_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
 __all__ = ["OneLearner", "is_parallel", "takes_turns"]
+
+_STEP_PARTS = ("observations", "rewards", "terminations", "truncations", "infos")
+_FIX = "return a bool for each agent"
 
 
 class TakesTurns(Protocol):
@@ -86,7 +91,7 @@ class OneLearner(gymnasium.Env[Any, Any]):
             raise RuntimeError(f"the learner {self._learner!r} is missing in the first step of the environment")
         return self._seen[self._learner], dict(self._infos.get(self._learner, {}))
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Let all agents act, and return the learner's results of the step."""
         learner = self._learner
         actions = {
@@ -95,12 +100,17 @@ class OneLearner(gymnasium.Env[Any, Any]):
             if name in self._seen
         }
         before = self._seen[learner]
-        self._seen, rewards, ended, cut, self._infos = self._parallel.step(actions)
-        over = ended.get(learner, True)
-        gone = not over and learner not in self._parallel.agents and not cut.get(learner, False)
+        returned = self._parallel.step(actions)
+        for part, name in zip(returned, _STEP_PARTS, strict=False):
+            if not isinstance(part, Mapping):
+                raise TypeError(f"step() returned {name} = {part!r:.80}, which is not a dictionary by agent")
+        self._seen, rewards, ended, cut, self._infos = returned
+        over = truth_of(ended.get(learner, True), f"terminations[{learner!r}]", _FIX)
+        is_cut = truth_of(cut.get(learner, False), f"truncations[{learner!r}]", _FIX)
+        gone = not over and not is_cut and learner not in self._parallel.agents
         shown = self._seen.get(learner, before)
         info = dict(self._infos.get(learner, {}))
-        return shown, float(rewards.get(learner, 0.0)), bool(over or gone), bool(cut.get(learner, False)), info
+        return shown, rewards.get(learner, 0.0), over or gone, is_cut, info
 
     def render(self) -> Any:
         """Return what the environment renders."""

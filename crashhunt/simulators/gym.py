@@ -6,23 +6,34 @@ Scenes of such environments have no actors: recordings contain observations and 
 from __future__ import annotations
 
 import logging
+import math
 import warnings
 from collections.abc import Mapping
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
-import numpy as np
 
 from crashhunt.base.boundaries import Boundary, ForeignError, Party
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.base.exceptions import in_words, place_of
 from crashhunt.base.plugins import load_object
-from crashhunt.base.text import did_you_mean, encodable, one_of
+from crashhunt.base.scalars import number_of, truth_of
+from crashhunt.base.signals import InterruptedCodeError, interrupted_after
+from crashhunt.base.text import count_of, did_you_mean, encodable, one_of
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.gym import GymSetup
 from crashhunt.simulators._gym_crash_types import crash_cell
-from crashhunt.simulators._gymnasium import ObservationForm, action_form, as_tables, merge, native, reseed_in_place
+from crashhunt.simulators._gymnasium import (
+    ObservationForm,
+    action_form,
+    as_tables,
+    has_nan,
+    merge,
+    native,
+    reseed_in_place,
+    time_limit_of,
+)
 from crashhunt.simulators._pettingzoo import OneLearner, is_parallel, takes_turns
 from crashhunt.world import Contact, Roster, Scene
 
@@ -30,6 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.scenario import Scenario
@@ -45,6 +57,12 @@ _RESET_PARTS = ("observation", "info")
 _STEP_PARTS = ("observation", "reward", "terminated", "truncated", "info")
 _CRASH_KIND_KEY = "crash_kind"
 _MAX_KIND_CHARACTERS = 80
+_MAX_CLOSE_S = 5.0
+"""Wall time that an environment may need to close; Unity and CARLA need some seconds."""
+_WRAP_FIX = "return a number from step(), or name a function in gym.id that wraps the environment"
+_INFO_FIX = "set gym.crash.function to a function that returns a bool, instead of gym.crash.info"
+_FUNCTION_FIX = "return True or False from gym.crash.function, or a text that describes the crash"
+_DANGER_FIX = "name a key of info in gym.danger whose value is a number"
 _CONSTRUCTOR, _RESET, _STEP, _REWARD, _INFO, _CLOSE = (
     Boundary(Party.ENVIRONMENT, place) for place in ("constructor", "reset", "step", "reward", "info", "close")
 )
@@ -55,7 +73,7 @@ class GymSimulator:
 
     Scenario arguments are keyword arguments of the environment, or entries of the options of its reset. When the
     crash rule holds, the step has a collision without a collision partner. An episode that ends without a crash has
-    finished. The environment's own step limit is disabled.
+    finished, also by the environment's own time limit. The environment has the wrappers with which it is registered.
 
     Args:
         scenario: The scenario to run.
@@ -72,15 +90,17 @@ class GymSimulator:
         self.step_length_s = scenario.step_length_s
         self._factory = self._find()
         self._others = load_object(self._setup.others) if self._setup.others else None
-        self._rule = _Rule(self._setup.crash)
+        self._rule = _Rule(self._setup.crash, self._number)
         self._near, _, self._key = self._setup.danger.partition("info.")
         self.named_danger: float | None = None
         self.crash_cell = ""
         self.agents: list[str] = []
         self.notices: dict[str, None] = {}
         self._steps = 0
+        self._is_open = False
         try:
             self._adopt(self._make(self._configured(argument_values(scenario))[0]))  # to read its spaces
+            self._close()  # here, because the time of a trial does not include it
         except ForeignError as error:
             place = place_of(error.error)
             what = f"its {error.place} fails{f' at {place}' if place else ''}: {in_words(error.error)}"
@@ -120,19 +140,28 @@ class GymSimulator:
         action = native(self.actions[self._agent], actions[self._agent])
         with _STEP:
             observation, reward, ended, cut, info = _parts("step", self._env.step(action), _STEP_PARTS)
-        with _REWARD:  # these may be objects of any class
-            reward, terminated, truncated = float(reward), bool(ended), bool(cut)
         self._steps += 1
+        with _REWARD:  # these may be objects of any class
+            reward = self._number(reward, "the reward", _WRAP_FIX)
+            terminated, truncated = (
+                truth_of(ended, "terminated", _WRAP_FIX),
+                truth_of(cut, "truncated", _WRAP_FIX),
+            )
         with _INFO:  # the crash rule may be a function of the user's
             if self._steps == 1 and (key := self._setup.crash.info) and key not in info:
                 self._report_misspelt_key(key, info)
             what = self._rule(observation, reward, terminated, truncated, info)
             if what and not self._crashed:
                 self.crash_cell = "" if self._rule.has_named else crash_cell(info)
-            reported = info[self._key] if self._key and self._key in info else None
+            danger = math.nan
+            if self._key and self._key in info:
+                danger = self._number(info[self._key], f"gym.danger = {self._setup.danger!r}", _DANGER_FIX)
         self._look(what)
-        if reported is not None:
-            self._record_danger(reported)
+        self._record_danger(danger)
+        if truncated and not terminated and self._steps == time_limit_of(self._env):
+            fix = '; set gym.time_limit = "none" to lift it' if self._is_registered else ""
+            what = f"ends an episode after {count_of(self._steps, 'step')}, which is its own time limit"
+            self._notice(f"the environment {self._setup.id!r} {what}{fix}")
         over = terminated or truncated or self._crashed
         if over:
             self.agents = []
@@ -153,11 +182,17 @@ class GymSimulator:
 
     def _close(self) -> None:
         """Close the environment; report a failure once per hunt, because it cannot affect the episode."""
+        if not self._is_open:
+            return
+        self._is_open = False
         try:
-            with _CLOSE:
+            with _CLOSE, interrupted_after(_MAX_CLOSE_S):
                 self._env.close()
         except ForeignError as error:
-            self._notice(f"the environment {self._setup.id!r} cannot be closed: {in_words(error.error)}")
+            what = f"cannot be closed: {in_words(error.error)}"
+            if isinstance(error.error, InterruptedCodeError):
+                what = f"cannot be closed: its close() was stopped after {_MAX_CLOSE_S:g} s"
+            self._notice(f"the environment {self._setup.id!r} {what}")
 
     def _recorded_observation(self, observation: object) -> NDArray[np.generic]:
         """Return an observation in its recorded form; report an observation outside of the space once per hunt.
@@ -167,7 +202,7 @@ class GymSimulator:
         array = self._form.encode(observation)
         if not self._form.contains(observation, array):
             what = "outside its own observation space"
-            if array.dtype.kind == "f" and np.isnan(array).any():
+            if has_nan(observation):
                 what = "that contains NaN"
             self._notice(f"the environment {self._setup.id!r} shows its agent an observation {what}")
         return array
@@ -187,11 +222,12 @@ class GymSimulator:
 
     def _find(self) -> Callable[..., object]:
         name = self._setup.id
-        if name.partition(":")[2].isidentifier():
+        self._is_registered = not name.partition(":")[2].isidentifier()
+        if not self._is_registered:
             factory: Callable[..., object] = load_object(name)
             return factory
-        # The trial limits the number of steps, not the environment.
-        return lambda **kwargs: gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True, **kwargs)
+        lifted = {"max_episode_steps": -1} if self._setup.time_limit == "none" else {}
+        return lambda **kwargs: gymnasium.make(name, **{**lifted, **kwargs})
 
     def _configured(self, arguments: Mapping[str, Value]) -> tuple[dict[str, object], dict[str, object] | None]:
         """Return the keyword arguments of the environment, and the options of its reset."""
@@ -245,7 +281,7 @@ class GymSimulator:
         return ScenarioError(text, fix=fix, where=self._scenario.origin)
 
     def _adopt(self, env: gymnasium.Env[Any, Any]) -> None:
-        self._env = env
+        self._env, self._is_open = env, True
         with _CONSTRUCTOR:
             spaces = env.observation_space, env.action_space
         for name, space in zip(("observation_space", "action_space"), spaces, strict=True):
@@ -257,13 +293,20 @@ class GymSimulator:
         self.shown_spaces = {self._agent: self._form.original} if self._form.structured else {}
         self.actions: dict[str, ActionForm] = {self._agent: action_form(spaces[1])}
 
-    def _record_danger(self, reported: Any) -> None:
-        try:
-            value = float(reported)
-        except (TypeError, ValueError):
-            message = f"gym.danger = {self._setup.danger!r} is {reported!r:.80}; it must be a number"
-            raise self._mistake(message) from None
-        if not np.isnan(value):
+    def _number(self, value: object, what: str, fix: str) -> float:
+        """Return a number of the environment; report NaN once per hunt, because no comparison with it holds.
+
+        Raises:
+            UnusableValueError: the value is neither a bool nor a number.
+        """
+        number = number_of(value, what, fix)
+        if math.isnan(number):
+            words = "NaN is not compared, so such a step is no crash by this value"
+            self._notice(f"{what} is NaN in the environment {self._setup.id!r}: {words}")
+        return number
+
+    def _record_danger(self, value: float) -> None:
+        if not math.isnan(value):
             found = 1 / (1 + max(0.0, value)) if self._near else min(1.0, max(0.0, value))
             self.named_danger = max(found, self.named_danger or 0.0)
 
@@ -299,8 +342,9 @@ def _parts(method: str, returned: Any, wanted: tuple[str, ...]) -> Sequence[Any]
 
 
 class _Rule:
-    def __init__(self, rule: CrashRule) -> None:
+    def __init__(self, rule: CrashRule, number: Callable[[object, str, str], float]) -> None:
         self._rule = rule
+        self._number = number
         self._function = load_object(rule.function) if rule.function else None
         self._kind = load_object(rule.kind) if rule.kind else None
         self.has_named = False
@@ -319,12 +363,20 @@ class _Rule:
 
     def _find(self, observation: object, reward: float, terminated: bool, truncated: bool, info: Info) -> str:
         rule = self._rule
-        if rule.info and info.get(rule.info):
+        if rule.info and rule.info in info and self._is_true(info[rule.info], f"info[{rule.info!r}]", _INFO_FIX):
             return rule.info
         if rule.reward_below is not None and reward < rule.reward_below:
             return f"reward {reward:g}"
         if self._function is not None:
             found = self._function(observation, reward, terminated, truncated, info)
-            if found:
-                return encodable(found) if isinstance(found, str) else self._rule.function
+            if isinstance(found, str):
+                if found:
+                    return encodable(found)
+            elif found is not None and self._is_true(found, f"the result of {rule.function}", _FUNCTION_FIX):
+                return rule.function
         return "terminated" if rule.termination and terminated else ""
+
+    def _is_true(self, value: object, what: str, fix: str) -> bool:
+        """Return whether a value means a crash; NaN is neither true nor false, and is reported."""
+        number = self._number(value, what, fix)
+        return number != 0 and not math.isnan(number)

@@ -14,7 +14,13 @@ from ._disturbance import (
     steps_of as steps_of,
     why_not as why_not,
 )
-from ._evidence import KILLED as KILLED, Collision as Collision, Escape as Escape, Failure as Failure
+from ._evidence import (
+    KILLED as KILLED,
+    UNUSABLE_VALUE as UNUSABLE_VALUE,
+    Collision as Collision,
+    Escape as Escape,
+    Failure as Failure,
+)
 from ._outcome import (
     CRASHES as CRASHES,
     EVENTS as EVENTS,

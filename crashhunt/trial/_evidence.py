@@ -12,10 +12,12 @@ from crashhunt.base.codec import OMIT_DEFAULT, Serializable, null_is
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.base.text import encodable
 
-__all__ = ["KILLED", "Collision", "Escape", "Failure"]
+__all__ = ["KILLED", "UNUSABLE_VALUE", "Collision", "Escape", "Failure"]
 
 KILLED: Final = "killed from outside"
 """Kind of the failure of a trial whose processes were killed from outside until no attempt was left."""
+UNUSABLE_VALUE: Final = "unusable value"
+"""Kind of the failure of a trial in which a value of the user's code is neither a bool nor a number."""
 _OF_SURROUNDINGS: Final = frozenset({
     errno.EAGAIN, errno.ECONNREFUSED, errno.ECONNRESET, errno.EDQUOT, errno.EHOSTUNREACH, errno.EIO, errno.EMFILE,
     errno.ENETUNREACH, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EROFS, errno.ESTALE, errno.ETIMEDOUT,
@@ -97,7 +99,8 @@ class Failure(Serializable):
     """The evidence of a software fault.
 
     Args:
-        kind: The exception's type, ``exit code``, ``signal``, ``timeout`` or ``killed from outside``.
+        kind: The exception's type, ``exit code``, ``signal``, ``timeout``, ``unusable value`` or ``killed from
+            outside``.
         message: The message of the exception or failure, in one line.
         traceback: The traceback of the exception, or the stack of the stuck thread.
         agent: The agent whose code failed; empty if the code was not an agent's.

@@ -19,7 +19,7 @@ from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace
 from crashhunt.hunts._state import ledger_owner
 from crashhunt.ledger import Ledger
-from crashhunt.trial import Branches, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import UNUSABLE_VALUE, Branches, Failure, Outcome, TrialResult, TrialSpec
 
 TOY = """
 title = "A toy"
@@ -123,6 +123,21 @@ def test_loop_submits_as_many_trials_as_workers_need_and_ends_with_the_last(run)
     assert all(status.disturbed is None and status.kinds is None for status in found.seen)
     assert last.time_left_s == math.inf
     assert (last.crashes, last.branched, last.stressed) == (0, 0, None)
+
+
+@pytest.mark.parametrize("keep_going", [True, False])
+def test_late_value_that_cannot_be_compared_ends_the_hunt_and_its_trial_is_recorded(run, tmp_path, keep_going):
+    def ends(spec):
+        if spec.number < 4:
+            return survives(spec)
+        failure = Failure(UNUSABLE_VALUE, "info['hit'] is of type dict", party="environment", place="info")
+        return replace(survives(spec), outcome=Outcome.SIMULATOR_ERROR, failure=failure)
+
+    with pytest.raises(ScenarioError, match=r"of trial 4 \(seed \d+\): info\['hit'\] is of type dict$"):
+        run(9, ends, keep_going=keep_going, crash_on=["collision"])
+    with closing(Ledger(tmp_path / "h/ledger.sqlite")) as ledger:
+        assert ledger.outcomes() == {"survived": 4, "simulator_error": 1}
+        assert ledger.facts()["state"] == "error"
 
 
 def test_hunt_waits_while_it_is_far_ahead_of_its_partner(run, tmp_path, monkeypatch):

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base import layout
-from crashhunt.errors import ArgumentError, UsageError
+from crashhunt.errors import ArgumentError, ScenarioError, UsageError
 from crashhunt.executors import EXCLUDED_WORDS
 from crashhunt.hunts import Preflight
-from crashhunt.hunts._preflight import WorkerNotices, _describe_end, why_invalid
+from crashhunt.hunts._preflight import WorkerNotices, _describe_end, unusable_value, why_invalid
 from crashhunt.plans import Request, plan
-from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import UNUSABLE_VALUE, Failure, Outcome, TrialResult, TrialSpec
 
 
 def settings_of(**arguments):
@@ -36,6 +36,20 @@ def test_what_fails_in_every_trial_in_the_same_way_is_refused():
         preflight.filter_setup_failures(result(3, kind="KeyError"))
     assert caught.value.where == "my.py:7"
     assert caught.value.exit_code == 2
+
+
+def test_value_that_cannot_be_compared_in_the_first_trial_is_refused_at_once():
+    failed = result(4, "info['hit'] is of type tuple", kind=UNUSABLE_VALUE, agent="")
+    failed = replace(failed, outcome=Outcome.SIMULATOR_ERROR, steps=6)
+    with pytest.raises(
+        ScenarioError, match=r"^step 7 of trial 4 \(seed 1\): info\['hit'\] is of type tuple$"
+    ) as caught:
+        Preflight(settings_of(speed="15"), 20).filter_setup_failures(failed)
+    assert caught.value.exit_code == 2
+    preflight = Preflight(settings_of(speed="15"), 20)
+    survived = result(0, outcome=Outcome.SURVIVED)
+    assert [preflight.filter_setup_failures(one) for one in (survived, failed)] == [[survived], [failed]]
+    assert unusable_value(survived) is None
 
 
 def test_constructor_that_needs_more_than_it_is_given_is_not_blamed_on_a_line_of_crashhunt():

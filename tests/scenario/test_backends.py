@@ -12,6 +12,7 @@ from crashhunt.scenario import (
     AgentSetup,
     Backend,
     Scenario,
+    as_plain_data,
     backend_names,
     backend_of,
     load_scenario,
@@ -160,3 +161,19 @@ def test_what_ran_before_with_a_table_that_no_one_used_still_runs(tmp_path):
     file = tmp_path / "s" / "scenario.toml"
     file.write_text('schema = 1\nsimulator = "toy"\n[agents.ego]\n[sumo]\nnet = "gone.net.xml"\n')
     assert list(load_scenario(file, kept=True).files()) == []
+
+
+@pytest.mark.parametrize(("simulator", "key"), [("gym", "CartPole-v1"), ("highway", "highway-fast-v0")])
+def test_snapshot_of_an_earlier_version_keeps_the_time_limit_lifted(tmp_path, simulator, key):
+    """Its trials ran without the registered limit, and a replay repeats them."""
+    text = f'schema = 1\nsimulator = "{simulator}"\n[{simulator}]\nid = "{key}"\n'
+    file = tmp_path / "scenario.toml"
+    for written, kept, expected in (
+        ("", True, "none"),
+        ("", False, "registered"),
+        ('"registered"', True, "registered"),
+    ):
+        file.write_text(text + (f"time_limit = {written}\n" if written else ""))
+        scenario = load_scenario(file, kept=kept)
+        assert scenario.tables[simulator].time_limit == expected
+        assert as_plain_data(scenario)[simulator]["time_limit"] == expected

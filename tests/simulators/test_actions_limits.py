@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from crashhunt.base.scalars import describe_value
 from crashhunt.errors import ActionError
 from crashhunt.simulators import MetaAction
-from crashhunt.simulators._actions import cast, describe_action
+from crashhunt.simulators._actions import cast
 
 
 @pytest.mark.parametrize(
@@ -44,11 +45,11 @@ def test_number_is_cast_where_its_type_can_hold_it(action, dtype, found):
 
 @pytest.mark.parametrize(("length", "cut"), [(198, False), (199, True), (300, True)])
 def test_text_of_an_action_is_one_line_of_200_characters(length, cut):
-    text = describe_action("x" * length)
+    text = describe_value("x" * length)
     assert text == (f"'{'x' * 198}…" if cut else f"'{'x' * length}'")
     assert len(text) <= 200
     lines = type("Lines", (), {"__repr__": lambda self: " a \n\t b "})
-    assert describe_action(lines()) == "a b"
+    assert describe_value(lines()) == "a b"
 
 
 @pytest.mark.parametrize("action", [0, 4, np.int64(4), np.array([3]), np.array([[2]]), np.int8(1), True])

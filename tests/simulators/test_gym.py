@@ -61,7 +61,9 @@ class Tray(gymnasium.Env):
         )
 
 
-gymnasium.register("Tray-v0", entry_point=Tray, max_episode_steps=10)
+# The checker would warn, because the ball is the same array in each observation.
+gymnasium.register("Tray-v0", entry_point=Tray, disable_env_checker=True)
+gymnasium.register("Short-v0", entry_point=Tray, disable_env_checker=True, max_episode_steps=10)
 
 
 def fell_hard(observation, reward, terminated, truncated, info):
@@ -127,11 +129,74 @@ def test_the_crash_rule_states_when_and_why(tmp_path, crash, says):
     assert (finding.collision.role, finding.collision.kind) == ("alone", contact.kind)
 
 
-def test_without_a_rule_it_finishes_and_its_own_bound_on_steps_does_not_count(tmp_path):
+def test_without_a_rule_the_episode_finishes_when_the_environment_terminates(tmp_path):
     simulator = simulator_of(tmp_path, "Tray-v0")
     assert fall(simulator) == 40
     assert simulator.scene().contacts == ()
     assert simulator.agents == []
+
+
+def was_cut(observation, reward, terminated, truncated, info):
+    return truncated and "cut"
+
+
+OWN_LIMIT = "the environment 'Short-v0' ends an episode after {} steps, which is its own time limit; set "
+
+
+@pytest.mark.parametrize(
+    ("limit", "kwargs", "ends", "told"),
+    [
+        ("registered", {}, 10, OWN_LIMIT.format(10)),
+        ("registered", {"max_episode_steps": 7}, 7, OWN_LIMIT.format(7)),
+        ("registered", {"max_episode_steps": -1}, 40, ""),
+        ("registered", {"max_episode_steps": 60}, 40, ""),
+        ("none", {}, 40, ""),
+        ("none", {"max_episode_steps": 7}, 7, OWN_LIMIT.format(7)),
+    ],
+)
+def test_registered_time_limit_ends_an_episode_unless_the_scenario_lifts_it(tmp_path, limit, kwargs, ends, told):
+    scenario = scenario_of("Short-v0", crash={"function": f"{__name__}:was_cut"}, **kwargs)
+    simulator = GymSimulator(scenario.with_table(replace(scenario.table(GymSetup), time_limit=limit)), tmp_path)
+    for _ in range(2):
+        assert fall(simulator) == ends
+    assert [contact.kind for contact in simulator.scene().contacts] == (["cut"] if ends < 40 else [])
+    assert [notice.partition("gym.time_limit")[0] for notice in simulator.notices] == ([told] if told else [])
+
+
+def test_scenario_that_lifts_the_time_limit_has_a_note():
+    for kwargs, limit, count in (({}, "registered", 0), ({}, "none", 1), ({"max_episode_steps": -1}, "registered", 1)):
+        scenario = scenario_of("Short-v0", crash={"info": "fell"}, **kwargs)
+        notes = list(BACKEND.notes(scenario.with_table(replace(scenario.table(GymSetup), time_limit=limit))))
+        assert len(notes) == count
+        assert all("'Short-v0' is registered is lifted" in note for note in notes)
+
+
+class Doubled(gymnasium.RewardWrapper, gymnasium.utils.RecordConstructorArgs):
+    def __init__(self, env):
+        gymnasium.utils.RecordConstructorArgs.__init__(self)
+        super().__init__(env)
+
+    def reward(self, reward):
+        return 2 * float(reward)
+
+
+gymnasium.register(
+    "Doubled-v0",
+    entry_point=Tray,
+    disable_env_checker=True,
+    additional_wrappers=(Doubled.wrapper_spec(),),
+    max_episode_steps=9,
+)
+
+
+def test_environment_has_the_wrappers_with_which_it_is_registered(tmp_path):
+    plain, doubled = simulator_of(tmp_path, "Tray-v0"), simulator_of(tmp_path, "Doubled-v0")
+    rewards = []
+    for simulator in (plain, doubled):
+        simulator.reset(seed=1)
+        rewards.append(simulator.step({"ball": simulator.actions["ball"].encode(FALL)})[1]["ball"])
+    assert rewards[1] == 2 * rewards[0]
+    assert fall(doubled) == 9
 
 
 def test_scenario_without_a_crash_rule_has_a_note():
@@ -238,7 +303,7 @@ class Spaceless(Tray):
     observation_space = None
 
 
-gymnasium.register("Spaceless-v0", entry_point=Spaceless)
+gymnasium.register("Spaceless-v0", entry_point=Spaceless, disable_env_checker=True)
 
 
 @pytest.mark.parametrize(
@@ -329,7 +394,7 @@ class Near(Tray):
         }
 
 
-gymnasium.register("Near-v0", entry_point=Near)
+gymnasium.register("Near-v0", entry_point=Near, disable_env_checker=True)
 
 
 @pytest.mark.parametrize(("danger", "most"), [("-info.left", 1 / 1.25), ("info.share", 0.875), ("info.other", None)])
@@ -357,8 +422,9 @@ def test_a_danger_that_names_nothing_or_is_no_number_is_one_line(tmp_path):
             BACKEND.check(scenario.with_table(replace(scenario.table(GymSetup), danger=danger)), "scenario.toml")
     simulator = GymSimulator(scenario.with_table(replace(scenario.table(GymSetup), danger="info.word")), tmp_path)
     simulator.reset(seed=1)
-    with pytest.raises(ScenarioError, match=r"gym\.danger = 'info\.word' is 'far'; it must be a number"):
+    with pytest.raises(ForeignError) as caught:
         simulator.step({"ball": simulator.actions["ball"].encode({"tilt": np.zeros(2, np.float32), "kick": 0})})
+    assert str(caught.value.error).startswith("gym.danger = 'info.word' is of type str: 'far' (allowed: a bool, ")
 
 
 class Kinds(Tray):
@@ -368,7 +434,7 @@ class Kinds(Tray):
         return *rest, {**info, "crash_kind": kind}
 
 
-gymnasium.register("Kinds-v0", entry_point=Kinds)
+gymnasium.register("Kinds-v0", entry_point=Kinds, disable_env_checker=True)
 
 
 def kind_of(observation, reward, terminated, truncated, info):

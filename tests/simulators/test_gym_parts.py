@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import signal
+import time
+from contextlib import suppress
 from types import SimpleNamespace
 
 import gymnasium
@@ -11,7 +14,8 @@ import pytest
 from gymnasium import spaces
 
 from crashhunt.base.boundaries import ForeignError
-from crashhunt.base.errors import ActionError, InvalidEpisodeError, ScenarioError
+from crashhunt.base.errors import ActionError, InvalidEpisodeError, UnusableValueError
+from crashhunt.base.scalars import number_of
 from crashhunt.recording import encode_value
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.scenario.backends.gym import CrashRule, GymSetup
@@ -215,7 +219,7 @@ def test_crash_cell_has_true_flags_and_short_texts(info, cell):
 )
 def test_crash_rule_names_the_crash(rule, step, found):
     reward, terminated, info = step
-    made = gym._Rule(CrashRule(**rule))
+    made = gym._Rule(CrashRule(**rule), number_of)
     assert made("seen", reward, terminated, False, info) == found
     assert made.has_named == (found not in ("", "crash", "terminated") and not found.startswith("reward"))
 
@@ -223,7 +227,7 @@ def test_crash_rule_names_the_crash(rule, step, found):
 def test_functions_of_a_rule_get_the_step_and_name_it(monkeypatch):
     asked, answers = [], {"f": "hit", "k": "rear end"}
     monkeypatch.setattr(gym, "load_object", lambda name: lambda *given: asked.append((name, given)) or answers[name])
-    made = gym._Rule(CrashRule(function="f", kind="k"))
+    made = gym._Rule(CrashRule(function="f", kind="k"), number_of)
     step = ("seen", 1.0, True, False, {"crash_kind": "other"})
     assert made(*step) == "rear end"
     assert asked == [("f", step), ("k", step)]
@@ -371,8 +375,9 @@ def test_named_danger_is_the_largest_of_an_episode(make, danger, values, found):
             step(made, SEEN, 0.5, False, False, {} if value is None else {"d": value})
         assert made.named_danger == found
     if danger:
-        with pytest.raises(ScenarioError, match="it must be a number"):
+        with pytest.raises(ForeignError) as caught:
             step(made, SEEN, 0.5, False, False, {"d": "much"})
+        assert isinstance(caught.value.error, UnusableValueError)
 
 
 def test_odd_observations_and_failing_ends_are_noticed_once(make, caplog, monkeypatch):
@@ -390,13 +395,131 @@ def test_odd_observations_and_failing_ends_are_noticed_once(make, caplog, monkey
     assert [record.getMessage().rpartition(" ")[2] for record in caplog.records] == ["1", "2", "4"]
 
 
-def test_environment_that_is_registered_has_no_limit_of_its_own(monkeypatch):
+@pytest.mark.parametrize(
+    ("limit", "given"),
+    [("registered", {"a": 1}), ("none", {"max_episode_steps": -1, "a": 1})],
+)
+def test_registered_environment_is_made_as_gymnasium_makes_it(monkeypatch, limit, given):
     made = []
-    monkeypatch.setattr(gym.gymnasium, "make", lambda *given, **named: made.append((given, named)) or Environment())
+    monkeypatch.setattr(gym.gymnasium, "make", lambda *names, **named: made.append((names, named)) or Environment())
     scenario = Scenario(
         simulator="gym",
         agents={"ego": AgentSetup()},
-        tables={"gym": GymSetup(id="mine/Env-v0", kwargs={"a": 1}, crash=CrashRule(termination=True))},
+        tables={
+            "gym": GymSetup(id="mine/Env-v0", kwargs={"a": 1}, crash=CrashRule(termination=True), time_limit=limit)
+        },
     )
     GymSimulator(scenario, None)
-    assert made == [(("mine/Env-v0",), {"max_episode_steps": -1, "disable_env_checker": True, "a": 1})]
+    assert made == [(("mine/Env-v0",), given)]
+
+
+WRONG = [(False, False), [True], {"a": True}, "False", "", b"1", None, 1j, np.array([True, False]), np.array([]),
+         np.array(["1"]), np.array([None]), np.ma.array([1.0], mask=[True]), object()]  # fmt: skip
+
+
+@pytest.mark.parametrize("value", WRONG, ids=lambda value: type(value).__name__)
+@pytest.mark.parametrize(
+    ("place", "what", "fix"),
+    [
+        ("info", "info['hit']", "gym.crash.function"),
+        ("function", "the result of m:f", "gym.crash.function"),
+        ("danger", "gym.danger = 'info.d'", "gym.danger"),
+        ("reward", "the reward", "gym.id"),
+        ("terminated", "terminated", "gym.id"),
+        ("truncated", "truncated", "gym.id"),
+    ],
+)
+def test_value_that_is_no_number_is_no_truth_value(make, monkeypatch, place, what, fix, value):
+    if place == "function" and (value is None or isinstance(value, str)):
+        return  # a function that returns nothing has found nothing, and a text describes the crash
+    made = make(danger="info.d", info="hit", reward_below=-5.0)
+    monkeypatch.setattr(made._rule, "_function", lambda *_: value if place == "function" else None)
+    monkeypatch.setattr(made._rule, "_rule", CrashRule(info="hit", reward_below=-5.0, function="m:f"))
+    made.reset(seed=1)
+    given = {"reward": 0.5, "terminated": False, "truncated": False, place: value}
+    info = {key: value for key, name in (("hit", "info"), ("d", "danger")) if place == name}
+    with pytest.raises(ForeignError) as caught:
+        step(made, SEEN, given["reward"], given["terminated"], given["truncated"], info)
+    error = caught.value.error
+    assert isinstance(error, UnusableValueError)
+    assert (caught.value.party, made.scene().contacts) == ("environment", ())
+    assert error.message.startswith(f"{what} is of type {type(value).__name__}")
+    assert fix in error.fix
+
+
+@pytest.mark.parametrize(
+    "value", [True, 1, 2.5, np.True_, np.float32(1), np.array([1]), np.array([[True]]), np.array(3.0)]
+)
+def test_number_and_array_with_one_element_are_truth_values(make, value):
+    made = make(info="hit")
+    for flag in (value, value * 0):
+        made.reset(seed=1)
+        assert step(made, SEEN, np.array([0.5]), np.array(flag), np.array([flag * 0]), {})[1:3] == [0.5, bool(flag)]
+        made.reset(seed=1)
+        step(made, SEEN, 0.5, False, False, {"hit": flag})
+        assert bool(made.scene().contacts) is bool(flag)
+
+
+def test_nan_is_reported_once_for_each_value_and_is_no_crash(make, monkeypatch):
+    made = make(danger="info.d", info="hit", reward_below=-5.0)
+    monkeypatch.setattr(made._rule, "_function", lambda *_: math.nan)
+    made.reset(seed=1)
+    for _ in range(3):
+        result = step(
+            made, np.full(2, np.nan, np.float32), np.float32("nan"), False, False, {"hit": math.nan, "d": math.nan}
+        )
+        assert (result[2], made.scene().contacts, made.named_danger) == (False, (), None)
+    names = [notice.partition(" is NaN in the environment 'm:Environment'")[0] for notice in made.notices]
+    assert names[:4] == ["the reward", "info['hit']", "the result of ", "gym.danger = 'info.d'"]
+    assert names[4].endswith("an observation that contains NaN")
+    assert len(names) == 5
+
+
+def test_nan_as_the_end_of_an_episode_is_refused(make):
+    made = make()
+    made.reset(seed=1)
+    with pytest.raises(ForeignError) as caught:
+        step(made, SEEN, 0.5, math.nan, False, {})
+    assert str(caught.value.error).startswith("terminated is NaN (allowed: ")
+
+
+@pytest.mark.parametrize(
+    ("observation", "nan"),
+    [(math.nan, True), (np.float16("nan"), True), ({"a": [1, (np.array([1, np.nan]),)]}, True), ([], False),
+     ({"a": "nan", "b": np.array(["nan"]), "c": np.array([1]), "d": None}, False), (np.array([np.inf]), False)],
+)  # fmt: skip
+def test_nan_is_found_in_observations_of_any_space(observation, nan):
+    assert _gymnasium.has_nan(observation) is nan
+
+
+def test_timeout_of_the_environment_itself_is_no_hang(make, monkeypatch):
+    def fails(self):
+        raise TimeoutError("no answer")
+
+    monkeypatch.setattr(Environment, "close", fails)
+    assert list(make().notices) == ["the environment 'm:Environment' cannot be closed: TimeoutError: no answer"]
+
+
+def test_close_that_does_not_return_is_stopped_and_named(make, monkeypatch):
+    monkeypatch.setattr(gym, "_MAX_CLOSE_S", 0.05)
+
+    def hang(self):
+        while True:
+            with suppress(Exception):
+                time.sleep(60)
+
+    monkeypatch.setattr(Environment, "close", hang)
+    handler = signal.getsignal(signal.SIGALRM)
+    made = make()
+    assert list(made.notices) == [
+        "the environment 'm:Environment' cannot be closed: its close() was stopped after 0.05 s"
+    ]
+    assert signal.getsignal(signal.SIGALRM) is handler
+
+
+def test_environment_whose_spaces_are_read_is_closed_before_the_first_episode(make):
+    made = make()
+    assert [one.closed for one in Environment.made] == [1]
+    made.reset(seed=1)
+    made.close(), made.close()
+    assert [one.closed for one in Environment.made] == [1, 1]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from conftest import mostly_nightly
 
-from crashhunt.errors import InvalidEpisodeError, ScenarioError
+from crashhunt.errors import InvalidEpisodeError, ScenarioError, UnusableValueError
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
 from crashhunt.scenario import (
     AgentSetup,
@@ -281,6 +281,47 @@ def test_an_episode_has_no_end_in_time_unless_asked_for(tmp_path):
     assert len(list(drive(simulator_of(tmp_path, "highway-fast-v0", config=quiet), "IDLE", 50))) == 50
     ends = simulator_of(tmp_path, "highway-fast-v0", config={**quiet, "duration": 7})
     assert len(list(drive(ends, "IDLE", 50))) == 7
+
+
+def test_end_of_time_that_does_not_apply_is_reported_when_an_episode_passes_it(tmp_path):
+    quiet = {"vehicles_count": 0}
+    for config, steps, count in ((quiet, 30, 0), (quiet, 31, 1), ({**quiet, "duration": math.inf}, 31, 0)):
+        simulator = simulator_of(tmp_path, "highway-fast-v0", config=config)
+        list(drive(simulator, "IDLE", steps))
+        assert len(simulator.notices) == count
+        assert all("beyond the 30 s after which 'highway-fast-v0' ends" in notice for notice in simulator.notices)
+
+
+@pytest.mark.parametrize(("limit", "steps"), [("registered", 6), ("none", 20)])
+def test_registered_time_limit_ends_an_episode(tmp_path, limit, steps):
+    spec = gymnasium.spec("highway-fast-v0")
+    if "short-highway-v0" not in gymnasium.registry:
+        gymnasium.register("short-highway-v0", entry_point=spec.entry_point, max_episode_steps=6)
+    simulator = simulator_of(tmp_path, "short-highway-v0", config={"vehicles_count": 0}, time_limit=limit)
+    assert len(list(drive(simulator, "IDLE", 20))) == steps
+
+
+def test_registered_wrapper_that_would_be_lost_is_refused(tmp_path):
+    wrapper = gymnasium.wrappers.ClipReward.wrapper_spec(min_reward=0.0, max_reward=0.5)
+    if "clipped-highway-v0" not in gymnasium.registry:
+        entry_point = gymnasium.spec("highway-fast-v0").entry_point
+        gymnasium.register("clipped-highway-v0", entry_point=entry_point, additional_wrappers=(wrapper,))
+    with pytest.raises(ScenarioError, match='has the wrapper ClipReward, which would be lost; write simulator = "gym"'):
+        simulator_of(tmp_path, "clipped-highway-v0")
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [({1: "0.5"}, "the reward is of type str"), ({2: (False,)}, "terminated is of type tuple")],
+)
+def test_value_of_an_environment_that_is_no_number_is_refused(tmp_path, monkeypatch, changed, says):
+    simulator = simulator_of(tmp_path, "highway-fast-v0", config={"vehicles_count": 0})
+    step = simulator._env.step
+    monkeypatch.setattr(
+        simulator._env, "step", lambda action: tuple(changed.get(i, part) for i, part in enumerate(step(action)))
+    )
+    with pytest.raises(UnusableValueError, match=says):
+        simulator.step({"agent-0": simulator.actions["agent-0"].encode(1)})
 
 
 def test_arguments_are_entries_of_the_configuration(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from crashhunt.base.boundaries import ForeignError
 from crashhunt.errors import ScenarioError
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.scenario.backends.gym import CrashRule, GymSetup
@@ -161,3 +162,31 @@ def test_learner_that_comes_later_makes_the_trial_invalid(tmp_path):
     simulator = simulator_of(tmp_path, late=True)
     with pytest.raises(Exception, match="the learner 'runner' is missing in the first step of the environment"):
         simulator.reset(seed=1)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "says"),
+    [
+        (1, {"runner": (1.0,)}, "the reward is of type tuple: (1.0,)"),
+        (2, {"runner": {"over": False}}, "terminations['runner'] is of type dict: {'over': False}"),
+        (3, {"runner": "False"}, "truncations['runner'] is of type str: 'False'"),
+        (2, False, "step() returned terminations = False, which is not a dictionary by agent"),
+        (4, [], "step() returned infos = [], which is not a dictionary by agent"),
+        (4, {"runner": {"caught": {"hunter_0": False}}}, "info['caught'] is of type dict: {'hunter_0': False}"),
+    ],
+)
+def test_value_of_the_learner_that_is_no_number_is_refused(tmp_path, monkeypatch, place, value, says):
+    step = Chase.step
+
+    def changed(self, actions):
+        parts = list(step(self, actions))
+        parts[place] = value
+        return tuple(parts)
+
+    monkeypatch.setattr(Chase, "step", changed)
+    simulator = simulator_of(tmp_path)
+    simulator.reset(seed=1)
+    with pytest.raises(ForeignError) as caught:
+        simulator.step({"me": simulator.actions["me"].encode(1)})
+    assert str(caught.value.error).startswith(says)
+    assert caught.value.party == "environment"

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.scenario._scenario import Backend
@@ -52,6 +52,8 @@ class GymSetup:
         reset_options: the table ``options`` that the environment's ``reset`` receives in each trial. An argument with
             ``option = "reset_options.NAME"`` sets its entry NAME. Without this key, ``reset`` receives no options.
         crash: rules that define a crash.
+        time_limit: ``registered`` keeps the ``max_episode_steps`` with which the id is registered, or that ``kwargs``
+            sets; ``none`` lifts the limit, so that only MAX_STEPS limits an episode.
         learner: name of the tested agent in a parallel environment of PettingZoo; empty for the first agent.
         others: for a parallel environment, ``module:function``, which is called with name, observation, action space
             and random generator of each other agent and returns its action. If the text is empty, the other agents act
@@ -66,6 +68,7 @@ class GymSetup:
     reset_options: dict[str, object] | None = None
     crash: CrashRule = field(default_factory=CrashRule)
     danger: str = ""
+    time_limit: Literal["registered", "none"] = "registered"
     learner: str = ""
     others: str = ""
 
@@ -85,7 +88,10 @@ def _check(scenario: Scenario, where: str) -> None:
 
 
 def _notes(scenario: Scenario) -> Iterator[str]:
-    if replace(scenario.table(GymSetup).crash, kind="") == CrashRule():
+    setup = scenario.table(GymSetup)
+    if setup.time_limit == "none" or setup.kwargs.get("max_episode_steps") == -1:
+        yield f"the time limit with which {setup.id!r} is registered is lifted, so only MAX_STEPS limits an episode"
+    if replace(setup.crash, kind="") == CrashRule():
         yield "gym.crash has no rule, so only failures of the agent and of the environment are crashes"
 
 
@@ -109,6 +115,7 @@ BACKEND = Backend(
     shows_itself=True,
     check=_check,
     modules=_modules,
+    implied={"time_limit": "none"},
     notes=_notes,
     versions=("gymnasium",),
     reported_events=(),

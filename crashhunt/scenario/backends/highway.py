@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.scenario._scenario import STEP_LENGTH_S, Accelerator, Backend
@@ -37,12 +37,14 @@ class HighwaySetup:
             replaces the default.
         off_road: whether leaving the lanes is a crash; by default yes, except in car parks, whose lanes are parking
             bays.
+        time_limit: ``registered`` keeps the ``max_episode_steps`` with which the id is registered; ``none`` lifts it.
         accelerate: whether the accelerator is used; results are bit-identical with and without it.
     """
 
     id: str
     config: dict[str, object] = field(default_factory=dict)
     off_road: bool | None = None
+    time_limit: Literal["registered", "none"] = "registered"
     accelerate: bool = True
 
 
@@ -105,6 +107,7 @@ BACKEND = Backend(
     step_length_s=_step_length,
     reported_events=("wrong_way", "not_moving"),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "ignore_priority", "unseen"),
+    implied={"time_limit": "none"},
     accelerator=Accelerator(switched_off=_as_it_is, note=_not_accelerated),
     side_effect=_side_effect,
     plays_paths=True,

@@ -20,6 +20,7 @@ from crashhunt.simulators.highway._fast_import import highway_env  # before anyt
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Discrete
+from gymnasium.wrappers import OrderEnforcing, TimeLimit
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.action import DiscreteMetaAction, MultiAgentAction
 from highway_env.envs.common.observation import MultiAgentObservation
@@ -29,10 +30,18 @@ from highway_env.vehicle.objects import Obstacle, RoadObject
 from crashhunt.accelerator import Onlooker, SkippedObservation, kernel, switch_off, switch_on
 from crashhunt.base.boundaries import Party
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
+from crashhunt.base.scalars import number_of, truth_of
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.highway import BACKEND, HighwaySetup
 from crashhunt.simulators._actions import MetaAction
-from crashhunt.simulators._gymnasium import ObservationForm, action_form, native, reseed_in_place
+from crashhunt.simulators._gymnasium import (
+    ObservationForm,
+    action_form,
+    as_tables,
+    native,
+    reseed_in_place,
+    time_limit_of,
+)
 from crashhunt.simulators._kinematics_observation import Kinematics, Unseen
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
@@ -60,6 +69,8 @@ if TYPE_CHECKING:
 __all__ = ["HighwaySimulator"]
 
 _PACKAGES = frozenset(("highway_env", "gymnasium", "typing", "builtins"))
+_REPLACED_WRAPPERS = (OrderEnforcing, TimeLimit)  # whose work this simulator does itself
+_STEP_FIX = "return one number or bool for each agent from step()"
 _LANE_INTERVAL_STEPS = 10  # steps between two scenes that contain the lane of each vehicle
 
 assert highway_env  # importing it registers its environments
@@ -68,8 +79,8 @@ assert highway_env  # importing it registers its environments
 class HighwaySimulator:
     """Runs the episodes of a scenario on highway-env, each in a new environment.
 
-    A control step is a step of the policy. Only ``max_steps`` limits the length of an episode, unless the configuration
-    has a ``duration``. A terminated agent idles until the episode ends.
+    A control step is a step of the policy. An episode ends after ``max_steps``, the ``duration`` in the scenario's
+    configuration, or the registered ``max_episode_steps``. A terminated agent idles until the episode ends.
 
     Args:
         scenario: The scenario to run.
@@ -91,6 +102,7 @@ class HighwaySimulator:
             logging.getLogger(__name__).warning("the accelerator is disabled: %s", reason)
         self._compiled = kernel() if self._setup.accelerate and not reason else None
         self.agents: list[str] = []
+        self.notices: dict[str, None] = {}
         self._lane_names: dict[tuple[str, str, int], str] = {}
         self._spare: AbstractEnv | None = None
         try:
@@ -156,6 +168,11 @@ class HighwaySimulator:
             for agent in self._possible
         ]
         self._contacts = []
+        if self._steps >= self._lifted_at:
+            self._notice(
+                f"trials run beyond the {self._own_duration_s:g} s after which {self._setup.id!r} ends its episodes: "
+                "set highway.config.duration to end them there"
+            )
         with self._skipping:
             shown, reward, terminated, truncated, info = self._env.step(tuple(given) if self._many_act else given[0])
         self._steps += 1
@@ -174,20 +191,32 @@ class HighwaySimulator:
                 (arrived if self._is_at_an_end(vehicle) else off_road).append(agent)
         self._read_scene(tuple(off_road))
         self._scene.events = tuple([event for agent in actions for event in self._events_of(agent)])
-        ended = bool(terminated or truncated)
+        ended = truth_of(terminated, "terminated", _STEP_FIX) or truth_of(truncated, "truncated", _STEP_FIX)
+        ended = ended or self._steps == self._max_episode_steps
         rewards = info.get("agents_rewards", (reward,) * len(self._possible))
         arrived += [
-            agent for agent, over in zip(self._possible, info.get("agents_terminated", ()), strict=False) if over
+            agent
+            for agent, over in zip(self._possible, info.get("agents_terminated", ()), strict=False)
+            if truth_of(over, "info['agents_terminated']", _STEP_FIX)
         ]
         terminations = {agent: ended or agent in self._crashed or agent in arrived for agent in actions}
         self.agents = [agent for agent in self.agents if not terminations.get(agent, False)]
         return (
             self._show(actions, shown),
-            {agent: float(rewards[self._possible.index(agent)]) for agent in actions},
+            {agent: self._reward(rewards[self._possible.index(agent)]) for agent in actions},
             terminations,
             dict.fromkeys(actions, False),
             dict.fromkeys(actions, info),
         )
+
+    def _reward(self, value: object) -> float:
+        number = number_of(value, "the reward", _STEP_FIX)
+        if math.isnan(number):
+            self._notice(f"the reward is NaN in the environment {self._setup.id!r}")
+        return number
+
+    def _notice(self, notice: str) -> None:
+        self.notices[notice] = None
 
     def scene(self) -> Scene:
         """Return the state of all vehicles and obstacles."""
@@ -275,7 +304,12 @@ class HighwaySimulator:
     def _make(self, arguments: Mapping[str, Value]) -> AbstractEnv:
         """Create the environment and set its configuration, which the next reset applies."""
         env, self._spare = self._spare or self._construct(), None
+        own = env.config.get("duration")
         env.config = configured(env.config, self._scenario, arguments)
+        tables = (self._setup.config, *as_tables(self._scenario, arguments))
+        is_lifted = isinstance(own, int | float) and not any("duration" in table for table in tables)
+        self._own_duration_s = own if is_lifted else math.inf
+        self._lifted_at = self._own_duration_s * env.config["policy_frequency"]
         return env
 
     def _construct(self) -> AbstractEnv:
@@ -283,7 +317,7 @@ class HighwaySimulator:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)  # for an outdated version, which the user chose
-                made = gymnasium.make(self._setup.id, disable_env_checker=True)
+                made: Any = gymnasium.make(self._setup.id, disable_env_checker=True)
         except (gymnasium.error.Error, ImportError) as error:
             message = " ".join(str(error).split())
             raise mistake(
@@ -293,6 +327,12 @@ class HighwaySimulator:
         if not isinstance(env, AbstractEnv):
             fix = 'write simulator = "gym"'
             raise mistake(self._scenario, "id", self._setup.id, "is not an environment of highway-env", fix)
+        self._max_episode_steps = None if self._setup.time_limit == "none" else time_limit_of(made)
+        while isinstance(made, gymnasium.Wrapper):
+            if not isinstance(made, _REPLACED_WRAPPERS) and not type(made).__module__.startswith("highway_env."):
+                what, fix = f"has the wrapper {type(made).__name__}, which would be lost", 'write simulator = "gym"'
+                raise mistake(self._scenario, "id", self._setup.id, what, fix)
+            made = made.env
         return env
 
     def _adopt(self, env: AbstractEnv) -> None:
