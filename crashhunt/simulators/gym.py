@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from crashhunt.base.boundaries import Boundary, ForeignError, Party
-from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
+from crashhunt.base.errors import InvalidEpisodeError, PluginError, ScenarioError
 from crashhunt.base.exceptions import in_words, place_of
 from crashhunt.base.plugins import load_object
 from crashhunt.base.scalars import number_of, truth_of
@@ -55,6 +55,7 @@ _RESET_OPTIONS = "reset_options"  # the key of the table [gym], and the first pa
 _NO_ACTORS = Roster(())
 _RESET_PARTS = ("observation", "info")
 _STEP_PARTS = ("observation", "reward", "terminated", "truncated", "info")
+_LIMIT = "max_episode_steps"
 _CRASH_KIND_KEY = "crash_kind"
 _MAX_KIND_CHARACTERS = 80
 _MAX_CLOSE_S = 5.0
@@ -139,14 +140,16 @@ class GymSimulator:
         """Run one step of the environment."""
         action = native(self.actions[self._agent], actions[self._agent])
         with _STEP:
-            observation, reward, ended, cut, info = _parts("step", self._env.step(action), _STEP_PARTS)
+            try:
+                returned = self._env.step(action)
+            except ValueError as error:
+                raise _as_raised_without_wrappers(error) from error
+            observation, reward, ended, cut, info = _parts("step", returned, _STEP_PARTS)
         self._steps += 1
         with _REWARD:  # these may be objects of any class
             reward = self._number(reward, "the reward", _WRAP_FIX)
-            terminated, truncated = (
-                truth_of(ended, "terminated", _WRAP_FIX),
-                truth_of(cut, "truncated", _WRAP_FIX),
-            )
+            terminated = truth_of(ended, "terminated", _WRAP_FIX)
+            truncated = truth_of(cut, "truncated", _WRAP_FIX)
         with _INFO:  # the crash rule may be a function of the user's
             if self._steps == 1 and (key := self._setup.crash.info) and key not in info:
                 self._report_misspelt_key(key, info)
@@ -159,9 +162,11 @@ class GymSimulator:
         self._look(what)
         self._record_danger(danger)
         if truncated and not terminated and self._steps == time_limit_of(self._env):
-            fix = '; set gym.time_limit = "none" to lift it' if self._is_registered else ""
-            what = f"ends an episode after {count_of(self._steps, 'step')}, which is its own time limit"
-            self._notice(f"the environment {self._setup.id!r} {what}{fix}")
+            self._report_time_limit()
+        elif self._steps == self._limit_of_other_id[0] + 1:
+            limit, other = self._limit_of_other_id
+            what = f"is registered as {other!r} with a time limit of {count_of(limit, 'step')}"
+            self._notice(f"the environment {self._setup.id!r} {what}, which only that id has")
         over = terminated or truncated or self._crashed
         if over:
             self.agents = []
@@ -220,13 +225,30 @@ class GymSimulator:
         if hint := did_you_mean(key, map(str, info)):
             self._notice(f"gym.crash.info = {key!r} is not a key of the first step's info: {hint}")
 
+    def _report_time_limit(self) -> None:
+        is_default = self._is_registered and self._setup.time_limit == "registered"
+        fix = '; set gym.time_limit = "none" to lift it' if is_default and _LIMIT not in self._setup.kwargs else ""
+        what = f"ends an episode after {count_of(self._steps, 'step')}, which is its own time limit"
+        self._notice(f"the environment {self._setup.id!r} {what}{fix}")
+
     def _find(self) -> Callable[..., object]:
+        """Return the function that makes the environment."""
         name = self._setup.id
-        self._is_registered = not name.partition(":")[2].isidentifier()
-        if not self._is_registered:
-            factory: Callable[..., object] = load_object(name)
-            return factory
-        lifted = {"max_episode_steps": -1} if self._setup.time_limit == "none" else {}
+        attribute = name.partition(":")[2]
+        self._is_registered, self._limit_of_other_id = True, (-1, "")
+        if attribute.isidentifier():
+            try:
+                factory: Callable[..., object] = load_object(name)
+            except PluginError:
+                if attribute not in gymnasium.registry:  # by the module: not all ids have a version
+                    raise
+            else:
+                self._is_registered = False
+                for other, spec in gymnasium.registry.items():
+                    if spec.entry_point in (name, factory) and spec.max_episode_steps:
+                        self._limit_of_other_id = spec.max_episode_steps, other
+                return factory
+        lifted = {_LIMIT: -1} if self._setup.time_limit == "none" else {}
         return lambda **kwargs: gymnasium.make(name, **{**lifted, **kwargs})
 
     def _configured(self, arguments: Mapping[str, Value]) -> tuple[dict[str, object], dict[str, object] | None]:
@@ -339,6 +361,17 @@ def _parts(method: str, returned: Any, wanted: tuple[str, ...]) -> Sequence[Any]
     if method == "step" and not isinstance(returned[-1], Mapping):
         raise TypeError(f"step() returned info = {returned[-1]!r:.80}, which is not a dictionary")
     return returned
+
+
+def _as_raised_without_wrappers(error: ValueError) -> Exception:
+    """Return the error that names the environment if a wrapper of Gymnasium cannot unpack what it has returned."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    inside = trace is not None and str(trace.tb_frame.f_globals.get("__name__")).startswith("gymnasium.")
+    if not inside or "to unpack" not in str(error):
+        return error
+    return TypeError(f"step() of Gymnasium returns {', '.join(_STEP_PARTS)}, but step() of the environment: {error}")
 
 
 class _Rule:

@@ -147,11 +147,11 @@ OWN_LIMIT = "the environment 'Short-v0' ends an episode after {} steps, which is
     ("limit", "kwargs", "ends", "told"),
     [
         ("registered", {}, 10, OWN_LIMIT.format(10)),
-        ("registered", {"max_episode_steps": 7}, 7, OWN_LIMIT.format(7)),
+        ("registered", {"max_episode_steps": 7}, 7, OWN_LIMIT.format(7).removesuffix("; set ")),
         ("registered", {"max_episode_steps": -1}, 40, ""),
         ("registered", {"max_episode_steps": 60}, 40, ""),
         ("none", {}, 40, ""),
-        ("none", {"max_episode_steps": 7}, 7, OWN_LIMIT.format(7)),
+        ("none", {"max_episode_steps": 7}, 7, OWN_LIMIT.format(7).removesuffix("; set ")),
     ],
 )
 def test_registered_time_limit_ends_an_episode_unless_the_scenario_lifts_it(tmp_path, limit, kwargs, ends, told):
@@ -161,6 +161,23 @@ def test_registered_time_limit_ends_an_episode_unless_the_scenario_lifts_it(tmp_
         assert fall(simulator) == ends
     assert [contact.kind for contact in simulator.scene().contacts] == (["cut"] if ends < 40 else [])
     assert [notice.partition("gym.time_limit")[0] for notice in simulator.notices] == ([told] if told else [])
+
+
+def test_limit_of_an_id_is_reported_where_its_class_is_named_and_runs_longer(tmp_path):
+    simulator = simulator_of(tmp_path, f"{__name__}:Tray")
+    fall(simulator, steps=6)
+    assert list(simulator.notices) == []
+    assert fall(simulator) == 40
+    told = "is registered as 'Doubled-v0' with a time limit of 9 steps, which only that id has"
+    assert list(simulator.notices) == [f"the environment '{__name__}:Tray' {told}"]
+
+
+def test_id_without_a_version_may_have_the_form_of_an_attribute(tmp_path):
+    gymnasium.register("TrayWithoutVersion", entry_point=Tray, disable_env_checker=True, max_episode_steps=6)
+    assert fall(simulator_of(tmp_path, f"{__name__}:TrayWithoutVersion")) == 6
+    del gymnasium.registry["TrayWithoutVersion"]
+    with pytest.raises(CrashhuntError, match="has no attribute 'TrayWithoutVersion'"):
+        simulator_of(tmp_path, f"{__name__}:TrayWithoutVersion")
 
 
 def test_scenario_that_lifts_the_time_limit_has_a_note():
@@ -288,6 +305,20 @@ def test_error_of_an_old_gym_environment_states_what_gymnasium_returns(tmp_path,
     with pytest.raises((ForeignError, InvalidEpisodeError)) as caught:
         fall(simulator, steps=1)
     assert says in str(getattr(caught.value, "error", caught.value))
+
+
+gymnasium.register("OldTray-v0", entry_point=OldTray, max_episode_steps=5, disable_env_checker=True)
+
+
+def test_error_of_an_old_gym_environment_is_the_same_inside_a_wrapper(tmp_path):
+    simulator = simulator_of(tmp_path, "OldTray-v0", size=2.5)
+    simulator.reset(seed=1)
+    with pytest.raises(ForeignError) as caught:
+        simulator.step({"ball": simulator.actions["ball"].encode(FALL)})
+    assert str(caught.value.error) == (
+        "step() of Gymnasium returns observation, reward, terminated, truncated, info, but step() of the environment: "
+        "not enough values to unpack (expected 5, got 4)"
+    )
 
 
 def test_a_flattened_action_has_the_type_of_its_space_or_is_refused(tmp_path):
