@@ -10,8 +10,9 @@ import math
 import sys
 from decimal import Decimal
 from numbers import Real
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
+from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import UnusableValueError
 
 __all__ = ["describe_value", "is_masked", "number_of", "truth_of"]
@@ -19,6 +20,15 @@ __all__ = ["describe_value", "is_masked", "number_of", "truth_of"]
 _ALLOWED: Final = "a bool, a number, an array with one element"
 _MAX_CHARACTERS: Final = 200  # of a value in an error message
 _MAX_NESTING: Final = 4  # an array with one element may contain another such array
+
+
+class _Array(Protocol):
+    """What the arrays of NumPy, torch, jax and pandas have in common."""
+
+    shape: tuple[int, ...]
+
+    def item(self) -> Any:
+        """Return the only element."""
 
 
 def number_of(value: object, what: str, fix: str) -> float:
@@ -75,11 +85,11 @@ def _only_element(value: Any) -> Any:
     raise TypeError
 
 
-def _shape_of(value: Any) -> tuple[int, ...] | None:
+def _shape_of(value: object) -> tuple[int, ...] | None:
     """Return the shape of an array of any library; None if the value is no array."""
-    shape = getattr(value, "shape", None)
-    is_array = isinstance(shape, tuple) and hasattr(value, "item") and not isinstance(value, type)
-    return shape if is_array else None
+    if isinstance(value, type) or not supports(value, _Array):
+        return None
+    return value.shape if isinstance(value.shape, tuple) else None
 
 
 def is_masked(value: object) -> bool:
