@@ -189,7 +189,8 @@ def unusable_value(result: TrialResult) -> ScenarioError | None:
     if failure is None or failure.kind != UNUSABLE_VALUE or failure.agent:
         return None
     when = f"step {result.steps + 1} of trial {result.spec.number} (seed {result.spec.seed})"
-    return ScenarioError(f"{failure.message}", where=when)
+    message, _, fix = failure.message.rpartition("; ")
+    return ScenarioError(message or fix, fix=fix if message else "", where=when)
 
 
 def is_hopeless(settings: HuntSettings, outcomes: Mapping[str, int]) -> bool:
