@@ -9,12 +9,15 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from crashhunt.base import layout
+from crashhunt.base.boundaries import ForeignError
 from crashhunt.episode import Episode, Nearness, Observer, Parts, Recorder, WorkerSettings, _failures, run_episode
+from crashhunt.episode._blame import guarded_check, guarded_step
 from crashhunt.episode._fast_path import FastPath
-from crashhunt.errors import InternalError, RecorderError, ScenarioError
+from crashhunt.errors import InternalError, RecorderError, ScenarioError, UnusableValueError
 from crashhunt.oracles import ReportedCollision
 from crashhunt.recording import BlackBox
 from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario, scenario_from_dict
@@ -583,3 +586,28 @@ def test_fault_of_crashhunt_ends_the_hunt_with_a_line_to_report_it(shell):
     assert again.returncode == 2
     assert "broken.py" in err
     assert "Traceback" in err
+
+
+def test_values_of_a_foreign_simulator_are_numbers_or_refused():
+    def stepped(reward, ended, cut):
+        return guarded_step(lambda _: ({}, {"ego": reward}, {"ego": ended}, {"ego": cut}, {}))({})
+
+    assert stepped(np.array([2]), np.array([True]), 0) == ({}, {"ego": 2.0}, {"ego": True}, {"ego": False}, {})
+    for values, says in (
+        (("2", False, False), "rewards['ego'] is of type str: '2'"),
+        ((2, (False,), False), "terminations['ego'] is of type tuple: (False,)"),
+        ((2, False, {"over": False}), "truncations['ego'] is of type dict: "),
+    ):
+        with pytest.raises(ForeignError) as caught:
+            stepped(*values)
+        assert isinstance(caught.value.error, UnusableValueError)
+        assert str(caught.value.error).startswith(says)
+
+
+@pytest.mark.parametrize("found", [True, 3, np.float64(1.0)])
+def test_oracle_that_answers_with_a_truth_value_is_told_what_to_return(found):
+    with pytest.raises(ForeignError) as caught:
+        guarded_check(lambda scene, agents: found)(None, ())
+    assert str(caught.value.error) == f"check() returned {found!r}; it must return a list of Finding"
+    assert guarded_check(lambda scene, agents: None)(None, ()) == []
+    assert guarded_check(lambda scene, agents: False)(None, ()) == []

@@ -41,9 +41,7 @@ def test_what_fails_in_every_trial_in_the_same_way_is_refused():
 def test_value_that_cannot_be_compared_in_the_first_trial_is_refused_at_once():
     failed = result(4, "info['hit'] is of type tuple: ('; ',); return a bool", kind=UNUSABLE_VALUE, agent="")
     failed = replace(failed, outcome=Outcome.SIMULATOR_ERROR, steps=6)
-    with pytest.raises(
-        ScenarioError, match=r"^step 7 of trial 4 \(seed 1\): info\['hit'\] is of"
-    ) as caught:
+    with pytest.raises(ScenarioError, match=r"^step 7 of trial 4 \(seed 1\): info\['hit'\] is of") as caught:
         Preflight(settings_of(speed="15"), 20).filter_setup_failures(failed)
     assert (caught.value.exit_code, caught.value.fix) == (2, "return a bool")
     preflight = Preflight(settings_of(speed="15"), 20)

@@ -324,6 +324,21 @@ def test_value_of_an_environment_that_is_no_number_is_refused(tmp_path, monkeypa
         simulator.step({"agent-0": simulator.actions["agent-0"].encode(1)})
 
 
+def test_nan_is_reported_once_for_each_value(tmp_path, monkeypatch):
+    simulator = simulator_of(tmp_path, "highway-fast-v0", config={"vehicles_count": 0})
+    step = simulator._env.step
+    monkeypatch.setattr(
+        simulator._env, "step", lambda action: (np.full((5, 5), np.nan, np.float32), math.nan, *step(action)[2:])
+    )
+    for _ in range(2):
+        _, rewards, *_ = simulator.step({"agent-0": simulator.actions["agent-0"].encode(1)})
+        assert math.isnan(rewards["agent-0"])
+    assert sorted(notice.partition("'")[0] for notice in simulator.notices) == [
+        "the environment ",
+        "the reward is NaN in the environment ",
+    ]
+
+
 def test_arguments_are_entries_of_the_configuration(tmp_path):
     arguments = {
         "vehicles_count": ArgumentSetup(default=3),

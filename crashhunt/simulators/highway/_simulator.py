@@ -38,6 +38,7 @@ from crashhunt.simulators._gymnasium import (
     ObservationForm,
     action_form,
     as_tables,
+    has_nan,
     native,
     reseed_in_place,
     time_limit_of,
@@ -391,7 +392,10 @@ class HighwaySimulator:
         if self._kinematics is not None:
             return {agent: self._observe(agent) for agent in agents}
         each = shown if self._many_see else (shown,)
-        return {agent: self._forms[agent].encode(each[self._possible.index(agent)]) for agent in agents}
+        found = {agent: self._forms[agent].encode(each[self._possible.index(agent)]) for agent in agents}
+        if any(map(has_nan, found.values())):
+            self._notice(f"the environment {self._setup.id!r} shows its agent an observation that contains NaN")
+        return found
 
     def _observe(self, agent: str) -> NDArray[np.float32]:
         """Return the agent's observation in the Kinematics layout that SUMO scenarios use as well."""
