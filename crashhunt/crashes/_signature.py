@@ -11,7 +11,7 @@ from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.crashes._contact import contact_record
 from crashhunt.crashes._lanes import LaneMap
-from crashhunt.trial import Outcome
+from crashhunt.trial import UNUSABLE_VALUE, Outcome
 
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
@@ -193,4 +193,6 @@ def _innermost_frames(failure: Failure) -> str:
     chosen = own_frames(failure)
     if chosen:
         return " < ".join(f"{frame.file.name}:{frame.function}" for frame in chosen[:_MAX_FRAMES])
-    return _NUMBERS.sub("#", failure.message)
+    # Behind the type of an unusable value, its message has the value itself.
+    message = failure.message.partition(": ")[0] if failure.kind == UNUSABLE_VALUE else failure.message
+    return _NUMBERS.sub("#", message)

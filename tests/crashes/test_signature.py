@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.crashes import Signature, group_crashes, signature_of
-from crashhunt.trial import Disturbance, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import UNUSABLE_VALUE, Disturbance, Failure, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Event
 
 SPEC = TrialSpec(0, 1, {"ego": {}}, {}, max_steps=10)
@@ -77,6 +77,12 @@ def test_without_a_stack_what_is_said_counts_but_for_its_numbers():
     said = [Failure("bad action", f"speed {value} is not within 0 and 100") for value in ("-1.5", "130", "0x7f")]
     assert len({signature_of(bundle(0, failure=failure)) for failure in said}) == 1
     assert signature_of(bundle(0, failure=said[0])) != signature_of(bundle(0, failure=Failure("bad action", "nan")))
+
+
+def test_unusable_values_of_one_type_are_one_crash_type():
+    texts = ("str: 'a' (allowed: a bool)", "str: 'b' (allowed: a bool)")
+    said = [Failure(UNUSABLE_VALUE, f"info['hit'] is of type {text}") for text in texts]
+    assert {signature_of(bundle(0, failure=failure)).where for failure in said} == {"info['hit'] is of type str"}
 
 
 def test_code_of_libraries_is_excluded_where_there_is_other():

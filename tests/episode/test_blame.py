@@ -605,7 +605,7 @@ def test_values_of_a_foreign_simulator_are_numbers_or_refused():
 
 
 @pytest.mark.parametrize("found", [True, 3, np.float64(1.0)])
-def test_oracle_that_answers_with_a_truth_value_is_told_what_to_return(found):
+def test_oracle_that_returns_a_truth_value_gets_an_error_that_names_the_right_type(found):
     with pytest.raises(ForeignError) as caught:
         guarded_check(lambda scene, agents: found)(None, ())
     assert str(caught.value.error) == f"check() returned {found!r}; it must return a list of Finding"
