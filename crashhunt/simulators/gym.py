@@ -271,6 +271,8 @@ class GymSimulator:
             if isinstance(error.error, gymnasium.error.Error | ImportError | TypeError):
                 is_of_reset = _RESET_OPTIONS in keywords and self._setup.reset_options is None
                 fix = "add reset_options = {} to the table [gym]" if is_of_reset else ""
+                if _LIMIT in keywords and not self._is_registered:
+                    fix = f"remove {_LIMIT}, or name the id with which the environment is registered"
                 raise self._mistake(str(error.error), fix=fix) from None
             raise
         if is_parallel(made):

@@ -343,6 +343,7 @@ gymnasium.register("Spaceless-v0", entry_point=Spaceless, disable_env_checker=Tr
         ("Carpole-v1", {}, "Carpole"),
         ("Tray-v0", {"colour": "red"}, "colour"),
         ("Tray-v0", {"reset_options": {"low": 1}}, "; add reset_options = {} to the table [gym]"),
+        (f"{__name__}:Tray", {"max_episode_steps": 5}, "; remove max_episode_steps, or name the id with which the env"),
         ("Spaceless-v0", {}, "the environment's observation_space is None, not a gymnasium.Space; set it"),
         ("no_such_module:make", {}, "no_such_module"),
         (f"{__name__}:make_nested", {"config": {"friction": {"of": -1}}}, "friction is negative"),
