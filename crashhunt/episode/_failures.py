@@ -538,7 +538,9 @@ class Ending:
         if blamed.party is Party.CRASHHUNT and not blamed.is_resource:
             raise internal_error(error, self.spec.number, self.steps) from error
         party = party_of_simulator(self.simulator) if blamed.is_resource else blamed.party
-        return self._fail(Outcome.SIMULATOR_ERROR, blamed.error, party=party, place=blamed.place)
+        # Neither the agent nor the simulator has failed: the adapter cannot observe or control a vehicle any more.
+        outcome = Outcome.INVALID if type(blamed.error) is InvalidEpisodeError else Outcome.SIMULATOR_ERROR
+        return self._fail(outcome, blamed.error, party=party, place=blamed.place)
 
     def _fail_in_set_up(self, error: BaseException) -> TrialResult:
         """End the episode with an exception that was raised before the first step, outside the agents' own methods.

@@ -26,7 +26,7 @@ __all__ = [
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 9
+_INTERFACE = 10
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -237,7 +237,7 @@ class Core(Protocol):
         """Return the columns of a scene with persons; None if the arguments are not lists of numbers."""
 
     def is_coming_or_going(self) -> bool | None:
-        """Return whether a vehicle has entered or left in the last step."""
+        """Return whether a vehicle has entered or left in the last step, or has begun or ended parking."""
 
     def in_sight(self, controlled: _Vehicles, squared: float, /) -> tuple[tuple[str, ...], Points] | None:
         """Return the ids of all vehicles near the controlled vehicles, and the positions of these; None on failure.

@@ -76,7 +76,7 @@ struct Sumo {
     NeighborOf follower;
     Command set_speed;
     Number time;
-    Count departed, arrived, vanishing, appearing, on_foot, emergencies;
+    Count departed, arrived, vanishing, appearing, parking, unparking, on_foot, emergencies;
     Collisions collisions;
     Names everybody;
     VehicleOf vehicle;
@@ -120,6 +120,8 @@ PyObject *bind(PyObject *, PyObject *path) {
                  find(library, "_ZN7libsumo10Simulation17getDepartedNumberEv", found.departed) &&
                  find(library, "_ZN7libsumo10Simulation16getArrivedNumberEv", found.arrived) &&
                  find(library, "_ZN7libsumo10Simulation25getStartingTeleportNumberEv", found.vanishing) &&
+                 find(library, "_ZN7libsumo10Simulation32getParkingStartingVehiclesNumberEv", found.parking) &&
+                 find(library, "_ZN7libsumo10Simulation30getParkingEndingVehiclesNumberEv", found.unparking) &&
                  find(library, "_ZN7libsumo6Person10getIDCountEv", found.on_foot) &&
                  find(library, "_ZN7libsumo10Simulation13getCollisionsEv", found.collisions) &&
                  find(library, "_ZN7libsumo10Simulation23getEndingTeleportNumberEv", found.appearing) &&
@@ -163,7 +165,8 @@ bool unbound() {
 }
 
 bool coming_or_going() {
-    return sumo.departed() || sumo.arrived() || sumo.vanishing() || sumo.appearing();
+    return sumo.departed() || sumo.arrived() || sumo.vanishing() || sumo.appearing() || sumo.parking() ||
+           sumo.unparking();
 }
 
 PyObject *is_coming_or_going(PyObject *, PyObject *) {

@@ -305,7 +305,8 @@ struct Steps {
         PyObject *seen = nullptr;
         bool near = false;
         try {
-            if (sumo.vanishing() || sumo.on_foot() || sumo.emergencies() || !sumo.collisions().empty()) {
+            if (sumo.vanishing() || sumo.parking() || sumo.unparking() || sumo.on_foot() || sumo.emergencies() ||
+                !sumo.collisions().empty()) {
                 return SIMULATED;
             }
             if (number % every == 0 || sumo.departed() || sumo.arrived() || sumo.appearing()) {

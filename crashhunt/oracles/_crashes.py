@@ -13,7 +13,7 @@ from crashhunt.world import MAX_CONTACT_GAP_M, contact_at, first_contact, lane_j
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.world import Contact, Rectangle, Scene, Touch
+    from crashhunt.world import Actor, Contact, Rectangle, Scene, Touch
 
 __all__ = ["MAX_BRAKING_MPS2", "OffRoad", "Overlap", "ReportedCollision"]
 
@@ -70,7 +70,7 @@ class Overlap:
 
     Simulators miss some of these collisions, because SUMO compares only vehicles of the same lane. The collider is the
     vehicle that moves into the other's lane, or that has the other vehicle in front of it at the first touch. A
-    standing vehicle is never the collider.
+    standing vehicle is never the collider. A parked vehicle takes no part.
     """
 
     name = "overlap"
@@ -80,13 +80,19 @@ class Overlap:
         findings = []
         previous = scene.previous if scene.swept else None
         for agent in agents:
-            row = scene.roster.index.get(agent)
-            if row is None:
+            actors, row = scene.roster.actors, scene.roster.index.get(agent)
+            if row is None or actors[row].parked:
                 continue
             for other in _within_reach(scene, previous, row):
-                touch = first_contact(previous, scene, row, other)
+                if actors[other].parked:
+                    continue
+                # Between a parking space and a lane, SUMO moves a vehicle at once and drives no path.
+                jumped = previous is not None and (
+                    _was_parked(previous, actors[row]) or _was_parked(previous, actors[other])
+                )
+                touch = first_contact(None if jumped else previous, scene, row, other)
                 if touch is not None:
-                    name = scene.roster.actors[other].id
+                    name = actors[other].id
                     lane = _lane_at(scene, agent, touch)
                     collision = _touching(self.name, agent, name, touch, "overlap", lane)
                     findings.append(Finding(Outcome.COLLISION, collision))
@@ -121,6 +127,11 @@ class OffRoad:
                 )
                 findings.append(Finding(Outcome.OFF_ROAD, collision))
         return findings
+
+
+def _was_parked(previous: Scene, actor: Actor) -> bool:
+    row = previous.roster.index.get(actor.id)
+    return row is not None and previous.roster.actors[row].parked
 
 
 def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:

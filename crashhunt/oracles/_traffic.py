@@ -66,6 +66,8 @@ class TooClose:
         for squared, other in scene.neighbors(row):
             if squared > (scene.roster.touch_distance + self._gap_m) ** 2:  # all further ones as well
                 break
+            if scene.roster.actors[other].parked:
+                continue
             if squared <= (reaches[row] + reaches[other] + self._gap_m) ** 2 and on_one_level(scene, row, other):
                 found.append((scene, row, other))
         return found

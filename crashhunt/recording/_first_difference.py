@@ -112,6 +112,5 @@ def has_same_scenes(recorded: Recording, rerun: Recording, step: int) -> bool:
     """
     rerun = rerun.like(recorded)
     return rerun.steps >= step and all(
-        recorded.scene(number).frame[1].tobytes() == rerun.scene(number).frame[1].tobytes()
-        for number in range(step + 1)
+        recorded.scene(number).data.tobytes() == rerun.scene(number).data.tobytes() for number in range(step + 1)
     )

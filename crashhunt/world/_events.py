@@ -18,6 +18,7 @@ EVENT_WORDS = {
     "red_light": ("red light run", "red lights run"),
     "wrong_way": ("wrong-way drive", "wrong-way drives"),
     "off_route": ("route missed", "routes missed"),
+    "stop_missed": ("scheduled stop missed", "scheduled stops missed"),
     "not_moving": ("long standstill", "long standstills"),
     "others_collided": ("collision of others", "collisions of others"),
     "hard_braking": ("hard braking of another", "hard brakings of others"),

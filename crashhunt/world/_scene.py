@@ -41,7 +41,7 @@ Spine = tuple[tuple[float, float, float], ...]
 
 @dataclass(frozen=True, slots=True)
 class Actor:
-    """The properties of an actor that do not change.
+    """The properties of an actor that seldom change.
 
     Args:
         id: identifier, unique within the episode; for a person, ``person``, a space and the person's name.
@@ -49,6 +49,8 @@ class Actor:
         length: length of the actor, in m.
         width: width of the actor, in m.
         height: height of the actor, in m; 0 if the map is flat.
+        parked: whether the simulator has taken the actor out of the traffic, as SUMO does beside the road. A parked
+            actor touches no other actor, wherever it is drawn.
     """
 
     id: str
@@ -56,6 +58,7 @@ class Actor:
     length: float
     width: float
     height: float = 0.0
+    parked: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +143,12 @@ class Roster:
         return [math.hypot(actor.length, actor.width / 2) for actor in self.actors]
 
     @cached_property
+    def traffic(self) -> tuple[Roster, list[int]] | None:
+        """The roster without parked actors, and the rows that it keeps; None if no actor is parked."""
+        rows = [row for row, actor in enumerate(self.actors) if not actor.parked]
+        return None if len(rows) == len(self.actors) else (Roster(tuple(self.actors[row] for row in rows)), rows)
+
+    @cached_property
     def touch_distance(self) -> float:
         """The distance between front bumpers beyond which no two outlines touch, in m."""
         return 2 * max(self.reaches, default=0.0)
@@ -204,7 +213,7 @@ def part_of(frame: Frame, agent: str, numbers: list[int]) -> Part:
 def joined_frame(
     roster: Roster, columns: NDArray[np.float64], scenes: Sequence[Scene | None], core: Core | None = None
 ) -> Frame:
-    """Return scenes with the same roster as a frame.
+    """Return scenes with the same roster as a frame; parked actors are left out, because nothing can approach them.
 
     Args:
         roster: the roster of all scenes.
@@ -219,6 +228,15 @@ def joined_frame(
         heights = np.array(rows).reshape(len(scenes), 2 * len(roster))
     if any(scene is not None and scene.spines for scene in scenes):
         spines = tuple(scene.spines if scene is not None else _NO_SPINES for scene in scenes)
+    if roster.traffic is not None:
+        count, (roster, kept) = len(roster), roster.traffic
+        of_points = [2 * row + side for row in kept for side in (0, 1)]
+        of_values = [times * count + row for times in (2, 3) for row in kept]
+        columns = np.ascontiguousarray(columns[:, np.array([*of_points, *of_values], np.intp)])
+        if heights is not None:
+            heights = heights[:, np.array([times * count + row for times in (0, 1) for row in kept], np.intp)]
+        if spines is not None:
+            spines = tuple({kept.index(row): one for row, one in each.items() if row in kept} for each in spines)
     return Frame(roster=roster, columns=columns, heights=heights, spines=spines, core=core)
 
 

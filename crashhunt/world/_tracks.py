@@ -498,7 +498,7 @@ class Paths(Serializable):
 
 
 def paths_of(scenes: Sequence[Scene], agents: Collection[str]) -> Paths:
-    """Return the paths of all actors in consecutive scenes.
+    """Return the paths of all actors in consecutive scenes; the path of another actor is interrupted where it parks.
 
     Args:
         scenes: the scenes before the first step and after each step.
@@ -509,6 +509,8 @@ def paths_of(scenes: Sequence[Scene], agents: Collection[str]) -> Paths:
     for step, scene in enumerate(scenes):
         present: dict[str, _Open] = {}
         for row, actor in enumerate(scene.roster.actors):
+            if actor.parked and actor.id not in agents:
+                continue
             way = current.get(actor.id)
             if way is None:
                 way = _Open(actor, step)
@@ -571,7 +573,8 @@ def _path(
     spines: Iterable[tuple[int, Iterable[Iterable[float]]]],
 ) -> Path:
     name, kind, *size = who
-    actor = Actor(str(name), str(kind), *map(float, size))
+    length, width, height = (*map(float, size), 0.0)[:3]
+    actor = Actor(str(name), str(kind), length, width, height)
     centre_lines = tuple((int(step), tuple(tuple(map(float, point)) for point in line)) for step, line in spines)
     where = tuple((int(step), str(lane)) for step, lane in lanes)
     seen = tuple(ActorState(*map(float, state)) for state in states)

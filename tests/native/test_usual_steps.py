@@ -433,9 +433,9 @@ def test_an_agent_that_meddles_with_sumo_sees_the_same(street, what, tmp_path, m
             MEDDLING[what](libsumo)
         return 8.0, 0
 
-    *_, calls = street.both(meddle)
-    if what == "goes":
-        assert calls == "[('_simulator.py', 'step')]"
+    result, *_ = street.both(meddle)
+    if what == "goes":  # the agent has removed its own vehicle, and SUMO has not failed
+        assert "Outcome.FINISHED" in result
     assert street.comes[DONE] > 10
 
 

@@ -158,7 +158,8 @@ def events(sumo, braking):
     sumo.answers |= {
         "vehicle_getStopState": 0, "simulation_getEmergencyStoppingVehiclesNumber": 0, "vehicle_getLanePosition": 7.0,
         "simulation_getStartingTeleportNumber": 0, "lane_getAngle": 90.0, "lane_getLinks": (),
-        "vehicle_getLeader": None, "vehicle_getFollower": ("", -1.0),
+        "vehicle_getLeader": None, "vehicle_getFollower": ("", -1.0), "vehicle_getLaneIndex": 0, "vehicle_getStops": (),
+        "simulation_getStartingTeleportIDList": (), "simulation_getEndingTeleportIDList": (),
     }  # fmt: skip
 
     def begin(agents=("ego",), **limits):

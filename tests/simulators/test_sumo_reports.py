@@ -37,18 +37,21 @@ def sumo(monkeypatch):
 
 # Actors in sight.
 
+ENDS = ("Starting", "Ending")
+
 
 @pytest.fixture
 def world(sumo):
     """Vehicles and persons by name: x, y, SUMO's angle and speed."""
     sumo.vehicles = {"ego": (0.0, 0.0, 90.0, 10.0), "near": (149.0, 0.0, 0.0, 5.0), "far": (151.0, 0.0, 180.0, 6.0)}
     sumo.persons = {}
-    sumo.numbers = dict.fromkeys(("Departed", "Arrived", "StartingTeleport", "EndingTeleport"), 0)
+    kinds = ("Departed", "Arrived", "StartingTeleport", "EndingTeleport", *(f"Parking{when}Vehicles" for when in ENDS))
+    sumo.numbers = dict.fromkeys(kinds, 0)
     sumo.answers |= {
         "vehicle_getIDList": lambda: tuple(sumo.vehicles), "person_getIDList": lambda: tuple(sumo.persons),
         "person_getIDCount": lambda: len(sumo.persons), "simulation_getOption": "striping", "simulation_getTime": 1.5,
         "simulation_getCollisions": (), "person_getVehicle": "", "person_getLaneID": lambda name: f"{name}_walk",
-        "vehicle_getLaneID": lambda name: f"{name}_0", "lane_getIDList": (),
+        "vehicle_getLaneID": lambda name: f"{name}_0", "lane_getIDList": (), "vehicle_getStopState": 0,
         **{f"simulation_get{name}Number": lambda name=name: sumo.numbers[name] for name in sumo.numbers},
     }  # fmt: skip
     for kind, there in (("vehicle", sumo.vehicles), ("person", sumo.persons)):
@@ -99,6 +102,29 @@ def test_look_around_follows_when_a_vehicle_enters_or_leaves(world, number):
     assert "far" not in names(made.look(1, ()))
     world.numbers[number] = 1
     assert "far" in names(made.look(2, ()))
+
+
+def test_vehicle_is_parked_until_the_step_after_sumo_puts_it_back(world):
+    """SUMO moves the vehicle from the parking space to its lane only in that step."""
+    made, state, lists = sight(), {"near": 0}, {}
+    world.answers["vehicle_getStopState"] = lambda name: state.get(name, 0)
+    world.answers |= {f"simulation_getParking{when}VehiclesIDList": lambda when=when: lists[when] for when in ENDS}
+
+    def look(step, starting=(), ending=(), stops=0):
+        state["near"] = stops
+        for when, names_ in zip(ENDS, (starting, ending), strict=True):
+            lists[when], world.numbers[f"Parking{when}Vehicles"] = names_, len(names_)
+        return [actor.id for actor in made.look(step, ()).roster.actors if actor.parked]
+
+    assert look(0) == []
+    assert look(1, starting=("near", "far")) == []  # stopped on its lane, as some parking areas have it
+    assert look(2, starting=("near",), stops=131) == ["near"]
+    assert look(3, stops=131) == ["near"]
+    assert made.plain is None or made.core is None
+    assert look(4, ending=("near",), stops=131) == ["near"]
+    assert look(5) == []
+    state["near"] = 131
+    assert [actor.parked for actor in sight().look(0, ()).roster.actors] == [False, True]  # seen when it is parked
 
 
 @pytest.mark.parametrize(("dt", "every"), [(0.1, 10), (0.05, 10), (0.5, 2), (1.0, 1), (3.0, 1), (0.3, 3)])

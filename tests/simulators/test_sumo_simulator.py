@@ -101,16 +101,20 @@ def test_window_follows_the_first_actor_and_marks_the_second(make, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "error", [libsumo.TraCIException("Vehicle 'x'\n is not known"), libsumo.FatalTraCIError("gone")]
+    ("error", "kind", "before"),
+    [
+        (libsumo.TraCIException("Vehicle 'x'\n is not known"), InvalidEpisodeError, "SUMO says: "),
+        (libsumo.FatalTraCIError("gone"), SimulatorError, "SUMO gave up: "),
+    ],
 )
-def test_errors_of_sumo_are_one_line(error, monkeypatch):
+def test_errors_of_sumo_are_one_line_and_those_outside_its_step_are_not_its_failure(error, kind, before, monkeypatch):
     def fails(*_):
         raise error
 
     text = " ".join(str(error).split())
-    with pytest.raises(SimulatorError) as caught:
+    with pytest.raises(kind) as caught:
         _simulator._part(fails)(1, 2)
-    assert str(caught.value) == f"SUMO gave up: {text}"
+    assert str(caught.value).endswith(f"{before}{text}")
     assert _simulator._part(lambda one, *, two: (one, two))(1, two=2) == (1, 2)
     assert _simulator._one_line(KeyError()) == "KeyError"
     monkeypatch.setattr(_simulator.libsumo, "simulationStep", fails)
@@ -185,7 +189,7 @@ def running(make, sumo, monkeypatch):
     monkeypatch.setattr(_simulator, "_current", lambda: made)
     stepped = []
     monkeypatch.setattr(_simulator.libsumo, "simulationStep", lambda: stepped.append(1))
-    made.agents, made._steps, made._start = ["a", "b"], 0, {"a": 100.0, "b": 0.0}
+    made.agents, made._steps, made._start, made._last_lanes = ["a", "b"], 0, {"a": 100.0, "b": 0.0}, {}
     made.stepped, made.looks, made.applied = stepped, [], []
     sumo.answers |= {"vehicle_getRoadID": "e", "vehicle_getLaneIndex": 1, "vehicle_getDistance": 130.0}
     made._driving = SimpleNamespace(

@@ -45,12 +45,18 @@ __all__ = [
 # Actors that were not seen before, as JSON; each is numbered in order of appearance.
 
 _ACTORS_FIELDS = len(Actor.__slots__)
+_ALWAYS_WRITTEN = 4  # fields; the later ones, which have defaults, are written up to the last that differs
 
 
 def encode_actors(actors: Iterable[Actor]) -> bytes:
     """Return the payload that introduces actors."""
-    known = [[actor.id, actor.kind, actor.length, actor.width, actor.height] for actor in actors]
-    return json.dumps([entry if entry[-1] else entry[:-1] for entry in known]).encode()
+    known = []
+    for actor in actors:
+        entry = [actor.id, actor.kind, actor.length, actor.width, actor.height, actor.parked]
+        while len(entry) > _ALWAYS_WRITTEN and not entry[-1]:
+            del entry[-1]
+        known.append(entry)
+    return json.dumps(known).encode()
 
 
 def _read_actors(reading: Reading, _aux: int, payload: bytes) -> None:

@@ -337,6 +337,8 @@ class SumoDisturbances:
     def resolve_target(self, disturbance: Disturbance, scene: Scene) -> str:
         """Return the identifier of the actor at a place around an agent; empty if the place has none or an agent."""
         try:
+            if not sumo.vehicle_getLaneID(disturbance.agent):
+                return ""  # SUMO still names neighbours of a vehicle that is parked
             if disturbance.what == "ignore_priority":
                 found = self._crossing(disturbance.agent, disturbance.who, scene)
             elif disturbance.what == "step_out":

@@ -48,12 +48,17 @@ class Driving:
     def apply(self, agent: str, action: NDArray[np.generic]) -> bool:
         """Apply an encoded action; return whether the vehicle stays on the road."""
         setup = self._setups[agent]
-        if setup.action == "meta":
-            self._apply_meta(agent, setup, META_ACTIONS[int(action[0])])
-            return True
-        speed, change = action.tolist()
-        sumo.vehicle_setSpeed(agent, speed)
-        return not change or self._change_lane(agent, int(change))
+        try:
+            if setup.action == "meta":
+                self._apply_meta(agent, setup, META_ACTIONS[int(action[0])])
+                return True
+            speed, change = action.tolist()
+            sumo.vehicle_setSpeed(agent, speed)
+            return not change or self._change_lane(agent, int(change))
+        except libsumo.TraCIException:
+            if agent in sumo.vehicle_getIDList():
+                raise
+            return True  # the vehicle has left: the agent's own code may have removed it
 
     def _apply_meta(self, agent: str, setup: AgentSetup, action: str) -> None:
         """Apply a meta-action as highway-env does: FASTER and SLOWER select the next target speed."""
@@ -81,18 +86,18 @@ class Driving:
     def neighboring_lane(self, agent: str, change: int) -> tuple[bool, int] | None:
         """Return whether the vehicle may use a neighbouring lane, and the difference of SUMO's lane indices.
 
-        The result is None inside a junction, where lanes have no neighbours.
+        The result is None inside a junction, where lanes have no neighbours, and for a vehicle off its lane.
 
         Args:
             agent: identifier of the vehicle.
             change: 1 to the left, -1 to the right.
         """
-        edge = sumo.vehicle_getRoadID(agent)
-        if edge.startswith(":"):
+        edge, lane = sumo.vehicle_getRoadID(agent), sumo.vehicle_getLaneIndex(agent)
+        if edge.startswith(":") or lane < 0:
             return None
         lanes = self.lanes(edge)
         direction = -change if self.left_hand else change
-        target = sumo.vehicle_getLaneIndex(agent) + direction
+        target = lane + direction
         exists = 0 <= target < lanes
         if exists and self._is_closed(f"{edge}_{target}", sumo.vehicle_getVehicleClass(agent)):
             exists = False

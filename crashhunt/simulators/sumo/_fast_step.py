@@ -178,10 +178,10 @@ class UsualSteps:
 
     def reads_right(self) -> bool:
         """Return whether the core's values are bit-identical to the values of libsumo's getters."""
-        if self._sight.plain is None:
+        agent, lane = self._agent, sumo.vehicle_getLaneID(self._agent)
+        if self._sight.plain is None or not lane:
             return True
         vehicles, ids = self._sight.plain
-        agent, lane = self._agent, sumo.vehicle_getLaneID(self._agent)
         along = sumo.vehicle_getLanePosition(agent)
         read = (
             sumo.vehicle_getRoadID(agent),

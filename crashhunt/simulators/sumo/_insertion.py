@@ -138,6 +138,11 @@ def _replace(vehicle: str, agent: str) -> None:
     """Replace a vehicle of the traffic by an agent's vehicle with the same position, speed, type and route."""
     route, kind = f"crashhunt.{agent}", libsumo.vehicle.getTypeID(vehicle)
     lane, place = libsumo.vehicle.getLaneIndex(vehicle), libsumo.vehicle.getLanePosition(vehicle)
+    if lane < 0:
+        raise InvalidEpisodeError(
+            f"the vehicle {vehicle!r} enters parked beside the road, so no vehicle can take its place",
+            fix="choose a vehicle that enters on a lane",
+        )
     speed = libsumo.vehicle.getSpeed(vehicle)
     # A vehicle with a departEdge begins in the middle of its route, so use the rest of the route.
     libsumo.route.add(route, libsumo.vehicle.getRoute(vehicle)[libsumo.vehicle.getRouteIndex(vehicle) :])

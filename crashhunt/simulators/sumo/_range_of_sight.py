@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from libsumo import _libsumo as sumo
@@ -37,6 +38,8 @@ _SIGHT_SQUARED = SIGHT_M**2
 _RAD_PER_DEGREE = math.pi / 180.0
 _HEIGHT_EVERY_M = 20.0  # distance between the points of a lane at which heights are read
 _FLAT_M = 0.5  # a map with smaller height differences has no bridges and is treated as flat
+_NO_VALUE = -1073741824.0  # of SUMO's getters, as in `libsumo.INVALID_DOUBLE_VALUE`
+_PARKED_BIT = 2  # of SUMO's stop state: the vehicle is beside the road, and off its lane
 _PERSON_LANE_TYPES = frozenset({"sharedLane", "junctionPedestrian", "crossing", "walkingarea"})
 """SUMO's collision types with a person as victim; a person may have the same id as a vehicle."""
 
@@ -85,6 +88,7 @@ class Sight:
         self._bends.reset()
         self._speeds.clear()
         self._touched: set[tuple[str, str]] = set()
+        self._unparking: frozenset[str] = frozenset()
         self._see((), ())
         self._all_persons: tuple[str, ...] = ()
         self._persons_count: bool | None = None
@@ -95,7 +99,7 @@ class Sight:
             self._persons_count = sumo.simulation_getOption("pedestrian.model") != "nonInteracting"
             self._high = self._is_high() if self._high is None else self._high
         time_to_look = steps % self._every == 0
-        if steps and self._plain is not None and self._eyes is not None and not (self._high or self._all_persons):
+        if steps and self._eyes is not None and self.plain is not None and self._plain is not None:
             # Most steps need only this one call of the core.
             columns = self._plain.look(self._eyes, _SIGHT_SQUARED if time_to_look else 0.0)
             if isinstance(columns, tuple):
@@ -114,7 +118,8 @@ class Sight:
             or (self.core.is_coming_or_going() if self.core is not None else _is_coming_or_going())
             or (self._persons_count and self._persons_changed())
         ):
-            self._select_in_sight()
+            self.look_around()
+        self._update_parked()
         ids, persons = self._ids, self._persons
         contacts = self._contacts()
         lanes = ()
@@ -137,12 +142,14 @@ class Sight:
         if self._high:
             heights = [sumo.vehicle_getPosition3D(vehicle)[2] for vehicle in ids]
             heights += [sumo.person_getPosition3D(person)[2] for person in persons]
-            grades = [math.tan(sumo.vehicle_getSlope(vehicle) * _RAD_PER_DEGREE) for vehicle in ids]
-            grades += [math.tan(sumo.person_getSlope(person) * _RAD_PER_DEGREE) for person in persons]
+            slopes = [*map(sumo.vehicle_getSlope, ids), *map(sumo.person_getSlope, persons)]
+            # SUMO knows no slope of a vehicle that was moved off every lane.
+            grades = [0.0 if slope == _NO_VALUE else math.tan(slope * _RAD_PER_DEGREE) for slope in slopes]
         return Scene(
             sumo.simulation_getTime(), self._roster, points, headings, speeds, contacts, tuple(off_road), lanes,
-            heights, grades, self._spines(points, headings) if self._long else {}, swept=True, core=self.core,
-            columns=columns,
+            heights, grades, self._spines(points, headings) if self._long else {},
+            # A teleport that ends in the step in which it starts leaves the vehicle in sight.
+            swept=not sumo.simulation_getStartingTeleportNumber(), core=self.core, columns=columns,
         )  # fmt: skip
 
     @property
@@ -154,7 +161,7 @@ class Sight:
     @property
     def plain(self) -> tuple[Vehicles, tuple[str, ...]] | None:
         """The ids of the vehicles in sight and their data for the core; None if the core cannot read the scene."""
-        if self._plain is None or self._high or self._all_persons:
+        if self._plain is None or self._high or self._all_persons or self._unparking:
             return None
         return self._plain, self._ids
 
@@ -224,7 +231,7 @@ class Sight:
             return True
         return any(map(sumo.person_getVehicle, self._persons))
 
-    def _select_in_sight(self) -> None:
+    def look_around(self) -> None:
         """Select the actors in sight: the controlled vehicles and all actors near them."""
         found = self.core.in_sight(self._eyes, _SIGHT_SQUARED) if self.core is not None and self._eyes else None
         ids, eyes = found or self._in_sight()
@@ -241,6 +248,26 @@ class Sight:
         if vehicle in self._ids:
             self._see(tuple(name for name in self._ids if name != vehicle), self._persons)
 
+    def _update_parked(self) -> None:
+        """Update which of the vehicles in sight are parked, that is, not part of the traffic.
+
+        SUMO puts a vehicle that ends its parking back on its lane in one step, and moves it there in the next one.
+        """
+        ended: tuple[str, ...] = ()
+        changed = self._unparking
+        if sumo.simulation_getParkingStartingVehiclesNumber() or sumo.simulation_getParkingEndingVehiclesNumber():
+            ended = sumo.simulation_getParkingEndingVehiclesIDList()
+            changed = changed.union(sumo.simulation_getParkingStartingVehiclesIDList(), ended)
+        if not changed:
+            return
+        self._unparking = frozenset(ended)
+        for vehicle in changed.intersection(sumo.vehicle_getIDList(), self._known):
+            self._known[vehicle] = replace(self._known[vehicle], parked=_is_parked(vehicle))
+        if any(
+            self._known[vehicle] is not actor for vehicle, actor in zip(self._ids, self._roster.actors, strict=False)
+        ):
+            self._see(self._ids, self._persons)
+
     def _in_sight(self) -> tuple[tuple[str, ...], list[tuple[float, float]]]:
         """Return the vehicles in sight, and the positions of the controlled vehicles that are present."""
         present = sumo.vehicle_getIDList()
@@ -254,7 +281,7 @@ class Sight:
             kind = sumo.vehicle_getVehicleClass(vehicle)
             height = sumo.vehicle_getHeight(vehicle) if self._high else 0.0
             size = sumo.vehicle_getLength(vehicle), sumo.vehicle_getWidth(vehicle), height
-            found = self._known[vehicle] = Actor(vehicle, kind, *size)
+            found = self._known[vehicle] = Actor(vehicle, kind, *size, parked=_is_parked(vehicle))
             if is_articulated(found):
                 self._articulated.add(vehicle)
         return found
@@ -311,13 +338,19 @@ def _lists(columns: Columns) -> Lists:
 
 
 def _is_coming_or_going() -> bool:
-    """Return whether a vehicle entered or left the simulation in the last step."""
+    """Return whether a vehicle entered or left the simulation in the last step, or began or ended parking."""
     return bool(
         sumo.simulation_getDepartedNumber()
         or sumo.simulation_getArrivedNumber()
         or sumo.simulation_getStartingTeleportNumber()
         or sumo.simulation_getEndingTeleportNumber()
+        or sumo.simulation_getParkingStartingVehiclesNumber()
+        or sumo.simulation_getParkingEndingVehiclesNumber()
     )
+
+
+def _is_parked(vehicle: str) -> bool:
+    return bool(sumo.vehicle_getStopState(vehicle) & _PARKED_BIT)
 
 
 def _near(

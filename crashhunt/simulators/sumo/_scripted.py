@@ -66,7 +66,7 @@ class ScriptedSight:
             [state.z for state in states] if scene.heights else (),
             [state.grade for state in states] if scene.heights else (),
             {row: spine for row, (*_, spine) in enumerate(rows) if spine is not None},
-            swept=True,
+            swept=scene.swept,
             core=scene.core,
         )
 
@@ -102,9 +102,9 @@ def place_agents(script: Paths) -> None:
         libsumo.simulationStep()
     for path in script.agents:
         agent, state = path.actor.id, path.states[0]
-        if path.first > 0 or not path.lanes or path.lanes[0][0] > 0 or agent not in sumo.vehicle_getIDList():
-            raise InvalidEpisodeError(f"the start position of {agent!r} is unknown")
-        lane = path.lanes[0][1]
+        first, lane = path.lanes[0] if path.lanes else (0, "")
+        if path.first > 0 or first > 0 or not lane or agent not in sumo.vehicle_getIDList():
+            raise InvalidEpisodeError(f"the start position of {agent!r} is unknown, or off every lane")
         libsumo.vehicle.moveTo(agent, lane, _along(lane, (state.x, state.y)))
         libsumo.vehicle.setPreviousSpeed(agent, state.speed)
         sumo.vehicle_setSpeed(agent, -1.0)

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from crashhunt.base.errors import EpisodeError
     from crashhunt.scenario import Scenario
     from crashhunt.simulators._protocol import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
@@ -155,6 +156,7 @@ class SumoSimulator:
         self.agents = list(self._setups)
         self._driving.begin(self.agents)
         self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
+        self._last_lanes: dict[str, tuple[str, int]] = {}
         self._steps = 0
         self._kinematics.hidden.clear()
         self._off_road: list[str] = []
@@ -194,14 +196,17 @@ class SumoSimulator:
                 "another simulator in this process has been reset after this simulator",
                 fix="run one simulation at a time, or each simulation in its own process",
             )
+        is_simulating = False
         try:
             for agent, action in actions.items():
                 if not self._driving.apply(agent, action):
                     self._off_road.append(agent)
+            is_simulating = True
             libsumo.simulationStep()
+            is_simulating = False
             return self._finish(actions)
         except _TRACI_ERRORS as error:
-            raise _set_up_failure(error) from error
+            raise _failure_of(error, is_simulating=is_simulating) from error
 
     def _finish(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Return the result of a step that SUMO has simulated."""
@@ -367,14 +372,22 @@ class SumoSimulator:
 
     def _read_scene(self) -> None:
         """Read the scene after the last step."""
-        self._scene = self._look_with.look(self._steps, self._off_road)
+        try:
+            self._scene = self._look_with.look(self._steps, self._off_road)
+        except libsumo.TraCIException:
+            self._sight.look_around()  # an agent's own code has removed a vehicle, which SUMO does not report
+            self._scene = self._look_with.look(self._steps, self._off_road)
 
     def _observe(self, agent: str, row: int) -> NDArray[np.float32]:
-        edge = sumo.vehicle_getRoadID(agent)
-        lanes, lane = self._driving.lanes(edge), sumo.vehicle_getLaneIndex(agent)
+        edge, lane = sumo.vehicle_getRoadID(agent), sumo.vehicle_getLaneIndex(agent)
+        is_on_lane = lane >= 0
+        if not is_on_lane:  # parked, or moved away by remote control: at its last lane
+            edge, lane = self._last_lanes.get(agent) or (edge, 0)
+        self._last_lanes[agent] = edge, lane
+        lanes = self._driving.lanes(edge)
         self._scene.agent_lanes[agent] = f"{edge}_{lane}"
         from_left, lateral_speed = self._driving.from_left(edge, lane), 0.0
-        if self._lateral:
+        if self._lateral and is_on_lane:
             aside, lateral_speed = self._driving.aside(agent)
             from_left += aside
         return self._kinematics.observe(
@@ -394,7 +407,7 @@ def _part(do: Callable[P, T]) -> Callable[P, T]:
         try:
             return do(*given, **named)
         except _TRACI_ERRORS as error:
-            raise _set_up_failure(error) from error
+            raise _failure_of(error) from error
 
     return step
 
@@ -404,13 +417,16 @@ def _simulating() -> Callable[[], None]:
         try:
             libsumo.simulationStep()
         except _TRACI_ERRORS as error:
-            raise _set_up_failure(error) from error
+            raise _failure_of(error, is_simulating=True) from error
 
     return step
 
 
-def _set_up_failure(error: BaseException) -> SimulatorError:
-    return SimulatorError(f"SUMO gave up: {_one_line(error)}")
+def _failure_of(error: BaseException, *, is_simulating: bool = False) -> EpisodeError:
+    """Return the failure of a trial: SUMO's own in a step, and an invalid trial if SUMO refuses a call of crashhunt."""
+    if is_simulating or isinstance(error, libsumo.FatalTraCIError):
+        return SimulatorError(f"SUMO gave up: {_one_line(error)}")
+    return InvalidEpisodeError(f"crashhunt can no longer observe or control a vehicle: SUMO says: {_one_line(error)}")
 
 
 def _one_line(error: BaseException) -> str:

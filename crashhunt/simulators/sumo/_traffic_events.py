@@ -277,6 +277,8 @@ class SumoEvents:
         left, edge = before.rpartition("_")[0], lane.rpartition("_")[0]
         if left == edge:
             return  # the vehicle has changed lanes
+        if agent in sumo.simulation_getStartingTeleportIDList() or agent in sumo.simulation_getEndingTeleportIDList():
+            return
         ways = _ways_between(before, edge)
         if ways and all(any(state in _RED_STATES for state in states) for states in ways):
             speed = scene.speeds[scene.roster.index[agent]]
@@ -286,7 +288,7 @@ class SumoEvents:
     def _ask_direction(self, agent: str, lane: str, last: Scene, scene: Scene, found: list[Event]) -> None:
         """Add an event if the agent drives against the direction of its lane."""
         row, earlier = scene.roster.index[agent], last.roster.index.get(agent)
-        if earlier is None or lane.startswith(":"):
+        if earlier is None or lane.startswith(":") or sumo.vehicle_getLaneIndex(agent) < 0:
             return
         (x, y), (was_x, was_y) = scene.points[row], last.points[earlier]
         driven = math.hypot(x - was_x, y - was_y)
@@ -302,7 +304,10 @@ class SumoEvents:
             found.append(self._of(scene, agent, "wrong_way", f"{agent} drove the wrong way on lane {lane}"))
 
     def _at_dead_ends(self, scene: Scene, agents: Sequence[str], found: list[Event]) -> None:
-        """Add an event for agents at the end of a lane that does not lead along their route, where SUMO stops them."""
+        """Add an event for agents that SUMO stops at the end of a lane.
+
+        Either the lane does not lead along their route, or they have passed a scheduled stop, or are in another lane.
+        """
         for agent in set(sumo.simulation_getEmergencyStoppingVehiclesIDList()).intersection(agents):
             lane = scene.agent_lanes.get(agent, "")
             if not lane or lane.startswith(":") or (agent, lane) in self._stuck:
@@ -313,6 +318,10 @@ class SumoEvents:
                 self._stuck.add((agent, lane))
                 what = f"{agent} missed its route: it is at the end of lane {lane}, which does not lead there"
                 found.append(self._of(scene, agent, "off_route", what))
+            elif missed := _missed_stop(agent, lane):
+                self._stuck.add((agent, lane))
+                what = f"{agent} missed its scheduled stop {missed}: SUMO stopped it at the end of lane {lane}"
+                found.append(self._of(scene, agent, "stop_missed", what))
 
     def _others_collided(self, scene: Scene, agents: Sequence[str], found: list[Event]) -> None:
         index = scene.roster.index
@@ -351,6 +360,17 @@ class SumoEvents:
             if near is not None and near[0] <= _NEAR_M:
                 what = f"SUMO teleported {vehicle}, {near[0]:.0f} m from {near[1]}"
                 found.append(self._of(scene, near[1], "teleport", what, (vehicle,)))
+
+
+def _missed_stop(agent: str, lane: str) -> str:
+    """Return the place of the scheduled stop that a vehicle at the end of a lane has missed; empty if there is none."""
+    for stop in sumo.vehicle_getStops(agent, 1):
+        edge = lane.rpartition("_")[0]
+        is_here = stop.lane.rpartition("_")[0] == edge and stop.speed <= 0
+        if is_here and (stop.lane != lane or sumo.vehicle_getLanePosition(agent) > stop.endPos):
+            name = f"at {stop.stoppingPlaceID}, " if stop.stoppingPlaceID else "on "
+            return f"{name}lane {stop.lane}, {stop.startPos:.0f}-{stop.endPos:.0f} m"
+    return ""
 
 
 def _ways_between(lane: str, edge: str) -> list[tuple[str, ...]]:
