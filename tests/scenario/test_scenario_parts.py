@@ -32,7 +32,7 @@ from crashhunt.scenario._load import check, copy_shipped_scenario, scenario_from
 from crashhunt.scenario._scenario import STEP_LENGTH_S, digest_of_described, with_action
 from crashhunt.scenario.backends.gym import BACKEND as GYM, CrashRule, GymSetup
 from crashhunt.scenario.backends.highway import BACKEND as HIGHWAY, HighwaySetup
-from crashhunt.scenario.backends.sumo import BACKEND as SUMO, StagedFiles, SumoSetup, _ego, _names
+from crashhunt.scenario.backends.sumo import BACKEND as SUMO, StagedFiles, SumoSetup, _ego
 from crashhunt.scenario.backends.sumo._files import (
     filled_in,
     movable,
@@ -487,17 +487,6 @@ def test_descriptor_of_a_plugin_is_a_backend(monkeypatch):
     find = getattr(backend_of, "__wrapped__", backend_of)
     assert find("mine") is plugin
     assert find("nobody") is None
-
-
-def test_line_of_a_definition_is_counted_from_1(tmp_path):
-    first, second = tmp_path / "a.xml", tmp_path / "b.xml"
-    first.write_text('<routes>\n<vehicle id="x"/>\n</routes>')
-    second.write_text('<vehicle id="y"/>')
-    assert _names.line_of("x", [first, second]) == f"{first}, line 2"
-    assert _names.line_of("y", [first, second]) == f"{second}, line 1"
-    second.write_text('\n<vehicle id="y"/>')
-    assert _names.line_of("y", [first, second]) == f"{second}, line 2"
-    assert _names.line_of("z", [first, second]) == ""
 
 
 def test_options_of_every_device_are_harmless_and_those_of_windows_are_not():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 import shutil
 
 import pytest
@@ -197,6 +198,64 @@ def test_sumos_words_get_file_key_and_fix(own, message, output, where, says):
     assert says in str(error)
     assert error.fix
     assert "stage-" not in str(error)
+
+
+LATER = """<routes><vType id="late"/><route id="last" edges="x"/>
+<vehicle id="v" route="last"/><vehicle id="w" route="last"/><vehicle id="w" route="last"/></routes>"""
+USERS = """<additional><include href="inner/deep.add.xml.gz"/>
+<calibrator id="c" edge="e"><flow type="late" begin="0"/></calibrator>
+<flow id="f" type="nowhere"/><flow id="g" type="late"/>
+<rerouter id="r" edges="e"/><vTypeDistribution id="d" vTypes="late"/>
+<inductionLoop id="1" lane="gone_0"/><laneAreaDetector id="2" lane="gone_0"/><e3Detector id="3"><detEntry lane="gone_0"/></e3Detector>
+<busStop id="b" lane="gone_0"/><variableSpeedSign id="s" lanes="gone_0"/>
+<WAUT id="x"/><wautJunction wautID="y" junctionID="gone"/></additional>"""  # noqa: E501
+
+
+@pytest.fixture
+def several(tmp_path):
+    """A scenario whose additional file uses things that are defined later, or nowhere."""
+    shutil.copytree(shipped_folder() / "loop", tmp_path / "own")
+    folder = tmp_path / "own"
+    (folder / "late.rou.xml").write_text(LATER)
+    (folder / "a.add.xml").write_text(USERS)
+    (folder / "inner").mkdir()
+    with gzip.open(folder / "inner" / "deep.add.xml.gz", "wb") as file:
+        file.write(b'<additional>\n\n<parkingArea id="p" lane="gone_0"/></additional>')
+    text = (folder / "scenario.toml").read_text()
+    found = re.search(r'routes = \["(.*?)"\]', text)
+    files = f'routes = ["{found[1]}", "late.rou.xml"]\nadditional = ["a.add.xml"]'
+    (folder / "scenario.toml").write_text(text.replace(found[0], files))
+    return load_scenario(folder / "scenario.toml")
+
+
+@pytest.mark.parametrize(
+    ("says", "where"),
+    [
+        ("Unknown vehicle type 'late' in calibrator 'c'.", "a.add.xml, line 2"),
+        ("The vehicle type 'nowhere' for flow 'f' is not known.", "a.add.xml, line 3"),
+        ("The vehicle type 'late' for flow 'g' is not known.", "a.add.xml, line 3"),
+        ("rerouter 'r': Alternative route 'last' does not exist.", "a.add.xml, line 4"),
+        ("The edge 'gone' to use within rerouter 'r' is not known.", "a.add.xml, line 4"),
+        ("Unknown vtype 'late' in distribution 'd'.", "a.add.xml, line 4"),
+        ("The lane with the id 'gone_0' is not known (while building e1Detector '1').", "a.add.xml, line 5"),
+        ("The lane with the id 'gone_0' is not known (while building e2Detector '2').", "a.add.xml, line 5"),
+        ("The lane with the id 'gone_0' is not known (while building e3Detector '3').", "a.add.xml, line 5"),
+        ("The lane gone_0 to use within the busStop 'b' is not known.", "a.add.xml, line 6"),
+        ("The lane gone_0 to use within the parkingArea 'p' is not known.", "inner/deep.add.xml.gz, line 3"),
+        ("The lane 'gone_0' to use within MSLaneSpeedTrigger 's' is not known.", "a.add.xml, line 6"),
+        ("TLS 'gone' to switch in WAUT 'x' was not yet defined.", "a.add.xml, line 7"),
+        ("Waut 'y' was not yet defined.", "a.add.xml, line 7"),
+        ("stop for vehicle 'v' on lane 'south_0' is not downstream the current route.", "late.rou.xml, line 2"),
+        ("Another vehicle with the id 'w' exists.", "scenario.toml"),  # either of two
+        ("The vehicle type 'late' for vehicle 'nobody' is not known.", "scenario.toml"),
+        ("The route 'no such' for vehicle 'w' is not known.", "scenario.toml"),
+    ],
+)
+def test_place_is_of_the_element_that_uses_what_is_unknown(several, says, where):
+    error = explained(f"SUMO could not set up the episode: {says}", "", several)
+    assert error.where == str(several.folder / where)
+    is_later = "'late'" in says or "'last'" in says
+    assert ("late.rou.xml, which SUMO reads later; name that file first in additional-files" in error.fix) == is_later
 
 
 def test_a_process_that_died_at_set_up_states_what_it_said(own):

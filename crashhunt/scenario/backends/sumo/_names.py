@@ -16,13 +16,13 @@ from crashhunt.scenario.backends.sumo._files import read_xml
 from crashhunt.scenario.backends.sumo._options import SumoSetup
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Mapping
     from pathlib import Path
 
     from crashhunt.scenario._scenario import AgentSetup, Scenario
 
 
-__all__ = ["check_names", "explained", "line_of"]
+__all__ = ["check_names", "explained"]
 
 
 # Where one of these is, things may be defined that are not written there as `id="NAME"`.
@@ -55,17 +55,6 @@ def check_names(scenario: Scenario, ego: str = "") -> None:
             if setup.route and not setup.route.startswith("!"):  # SUMO's own name for the route of a vehicle
                 _check(f"--ego {ego!r}" if ego else f"{key}.route", "route", setup.route, demand, scenario.origin)
         _check_edges(scenario, setup, f"--ego {ego!r}" if ego else f"{key}.edges")
-
-
-def line_of(name: str, files: Iterable[Path]) -> str:
-    """Return ``FILE, line N`` of the first definition of an id; empty if there is none."""
-    for file in files:
-        text = read_xml(file)
-        found = _definition(name).search(text)
-        if found is not None:
-            line = text.count(b"\n", 0, found.start()) + 1
-            return f"{file}, line {line}"
-    return ""
 
 
 def _check_replaced(scenario: Scenario, setup: AgentSetup, demand: list[bytes]) -> None:
@@ -132,6 +121,7 @@ def _ids(tags: bytes, texts: list[bytes]) -> list[str]:
 
 # SUMO's complaints about an episode that it could not set up, as file, key and value that the user can correct.
 
+_NEWLINE = b"\n"
 _SET_UP_ERROR = "SUMO could not set up the episode: "
 _FIX_IN_FILE = "correct it there"
 # SUMO raises one of these, and says on its output what it means.
@@ -143,7 +133,24 @@ _LINE_ERROR = re.compile(r"In file '([^']+)' At line/column (\d+)")
 _VEHICLE_ERROR = re.compile(r"(?:Invalid|departing) (\w+?)(?: definition)?(?: '[^']*')? for vehicle '([^']+)'")
 _KEY_BY_ATTRIBUTE = {"type": "type", "route": "route", "departLane": "depart_lane", "departPos": "depart_pos"}
 _KEY_BY_ATTRIBUTE |= {"departSpeed": "depart_speed"}
-_DEFINED_ID = re.compile(r"(?:flow|vType|vehicle type|vehicle|trip|route|edge|lane|junction) '([^']+)'")
+# In a message, an element is named by its kind and its id; the one that is unknown is not the one to correct.
+_NAMED_ID = re.compile(r"(\w+(?: type)?)(?: with the id)? '([^']+)'")
+_BARE_ID = re.compile(r"\b(edge|lane) ([^'\s]+) to use\b")
+_UNKNOWN = re.compile(r"[Uu]nknown|not (?:yet )?(?:known|defined)|does not exist|[Nn]o such")
+_TAGS_BY_WORD = {
+    **dict.fromkeys(("vehicle", "trip"), "vehicle|trip"),
+    "flow": "flow|personFlow|containerFlow",
+    **dict.fromkeys(("vehicle type", "type", "vtype"), "vType|vTypeDistribution"),
+    "route": "route|routeDistribution",
+    "distribution": "routeDistribution|vTypeDistribution",
+    "e1detector": "inductionLoop|e1Detector",
+    "e2detector": "laneAreaDetector|e2Detector",
+    "e3detector": "entryExitDetector|e3Detector",
+    "mslanespeedtrigger": "variableSpeedSign",
+    "tls": "tlLogic",
+    "access": "busStop|trainStop|parkingArea|containerStop",
+}
+"""The tags of the elements that SUMO's messages call by another word."""
 
 
 def explained(message: str, output: str, scenario: Scenario) -> ScenarioError | None:
@@ -213,9 +220,47 @@ def _about_a_file(said: str, scenario: Scenario) -> ScenarioError:
     if line is not None:
         text = said[: line.start()].strip()
         return ScenarioError(f"SUMO says: {text}", fix=_FIX_IN_FILE, where=f"{line[1]}, line {line[2]}")
-    files = [scenario.folder / name for name in reversed(list(scenario.files()))]  # the network last, which is large
-    for name in _DEFINED_ID.findall(said):
-        where = line_of(name, files)
-        if where:
-            return ScenarioError(f"SUMO says: {said}", fix=_FIX_IN_FILE, where=where)
-    return ScenarioError(f"SUMO says: {said}", fix="see [sumo] and the files that it names", where=scenario.origin)
+    named = _NAMED_ID.findall(_BARE_ID.sub(r"\1 '\2'", said))
+    texts = {scenario.folder / name: read_xml(scenario.folder / name) for name in scenario.texts()}
+    unknown = None
+    if _UNKNOWN.search(said) and named:
+        unknown = named.pop("': " in said and len(named) > 1)
+    fix = _FIX_IN_FILE
+    if unknown is not None and (defined := _places(*unknown, texts)):
+        later, _, _ = defined[0].rpartition(", line ")
+        fix = f"{unknown[1]!r} is defined in {later}, which SUMO reads later; name that file first in additional-files"
+    for word, name in named:
+        places = _places(word, name, texts)
+        if not places and word.lower() == "vehicle":
+            places = _places("flow", name.rpartition(".")[0], texts)  # FLOW.0, FLOW.1, …
+        if len(places) == 1:
+            return ScenarioError(f"SUMO says: {said}", fix=fix, where=places[0])
+    if unknown is not None and len(places := _uses(unknown[1], texts)) == 1:
+        return ScenarioError(f"SUMO says: {said}", fix=fix, where=places[0])
+    if unknown is None:
+        net = scenario.folder / scenario.table(SumoSetup).net
+        for word, name in named:
+            if word.lower() in ("edge", "lane", "junction") and (places := _places(word, name, {net: read_xml(net)})):
+                return ScenarioError(f"SUMO says: {said}", fix=fix, where=places[0])
+    fix = "see [sumo] and the files that it names" if fix == _FIX_IN_FILE else fix
+    return ScenarioError(f"SUMO says: {said}", fix=fix, where=scenario.origin)
+
+
+def _places(word: str, name: str, texts: Mapping[Path, bytes]) -> list[str]:
+    """Return ``FILE, line N`` of each element that a word of SUMO's messages and an id name."""
+    tags = _TAGS_BY_WORD.get(word.lower(), word).encode()
+    return _lines(re.compile(rb"<(?i:%b)\s[^<>]*?%b" % (tags, _definition(name).pattern)), texts)
+
+
+def _uses(name: str, texts: Mapping[Path, bytes]) -> list[str]:
+    """Return ``FILE, line N`` of each element with an attribute other than its id that is a name."""
+    value = re.escape(name.encode())
+    return _lines(re.compile(rb"""<\w+\s(?:[^<>]*\s)?(?!id\b)\w+\s*=\s*(?:"%b"|'%b')""" % (value, value)), texts)
+
+
+def _lines(pattern: re.Pattern[bytes], texts: Mapping[Path, bytes]) -> list[str]:
+    return [
+        f"{path}, line {text.count(_NEWLINE, 0, found.start()) + 1}"
+        for path, text in texts.items()
+        for found in pattern.finditer(text)
+    ]
