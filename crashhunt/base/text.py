@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 
 __all__ = [
+    "NOTICE_TOPIC",
     "any_of",
     "command_line",
     "count_of",
@@ -32,6 +33,9 @@ __all__ = [
     "visible",
 ]
 
+
+NOTICE_TOPIC = "\t"
+"""Separates the topic of a notice of a worker from its text; of each topic, a hunt prints one notice."""
 
 # Control and format characters, lone surrogates, and separators of lines that are no newline.
 _INVISIBLE_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}

@@ -166,6 +166,7 @@ def _facts(state: HuntState) -> list[str]:
     lines = [f"{state.crashes} {'crash' if state.crashes == 1 else 'crashes'}: {crashes}"] if crashes else []
     lines += [describe_running(state.rate) + _not_counted(state)] if state.rate is not None else []
     lines += fork_lines(state)
+    lines += [one_line(notice) for notice in state.notices or ()]
     return [*lines, *([f"compiled core {state.core}"] if state.core is not None else [])]
 
 

@@ -13,6 +13,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.json_types import ErrorData, ErrorWords
+from crashhunt.base.text import NOTICE_TOPIC
 from crashhunt.plans import ChoosesParallelism, executor_of
 
 if TYPE_CHECKING:
@@ -235,19 +236,21 @@ class Notes:
 
     def __init__(self, scratch: Path) -> None:
         self._file = scratch / layout.NOTICES
-        self._all: dict[str, None] = {}  # in order
+        self._all: dict[str, str] = {}  # by topic, in order
         self._told = 0
 
     def add(self, note: str) -> None:
-        """Add a notice, unless it was added before."""
-        self._all[note] = None
+        """Add a notice, unless it was added before, or another one of its topic."""
+        topic, _, text = note.rpartition(NOTICE_TOPIC)
+        self._all.setdefault(topic or text, text)
 
     def fresh(self) -> list[str]:
         """Return the notices that were not returned before."""
         with suppress(OSError):
             text = self._file.read_text(encoding="utf-8", errors="replace")
-            self._all |= dict.fromkeys(text.splitlines())
-        fresh = list(self._all)[self._told :]
+            for note in text.splitlines():
+                self.add(note)
+        fresh = list(self._all.values())[self._told :]
         self._told += len(fresh)
         return fresh
 

@@ -223,6 +223,7 @@ class Hunt:
             independent=sampler.independent and not settings.seeds and alike,
             plain_origin=sampler.plain_origin or None,
             core=core_of(self.scenario, settings.run),
+            notices=list(dict.fromkeys((*self.scenario.warnings, *(before.get("notices") or ())))) or None,
             disturb=list(settings.disturb) or None,
             copies=copies_to_come(settings),
             audits_left=self._audits_left.numbers or before.get("audits_left"),
@@ -485,6 +486,8 @@ class Hunt:
         for note in self._heard.take(executor):
             ledger.remark(note)
             progress.notes.append(note)
+            if note not in (known := ledger.facts().get("notices") or []):
+                ledger.note(notices=[*known, note])
         progress.look_at(executor)
         for difference in audit.look(wait_s):
             ledger.remark(f"audit: {difference}")

@@ -215,6 +215,8 @@ class HuntState(Serializable):
         branches: present results of the branches; None if the hunt has no branches.
         rate: the crash rate at the hunt's last heartbeat, with the fields of `RunningRate`; None if it is unknown.
         core: whether the simulator's compiled core is used; None if the simulator has none.
+        notices: what trials test otherwise than the user's files say, such as demand that the simulator omits;
+            None if there is nothing.
         nodes: the machines of the hunt's last run, with the fields of `NodeFigures`; None if it used only this machine.
         kinds: crash types, the most frequent first, with the fields of `KindData`; None if the hunt ends at its first
             crash.
@@ -238,6 +240,7 @@ class HuntState(Serializable):
     phase: dict[str, Any] | None = field(default=None, metadata=OMIT_DEFAULT)
     disturbed: int | None = field(default=None, metadata=OMIT_DEFAULT)
     core: str | None = field(default=None, metadata=OMIT_DEFAULT)
+    notices: list[str] | None = field(default=None, metadata=OMIT_DEFAULT)
     nodes: list[dict[str, Any]] | None = field(default=None, metadata=OMIT_DEFAULT)
     kinds: list[KindData] | None = field(default=None, metadata=OMIT_DEFAULT)
     newest_kind_s: float | None = field(default=None, metadata=written_if(lambda state: state.kinds is not None))
@@ -368,6 +371,7 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
         phase=_phase(facts) if state == "running" else None,
         owner_alive=alive,
         core=facts.get("core"),
+        notices=facts.get("notices"),
         nodes=facts.get("nodes"),
         kinds=facts.get("kinds"),
         types_by_cause=facts.get("types_by_cause"),

@@ -127,6 +127,8 @@ class Noted(TypedDict, total=False):
             which have version 1.
         origins: whether the sampler reports the origin of each trial.
         core: whether the compiled core of the simulator is used; None if the simulator has no compiled core.
+        notices: what trials test otherwise than the user's files say, such as demand that the simulator omits;
+            None if there is nothing.
         disturb: disturbances of the trials with their rates; None without disturbances.
         copies: the types of forks that the hunt makes of its trials: ``probes``, ``branches`` or both; None if the hunt
             makes no forks.
@@ -170,6 +172,7 @@ class Noted(TypedDict, total=False):
     sampler_version: int | None
     origins: bool
     core: str | None
+    notices: list[str] | None
     disturb: list[str] | None
     copies: list[str] | None
     confirmed: Mapping[str, Sequence[int]] | None

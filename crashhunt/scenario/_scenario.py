@@ -176,6 +176,7 @@ class ObservationSetup:
 
 STEP_LENGTH_S = 0.1  # ten decisions a second, as drivers' models are made for
 T = TypeVar("T")
+_WARNING = "warning: "  # what the notes begin with that are facts about each trial
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,6 +228,11 @@ class Scenario:
     def origin(self) -> str:
         """The path with which error messages identify the scenario."""
         return str(self.folder / self.file)
+
+    @property
+    def warnings(self) -> list[str]:
+        """The notes that are warnings, such as of demand that the simulator omits; facts about each trial."""
+        return [note.removeprefix(_WARNING) for note in self.notes if note.startswith(_WARNING)]
 
     @property
     def backends(self) -> dict[str, Backend]:

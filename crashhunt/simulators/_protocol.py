@@ -186,7 +186,11 @@ class ReportsNotices(Protocol):
 
     @property
     def notices(self) -> Iterable[str]:
-        """The notices as lines of text. A hunt reads them after each episode and prints each line once."""
+        """The notices as lines of text. A hunt reads them after each episode and prints each line once.
+
+        A line may begin with a topic and ``base.text.NOTICE_TOPIC``, which are not printed; of each topic, only the
+        first line is printed.
+        """
 
 
 class FlattensObservations(Protocol):

@@ -49,7 +49,7 @@ class Actor:
         length: length of the actor, in m.
         width: width of the actor, in m.
         height: height of the actor, in m; 0 if the map is flat.
-        parked: whether the simulator has taken the actor out of the traffic, as SUMO does beside the road. A parked
+        parked: whether the simulator has taken the actor out of the traffic, as SUMO does next to the road. A parked
             actor touches no other actor, wherever it is drawn.
     """
 
@@ -213,7 +213,7 @@ def part_of(frame: Frame, agent: str, numbers: list[int]) -> Part:
 def joined_frame(
     roster: Roster, columns: NDArray[np.float64], scenes: Sequence[Scene | None], core: Core | None = None
 ) -> Frame:
-    """Return scenes with the same roster as a frame; parked actors are left out, because nothing can approach them.
+    """Return scenes with the same roster as a frame; parked actors are excluded, because nothing can approach them.
 
     Args:
         roster: the roster of all scenes.

@@ -255,7 +255,7 @@ def test_place_is_of_the_element_that_uses_what_is_unknown(several, says, where)
     error = explained(f"SUMO could not set up the episode: {says}", "", several)
     assert error.where == str(several.folder / where)
     is_later = "'late'" in says or "'last'" in says
-    assert ("late.rou.xml, which SUMO reads later; name that file first in additional-files" in error.fix) == is_later
+    assert ("late.rou.xml, which SUMO reads later; list that file first in additional-files" in error.fix) == is_later
 
 
 def test_a_process_that_died_at_set_up_states_what_it_said(own):

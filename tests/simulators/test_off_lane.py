@@ -116,7 +116,7 @@ STOPS = {
 
 
 @pytest.mark.parametrize("stop", STOPS)
-def test_vehicle_that_parks_is_observed_at_its_last_lane_and_touches_nobody(drive, stop):
+def test_parked_agent_is_observed_at_its_last_lane_without_collision(drive, stop):
     """The parking area of the left lane lies on the right lane, on which others drive through the parked vehicle."""
     is_area = "parkingArea" in STOPS[stop]
     place = {"departPos": "stop", "departSpeed": "0"} if "start" in stop else {}
@@ -145,7 +145,7 @@ def test_parked_vehicles_of_the_traffic_are_passed(drive, lateral):
     assert (result.events, result.danger) == ({}, 0.0)
 
 
-def test_taxi_waits_beside_the_road(drive):
+def test_idle_taxi_survives(drive):
     result, recording = drive(steady, vehicle(type="cab", departLane="0"), traffic=ON_THE_ROAD, steps=200)
     assert (result.outcome, result.events) == (Outcome.SURVIVED, {})
     assert parked_steps(recording)
@@ -171,7 +171,7 @@ def test_vehicle_that_an_agent_moves_off_every_lane_is_observed(drive):
     assert (result.outcome, result.steps, result.failure) == (Outcome.FINISHED, 60, None)
 
 
-def test_teleport_runs_no_red_light_and_touches_nobody_on_its_way(drive):
+def test_teleport_across_a_junction_is_no_red_light_run(drive):
     """SUMO puts the vehicle behind the crossing in the same step."""
     result, _ = drive(steady, vehicle(departLane="0", depart="2"), options={"time-to-teleport": 5}, steps=300)
     assert (result.outcome, result.events) == (Outcome.SURVIVED, {"teleport": 1})

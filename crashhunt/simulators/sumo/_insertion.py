@@ -140,7 +140,7 @@ def _replace(vehicle: str, agent: str) -> None:
     lane, place = libsumo.vehicle.getLaneIndex(vehicle), libsumo.vehicle.getLanePosition(vehicle)
     if lane < 0:
         raise InvalidEpisodeError(
-            f"the vehicle {vehicle!r} enters parked beside the road, so no vehicle can take its place",
+            f"the vehicle {vehicle!r} enters parked next to the road, so no vehicle can take its place",
             fix="choose a vehicle that enters on a lane",
         )
     speed = libsumo.vehicle.getSpeed(vehicle)

@@ -39,7 +39,7 @@ _RAD_PER_DEGREE = math.pi / 180.0
 _HEIGHT_EVERY_M = 20.0  # distance between the points of a lane at which heights are read
 _FLAT_M = 0.5  # a map with smaller height differences has no bridges and is treated as flat
 _NO_VALUE = -1073741824.0  # of SUMO's getters, as in `libsumo.INVALID_DOUBLE_VALUE`
-_PARKED_BIT = 2  # of SUMO's stop state: the vehicle is beside the road, and off its lane
+_PARKED_BIT = 2  # of SUMO's stop state: the vehicle is next to the road, and off its lane
 _PERSON_LANE_TYPES = frozenset({"sharedLane", "junctionPedestrian", "crossing", "walkingarea"})
 """SUMO's collision types with a person as victim; a person may have the same id as a vehicle."""
 

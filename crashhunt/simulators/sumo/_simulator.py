@@ -25,6 +25,7 @@ from crashhunt.simulators.sumo._driving import Driving, hold_vehicle
 from crashhunt.simulators.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.simulators.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
 from crashhunt.simulators.sumo._loading import VERSION, Loading, ready_xml
+from crashhunt.simulators.sumo._omitted_demand import OmittedDemand
 from crashhunt.simulators.sumo._range_of_sight import Sight
 from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents
 from crashhunt.simulators.sumo._surroundings import surroundings_of
@@ -91,7 +92,8 @@ class SumoSimulator:
             speeds=self._disturbances.speeds,
             core=core,
         )
-        self.notices: list[str] = []
+        self._notices: list[str] = []
+        self._demand = OmittedDemand(scenario)
         self._lanes: list[Lane] | None = None
         self._program = ["sumo"]
         self._events = SumoEvents(scenario.step_length_s, scenario.events)
@@ -109,6 +111,11 @@ class SumoSimulator:
     def ready_process(self) -> None:
         """Initialize SUMO's XML library."""
         ready_xml()
+
+    @property
+    def notices(self) -> list[str]:
+        """Notices on how the last episode was simulated, and on demand that SUMO has omitted."""
+        return [*self._notices, *self._demand.notices()]
 
     def open_window(self) -> None:
         """Show the episodes in sumo-gui, which libsumo contains."""
@@ -143,14 +150,18 @@ class SumoSimulator:
         self._begin(options.get("only"), options.get("script"), arguments)
         command = self._files.arguments(seed, arguments)
         try:
+            self._demand.begin()
             notice = self._loading.load(self._program, command)
             _current = weakref.ref(self)
-            if notice and notice not in self.notices:
-                self.notices.append(notice)
+            if notice and notice not in self._notices:
+                self._notices.append(notice)
             with steps_counted(self, self.step_length_s):
                 enter(self._scenario, self._setups, self._replaced, self._taking_part)
+            self._demand.read()
             if script := options.get("script"):
                 place_agents(script)
+        except InvalidEpisodeError as error:
+            raise self._demand.explained(error, [*self._setups, *self._replaced]) from None
         except _TRACI_ERRORS as error:
             raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
         self.agents = list(self._setups)
@@ -165,7 +176,7 @@ class SumoSimulator:
         usual = self._usual_steps()
         if self._sight.core is not None and self._is_core_wrong(observations, usual):
             self._sight.distrust()
-            self.notices.append(_CORE_DISABLED_NOTICE)
+            self._notices.append(_CORE_DISABLED_NOTICE)
             self._read_scene()
             observations, usual = self._observe_all(), None
         self._events.begin(self._scene, self.agents, self._moved)

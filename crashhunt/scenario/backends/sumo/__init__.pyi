@@ -1,4 +1,5 @@
 from ._backend import BACKEND as BACKEND
+from ._demand_order import SORT_FIX as SORT_FIX, is_searched as is_searched, unsorted_notes as unsorted_notes
 from ._ego import NOT_ON_A_ROAD as NOT_ON_A_ROAD, SurveyedRun as SurveyedRun
 from ._files import (
     READ as READ,
@@ -12,7 +13,7 @@ from ._files import (
     rewritten as rewritten,
     written_by as written_by,
 )
-from ._names import check_names as check_names, explained as explained
+from ._names import check_names as check_names, explained as explained, places_of as places_of
 from ._options import (
     HARMLESS as HARMLESS,
     INPUTS as INPUTS,

@@ -81,7 +81,8 @@ def _relocated(path: Path) -> bytes | None:
 
 
 def _notes(scenario: Scenario) -> Iterator[str]:
-    """Yield a note on output files that SUMO would write, and that a trial does not write."""
+    """Yield notes on output files that a trial does not write, and on demand that SUMO omits."""
+    from crashhunt.scenario.backends.sumo._demand_order import unsorted_notes
     from crashhunt.scenario.backends.sumo._files import written_by
 
     sumo = scenario.table(SumoSetup)
@@ -90,6 +91,8 @@ def _notes(scenario: Scenario) -> Iterator[str]:
     found += written_by(scenario.folder, (*sumo.routes, *sumo.additional))
     if found:
         yield f"of {scenario.file}, a trial does not take over: {'; '.join(found)}"
+    begin_s = sumo.options.get("begin", 0.0)
+    yield from unsorted_notes(scenario.folder, sumo.routes, float(begin_s) if isinstance(begin_s, int | float) else 0.0)
 
 
 def _load(path: Path, ego: str) -> Scenario:

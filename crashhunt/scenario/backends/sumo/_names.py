@@ -8,6 +8,7 @@ network may have hundreds of megabytes.
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
@@ -17,18 +18,18 @@ from crashhunt.scenario.backends.sumo._options import SumoSetup
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
     from crashhunt.scenario._scenario import AgentSetup, Scenario
 
 
-__all__ = ["check_names", "explained"]
+__all__ = ["check_names", "explained", "places_of"]
 
 
 # Where one of these is, things may be defined that are not written there as `id="NAME"`.
 _GENERATED_ID = re.compile(rb"""\bid\s*=\s*["'][^"']*(?:\$\{|&#)""")
 _TAGS = {"type": b"vType|vTypeDistribution", "route": b"route|routeDistribution", "edge": b"edge"}
 _VEHICLES = b"vehicle|trip|flow"
+_DEMAND_TAGS = "vehicle|trip|flow|person|personFlow|container|containerFlow|calibrator"
 
 
 def check_names(scenario: Scenario, ego: str = "") -> None:
@@ -220,15 +221,14 @@ def _about_a_file(said: str, scenario: Scenario) -> ScenarioError:
     if line is not None:
         text = said[: line.start()].strip()
         return ScenarioError(f"SUMO says: {text}", fix=_FIX_IN_FILE, where=f"{line[1]}, line {line[2]}")
-    named = _NAMED_ID.findall(_BARE_ID.sub(r"\1 '\2'", said))
-    texts = {scenario.folder / name: read_xml(scenario.folder / name) for name in scenario.texts()}
-    unknown = None
+    named: list[tuple[str, str]] = _NAMED_ID.findall(_BARE_ID.sub(r"\1 '\2'", said))
+    texts, unknown = _texts(scenario), None
     if _UNKNOWN.search(said) and named:
         unknown = named.pop("': " in said and len(named) > 1)
     fix = _FIX_IN_FILE
     if unknown is not None and (defined := _places(*unknown, texts)):
         later, _, _ = defined[0].rpartition(", line ")
-        fix = f"{unknown[1]!r} is defined in {later}, which SUMO reads later; name that file first in additional-files"
+        fix = f"{unknown[1]!r} is defined in {later}, which SUMO reads later; list that file first in additional-files"
     for word, name in named:
         places = _places(word, name, texts)
         if not places and word.lower() == "vehicle":
@@ -244,6 +244,16 @@ def _about_a_file(said: str, scenario: Scenario) -> ScenarioError:
                 return ScenarioError(f"SUMO says: {said}", fix=fix, where=places[0])
     fix = "see [sumo] and the files that it names" if fix == _FIX_IN_FILE else fix
     return ScenarioError(f"SUMO says: {said}", fix=fix, where=scenario.origin)
+
+
+def places_of(name: str, scenario: Scenario) -> list[str]:
+    """Return ``FILE, line N``, without the folder, of each vehicle, flow, person or calibrator with an id."""
+    texts = {Path(file): read_xml(scenario.folder / file) for file in scenario.texts()}
+    return _places(_DEMAND_TAGS, name, texts)
+
+
+def _texts(scenario: Scenario) -> dict[Path, bytes]:
+    return {scenario.folder / name: read_xml(scenario.folder / name) for name in scenario.texts()}
 
 
 def _places(word: str, name: str, texts: Mapping[Path, bytes]) -> list[str]:

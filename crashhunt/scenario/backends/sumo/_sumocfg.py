@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import ScenarioError
 from crashhunt.scenario._scenario import ArgumentSetup, ObservationSetup, Scenario
 from crashhunt.scenario.backends.sumo._check import check_options
+from crashhunt.scenario.backends.sumo._demand_order import unsorted_notes
 from crashhunt.scenario.backends.sumo._ego import choose_ego, number, seconds
 from crashhunt.scenario.backends.sumo._files import nested_files, read_xml, written_by
 from crashhunt.scenario.backends.sumo._options import (
@@ -195,7 +196,7 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
                 literal=literal or None,
             )
         },
-        notes=(driven.note, *notes),
+        notes=(driven.note, *notes, *unsorted_notes(folder, routes, begin)),
     )
 
 
