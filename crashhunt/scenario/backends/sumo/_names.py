@@ -137,7 +137,7 @@ _KEY_BY_ATTRIBUTE |= {"departSpeed": "depart_speed"}
 # In a message, an element is named by its kind and its id; the one that is unknown is not the one to correct.
 _NAMED_ID = re.compile(r"(\w+(?: type)?)(?: with the id)? '([^']+)'")
 _BARE_ID = re.compile(r"\b(edge|lane) ([^'\s]+) to use\b")
-_UNKNOWN = re.compile(r"[Uu]nknown|not (?:yet )?(?:known|defined)|does not exist|[Nn]o such")
+_UNKNOWN = re.compile(r"(?i)unknown|not (?:yet )?(?:known|defined)|does not exist|no such")
 _TAGS_BY_WORD = {
     **dict.fromkeys(("vehicle", "trip"), "vehicle|trip"),
     "flow": "flow|personFlow|containerFlow",
