@@ -574,7 +574,7 @@ def _path(
 ) -> Path:
     name, kind, *size = who
     length, width, height = (*map(float, size), 0.0)[:3]
-    actor = Actor(str(name), str(kind), length, width, height)
+    actor = Actor(id=str(name), kind=str(kind), length=length, width=width, height=height)
     centre_lines = tuple((int(step), tuple(tuple(map(float, point)) for point in line)) for step, line in spines)
     where = tuple((int(step), str(lane)) for step, lane in lanes)
     seen = tuple(ActorState(*map(float, state)) for state in states)
