@@ -263,3 +263,21 @@ def test_the_one_that_is_excluded_has_not_touched():
         } == expected
         found += len(expected)
     assert found > 60
+
+
+@pytest.mark.parametrize("name", ["agent", "other"])
+def test_jump_out_of_a_parking_space_is_no_path(name):
+    """The other vehicle drives through the space, which lies on its lane; the parked one jumps to its own lane."""
+
+    def scene(time_s, parked, agent, other):
+        actors = [Actor(one, "car", 5.0, 1.8, parked=parked and one == name) for one in ("agent", "other")]
+        rows = (agent, other) if name == "agent" else (other, agent)
+        return Scene(time_s, Roster(tuple(actors)), rows, [0.0, 0.0], [6.0, 10.0], swept=True)
+
+    before = scene(0.0, True, (100.0, -4.8), (90.0, -4.8))
+    after = scene(1.0, False, (100.6, -1.6), (101.0, -4.8))
+    after.follow(before)
+    assert Overlap().check(before, ["agent"]) == Overlap().check(after, ["agent"]) == []
+    driven = scene(1.0, False, (100.6, -4.8), (101.0, -4.8))
+    driven.follow(scene(0.0, True, (100.0, -4.8), (90.0, -4.8)))
+    assert Overlap().check(driven, ["agent"])

@@ -202,11 +202,16 @@ def test_other_ways_off_the_lane_or_the_route_are_no_failure(drive, stop, more):
 
 
 def test_disturbances_around_a_parked_vehicle_have_no_target(drive):
-    ways = [("brake", "ahead"), ("cut_in", "left behind"), ("stop", "behind")]
-    given = [Disturbance(step=150, agent="ego", what=what, who=who, how_strong=3.0, how_long=1.0) for what, who in ways]
+    ways = [("brake", "ahead"), ("cut_in", "left behind"), ("cut_in", "left ahead"), ("stop", "behind")]
+    given = [
+        Disturbance(step=step, agent="ego", what=what, who=who, how_strong=3.0, how_long=0.5)
+        for step in range(130, 230, 10)
+        for what, who in ways
+    ]
     stop = vehicle(STOPS["beside the road"], departLane="0")
-    result, _ = drive(steady, stop, traffic=ON_THE_ROAD, steps=200, disturbances=tuple(given))
-    assert {disturbance.vehicle for disturbance in result.spec.disturbances} == {""}
+    left = [vehicle(id=f"left{n}", depart=str(n), departLane="1") for n in range(1, 20, 2)]
+    _, recording = drive(steady, stop, traffic=[*ON_THE_ROAD, *left], steps=240, disturbances=tuple(given))
+    assert {disturbance.vehicle for disturbance in recording.disturbances} == {""}
 
 
 @pytest.mark.parametrize(

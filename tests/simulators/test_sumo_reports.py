@@ -104,6 +104,14 @@ def test_look_around_follows_when_a_vehicle_enters_or_leaves(world, number):
     assert "far" in names(made.look(2, ()))
 
 
+def test_scene_of_a_teleport_is_not_swept(world):
+    """A vehicle whose teleport ends in the same step stays in sight, and has driven no path."""
+    made = sight()
+    assert made.look(0, ()).swept
+    world.numbers["StartingTeleport"] = 1
+    assert not made.look(1, ()).swept
+
+
 def test_vehicle_is_parked_until_the_step_after_sumo_puts_it_back(world):
     """SUMO moves the vehicle from the parking space to its lane only in that step."""
     made, state, lists = sight(), {"near": 0}, {}
