@@ -36,6 +36,7 @@ _WINDOW_S = 4.0  # earlier movements have not led to the contact
 _SAMPLE_S = 0.1  # as short as the usual steps of simulators
 _EVENTS_S = 10.0  # before the contact
 SAME_WAY = math.radians(45)
+_MIN_BEND_TURN_RAD = math.radians(20)  # between two vehicles that touch in one lane: less is no tight bend
 _OPPOSITE_RAD = math.radians(135)
 _UNSWEPT_CONTACT = "crashed"  # highway-env's collisions: its vehicles drive through several collision checks in a step
 _LATELY_S = 1.5
@@ -46,6 +47,15 @@ _DRIFTS_M = 0.1
 _ACROSS_M = 50.0  # from the line of a junction to where it ends; there are larger ones
 _BEND_M = 0.4  # with it, an actor on the neighbouring lane is still not in the way: its centre is more than 2 m away
 _BESIDE_M = 1.2  # of the path that another one drives; less is in its way
+_TRAIL_M = 40.0  # of the path before the contact; longer than any vehicle and the part that a follower must share
+_TRAIL_STEP_M = 0.25  # between two poses of a trail
+_MIN_LEG_M = 0.01  # a shorter leg of a trail has no direction
+_SHARED_M = 4.0  # of its path, a vehicle drives along the path of another one to count as on the same way
+_SHARED_ASIDE_M = 5.0  # a vehicle on a neighbouring lane drives the same way
+_MAX_SHARED_TURN_RAD = math.radians(35)  # between two paths at the same place
+_REAR_M = 1.5  # from the rear of a vehicle, along its path: further ahead, its side is touched
+_FRONTS_M = 2.0  # between two fronts that met, each with the middle or with a corner
+_MIN_COURSE_M = 0.5  # driven, to know in which direction the front of a vehicle moves
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,22 +273,117 @@ class ContactRecord:
             return "pedestrian"
         if self.is_disputed:
             return ""
-        turn = self.touch.turn
-        if abs(turn) > _OPPOSITE_RAD:
+        if self.same_way:
+            return "rear end" if self.follower else "side swipe"
+        if self.is_oncoming:
             return "head-on"
-        if not self.same_way:
-            return "crossing from the right" if turn > 0 else "crossing from the left"
-        return "rear end" if self.follower else "side swipe"
+        return "crossing from the right" if self.touch.turn > 0 else "crossing from the left"
 
     @property
     def turn(self) -> float:
         """The angle between the headings of both actors at the contact, in rad, from 0 to pi."""
         return abs(self.touch.turn)
 
-    @property
+    @cached_property
     def same_way(self) -> bool:
-        """Whether both actors drove in the same direction at the contact."""
-        return self.turn < SAME_WAY
+        """Whether both actors drove in the same direction: by their headings, or one along the path of the other.
+
+        In a tight bend, the headings of two vehicles of the same lane may differ by any angle.
+        """
+        return self.turn < SAME_WAY or any(self._shared_paths.values())
+
+    @cached_property
+    def is_oncoming(self) -> bool:
+        """Whether both actors drove towards each other at the contact, along a bend or a straight road."""
+        if self.same_way:
+            return False
+        if self.turn > _OPPOSITE_RAD:
+            return True
+        own, its = (self._course(actor) for actor in (self.agent, self.other))
+        if abs(math.remainder(own - its, math.tau)) <= _OPPOSITE_RAD:
+            return False
+        if (self.touch.face, self.touch.other_face) == ("front", "front"):
+            return True
+        # A corner of the front counts as a side in a bend. A vehicle that turns left comes from another lane.
+        front, its_front = (self._trail(actor).points[-1] for actor in (self.agent, self.other))
+        return math.dist(front, its_front) <= _FRONTS_M and self.lanes.joins(front, own, its_front, its + math.pi)
+
+    def _course(self, actor: str) -> float:
+        """Return the direction in which the front of an actor last moved; if it had not moved, its heading, in rad."""
+        trail = self._trail(actor)
+        back = trail.index(_MIN_COURSE_M)
+        if back is None:
+            return float(trail.headings[-1])
+        dx, dy = trail.points[-1] - trail.points[back]
+        return math.atan2(dy, dx)
+
+    @cached_property
+    def _shared_paths(self) -> dict[str, _SharedPath | None]:
+        """The part of each actor's path that leads along the path that the other actor had driven before."""
+        pair = (self.agent, self.other)
+        if any(is_person(actor) or self.reverses(actor) for actor in pair):
+            return dict.fromkeys(pair)
+        return {actor: self._shared_path(self._trail(actor), self._trail(self.partner(actor))) for actor in pair}
+
+    def _shared_path(self, own: _Trail, its: _Trail) -> _SharedPath | None:
+        """Return how the end of a path leads along the path that another actor had driven before, or None.
+
+        Paths that cross, merge or part within the last metres do not count, nor do those of distant vehicles.
+        """
+        first = own.index(_SHARED_M)
+        if first is None:
+            return None
+        path = its.with_rear
+        reach_m = its.length * math.pi / 2 + _REAR_M  # in a bend, the front has driven further than the body is long
+        aside = behind = 0.0
+        for place in range(first, len(own.points)):
+            start = int(np.argmax(path.to_go <= reach_m + own.to_go[place]))  # on a ring, it came past here before
+            away = np.hypot(*(path.points[start:] - own.points[place]).T)
+            nearest = start + int(np.argmin(away))
+            aside, behind = float(away[nearest - start]), float(path.to_go[nearest])
+            if nearest < len(path.points) - len(its.points):
+                # The recording begins when the other actor was here, or it has always stood: the lane must decide.
+                ends = own.points[place], float(own.courses[place]), its.centers(0.0)[-1], float(its.headings[-1])
+                if not self.lanes.joins(*ends):
+                    return None
+                continue
+            turn = math.remainder(float(own.courses[place] - path.courses[nearest]), math.tau)
+            if aside > _SHARED_ASIDE_M or abs(turn) > _MAX_SHARED_TURN_RAD:
+                return None
+        return _SharedPath(aside, behind, its.length) if 0 < behind < reach_m else None
+
+    def _trail(self, actor: str) -> _Trail:
+        """Return the path of an actor's front up to the contact, for at most 40 m."""
+        return self._trails[actor]
+
+    @cached_property
+    def _trails(self) -> dict[str, _Trail]:
+        return {actor: self._trail_of(actor) for actor in (self.agent, self.other)}
+
+    def _trail_of(self, actor: str) -> _Trail:
+        known = self.way(actor)
+        size = known.length, known.width
+        center, heading = self._at_contact(actor)
+        front = center + known.length / 2 * np.array([math.cos(heading), math.sin(heading)])
+        poses = [(float(front[0]), float(front[1]), heading)]
+        after = (*poses[0], *size)
+        left = _TRAIL_M
+        earlier = [scene for scene in self.scenes if scene.time_s < self.time_s - 1e-6]
+        for scene in reversed(earlier):
+            row = scene.roster.index.get(actor)
+            if row is None or left <= 0:
+                break
+            before = (*scene.points[row], scene.headings[row], *size)
+            driven = math.dist(before[:2], after[:2])
+            if driven < _MIN_LEG_M:
+                continue  # it stands: the direction of so short a leg is a rounding error
+            parts = max(1, math.ceil(driven / _TRAIL_STEP_M))
+            shares = [part / parts for part in range(parts)]
+            poses.extend(pose[:3] for pose in reversed(poses_between(before, after, shares, bends=self.swept)))
+            left -= driven
+            after = before
+        points = np.array(poses[::-1])
+        return _Trail(points[:, :2], points[:, 2], known.length)
 
     def turned(self, since_s: float) -> float:
         """Return the greatest angle between the headings of both actors in the seconds before the contact, in rad."""
@@ -310,16 +415,25 @@ class ContactRecord:
 
     @cached_property
     def _follower(self) -> str:
-        if not self.same_way or self.touch.is_sideways:
+        if self.touch.is_sideways:
             return ""
         faces = self.touch.face, self.touch.other_face
-        return self.agent if faces == ("front", "rear") else self.other if faces == ("rear", "front") else ""
+        if self.turn < SAME_WAY and faces in (("front", "rear"), ("rear", "front")):
+            return self.agent if faces[0] == "front" else self.other
+        if self.turn < _MIN_BEND_TURN_RAD:
+            return ""
+        # In a bend, a follower touches a corner of the vehicle ahead, which may count as its side.
+        behind = [actor for actor, path in self._shared_paths.items() if path is not None and path.meets_rear]
+        return behind[0] if len(behind) == 1 else ""
 
     def in_its_way_s(self, leader: str) -> float:
         """Return for how long before the contact the leader had been in the path of the follower, in s."""
         lead, follow = self.way(leader), self.way(self.partner(leader))
         # The leader is the last point: where the road bends, the follower would not have gone straight on.
         ends = [self._at_contact(actor)[0] for actor in (follow.id, leader)]
+        shared = None if self._drove_straight(follow.id) else self._shared_paths[follow.id]
+        if shared is not None and shared.meets_rear:  # where the road bends tightly, the leader shows the way
+            ends.insert(1, self._trail(leader).centers(lead.length))
         path = np.vstack((follow.centers, *ends))
         limit_m = _BESIDE_M + min(_BEND_M, self._bend_m / 2)
         found = 0.0
@@ -329,14 +443,17 @@ class ContactRecord:
             found = float(self.times[back])
         return found
 
+    def _drove_straight(self, actor: str) -> bool:
+        headings = np.unwrap(np.append(self.way(actor).headings, self._at_contact(actor)[1]))
+        return bool(np.ptp(headings) < _MAX_STRAIGHT_TURN_RAD)
+
     def turns_off_s(self, leader: str) -> float | None:
         """Return when a leader left the path of a follower that drove straight on, in s before the contact, or None.
 
         Before that, the leader was in the follower's path in every recorded step.
         """
         lead, follow = self.way(leader), self.way(self.partner(leader))
-        headings = np.unwrap(np.append(follow.headings, self._at_contact(follow.id)[1]))
-        straight = bool(np.ptp(headings) < _MAX_STRAIGHT_TURN_RAD) and self.ahead_m(leader) > 0
+        straight = self._drove_straight(follow.id) and self.ahead_m(leader) > 0
         before = abs(math.remainder(lead.headings[0] - follow.headings[0], math.tau))
         if not straight or before >= _MAX_STRAIGHT_TURN_RAD or self.turn < _MAX_STRAIGHT_TURN_RAD:
             return None
@@ -364,6 +481,27 @@ class ContactRecord:
         ):
             return float(self.times[-1])
         return None if left is None else self.time_s - self.before[left].time_s
+
+    def is_against_its_lane(self, actor: str, back: int | None = None) -> bool | None:
+        """Return whether an actor moved against the direction of all lanes at its centre; None if that is not known.
+
+        Args:
+            actor: identifier of the actor.
+            back: index of a time before the contact; None for the time of the contact.
+        """
+        way = self.way(actor)
+        x, y, heading = (
+            (*self._at_contact(actor)[0], self._at_contact(actor)[1])
+            if back is None
+            else (*way.centers[back], way.headings[back])
+        )
+        course = heading + math.pi if self.reverses(actor) else heading
+        return self.lanes.is_against((float(x), float(y)), float(course))
+
+    def reverses(self, actor: str) -> bool:
+        """Return whether an actor last moved backwards."""
+        trail = self._trail(actor)
+        return math.cos(self._course(actor) - float(trail.headings[-1])) < 0 and trail.index(_MIN_COURSE_M) is not None
 
     def until_contact(self, actor: str) -> list[Scene]:
         """Return the scenes before the contact and the first scene after it, without lane changes after the contact."""
@@ -565,6 +703,74 @@ def contact_record(bundle: Bundle, recording: Recording | None = None) -> Contac
         reported=hit,
         lane=(last.lanes[last.roster.index[hit.agent]] if last.lanes else "") or hit.lane,
     )
+
+
+@dataclass(frozen=True)
+class _Trail:
+    """The path of an actor's front up to the contact, the earliest pose first.
+
+    Args:
+        points: x and y of the front bumper, shape (n, 2), in m.
+        headings: headings of the actor, shape (n,), in rad.
+        length: length of the actor, in m.
+    """
+
+    points: NDArray[np.float64]
+    headings: NDArray[np.float64]
+    length: float
+
+    @cached_property
+    def to_go(self) -> NDArray[np.float64]:
+        """How far the actor drove from each point to the last one, shape (n,), in m."""
+        legs = np.hypot(*np.diff(self.points, axis=0).T)
+        return np.append(np.cumsum(legs[::-1])[::-1], 0.0)
+
+    @cached_property
+    def courses(self) -> NDArray[np.float64]:
+        """The direction of motion at each point, shape (n,), in rad; an instantaneous lane change does not count."""
+        legs = np.diff(self.points, axis=0)
+        along: NDArray[np.float64] = np.arctan2(legs[:, 1], legs[:, 0])
+        jumps = np.hypot(*legs.T) > 2 * _TRAIL_STEP_M
+        along[jumps] = self.headings[1:][jumps]
+        return np.append(along, along[-1:])
+
+    @property
+    def with_rear(self) -> _Trail:
+        """The path with the place of the actor's rear at its beginning."""
+        rear = self.points[0] - self.length * np.array([math.cos(self.headings[0]), math.sin(self.headings[0])])
+        parts = np.linspace(0.0, 1.0, math.ceil(self.length / _TRAIL_STEP_M), endpoint=False)[:, None]
+        points = np.vstack((rear + parts * (self.points[0] - rear), self.points))
+        return _Trail(points, np.append(np.full(len(parts), self.headings[0]), self.headings), self.length)
+
+    def index(self, to_go_m: float) -> int | None:
+        """Return the index of the last point from which the actor drove at least so far; None if it did not."""
+        found = np.flatnonzero(self.to_go >= to_go_m)
+        return int(found[-1]) if len(found) else None
+
+    def centers(self, driven_m: float) -> NDArray[np.float64]:
+        """Return the centres of the actor on its last metres, shape (n, 2)."""
+        directions = np.stack((np.cos(self.headings), np.sin(self.headings)), axis=1)
+        return (self.points - self.length / 2 * directions)[self.to_go <= driven_m]
+
+
+@dataclass(frozen=True, slots=True)
+class _SharedPath:
+    """The end of an actor's path, which leads along the path that another actor had driven before.
+
+    Args:
+        aside_m: distance of the actor's front from the path of the other actor at the contact, in m.
+        behind_m: how far the front of the actor is behind the front of the other one, along the path, in m.
+        length: length of the other actor, in m.
+    """
+
+    aside_m: float
+    behind_m: float
+    length: float
+
+    @property
+    def meets_rear(self) -> bool:
+        """Whether the actor was on the other's path and reached its rear."""
+        return self.aside_m <= _BESIDE_M and self.behind_m >= self.length - _REAR_M
 
 
 def _distance(path: NDArray[np.float64], point: NDArray[np.float64]) -> float:

@@ -105,16 +105,41 @@ def _red_light(case: ContactRecord) -> FaultFinding | None:
 
 
 def _wrong_way(case: ContactRecord) -> FaultFinding | None:
-    """Blame the vehicle that drove against the direction of its lane."""
+    """Blame the vehicle that drove against the direction of its lane, as when it overtakes on the opposite lane."""
+    if case.same_way:
+        return None
+    against = {actor: case.is_against_its_lane(actor) for actor in (case.agent, case.other)}
     for time_s, event in reversed(case.events):
-        if event.kind == "wrong_way" and event.agent in (case.agent, case.other) and case.time_s - time_s <= _RED_S:
+        if event.kind == "wrong_way" and event.agent in against and case.time_s - time_s <= _RED_S:
+            if against[event.agent] is False or against[case.partner(event.agent)]:
+                continue  # it has returned to a lane of its direction
             return FaultFinding(
                 rule="wrong way",
                 blames=_name_of(case, event.agent),
                 words=event.what,
                 source=_SOURCES["wrong_way"],
             )
-    return None
+    wrong = [actor for actor, is_wrong in against.items() if is_wrong]
+    if len(wrong) != 1 or not case.is_oncoming:
+        return None
+    (driver,) = wrong
+    other = case.partner(driver)
+    lately = [back for back, time_s in enumerate(case.times) if time_s <= _CHANGE_S]
+    if any(is_person(actor) or case.way(actor).speeds[lately].max() < STANDS_MPS for actor in against):
+        return None  # a vehicle that stands may be parked, and a place to park has no direction
+    if any(case.is_against_its_lane(other, back) is not False for back in (None, *lately)):
+        return None  # it may have come there from another road, or have been on the wrong side as well
+    since = lately[-1]
+    while since >= lately[0] and case.is_against_its_lane(driver, since):
+        since -= 1
+    since_s = float(case.times[since + 1]) if since < lately[-1] else 0.0
+    when = f"for the last {since_s:.1f} s" if since_s else "just before the contact"
+    return FaultFinding(
+        rule="wrong way",
+        blames=_name_of(case, driver),
+        words=f"{driver} drove against the direction of its lane {when}, towards {other}, which stayed in its lane",
+        source="Vienna, articles 10 and 11; StVO §§ 2 and 5",
+    )
 
 
 def _lane_change(case: ContactRecord) -> FaultFinding | None:
@@ -228,7 +253,7 @@ def _turns_off(case: ContactRecord) -> FaultFinding | None:
         if case.hardest_braking(leader) > _IMPOSSIBLE_BRAKING_MPS2 or float(lead.speeds.min()) < -STANDS_MPS:
             continue
         words = f"{follower} drove straight on into {leader}, which had been ahead of it until {left_s:.1f} s before"
-        words += " and was turning off"
+        words += " and was turning"
         return FaultFinding(
             rule="rear end", blames=_name_of(case, follower), words=words, source="Vienna, article 13 (5); StVO § 4 (1)"
         )

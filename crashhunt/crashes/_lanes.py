@@ -25,6 +25,7 @@ Borders: TypeAlias = "tuple[NDArray[np.float64], NDArray[np.float64]]"
 
 _NEAR_M = 60.0  # around where it happens; a town has thousands of lanes further away
 _MAX_DRIVING_ANGLE_RAD = math.radians(30)  # a vehicle within so much of a lane's direction drives along it
+_OPPOSITE_RAD = math.radians(150)  # a vehicle at a larger angle to a lane drives against the lane's direction
 _MIN_CROSSING_ANGLE_RAD = math.radians(30)  # lanes that differ by more cross each other, where they lie over each other
 _MOVED_M = 0.4  # sideways; less is drifting within a lane
 _OVER_M = 0.1
@@ -116,6 +117,33 @@ class LaneMap:
             for two in headings[:number]
         )
 
+    def is_against(self, point: tuple[float, float], course: float) -> bool | None:
+        """Return whether a point lies only in lanes of the opposite direction; None if other lanes lead elsewhere.
+
+        Args:
+            point: x and y, in m.
+            course: direction of motion, in rad.
+        """
+        spot = np.array(point)
+        angles = [
+            abs(math.remainder(place.heading - course, math.tau))
+            for lane in self._lanes
+            if lane.may_hold(spot) and abs((place := lane.place(spot)).aside_m) <= lane.half_width
+        ]
+        if any(angle < _MAX_DRIVING_ANGLE_RAD for angle in angles):
+            return False
+        return True if angles and min(angles) > _OPPOSITE_RAD else None
+
+    def joins(self, point: NDArray[np.float64], course: float, other: NDArray[np.float64], other_course: float) -> bool:
+        """Return whether a lane holds two points and leads in the given directions there; angles are in rad."""
+        return any(
+            abs(place.aside_m) <= lane.half_width and _is_along(place, course)
+            for lane in self._lanes
+            if lane.may_hold(point) and lane.may_hold(other)
+            if abs((there := lane.place(other)).aside_m) <= lane.half_width and _is_along(there, other_course)
+            for place in (lane.place(point),)
+        )
+
     def leaves_sideways(self, scenes: Sequence[Scene], actor: str) -> bool:
         """Return whether an actor leaves a lane over its side border, and then drives next to the lane.
 
@@ -130,7 +158,7 @@ class LaneMap:
             (
                 place
                 for (_, before), (place, after) in reversed(list(pairwise(poses)))
-                if (lane := self._driven(before)) is not None and self._has_left(lane, after)
+                if (lane := self._driven(before)) is not None and self._has_left(lane, before, after)
             ),
             None,
         )
@@ -181,36 +209,50 @@ class LaneMap:
         return False
 
     def _driven(self, pose: tuple[NDArray[np.float64], float]) -> _Lane | None:
-        """Return the lane on which an actor drives; of overlapping lanes, the lane with the nearest centre line."""
+        """Return the lane on which an actor drives; of overlapping lanes, the lane with the nearest centre line.
+
+        An actor that overtakes on the opposite lane drives on this lane, if no lane there leads in its direction.
+        """
         point, heading = pose
         found = [
-            (abs(place.aside_m), number, lane)
+            (not _is_along(place, heading), abs(place.aside_m), number, lane)
             for number, lane in enumerate(self._lanes)
             if lane.may_hold(point)  # a box is compared in a fiftieth of the time, and most lanes are elsewhere
             and abs((place := lane.place(point)).aside_m) <= lane.half_width
             and place.inside
-            and abs(math.remainder(place.heading - heading, math.tau)) < _MAX_DRIVING_ANGLE_RAD
+            and (_is_along(place, heading) or _is_along(place, heading + math.pi))
         ]
-        return min(found)[2] if found else None
+        return min(found)[3] if found else None
 
-    def _has_left(self, lane: _Lane, pose: tuple[NDArray[np.float64], float]) -> bool:
-        point, heading = pose
+    def _has_left(
+        self, lane: _Lane, before: tuple[NDArray[np.float64], float], after: tuple[NDArray[np.float64], float]
+    ) -> bool:
+        point, heading = after
         place = lane.place(point)
         if not place.inside or abs(place.aside_m) <= lane.half_width:
             return False
-        if abs(math.remainder(place.heading - heading, math.tau)) >= _MAX_DRIVING_ANGLE_RAD:
-            return False  # it turns off
-        return self._is_in_parallel_lane(lane, point, place.heading)
+        if _is_along(place, heading) and self._is_in_parallel_lane(lane, point, heading):
+            return True
+        dx, dy = point - before[0]
+        if dx * math.cos(heading) + dy * math.sin(heading) <= 0:
+            return False  # it reverses, which leads over the middle of the road, too
+        if _is_along(place, heading):
+            return self.is_against((float(point[0]), float(point[1])), heading) is True
+        # It has overtaken on the opposite lane and returns; otherwise, it turns off.
+        return _is_along(place, heading + math.pi) and self._is_in_parallel_lane(lane, point, heading)
 
     def _is_in_parallel_lane(self, lane: _Lane, point: NDArray[np.float64], heading: float) -> bool:
         """Return whether a point lies in another lane that leads in the same direction."""
         return any(
-            abs(other.aside_m) <= near.half_width
-            and abs(math.remainder(other.heading - heading, math.tau)) < _MAX_DRIVING_ANGLE_RAD
+            abs(place.aside_m) <= near.half_width and _is_along(place, heading)
             for near in self._lanes
             if near is not lane and near.may_hold(point)
-            for other in (near.place(point),)
+            for place in (near.place(point),)
         )
+
+
+def _is_along(place: _Place, heading: float) -> bool:
+    return abs(math.remainder(place.heading - heading, math.tau)) < _MAX_DRIVING_ANGLE_RAD
 
 
 def _poses(scenes: Sequence[Scene], actor: str) -> list[tuple[int, tuple[NDArray[np.float64], float]]]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SIGNATURE_VERSION", "Signature", "StackFrame", "own_frames", "signature_of", "signature_of_fault"]
 
-SIGNATURE_VERSION = 3
+SIGNATURE_VERSION = 4
 """Version of these rules. Raise it with each change by which a crash gets another type: types that an earlier version
 has noted in a ledger are then determined again."""
 

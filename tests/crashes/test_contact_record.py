@@ -353,7 +353,8 @@ def test_crossing_at_an_acute_angle_names_its_side(side, words):
     assert case.manner == words
     assert not case.same_way
     slight = side * math.radians(45.5)
-    assert not record(drives(12.0), lambda t: (4.5 + 6 * t, 0.0, slight, 6.0), step_s=0.1).same_way
+    c, s = math.cos(slight), math.sin(slight)
+    assert not record(drives(12.0), lambda t: (4.5 + 6 * c * t, 6 * s * t, slight, 6.0), step_s=0.1).same_way
 
 
 def test_both_that_jump_into_each_other_are_named_the_agent_first():

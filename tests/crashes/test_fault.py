@@ -213,7 +213,7 @@ def turning_left(after_s, speed=5.0, at=5.0):
 def test_who_drives_straight_on_into_who_is_turning_off():
     found = fault_in(drive(straight(12), turning_left(1.2, at=11.0)))
     assert (found.verdict, found.findings[0].rule) == ("ego", "rear end")
-    assert "which had been ahead of it until 0.5 s before and was turning off" in found.findings[0].words
+    assert "which had been ahead of it until 0.5 s before and was turning" in found.findings[0].words
     assert verdict(drive(turning_left(1.2, at=11.0), straight(12))) == "the other"
     # It has come there only lately, it left long ago, or who drove behind swerved as well.
     assert not turned_off(drive(straight(12), turning_left(1.2, at=11.0), seconds=3.0))
@@ -228,7 +228,7 @@ def test_who_drives_straight_on_into_who_is_turning_off():
 
 
 def turned_off(case):
-    return any("turning off" in finding.words for finding in fault_in(case).findings)
+    return any("was turning" in finding.words for finding in fault_in(case).findings)
 
 
 def walks(since, speed=3.0, ahead=5.0):
@@ -304,7 +304,8 @@ def test_a_red_light_the_wrong_way_and_who_stands():
     assert verdict(drive(straight(10), crossing(8), events=((-3.0, red),))) == "ego"
     assert verdict(drive(straight(10), crossing(8), events=((-9.0, red),))) == "nobody can tell"
     wrong = Event("wrong_way", "ego", "ego drove the wrong way")
-    assert verdict(drive(straight(10), lambda t: (10 + 9 * t, 0, math.pi, 9.0), events=((-3.0, wrong),))) == "ego"
+    turned = drive(lambda t: (10 + 9 * t, 0, math.pi, 9.0), straight(10), events=((-3.0, wrong),))
+    assert verdict(turned) == "ego"
     assert verdict(drive(straight(5), lambda t: (5.0, 0.0, math.pi / 2, 0.0))) == "ego"
     # It has stood for less than stopping takes.
     assert verdict(drive(straight(15), lambda t: (5.0, 0.0, math.pi / 2, 0.0), seconds=3.0)) == "nobody can tell"
