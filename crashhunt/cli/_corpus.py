@@ -59,7 +59,11 @@ def _add_add(commands: Commands) -> None:
     )
     add.add_argument(
         "bundles", metavar="BUNDLE", type=Path, nargs="+",
-        help="the folder of a crash, or a file that crashhunt export wrote",
+        help="the folder of a crash or of a hunt, or a file that crashhunt export wrote",
+    )  # fmt: skip
+    add.add_argument(
+        "--crash", metavar="ID", action="append", default=[],
+        help="of a hunt: the crash to add; the option may be given several times; default: the shortest crash",
     )  # fmt: skip
     add.add_argument("--to", metavar="CORPUS", type=Path, required=True, help="the folder of the corpus")
     add.add_argument(
@@ -105,9 +109,14 @@ def _add(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.corpus import add_case
     from crashhunt.crashes import list_bundles
 
+    if options.crash and len(options.bundles) > 1:
+        raise UsageError(
+            f"--crash chooses a crash of one hunt, and {len(options.bundles)} bundles are given",
+            fix="give the directory of one hunt",
+        )
     answers = []
-    for path in options.bundles:
-        with opened_crash(path, "") as (bundle, archive):
+    for path, crash in [(path, crash) for path in options.bundles for crash in options.crash or [""]]:
+        with opened_crash(path, crash) as (bundle, archive):
             # Every run of the corpus runs what its cases name.
             run_trusted(partial(check_trust, bundle), bundle, archive, options, path=path)
             added = add_case(bundle, options.to, expect=options.expect, note=options.note)
@@ -117,10 +126,15 @@ def _add(options: argparse.Namespace, _words: list[str]) -> int:
             say(_added(data["path"], data["bytes"], log=log, new=added.new), as_json=options.json)
             if added.changed:
                 say(in_lines([f"  expect is now {added.case.expect}{_note(added.case.note)}"]), as_json=options.json)
-            others = 0 if archive is not None or (path / layout.CRASH).is_file() else len(list_bundles(path)) - 1
+            if added.judged:
+                say("  its causes are in the corpus now", as_json=options.json)
+            others = (
+                0 if crash or archive is not None or (path / layout.CRASH).is_file() else len(list_bundles(path)) - 1
+            )
             if others > 0:
                 say(
-                    f"  one of {others + 1} crashes; to add all of them, give {command_line(path)}/crashes/*",
+                    f"  one of {others + 1} crashes; to add another one, give --crash ID; to add all of them, give "
+                    f"{command_line(path)}/crashes/*",
                     as_json=options.json,
                 )
             if bundle.confirmed is False:

@@ -10,17 +10,18 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import add_ci_options, add_json, add_trust, check_trust, integer, say, tell
-from crashhunt.cli._exit_codes import DONE, INTERRUPTED
+from crashhunt.cli._exit_codes import DONE, INTERRUPTED, THE_ANSWER_IS_NO
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.cli._common import Commands
-    from crashhunt.corpus import Case
-    from crashhunt.crashes import CauseGroup, Group, Signature
+    from crashhunt.corpus import Case, KnownType
+    from crashhunt.crashes import CauseGroup, Group, Groups, Signature
 
-__all__ = ["add_crashes"]
+__all__ = ["add_crashes", "add_known", "checked_cases", "compare_with_corpus"]
 
 _DEFAULT_RUNS = 8  # `crashhunt.whatif.REPRESENTATIVES`, which takes longer to import than a parser to build
 
@@ -35,10 +36,7 @@ def add_crashes(commands: Commands) -> None:
         "frequent first.",
     )
     crashes.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="directories of hunts or suites")
-    crashes.add_argument(
-        "--known", metavar="CORPUS", type=Path,
-        help="mark the crash types of which this corpus contains a case that is expected to reproduce",
-    )  # fmt: skip
+    add_known(crashes)
     crashes.add_argument(
         "--sarif", metavar="FILE", type=Path, help="write the crash types as SARIF 2.1.0, for code scanning and editors"
     )
@@ -53,6 +51,19 @@ def add_crashes(commands: Commands) -> None:
     crashes.set_defaults(command=_crashes)
 
 
+def add_known(parser: argparse.ArgumentParser) -> None:
+    """Add the options that compare crash types with a corpus."""
+    parser.add_argument(
+        "--known", metavar="CORPUS", type=Path,
+        help="mark the crash types of which this corpus contains a case that is expected to reproduce; if causes are "
+        "stored on both sides, a crash with another cause is new",
+    )  # fmt: skip
+    parser.add_argument(
+        "--fail-on-new", action="store_true",
+        help="with --known: exit with 1 if a crash is new, or cannot be compared with the corpus",
+    )  # fmt: skip
+
+
 def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.crashes import count_causes, group_crashes, join_causes, list_bundles
     from crashhunt.hunts import dropped_crashes, find_hunts
@@ -60,32 +71,125 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
 
     if options.by_cause is not None and options.by_cause < 1:
         raise UsageError(f"--by-cause is {options.by_cause}", fix="give at least 1")
-    cases = _cases(options.known)
+    cases = checked_cases(options)
     hunts = list(dict.fromkeys(hunt for directory in options.directories for hunt in find_hunts(directory)))
     bundles = (bundle for hunt in hunts for bundle in list_bundles(hunt))
     found = group_crashes(bundles, dropped_crashes(hunts))
-    known = _types_in_corpus(found.groups, cases)
     causes, interrupted = (None, False) if options.by_cause is None else _divide_types(options, found.groups)
+    comparison = _Comparison(found, cases, causes)
+    known = comparison.known
     say(describe_groups(found.groups, known), as_json=options.json)
     if causes is not None:
         say(describe_causes(found.groups, causes), as_json=options.json)
     for why in found.left_out:
         say(f"skipped: {why}", as_json=True)
+    for line in comparison.lines():
+        say(line, as_json=options.json)
     _print_groups(options, found.groups, known)
     if options.json:
-        groups = [dict(group.to_json()) for group in found.groups]
+        groups = comparison.to_json()
         by_cause: dict[str, object] = {}
         if causes is not None:
             joined = join_causes(found.groups, causes)
             by_cause = {"types_by_cause": count_causes(joined)[0], "by_cause": [one.to_json() for one in joined]}
             pairs = zip(groups, causes, strict=True)
             groups = [{**one, "causes": [each.to_json() for each in of]} for one, of in pairs]
-        if known is not None:
-            groups = [{**one, "known": known.get(of.signature)} for one, of in zip(groups, found.groups, strict=True)]
         print(json.dumps({"groups": groups, **by_cause, "left_out": list(found.left_out)}))
     if interrupted:
         say("Interrupted: some causes are not known yet. Run the same command to resume.", as_json=options.json)
-    return INTERRUPTED if interrupted else DONE
+    if interrupted:
+        return INTERRUPTED
+    return THE_ANSWER_IS_NO if options.fail_on_new and comparison.has_news else DONE
+
+
+class _Comparison:
+    """The crash types of hunts, compared with the cases of a corpus."""
+
+    def __init__(
+        self, found: Groups, cases: list[Case] | None, causes: Sequence[Sequence[CauseGroup]] | None = None
+    ) -> None:
+        from crashhunt.corpus import compare_types
+
+        self._found = found
+        self._types: dict[Signature, KnownType] | None = None
+        if cases is not None:
+            given = None if causes is None else [[part.cause for part in parts] for parts in causes]
+            self._types = compare_types(found.groups, cases, given)
+
+    @property
+    def known(self) -> dict[Signature, str] | None:
+        """The path of a case for each known crash type; None without a corpus. A type with a new cause is not known."""
+        if self._types is None:
+            return None
+        return {name: str(one.case.path) for name, one in self._types.items() if not one.new_causes}
+
+    @property
+    def has_news(self) -> bool:
+        known = self.known
+        return known is not None and (len(known) < len(self._found.groups) or bool(self._found.left_out))
+
+    def lines(self) -> list[str]:
+        """Return sentences on the comparison, without the crash types that are new."""
+        lines = []
+        for signature, one in (self._types or {}).items():
+            lines += [
+                f"new cause of the type {str(signature)!r}: {cause}; the corpus has the type with another cause "
+                f"({one.case.path})"
+                for cause in one.new_causes
+            ]
+            if one.by == "type":
+                lines.append(
+                    f"not judged: {str(signature)!r} is known by its type alone, so another cause would be hidden. "
+                    f"Fix: judge a crash of this type, add it to the corpus again, and use --by-cause"
+                )
+        known = self.known
+        if known is not None and self.has_news:
+            new, unknown = len(self._found.groups) - len(known), len(self._found.left_out)
+            words = [f"{new} new crash type{'' if new == 1 else 's'}"] if new else []
+            words += [f"{unknown} not compared"] if unknown else []
+            lines.append(", ".join(words))
+        return ["", *lines] if lines else []
+
+    def to_json(self) -> list[JsonObject]:
+        """Return the groups in the form that ``crashes --json`` prints."""
+        groups = [dict(group.to_json()) for group in self._found.groups]
+        if self._types is None:
+            return groups
+        known = self.known or {}
+        types = [self._types.get(group.signature) for group in self._found.groups]
+        return [
+            {
+                **one,
+                "known": known.get(group.signature),
+                "known_by": None if of is None else of.by,
+                "new_causes": [] if of is None else [str(cause) for cause in of.new_causes],
+            }
+            for one, group, of in zip(groups, self._found.groups, types, strict=True)
+        ]
+
+
+def compare_with_corpus(directory: Path, cases: list[Case], *, as_json: bool) -> tuple[JsonObject, bool]:
+    """Print the crash types of all hunts below a directory, compared with a corpus.
+
+    Args:
+        directory: directory of a suite.
+        cases: the cases of the corpus.
+        as_json: whether the standard output is for JSON.
+
+    Returns:
+        The types in the form that ``crashes --json`` prints, and whether a type is new or cannot be compared.
+    """
+    from crashhunt.crashes import group_crashes, list_bundles
+    from crashhunt.hunts import dropped_crashes, find_hunts
+    from crashhunt.report import describe_groups
+
+    hunts = find_hunts(directory)
+    found = group_crashes((bundle for hunt in hunts for bundle in list_bundles(hunt)), dropped_crashes(hunts))
+    comparison = _Comparison(found, cases)
+    say(describe_groups(found.groups, comparison.known), as_json=as_json)
+    for line in (*(f"skipped: {why}" for why in found.left_out), *comparison.lines()):
+        say(line, as_json=as_json)
+    return {"groups": comparison.to_json(), "not_compared": list(found.left_out)}, comparison.has_news
 
 
 def _divide_types(options: argparse.Namespace, groups: Sequence[Group]) -> tuple[list[tuple[CauseGroup, ...]], bool]:
@@ -110,25 +214,25 @@ def _divide_types(options: argparse.Namespace, groups: Sequence[Group]) -> tuple
         return divided, bool(stops)
 
 
-def _cases(corpus: Path | None) -> list[Case] | None:
-    """Return the cases of a corpus; None if no corpus was given."""
+def checked_cases(options: argparse.Namespace) -> list[Case] | None:
+    """Return the cases of the corpus of ``--known``; None without this option.
+
+    Raises:
+        UsageError: ``--fail-on-new`` without ``--known``.
+        BundleError: The corpus does not exist, or a case cannot be read.
+    """
     from crashhunt.corpus import find_cases, read_case
 
+    corpus = options.known
     if corpus is None:
+        if options.fail_on_new:
+            raise UsageError(
+                "--fail-on-new has no corpus to compare the crash types with", fix="add --known CORPUS, such as crashes"
+            )
         return None
     if corpus.is_dir() and not any(corpus.rglob(layout.CASE)):
         return []
     return [read_case(path) for path in find_cases([corpus])]
-
-
-def _types_in_corpus(groups: Sequence[Group], cases: list[Case] | None) -> dict[Signature, str] | None:
-    """Return for each crash type the name of its corpus case; None if no corpus was given."""
-    from crashhunt.corpus import known_kinds
-
-    if cases is None:
-        return None
-    found = known_kinds((group.signature for group in groups), cases)
-    return {signature: str(case.path) for signature, case in found.items()}
 
 
 def _print_groups(options: argparse.Namespace, groups: Sequence[Group], known: dict[Signature, str] | None) -> None:

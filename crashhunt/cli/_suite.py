@@ -19,6 +19,7 @@ from crashhunt.cli._common import (
     pairs,
     say,
 )
+from crashhunt.cli._crashes import add_known, checked_cases, compare_with_corpus
 from crashhunt.cli._exit_codes import DONE, THE_ANSWER_IS_NO
 from crashhunt.cli._status import show_states, states_console, states_table
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.cli._common import Commands
     from crashhunt.hunts import HuntState
 
@@ -54,6 +56,7 @@ def add_suite(commands: Commands) -> None:
                      help="number of trials that run at a time, "
                      "counted over all hunts; default: one per core")  # fmt: skip
     add_options_of_machine(run)
+    add_known(run)
     add_trust(run)
     add_json(run)
     run.set_defaults(command=_run)
@@ -106,6 +109,7 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.suites import Suite
 
     suite = Suite.read(options.file)
+    cases = checked_cases(options)
     watch, finish = _watcher(as_json=options.json)
     try:
         machine = chosen_of_machine(options)
@@ -124,7 +128,11 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
         raise
     finally:
         finish()
-    return _print_states(states, options.directory, as_json=options.json)
+    if cases is None:
+        return _print_states(states, options.directory, as_json=options.json)
+    types, has_news = compare_with_corpus(options.directory, cases, as_json=options.json)
+    code = _print_states(states, options.directory, as_json=options.json, more=types)
+    return THE_ANSWER_IS_NO if options.fail_on_new and has_news else code
 
 
 def _defaults(_options: argparse.Namespace, _words: list[str]) -> int:
@@ -152,7 +160,12 @@ def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
         finish()
     for place in replaced:
         say(f"replaced: {command_line(place)}", as_json=options.json)
-    return _print_states(states, options.to or options.directory, as_json=options.json, replaced=replaced)
+    return _print_states(
+        states,
+        options.to or options.directory,
+        as_json=options.json,
+        more={"replaced": [str(place) for place in replaced]},
+    )
 
 
 def _run_with_trust(run: Callable[[bool], T], options: argparse.Namespace) -> T:
@@ -194,12 +207,9 @@ def _watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Calla
     return tell, lambda: None
 
 
-def _print_states(
-    states: list[HuntState], directory: Path, *, as_json: bool, replaced: list[Path] | None = None
-) -> int:
+def _print_states(states: list[HuntState], directory: Path, *, as_json: bool, more: JsonObject | None = None) -> int:
     if as_json:
-        extra = {"replaced": [str(place) for place in replaced]} if replaced is not None else {}
-        print(json.dumps({"hunts": [state.to_json() for state in states], **extra}))
+        print(json.dumps({"hunts": [state.to_json() for state in states], **(more or {})}))
     console = states_console(stderr=as_json)
     show_states(states, console)
     # After Ctrl-C, a hunt has no reason; a hunt that could not resume has one.

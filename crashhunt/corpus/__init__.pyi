@@ -3,10 +3,13 @@ from ._cases import (
     Added as Added,
     Case as Case,
     Expectation as Expectation,
+    KnownType as KnownType,
     add_case as add_case,
+    cases_of_type as cases_of_type,
+    compare_types as compare_types,
     find_cases as find_cases,
-    known_kinds as known_kinds,
     read_case as read_case,
+    signature_today as signature_today,
 )
 from ._run import (
     CaseReport as CaseReport,

@@ -10,6 +10,7 @@ import math
 import shutil
 import tomllib
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -20,21 +21,35 @@ from crashhunt.base.files import cannot_write, sync_folder, sync_tree, whole_fil
 from crashhunt.base.temporary import remove_ended, temporary_beside
 from crashhunt.base.text import near_path
 from crashhunt.base.validation import validate
-from crashhunt.crashes import Bundle, authenticate_bundle, fault_of, list_bundles, signature_of
+from crashhunt.crashes import (
+    Bundle,
+    Cause,
+    authenticate_bundle,
+    cause_of,
+    fault_of,
+    judgement_of,
+    list_bundles,
+    signature_of,
+    with_judgement,
+    without_chance_lengths,
+)
 from crashhunt.recording import write_log
 from crashhunt.snapshots import Snapshot, without_code
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.crashes import Signature
+    from crashhunt.crashes import Group, Signature
     from crashhunt.recording import Recording
     from crashhunt.trial import TrialSpec, Value
 
 
-__all__ = ["Added", "Case", "Expectation", "add_case", "find_cases", "known_kinds", "read_case"]
+__all__ = [
+    "Added", "Case", "Expectation", "KnownType", "add_case", "cases_of_type", "compare_types", "find_cases",
+    "read_case", "signature_today",
+]  # fmt: skip
 
 
 Expectation = Literal["still", "fixed"]
@@ -198,11 +213,13 @@ class Added:
         case: The case in the corpus.
         new: Whether the case is new in the corpus.
         changed: Whether the expectation or the note of a present case changed.
+        judged: Whether a present case has got the causes of the crash.
     """
 
     case: Case
     new: bool
     changed: bool = False
+    judged: bool = False
 
 
 def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None, note: str | None = None) -> Added:
@@ -247,7 +264,7 @@ def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None,
                         raise
         before = read_case(final)
         case = before.expecting(expect, note)
-        return Added(case, new=False, changed=case != before)
+        return Added(case, new=False, changed=case != before, judged=_add_judgement(case, bundle))
     except OSError as error:
         raise cannot_write(corpus, error) from error
 
@@ -257,6 +274,15 @@ def _signature(bundle: Bundle) -> dict[str, str | bool]:
         return read_case(bundle.hunt).signature
     parts: dict[str, object] = dict(signature_of(bundle).to_json())
     return {name: value for name, value in parts.items() if isinstance(value, str | bool)}
+
+
+def _add_judgement(case: Case, bundle: Bundle) -> bool:
+    """Store the causes of a crash in its case, if the case has none; return whether it has got them."""
+    kept, judgement = case.bundle(), judgement_of(bundle)
+    if judgement is None or judgement_of(kept) is not None:
+        return False
+    with_judgement(kept, judgement).write(into=kept.path)
+    return True
 
 
 def _is_of_case(bundle: Bundle) -> bool:
@@ -347,21 +373,85 @@ def _facts(bundle: Bundle, recording: Recording) -> tuple[object, ...]:
 # The crash types that a corpus already has.
 
 
-def known_kinds(signatures: Iterable[Signature], cases: Iterable[Case]) -> dict[Signature, Case]:
-    """Return for each signature a case of the same crash type, if there is one.
-
-    Cases that expect ``fixed`` are ignored, because their crashes must not occur again.
+@dataclass(frozen=True, slots=True)
+class KnownType:
+    """A crash type of which the corpus has cases that are expected to reproduce, and the causes of its crashes.
 
     Args:
-        signatures: The signatures of the crashes.
-        cases: The cases of the corpus.
+        case: the first of these cases.
+        by: ``cause`` if the causes of crashes and cases were compared, else ``type``.
+        new_causes: causes of crashes that none of the cases has; with such a cause, the type has new crashes.
     """
-    still = [case for case in cases if case.expect == "still" and case.signature]
+
+    case: Case
+    by: Literal["cause", "type"]
+    new_causes: tuple[Cause, ...] = ()
+
+
+def compare_types(
+    groups: Sequence[Group], cases: Iterable[Case], causes: Sequence[Iterable[Cause]] | None = None
+) -> dict[Signature, KnownType]:
+    """Return the crash types that a corpus contains; no code of the crashes runs.
+
+    Crashes of one type may have different causes. If a cause is known on both sides, it decides: a crash of a known
+    type with another cause than all cases is new.
+
+    Args:
+        groups: the crashes, one group for each crash type.
+        cases: the cases of the corpus.
+        causes: the causes of the crashes of each group; by default, the causes that are stored in their bundles.
+    """
+    cases = list(cases)
+    today = cache(signature_today)
     found = {}
-    for signature in signatures:
-        parts = signature.to_json()
-        same = (case for case in still if all(parts.get(name, said) == said for name, said in case.signature.items()))
-        case = next(same, None)
-        if case is not None:
-            found[signature] = case
+    for number, group in enumerate(groups):
+        same = cases_of_type(group.signature, cases)
+        same = same or [case for case in cases if case.expect == "still" and today(case.path) == group.signature]
+        if not same:
+            continue
+        given = map(_stored_cause, group.bundles) if causes is None else causes[number]
+        own, its = ({cause for cause in some if cause.kind != "unknown"} for some in (given, map(_cause, same)))
+        if not own or not its:
+            found[group.signature] = KnownType(same[0], "type")
+            continue
+        lengths = without_chance_lengths(own | its)
+        new = {lengths[cause] for cause in own} - {lengths[cause] for cause in its}
+        found[group.signature] = KnownType(same[0], "cause", tuple(sorted(new)))
     return found
+
+
+def cases_of_type(signature: Signature, cases: Iterable[Case]) -> list[Case]:
+    """Return the cases of a crash type that expect ``still``; crashes that are ``fixed`` must not occur again."""
+    parts = signature.to_json()
+    return [
+        case
+        for case in cases
+        if case.expect == "still"
+        and case.signature
+        and all(parts.get(name, said) == said for name, said in case.signature.items())
+    ]
+
+
+def signature_today(case: Path) -> Signature | None:
+    """Return the signature of a case by the present rules; None if it has no readable log.
+
+    Earlier versions may have stored another one, such as a crossing for a rear end in a bend.
+    """
+    try:
+        return signature_of(read_case(case).bundle())
+    except BundleError:
+        return None
+
+
+def _cause(case: Case) -> Cause:
+    try:
+        return _stored_cause(case.bundle())
+    except BundleError:
+        return Cause("unknown")
+
+
+def _stored_cause(bundle: Bundle) -> Cause:
+    try:
+        return cause_of(bundle, judgement_of(bundle))
+    except BundleError:  # the recording of an omission is damaged
+        return Cause("unknown")

@@ -306,6 +306,8 @@ class CrashGroup(TypedDict):
     shortest: str
     members: list[str]
     known: NotRequired[str | None]
+    known_by: NotRequired[Literal["cause", "type"] | None]
+    new_causes: NotRequired[list[str]]
     causes: NotRequired[list[JsonObject]]
 
 
@@ -522,6 +524,8 @@ class SuiteRunData(TypedDict):
     """``crashhunt suite run``."""
 
     hunts: list[HuntState]
+    groups: NotRequired[list[CrashGroup]]
+    not_compared: NotRequired[list[str]]
 
 
 class RerunData(TypedDict):

@@ -200,7 +200,7 @@ def test_states_of_a_suite_end_it_with_1_after_an_error(capsys):
     stopped, refused = HuntState(dir="i", state="interrupted"), HuntState(dir="k", state="interrupted", detail="full")
     assert _suite._print_states([good, stopped], Path("s"), as_json=False) == 0
     assert "could not run" not in capsys.readouterr().out
-    assert _suite._print_states([good, bad], Path("s"), as_json=True, replaced=[Path("old")]) == 1
+    assert _suite._print_states([good, bad], Path("s"), as_json=True, more={"replaced": ["old"]}) == 1
     out, err = capsys.readouterr()
     data = json.loads(out)
     assert [one["dir"] for one in data["hunts"]] == ["g", "h"]

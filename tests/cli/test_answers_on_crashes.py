@@ -13,6 +13,8 @@ import pytest
 
 from crashhunt import cli
 from crashhunt.cli import _check, _guide, _judge, _replay, _shrink, _trust, _whatif
+from crashhunt.corpus import KnownType
+from crashhunt.crashes import Cause
 from crashhunt.errors import BundleError, HuntDirectoryError, UsageError
 from crashhunt.trial import Outcome
 
@@ -168,9 +170,13 @@ def test_types_of_a_corpus_are_marked(grouped, monkeypatch, capsys, tmp_path):
     case = SimpleNamespace(path=Path("corpus/case"))
     monkeypatch.setattr("crashhunt.corpus.find_cases", lambda places: [*places, "other"])
     monkeypatch.setattr("crashhunt.corpus.read_case", lambda path: case)
-    monkeypatch.setattr(
-        "crashhunt.corpus.known_kinds", lambda signatures, cases: {next(signatures): cases[0]} if cases else {}
-    )
+    known = {}
+
+    def compare_types(groups, cases, causes):
+        return {name: KnownType(case, *more) for name, (case, *more) in known.items()} if cases else {}
+
+    monkeypatch.setattr("crashhunt.corpus.compare_types", compare_types)
+    known["rear"] = (case, "cause")
     words = ("--known", tmp_path / "corpus", "--json")
     assert run("crashes", "a", *words, "--sarif", "s.sarif") == 0
     assert [one["known"] for one in json.loads(capsys.readouterr().out)["groups"]] == ["corpus/case", None]
@@ -181,6 +187,37 @@ def test_types_of_a_corpus_are_marked(grouped, monkeypatch, capsys, tmp_path):
     asked["told"].clear()
     assert run("crashes", "a", "--annotate") == 0
     assert asked["told"] == [("True, compared: False", ["::error"])]
+
+
+def test_new_crash_fails_where_that_is_asked_for(grouped, monkeypatch, capsys, tmp_path):
+    case, known, left_out = SimpleNamespace(path=Path("corpus/case")), {}, []
+    monkeypatch.setattr("crashhunt.corpus.find_cases", lambda places: places)
+    monkeypatch.setattr("crashhunt.corpus.read_case", lambda path: case)
+    monkeypatch.setattr("crashhunt.corpus.compare_types", lambda groups, cases, causes: known)
+    groups = grouped[0]
+    found = SimpleNamespace(groups=groups, left_out=left_out)
+    monkeypatch.setattr("crashhunt.crashes.group_crashes", lambda bundles, dropped: found)
+    words = ("crashes", "a", "--known", tmp_path)
+    known["rear"] = KnownType(case, "cause")
+    assert (run(*words), run(*words, "--fail-on-new")) == (0, 1)
+    assert capsys.readouterr().out.endswith("\n1 new crash type\n")
+    known["side"] = KnownType(case, "type")
+    assert run(*words, "--fail-on-new") == 0
+    assert "not judged: 'side' is known by its type alone, so another cause would be hidden" in capsys.readouterr().out
+    known["side"] = KnownType(case, "cause", (Cause("omission", "gap left", "changed lanes"),))
+    assert run(*words, "--fail-on-new", "--json") == 1
+    data = json.loads(capsys.readouterr().out)["groups"]
+    assert [(one["known"], one["known_by"]) for one in data] == [("corpus/case", "cause"), (None, "cause")]
+    assert data[1]["new_causes"] == ["omission: changes to the left lane into a gap that is not safe"]
+    del known["side"]
+    groups.pop()
+    left_out.append("h/crashes/9 is damaged")  # which may be of any type
+    assert (run(*words), run(*words, "--fail-on-new")) == (0, 1)
+    left_out.clear()
+    groups.clear()
+    assert run(*words, "--fail-on-new") == 0  # no crash
+    with pytest.raises(UsageError, match="--fail-on-new has no corpus"):
+        run("crashes", "a", "--fail-on-new")
 
 
 # crashhunt replay

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError, UsageError
-from crashhunt.corpus import CaseReport, _cases, _run, add_case, find_cases, known_kinds, read_case, run_cases
-from crashhunt.crashes import Signature
+from crashhunt.corpus import (
+    CaseReport,
+    _cases,
+    _run,
+    add_case,
+    cases_of_type,
+    compare_types,
+    find_cases,
+    read_case,
+    run_cases,
+)
+from crashhunt.crashes import Cause, Judgement, Signature, judgement_of, with_judgement
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "case"
@@ -227,9 +238,60 @@ def test_types_that_a_corpus_has_are_those_of_crashes_that_are_still_expected():
 
     one, other = kept("one", "still", manner="rear end", later=True), kept("other", "still", manner="rear end")
     fixed = kept("fixed", "fixed", manner="crossing from the left")
-    assert known_kinds([rear, crossing], [fixed, kept("early", "still"), one, other]) == {rear: one}
-    assert known_kinds([rear], [kept("x", "still", manner="rear end", disturbed=True), other]) == {rear: other}
-    assert known_kinds([], [one]) == {}
+    cases = [fixed, kept("early", "still"), one, other]
+    assert (cases_of_type(rear, cases), cases_of_type(crossing, cases)) == ([one, other], [])
+    assert cases_of_type(rear, [kept("x", "still", manner="rear end", disturbed=True), other]) == [other]
+
+
+CAR, TRUCK = Cause("omission", "vehicle"), Cause("omission", "vehicle", actor="long")
+GAP, UNKNOWN = Cause("omission", "gap left", "changed lanes"), Cause("unknown")
+
+
+@pytest.mark.parametrize(
+    ("crashes", "cases", "by", "new"),
+    [
+        ([CAR], [CAR], "cause", ()),
+        ([GAP, CAR], [CAR], "cause", (GAP,)),  # one rear end in the corpus hides no other one
+        ([GAP, CAR], [CAR, GAP], "cause", ()),
+        ([TRUCK, UNKNOWN], [CAR], "cause", ()),  # a long vehicle is chance where cars are hit in the same way
+        ([TRUCK], [TRUCK, UNKNOWN], "cause", ()),
+        ([GAP], [TRUCK, UNKNOWN], "cause", (GAP,)),
+        ([UNKNOWN], [CAR], "type", ()),  # not judged on one side
+        ([CAR, GAP], [UNKNOWN], "type", ()),
+    ],
+)
+def test_cause_decides_whether_a_crash_is_known_if_both_sides_have_causes(monkeypatch, crashes, cases, by, new):
+    rear = Signature("collision", manner="rear end")
+    said = {"expect": "still", "signature": {"manner": "rear end"}}
+    kept = [SimpleNamespace(path=Path(str(cause)), bundle=lambda cause=cause: cause, **said) for cause in cases]
+    monkeypatch.setattr(_cases, "judgement_of", lambda bundle: None)
+    monkeypatch.setattr(_cases, "cause_of", lambda bundle, judgement: bundle)
+    group = SimpleNamespace(signature=rear, bundles=crashes)
+    for causes in (None, [crashes]):
+        found = compare_types([group], kept, causes)[rear]
+        assert (found.case, found.by, found.new_causes) == (kept[0], by, new)
+
+
+def test_case_whose_stored_type_was_of_earlier_rules_is_still_known(case):
+    today = _cases.signature_today(case.path)
+    assert today.manner == "rear end"
+    early = replace(case, signature={**case.signature, "manner": "crossing from the right"})
+    early.write(case.path)
+    group = SimpleNamespace(signature=today, bundles=())
+    assert compare_types([group], [early])[today].case == early
+    other = replace(today, manner="head-on")
+    assert compare_types([SimpleNamespace(signature=other, bundles=())], [early]) == {}
+
+
+def test_case_gets_the_causes_of_its_crash_when_this_is_judged_later(case, tmp_path):
+    kept = add_case(case.bundle(), tmp_path / "corpus")
+    assert judgement_of(kept.case.bundle()) is None
+    judged = with_judgement(case.bundle(), Judgement(attempts=(), why_not="no brake"))
+    again = add_case(judged, tmp_path / "corpus")
+    assert (again.new, again.changed, again.judged) == (False, False, True)
+    assert judgement_of(again.case.bundle()).why_not == "no brake"
+    assert again.case.bundle().authentication_code == kept.case.bundle().authentication_code
+    assert not add_case(judged, tmp_path / "corpus").judged
 
 
 def report(**options):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.corpus import Case, CaseReport, known_kinds
+from crashhunt.corpus import Case, CaseReport, cases_of_type
 from crashhunt.crashes import Bundle, Group, Signature
 from crashhunt.report import (
     corpus_annotations,
@@ -136,10 +136,11 @@ def test_a_place_that_no_one_knows_is_the_hunt_however_it_was_given(tmp_path, mo
 def test_a_corpus_knows_what_is_expected_to_crash_still(groups):
     signature = groups[0].signature
     case = Case(Path("kept/one"), "still", "", "", dict(signature.to_json()))
-    assert known_kinds([signature, groups[1].signature], [case]) == {signature: case}
-    assert known_kinds([signature], [replace(case, expect="fixed")]) == {}
-    assert known_kinds([signature], [replace(case, signature={})]) == {}
-    assert known_kinds([replace(signature, lane_change="agent")], [case]) == {}
+    assert cases_of_type(signature, [case]) == [case]
+    assert cases_of_type(groups[1].signature, [case]) == []
+    assert cases_of_type(signature, [replace(case, expect="fixed")]) == []
+    assert cases_of_type(signature, [replace(case, signature={})]) == []
+    assert cases_of_type(replace(signature, lane_change="agent"), [case]) == []
 
 
 def test_cases_that_are_not_as_expected_come_first_and_are_reported_next_to_their_files():
