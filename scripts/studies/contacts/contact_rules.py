@@ -115,13 +115,14 @@ def _against_manner(
 ) -> Iterator[str]:
     if not manner or is_person(hit.agent) or is_person(hit.other):
         return  # the outlines contradict the simulator's report, and the type says nothing
-    low, high = {"head-on": (135, 180), "rear end": (0, 45), "side swipe": (0, 45)}.get(manner, (45, 135))
+    # In a bend, vehicles of one lane meet at any angle, and so do vehicles that come towards each other.
+    low, high = {"head-on": (45, 180), "rear end": (0, 180), "side swipe": (0, 180)}.get(manner, (45, 135))
     if not math.radians(low) - _ANGLE <= turn <= math.radians(high) + _ANGLE:
         yield f"{manner.split(' from')[0]} at an angle of another type"
     heading = victim.headings[0]
     dx, dy = victim.center[0] - collider.center[0], victim.center[1] - collider.center[1]
     ahead, aside = dx * math.cos(heading) + dy * math.sin(heading), dy * math.cos(heading) - dx * math.sin(heading)
-    if manner == "rear end":
+    if manner == "rear end" and turn <= math.radians(45):
         if hit.collider_speed <= hit.victim_speed:
             yield "a rear end with a slower collider"
         if ahead <= 0:
@@ -147,7 +148,7 @@ def _against_finding(
             yield f"drove into the back, and a {manner.split(' from')[0]}"
         if blamed != hit.collider:
             yield "drove into the back, and is not the collider"
-    if "turning off" in words and manner == "head-on":
+    if "was turning" in words and manner == "head-on":
         yield "turned off ahead of it, and head-on"
     if rule == "standing":
         if blamed != hit.collider or parties[blamed].stood:
