@@ -3,58 +3,80 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import math
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from zipfile import BadZipFile
 
 import numpy as np
 
 from crashhunt.agents._car_following import VX, Y, check_layout
 from crashhunt.agents._protocol import meta_actions
+from crashhunt.agents._trained_inputs import NOT_NORMALIZED, TrainedInputs, is_equal, read_statistics
 from crashhunt.trial import Argument
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import ModuleType
 
     from gymnasium import Space
     from numpy.typing import NDArray
 
+    ActionMasks = Callable[[], NDArray[np.bool_] | None]
 
 __all__ = ["NumpyPolicy", "OnnxPolicy", "StableBaselines3", "TorchPolicy"]
 
 
 _ALGORITHMS = ("PPO", "DQN", "A2C", "SAC", "TD3", "DDPG")
+_USUAL_CLIP = 10.0  # of VecNormalize
+_MASK = "action_mask"  # Gymnasium's and PettingZoo's key
+# To drive, a model needs no experience, which may be large, and some buffers cannot be made without an environment.
+_WITHOUT_REPLAY_BUFFER: Final[dict[str, object]] = {
+    "replay_buffer_class": None,
+    "replay_buffer_kwargs": {},
+    "buffer_size": 1,
+    "optimize_memory_usage": False,
+}
 
 
 class StableBaselines3:
-    """Drives by a model that Stable-Baselines3 has saved.
+    """Drives by a model that Stable-Baselines3 or sb3-contrib has saved.
 
-    Files of Stable-Baselines3 contain pickles, so load only your own files. The environment must have the observations
-    and actions on which the model was trained.
+    Files of Stable-Baselines3 contain pickles, so load only your own files. The model receives what it received in its
+    training: hidden states and action masks, and observations that are normalised and stacked as the arguments say. A
+    model whose observations or actions cannot be those of its training is refused.
 
     Args:
         path: path of the ``.zip`` file that ``model.save`` wrote.
         algorithm: name of the model's class, or ``module:Class`` such as ``sb3_contrib:TQC``.
         deterministic: whether to take the most probable action; otherwise an action is drawn.
+        normalize: path of the file that ``VecNormalize.save`` wrote; ``none`` if observations were not normalised.
+        frame_stack: number of observations that ``VecFrameStack`` stacked.
+        ignore_bounds: whether to drive in spaces with other bounds than those of the training.
         observation_space: observation space of the vehicle.
         action_space: action space of the vehicle.
+        action_masks: function that returns which actions are possible now; None if the simulator has no masks.
 
     Raises:
         ValueError: the file or the algorithm does not exist, the file is not a model of this algorithm, or the model
-            was trained with other observations or actions.
+            was trained with other observations or actions, with statistics, or with masks that are missing.
     """
 
-    libraries = ("stable_baselines3",)  # imported before any trial's time runs
+    libraries = ("stable_baselines3", "sb3_contrib")  # imported before any trial's time runs
 
     def __init__(
         self,
         path: Annotated[str, Argument("path", help="of the saved model, a .zip file")],
         algorithm: Annotated[str, Argument("algorithm", help=f"its class: {', '.join(_ALGORITHMS)}")] = "PPO",
         deterministic: Annotated[bool, Argument("deterministic", help="the most probable action")] = True,
+        normalize: Annotated[str | None, Argument("normalize", help="file of VecNormalize.save, or none")] = None,
+        frame_stack: Annotated[int | None, Argument("frame_stack", help="how many VecFrameStack stacked")] = None,
+        ignore_bounds: Annotated[bool | None, Argument("ignore_bounds", help="accept other bounds")] = None,
         observation_space: Space[object] | None = None,
         action_space: Space[object] | None = None,
+        action_masks: ActionMasks | None = None,
     ) -> None:
         module, _, name = algorithm.rpartition(":")
         if not module and name not in _ALGORITHMS:
@@ -63,39 +85,104 @@ class StableBaselines3:
         if kind is None:
             raise ValueError(f"algorithm {algorithm!r}: {module} has no class {name!r}")
         file = _existing(path)
+        if frame_stack is not None and frame_stack < 1:
+            raise ValueError(f"frame_stack is {frame_stack}; it must be at least 1")
+        statistics = read_statistics(normalize)
         try:
-            self._model = kind.load(file, device="cpu")
+            self._model = kind.load(file, device="cpu", custom_objects=_WITHOUT_REPLAY_BUFFER)
         except Exception as error:
             why = f"{type(error).__name__}: {_first_line(error)}"
             raise ValueError(
                 f"{path!r} is not a model of {name}, or was saved with another version of its libraries ({why})"
             ) from error
         self._deterministic = deterministic
+        self.notices: list[str] = [] if statistics is None else statistics.notices
+        if not normalize and (evidence := _evidence_of_normalization(self._model)):
+            fix = (
+                f"give normalize=FILE, where FILE is what VecNormalize.save wrote, or normalize={NOT_NORMALIZED} if "
+                "observations were not normalised (norm_obs=False)"
+            )
+            if evidence == "certain":
+                raise ValueError(f"{path!r} was trained under VecNormalize. Fix: {fix}")
+            self.notices.append(f"the model was probably trained under VecNormalize: {fix}")
         trained = self._model.observation_space
-        if observation_space is not None and _shape(trained) != _shape(observation_space):
-            raise ValueError(
-                f"{path!r} was trained on observations of shape {_shape(trained)}, but those of this scenario have "
-                f"shape {_shape(observation_space)}"
-            )
+        self._inputs = TrainedInputs(
+            path,
+            trained,
+            trained if observation_space is None else observation_space,
+            statistics=statistics,
+            frames=frame_stack or 1,
+            ignores_bounds=bool(ignore_bounds),
+        )
         decides = self._model.action_space
-        if action_space is not None and _choices(decides) != _choices(action_space):
+        if action_space is not None and not _is_same_choice(decides, action_space, ignores_bounds=bool(ignore_bounds)):
             raise ValueError(
-                f"{path!r} was trained with actions in {decides}, but those of this scenario are in {action_space}"
+                f"{path!r} was trained with actions in {decides}, but those of this scenario are in {action_space}. "
+                "Fix: name an environment with all action wrappers of the training"
             )
+        self._masks = None
+        if "action_masks" in inspect.signature(self._model.predict).parameters:
+            self._masks = _masks_for(path, observation_space, action_masks)
 
     def reset(self, seed: int) -> None:
-        """Forget the hidden state, and seed the model."""
+        """Forget the hidden state and earlier observations, and seed the model."""
         self._model.set_random_seed(seed)
+        if getattr(self._model, "use_sde", False):
+            self._model.policy.reset_noise()  # the model has drawn noise before it was seeded
         self._state: object = None
         self._first = True
+        self._inputs.reset()
 
     def act(self, observation: object) -> object:
         """Return the action that the model predicts."""
+        masked = {} if self._masks is None else {"action_masks": self._masks(observation)}
+        observation = self._inputs.convert(observation)
         action, self._state = self._model.predict(
-            observation, state=self._state, episode_start=np.array([self._first]), deterministic=self._deterministic
+            observation,
+            state=self._state,
+            episode_start=np.array([self._first]),
+            deterministic=self._deterministic,
+            **masked,
         )
         self._first = False
         return action
+
+
+def _evidence_of_normalization(model: Any) -> Literal["certain", "likely", ""]:
+    """Return whether a model was trained under `VecNormalize`, which the model itself does not say.
+
+    A model keeps its last observation, and the original of an observation that was normalised. An off-policy model also
+    keeps the observation before the last one as an original, if nothing was normalised.
+    """
+    original: Any = getattr(model, "_last_original_obs", None)
+    last: Any = getattr(model, "_last_obs", None)
+    if original is None:
+        return ""
+    if not hasattr(model, "replay_buffer_class"):
+        return "certain"
+    parts = [(original, last)] if not isinstance(original, dict) else [(original[key], last[key]) for key in original]
+    seen = [(np.abs(one), np.abs(other)) for one, other in parts if np.asarray(one).dtype.kind == "f"]
+    is_scaled = any(one.max() > _USUAL_CLIP >= other.max() for one, other in seen)
+    return "likely" if is_scaled and all(other.max() <= _USUAL_CLIP for _, other in seen) else ""
+
+
+def _masks_for(path: str, shown: Space[object] | None, masks: ActionMasks | None) -> Callable[[Any], object]:
+    """Return the function that returns the action mask for an observation.
+
+    Raises:
+        ValueError: neither the environment nor its observations contain a mask.
+    """
+    if masks is not None and masks() is not None:
+        return lambda _: masks()
+    from gymnasium.spaces import Dict
+
+    if isinstance(shown, Dict) and _MASK in shown.spaces:
+        return lambda observation: np.asarray(observation[_MASK], bool)
+    raise ValueError(
+        f"{path!r} was trained with action masks, but this scenario has none (allowed: the environment's method "
+        f"action_masks(), info[{_MASK!r}] of reset and step, or {_MASK!r} in a dictionary of observations). "
+        "Fix: name an environment that gives its masks, such as one in ActionMasker of sb3_contrib"
+    )
 
 
 class _Network(ABC):
@@ -105,9 +192,17 @@ class _Network(ABC):
         self,
         path: Annotated[str, Argument("path", help="of the weights, with their layers")],
         flatten: Annotated[bool, Argument("flatten", help="observations as one row of numbers")] = True,
+        normalize: Annotated[str | None, Argument("normalize", help="file of VecNormalize.save, or none")] = None,
+        mask: Annotated[bool | None, Argument("mask", help="take only possible actions")] = None,
         action_space: Space[object] | None = None,
         observation_space: Space[object] | None = None,
+        action_masks: ActionMasks | None = None,
     ) -> None:
+        self._statistics = read_statistics(normalize)
+        self.notices = [] if self._statistics is None else self._statistics.notices
+        self._masks = None
+        if mask:
+            self._masks = _masks_for(path, observation_space, action_masks)
         try:
             self._load(path)
         except ValueError:
@@ -121,7 +216,8 @@ class _Network(ABC):
 
     def _try(self, path: str, shown: Space[object]) -> None:
         """Call the policy once, to check that it accepts the observations and returns valid actions."""
-        blank = np.zeros(shown.shape or (), np.float32)
+        blank = self._normalized(np.zeros(shown.shape or (), np.float32))
+        self.notices.clear()  # of the blank observation
         batch = blank.reshape(1, -1) if self._flatten else blank[None]
         try:
             values = np.asarray(self._answer(batch))
@@ -136,6 +232,9 @@ class _Network(ABC):
             )
         self._forget(path)
 
+    def _normalized(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        return observation if self._statistics is None else self._statistics.apply("", observation)
+
     def _forget(self, path: str) -> None:  # noqa: B027 - most remember nothing
         """Reset the state to that before the first decision."""
 
@@ -149,11 +248,13 @@ class _Network(ABC):
 
     def act(self, observation: object) -> object:
         """Return the action for the network's output."""
-        seen = np.array(observation, np.float32)
+        seen = self._normalized(np.array(observation, np.float32))
         values = self._answer(seen.reshape(1, -1) if self._flatten else seen[None])[0]
         from gymnasium.spaces import Box, Discrete
 
         space = self._space
+        if self._masks is not None:
+            values = np.where(np.asarray(self._masks(observation)).reshape(values.shape), values, -np.inf)
         if isinstance(space, Box):
             return np.clip(values.reshape(space.shape), space.low, space.high).astype(space.dtype)
         return int(np.argmax(values) + (space.start if isinstance(space, Discrete) else 0))
@@ -169,8 +270,11 @@ class TorchPolicy(_Network):
     Args:
         path: path of the saved module.
         flatten: whether the network expects an observation as one row of numbers.
+        normalize: path of the file that ``VecNormalize.save`` wrote, if it normalised the network's observations.
+        mask: whether to take the greatest value among the possible actions only.
         action_space: action space of the vehicle.
         observation_space: observation space of the vehicle.
+        action_masks: function that returns which actions are possible now; None if the simulator has no masks.
 
     Raises:
         ValueError: the file does not exist, or the network has another shape of input or output.
@@ -206,8 +310,11 @@ class OnnxPolicy(_Network):
     Args:
         path: path of the ONNX model.
         flatten: whether the network expects an observation as one row of numbers.
+        normalize: path of the file that ``VecNormalize.save`` wrote, if it normalised the network's observations.
+        mask: whether to take the greatest value among the possible actions only.
         action_space: action space of the vehicle.
         observation_space: observation space of the vehicle.
+        action_masks: function that returns which actions are possible now; None if the simulator has no masks.
 
     Raises:
         ValueError: the file does not exist, or the network has another shape of input or output.
@@ -249,14 +356,16 @@ def _first_line(error: BaseException) -> str:
     return text if len(text) <= 200 else f"{text[:199]}…"
 
 
-def _choices(space: Space[object]) -> object:
-    """Return the properties of an action space on which a policy's output depends: kind, shape and number."""
-    from gymnasium.spaces import Discrete, MultiDiscrete
+def _is_same_choice(trained: Space[Any], given: Space[Any], *, ignores_bounds: bool) -> bool:
+    """Return whether a model that was trained on one action space can act in another."""
+    from gymnasium.spaces import Box
 
-    sizes = (
-        space.nvec.tolist() if isinstance(space, MultiDiscrete) else int(space.n) if isinstance(space, Discrete) else []
-    )
-    return type(space).__name__, _shape(space), sizes
+    if not isinstance(trained, Box) or not isinstance(given, Box):
+        return is_equal(trained, given)
+    if trained.shape != given.shape:
+        return False
+    bounds = ((trained.low, given.low), (trained.high, given.high))
+    return ignores_bounds or all(np.allclose(one, other, rtol=1e-5, atol=0.0) for one, other in bounds)
 
 
 def _count(space: Space[object] | None) -> int:
@@ -264,14 +373,6 @@ def _count(space: Space[object] | None) -> int:
     from gymnasium.spaces import Discrete
 
     return int(space.n) if isinstance(space, Discrete) else math.prod(space.shape or () if space is not None else ())
-
-
-def _shape(space: Space[object]) -> object:
-    from gymnasium.spaces import Dict, Tuple
-
-    if isinstance(space, Dict):
-        return {name: _shape(inner) for name, inner in space.spaces.items()}
-    return [_shape(inner) for inner in space.spaces] if isinstance(space, Tuple) else space.shape
 
 
 # A small trained policy: a multi-layer perceptron in plain NumPy.

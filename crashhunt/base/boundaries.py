@@ -7,7 +7,7 @@ names the owner of the code that raised it. An exception without a wrapper is th
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec, TypeGuard, TypeVar
 
 from crashhunt.base.errors import SimulatorError
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from types import TracebackType
 
-__all__ = ["Boundary", "ForeignError", "Party", "is_ours"]
+__all__ = ["Boundary", "ForeignError", "Party", "is_at_boundary", "is_ours"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -45,6 +45,8 @@ class ForeignError(SimulatorError):
         self.party = party
         self.place = place
         self.error = error
+        self.is_at_boundary = False
+        """Whether a boundary has raised this exception, and not code that knows the class."""
 
 
 class Boundary:
@@ -71,8 +73,16 @@ class Boundary:
             self.wrap(error)
 
     def wrap(self, error: BaseException) -> NoReturn:
-        """Raise a `ForeignError` that wraps an exception of a call inside this boundary."""
-        raise ForeignError(self._party, self._place, error) from error
+        """Raise a `ForeignError` that wraps an exception of a call inside this boundary.
+
+        The exception of a boundary inside this one already names its owner, for example if an agent calls a function of
+        the simulator.
+        """
+        if is_at_boundary(error):
+            raise error
+        wrapper = ForeignError(self._party, self._place, error)
+        wrapper.is_at_boundary = True
+        raise wrapper from error
 
     def around(self, function: Callable[P, R]) -> Callable[P, R]:
         """Return a function whose calls run inside this boundary."""
@@ -84,6 +94,11 @@ class Boundary:
                 self.wrap(error)
 
         return call
+
+
+def is_at_boundary(error: BaseException) -> TypeGuard[ForeignError]:
+    """Return whether a boundary has raised an exception, which then names the owner of the code that failed."""
+    return type(error) is ForeignError and error.is_at_boundary
 
 
 def is_ours(thing: Any) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from crashhunt.base.boundaries import Boundary, ForeignError, Party, is_ours
+from crashhunt.base.boundaries import Boundary, ForeignError, Party, is_at_boundary, is_ours
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InternalError, InvalidEpisodeError
 from crashhunt.base.forks import Copy, Held, SuspendedFork, held, shared_memory
@@ -273,7 +273,10 @@ class Episode(Forkable, Ending):
                 try:
                     answer = agents[name].act(observation)
                 except BaseException as error:
-                    self._fail(Outcome.AGENT_ERROR, error, name, place="act")
+                    if is_at_boundary(error):  # the agent has asked for its action mask
+                        self._fail_in_simulator(error)
+                    else:
+                        self._fail(Outcome.AGENT_ERROR, error, name, place="act")
                     return None
                 try:
                     action = self._encoders[number](answer)
@@ -440,6 +443,8 @@ class Episode(Forkable, Ending):
         except BaseException as error:
             if type(error) is InternalError and place == "constructor":  # an agent's constructor has a boundary
                 raise
+            if is_at_boundary(error) and error.party is not Party.AGENT:  # the agent has asked for its mask
+                return self._fail_in_set_up(error)
             error = error.error if type(error) is ForeignError else error
             return self._fail(Outcome.INVALID, error, agent, place=place)
         return None

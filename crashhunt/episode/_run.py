@@ -9,13 +9,14 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from crashhunt.agents import NeedsLibraries
-from crashhunt.base.boundaries import Boundary, Party
+from crashhunt.base.boundaries import Boundary, Party, is_ours
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.plugins import import_module, locate
@@ -26,7 +27,7 @@ from crashhunt.episode._failures import record_originals
 from crashhunt.episode._fast_path import FastEpisode
 from crashhunt.episode._observers import Nearness, Recorder
 from crashhunt.oracles import parse_oracle
-from crashhunt.simulators import FlattensObservations
+from crashhunt.simulators import FlattensObservations, MasksActions, ReportsNotices
 from crashhunt.trial import CRASHES, signature_of
 
 if TYPE_CHECKING:
@@ -205,6 +206,8 @@ class Parts:
             # What the snapshot does not have may come from where the hunt was started, as it did then.
             sys.path[:0] = [*settings.code, str(Path.cwd())]
         self._oracles = [parse_oracle(text) for text in settings.oracles]
+        self.reporting_agents: list[ReportsNotices] = []
+        """The agents that were created in this process and that may report notices to the user."""
 
     def oracles(self) -> list[Oracle]:
         """Return new oracles for a trial, because oracles may keep state."""
@@ -270,6 +273,8 @@ class Parts:
             raise internal_error(error) from error
         with _CONSTRUCTOR_BOUNDARY:
             made: Agent = factory(**given)
+        if is_ours(made) and supports(made, ReportsNotices):
+            self.reporting_agents.append(made)
         return made
 
     def _prepared(
@@ -285,6 +290,8 @@ class Parts:
             given["action_space"] = simulator.actions[agent].space
         if "step_length_s" in wanted:
             given["step_length_s"] = simulator.step_length_s
+        if "action_masks" in wanted:
+            given["action_masks"] = partial(simulator.action_mask, agent) if supports(simulator, MasksActions) else None
         files = self._settings.argument_files
         values = {
             name: files.get(value, value) if isinstance(value, str) else value for name, value in arguments.items()

@@ -261,6 +261,8 @@ class TrialProcess:
         del data["spec"]  # which the supervisor knows
         report: Report = {"result": data, "notices": self._notices}
         report["notices"] += simulator.notices if supports(simulator, ReportsNotices) else ()
+        for agent in self._parts.reporting_agents if self._parts is not None else ():
+            report["notices"] += agent.notices
         report["notices"] += notices_of_late_imports(self._modules, settings.code)
         kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
         kept = kept or settings.is_audited(result)

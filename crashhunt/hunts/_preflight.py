@@ -114,13 +114,13 @@ class Preflight:
         names = ", ".join(f"{name}={value}" for name, value in given.items() if isinstance(value, str))
         frames = re.findall(r'^  File "([^"]+)", line (\d+)', trace, re.MULTILINE)
         places = [frame for frame in frames if not frame[0].startswith(f"{layout.PACKAGE}/")]
-        fix = f"correct the agent or its arguments {names}" if names else "correct the agent"
+        message, _, fix = message.partition(" Fix: ")  # which crashhunt's own agents name
+        usual = f"correct the agent or its arguments {names}" if names else "correct the agent"
+        fix = fix.rstrip(".") or usual
         if "pip install" in message:
             fix = "install the package"
-        elif "of this scenario" in message:  # a policy that was trained elsewhere; see agents/_policies.py
-            fix = "choose a --scenario with the environment in which it was trained"
         return ArgumentError(
-            f"{self._settings.agents[failure.agent].agent} does not start: {kind}{message}",
+            f"{self._settings.agents[failure.agent].agent} does not start: {kind}{message.rstrip('.')}",
             fix=fix,
             where=":".join(places[-1]) if kind and places else f"agent {failure.agent}",
         )

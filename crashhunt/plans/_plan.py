@@ -25,7 +25,7 @@ from crashhunt.plans._run_options import TrialOptions
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
 from crashhunt.scenario import Scenario, backend_of, load_scenario, scenario_digest, titles, with_action
-from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, Signature, parse_spec
+from crashhunt.trial import CRASHES, EVENTS, FILLED_BY_NAME, Argument, Constant, Outcome, Signature, parse_spec
 from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
@@ -120,9 +120,8 @@ try:
 except (TypeError, ValueError):
     names, is_open, defaults = [], True, {}
 else:
-    given = ("observation_space", "action_space", "step_length_s")
     kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    names = [known.name for known in parameters if known.kind in kinds and known.name not in given]
+    names = [known.name for known in parameters if known.kind in kinds and known.name not in sys.argv[2:]]
     is_open = any(known.kind is known.VAR_KEYWORD for known in parameters)
     defaults = {known.name: known.default for known in parameters if type(known.default) in (bool, int, float, str)}
 json.dump([names, is_open, defaults], answer)
@@ -255,7 +254,7 @@ def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None)
     environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
     try:
         done = subprocess.run(
-            [sys.executable, "-P", "-c", _SIGNATURE_SCRIPT, target], env=environment, cwd=home,
+            [sys.executable, "-P", "-c", _SIGNATURE_SCRIPT, target, *FILLED_BY_NAME], env=environment, cwd=home,
             stdin=subprocess.DEVNULL, capture_output=True, timeout=_SIGNATURE_TIMEOUT_S, check=True,
         )  # fmt: skip
         names, is_open, defaults = json.loads(done.stdout)
@@ -329,6 +328,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
     scenario = _with_defaults(_with_notes(scenario, request.run), crash_on)
+    scenario = replace(scenario, notes=(*scenario.notes, *_notes_on_statistics(settings, signatures)))
     find = partial(_model_apart, code, request.run.timeout_s)
     with _name_scenario_in_errors(request, scenario):
         disturber(scenario, settings.disturb, tuple(settings.agents), find=find)  # it refuses what cannot be meant
@@ -350,6 +350,16 @@ def _with_notes(scenario: Scenario, run: RunSettings) -> Scenario:
     if outdated := outdated_modules():
         notes.append(f"compiled from other sources than those installed: {listed(outdated)}. Fix: {HOW_TO_REBUILD}")
     return replace(scenario, notes=(*scenario.notes, *filter(None, notes)))
+
+
+def _notes_on_statistics(settings: HuntSettings, signatures: Mapping[str, Signature]) -> Iterator[str]:
+    """Yield a note for each file beside a policy that may contain its statistics of `VecNormalize`, but is not used."""
+    for agent, chosen in settings.agents.items():
+        path = chosen.arguments["path"].distribution if "path" in chosen.arguments else None
+        is_asked = "normalize" in signatures[agent].arguments and "normalize" not in chosen.arguments
+        if is_asked and isinstance(path, Constant) and isinstance(path.value, str):
+            for file in sorted(Path(path.value).parent.glob("*.pkl")):
+                yield f"{file.name} is beside the policy and is not used; if VecNormalize wrote it: normalize={file}"
 
 
 def core_of(scenario: Scenario, run: RunSettings) -> str | None:

@@ -17,6 +17,7 @@ from ._protocol import (
     HasMap as HasMap,
     HasWindow as HasWindow,
     Info as Info,
+    MasksActions as MasksActions,
     NamesMetaActions as NamesMetaActions,
     NamesObservations as NamesObservations,
     Observations as Observations,

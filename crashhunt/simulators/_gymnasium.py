@@ -34,7 +34,9 @@ __all__ = [
     "OpaqueAction",
     "OpaqueSpace",
     "action_form",
+    "action_mask_of",
     "as_tables",
+    "has_action_masks",
     "has_nan",
     "merge",
     "native",
@@ -339,6 +341,47 @@ def native(form: ActionForm, action: NDArray[np.generic]) -> object:
     if isinstance(form, FlatAction):
         return spaces.unflatten(form.space, action)
     return action.item() if isinstance(form.space, spaces.Discrete) else np.array(action)
+
+
+# Action masks, as sb3-contrib (`action_masks`) and PettingZoo (`info["action_mask"]`) define them.
+
+_MASK_METHOD: Final = "action_masks"
+_MASK_KEY: Final = "action_mask"
+
+
+def has_action_masks(env: Env[Any, Any], info: Mapping[str, Any]) -> bool:
+    """Return whether an environment, one of its wrappers or its last info gives action masks."""
+    return env.has_wrapper_attr(_MASK_METHOD) or info.get(_MASK_KEY) is not None
+
+
+def action_mask_of(env: Env[Any, Any], info: Mapping[str, Any], space: Space[Any]) -> NDArray[np.bool_] | None:
+    """Return which actions an environment allows now; None if it gives no masks.
+
+    Args:
+        env: The environment with its wrappers.
+        info: The last info.
+        space: The action space; the mask has one value per action, those of several discrete actions in a row.
+
+    Raises:
+        ValueError: The mask does not have the form of the action space.
+    """
+    if not has_action_masks(env, info):
+        return None
+    is_method = env.has_wrapper_attr(_MASK_METHOD)
+    given = env.get_wrapper_attr(_MASK_METHOD)() if is_method else info[_MASK_KEY]
+    parts = given if isinstance(given, tuple | list) else [given]
+    mask = np.concatenate([np.ravel(part) for part in parts])
+    size = _number_of_choices(space)
+    if mask.dtype.kind not in "biuf" or mask.size != size:
+        name = f"{_MASK_METHOD}()" if is_method else f"info[{_MASK_KEY!r}]"
+        raise ValueError(f"{name} is {describe_action(given)}; it must have {size} values for actions in {space}")
+    return mask.astype(bool)
+
+
+def _number_of_choices(space: Space[Any]) -> int:
+    if isinstance(space, spaces.MultiBinary):
+        return 2 * int(np.prod(space.shape))
+    return int(space.nvec.sum() if isinstance(space, spaces.MultiDiscrete) else getattr(space, "n", 0))
 
 
 # Scenario arguments set entries in the configuration of an environment.

@@ -30,6 +30,7 @@ __all__ = [
     "HasMap",
     "HasWindow",
     "Info",
+    "MasksActions",
     "NamesMetaActions",
     "NamesObservations",
     "Observations",
@@ -127,10 +128,10 @@ class Simulator(Protocol):
     changes an array that it has returned.
 
     Each optional capability is its own protocol: `ReportsNotices`, `FlattensObservations`, `RestoresObservations`,
-    `NamesObservations`, `ReportsEvents`, `HasMap`, `HasWindow`, `SupportsFullBraking`, `ReportsSurroundings`,
-    `SupportsDisturbances`, `SupportsHolds`, `SupportsExclusion`, `SupportsScripts`, `SupportsReseeding`, `CountsSetUp`,
-    `RunsForeignCode`, `RestoresState` and `PreparesProcess`. A simulator supports a protocol if it has the methods and
-    attributes of the protocol. Registration is not needed.
+    `NamesObservations`, `ReportsEvents`, `MasksActions`, `HasMap`, `HasWindow`, `SupportsFullBraking`,
+    `ReportsSurroundings`, `SupportsDisturbances`, `SupportsHolds`, `SupportsExclusion`, `SupportsScripts`,
+    `SupportsReseeding`, `CountsSetUp`, `RunsForeignCode`, `RestoresState` and `PreparesProcess`. A simulator supports a
+    protocol if it has the methods and attributes of the protocol. Registration is not needed.
     """
 
     @property
@@ -250,6 +251,19 @@ class ReportsCrashCell(Protocol):
     @property
     def crash_cell(self) -> str:
         """The description, equal for similar crashes; empty before a crash, or if the environment names the type."""
+
+
+class MasksActions(Protocol):
+    """A simulator that reports which discrete actions are possible."""
+
+    def action_mask(self, agent: str, /) -> NDArray[np.bool_] | None:
+        """Return which actions of an agent are possible in the next step; None if the environment gives no masks.
+
+        The mask has one value per action, and those of several discrete actions in a row, as in sb3-contrib.
+
+        Raises:
+            ForeignError: The environment failed.
+        """
 
 
 class HasMap(Protocol):
@@ -523,6 +537,7 @@ FACULTIES: tuple[type, ...] = (
     ReportsDanger,
     NamesObservations,
     ReportsEvents,
+    MasksActions,
     HasMap,
     HasWindow,
     SupportsFullBraking,

@@ -27,7 +27,9 @@ from crashhunt.simulators._gym_crash_types import crash_cell
 from crashhunt.simulators._gymnasium import (
     ObservationForm,
     action_form,
+    action_mask_of,
     as_tables,
+    has_action_masks,
     has_nan,
     merge,
     native,
@@ -64,8 +66,9 @@ _WRAP_FIX = "return a number from step(), or name a function in gym.id that wrap
 _INFO_FIX = "set gym.crash.function to a function that returns a bool, instead of gym.crash.info"
 _FUNCTION_FIX = "return True or False from gym.crash.function, or a text that describes the crash"
 _DANGER_FIX = "name a key of info in gym.danger whose value is a number"
-_CONSTRUCTOR, _RESET, _STEP, _REWARD, _INFO, _CLOSE = (
-    Boundary(Party.ENVIRONMENT, place) for place in ("constructor", "reset", "step", "reward", "info", "close")
+_CONSTRUCTOR, _RESET, _STEP, _REWARD, _INFO, _CLOSE, _MASK = (
+    Boundary(Party.ENVIRONMENT, place)
+    for place in ("constructor", "reset", "step", "reward", "info", "close", "action mask")
 )
 
 
@@ -124,6 +127,8 @@ class GymSimulator:
             raise InvalidEpisodeError(f"the environment could not be set up: {in_words(error.error)}") from error.error
         self.agents = [self._agent]
         self._steps = 0
+        self._info: Info = info if isinstance(info, Mapping) else {}
+        self._masks_are_used = False
         self._crashed = False
         self.crash_cell = ""
         self.named_danger = None
@@ -138,6 +143,11 @@ class GymSimulator:
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Run one step of the environment."""
+        if not self._steps and not self._masks_are_used:
+            with _MASK:
+                has_masks = has_action_masks(self._env, self._info)
+            if has_masks:
+                self._notice(f"the environment {self._setup.id!r} gives action masks, which its agent does not use")
         action = native(self.actions[self._agent], actions[self._agent])
         with _STEP:
             try:
@@ -146,6 +156,7 @@ class GymSimulator:
                 raise _as_raised_without_wrappers(error) from error
             observation, reward, ended, cut, info = _parts("step", returned, _STEP_PARTS)
         self._steps += 1
+        self._info = info
         with _REWARD:  # these may be objects of any class
             reward = self._number(reward, "the reward", _WRAP_FIX)
             terminated = truth_of(ended, "terminated", _WRAP_FIX)
@@ -172,6 +183,12 @@ class GymSimulator:
             self.agents = []
         agent, shown = self._agent, self._recorded_observation(observation)
         return {agent: shown}, {agent: reward}, {agent: over}, {agent: False}, {agent: info}
+
+    def action_mask(self, _: str) -> NDArray[np.bool_] | None:
+        """Return which actions the environment allows in the next step; None if it gives no masks."""
+        self._masks_are_used = True
+        with _MASK:
+            return action_mask_of(self._env, self._info, self.actions[self._agent].space)
 
     def restore_observation(self, agent: str, array: NDArray[np.generic]) -> object:
         """Return the observation that the agent receives for a recorded observation."""

@@ -39,6 +39,7 @@ from ._result import (
     in_effect as in_effect,
 )
 from ._space import (
+    FILLED_BY_NAME as FILLED_BY_NAME,
     Argument as Argument,
     Choice as Choice,
     Constant as Constant,

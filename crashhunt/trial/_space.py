@@ -18,7 +18,7 @@ import types
 import typing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from crashhunt.base.errors import ArgumentError
 from crashhunt.base.text import one_of
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 
 __all__ = [
+    "FILLED_BY_NAME",
     "Argument",
     "Choice",
     "Constant",
@@ -409,6 +410,8 @@ def describe(space: Mapping[str, Distribution]) -> str:
 # What the factory of an agent, sampler or oracle takes: read off its signature.
 
 _CONSTRUCTORS = ("__new__", "__init__")
+FILLED_BY_NAME: Final = ("observation_space", "action_space", "step_length_s", "action_masks")
+"""Parameters of an agent that crashhunt fills: the spaces of the vehicle, the step length in s, and the masks."""
 _KINDS: dict[object, Kind] = {float: "float", int: "int", bool: "bool", str: "str"}
 
 
@@ -473,9 +476,8 @@ class Signature:
 def signature_of(factory: Callable[..., object]) -> Signature:
     """Return the arguments of a factory, read from its signature.
 
-    A parameter may be annotated ``Annotated[float, Argument(...)]`` to define which values a hunt tries. Parameters
-    named ``observation_space`` and ``action_space`` are not arguments, because they receive the spaces of the vehicle.
-    ``step_length_s`` is not an argument either, because it receives the step length of the simulation.
+    A parameter may be annotated ``Annotated[float, Argument(...)]`` to define which values a hunt tries. Parameters in
+    `FILLED_BY_NAME` are not arguments, because they receive facts about the simulation.
     """
     if _takes_nothing(factory):
         return Signature({}, open=False, given=())
@@ -493,7 +495,7 @@ def signature_of(factory: Callable[..., object]) -> Signature:
             is_open = True
         elif parameter.kind in (parameter.VAR_POSITIONAL, parameter.POSITIONAL_ONLY):
             continue
-        elif parameter.name in ("observation_space", "action_space", "step_length_s"):
+        elif parameter.name in FILLED_BY_NAME:
             given.append(parameter.name)
         else:
             arguments[parameter.name] = _argument(parameter, _annotation(parameter, names))

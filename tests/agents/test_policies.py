@@ -354,7 +354,7 @@ class _Model:
         self.calls = []
 
     @classmethod
-    def load(cls, path, device):
+    def load(cls, path, device, custom_objects):
         return cls()
 
     def set_random_seed(self, seed):
@@ -368,7 +368,7 @@ class _Model:
 def test_a_recurrent_model_receives_its_state_and_where_an_episode_begins(tmp_path, monkeypatch):
     library = ModuleType("stable_baselines3")
     library.PPO = library.DQN = _Model
-    library.Recurrent, library.Broken = _Model, SimpleNamespace(load=lambda path, device: {}[path])
+    library.Recurrent, library.Broken = _Model, SimpleNamespace(load=lambda path, **_: {}[path])
     monkeypatch.setitem(sys.modules, "stable_baselines3", library)
     (tmp_path / "model.zip").touch()
     path = str(tmp_path / "model.zip")

@@ -78,6 +78,23 @@ def test_agents_are_given_what_they_ask_for(made):
     assert type(parts.agent("ego", simulator, {})) is type(driver)
 
 
+def test_agent_is_given_the_masks_of_its_simulator(made):
+    parts = made()
+    parts._factories["ego"] = dict, ("action_masks",)
+    simulator = parts.simulator()
+    assert parts.agent("ego", simulator, {}) == {"action_masks": None}
+    simulator.action_mask = lambda agent: f"mask of {agent}"
+    assert parts.agent("ego", simulator, {})["action_masks"]() == "mask of ego"
+
+
+def test_notices_are_read_from_agents_of_crashhunt_only(made):
+    parts = made()
+    for module in ("crashhunt.agents.some", "mine"):
+        parts._factories["ego"] = type("Policy", (), {"__module__": module, "notices": [module]}), ()
+        parts.agent("ego", parts.simulator(), {})
+    assert [agent.notices for agent in parts.reporting_agents] == [["crashhunt.agents.some"]]
+
+
 def test_the_snapshot_comes_before_where_the_hunt_was_started(made, tmp_path):
     parts = made()
     assert sys.path[:2] == [str(tmp_path / "code"), str(tmp_path)]

@@ -70,9 +70,9 @@ def test_files_are_named_as_they_were_given():
         preflight.filter_setup_failures(result(0, "'/s/files/0-w.onnx' has nine outputs"))
 
 
-def test_policy_trained_in_another_environment_names_the_scenario_as_the_fix():
-    message = "'m.zip' was trained on observations of shape (5, 5), but those of this scenario have shape (8, 7)"
-    with pytest.raises(ArgumentError, match="choose a --scenario with the environment in which it was trained"):
+def test_fix_that_the_agent_names_is_the_fix():
+    message = "'m.zip' was trained on observations of shape (5, 5). Fix: give frame_stack=4"
+    with pytest.raises(ArgumentError, match=r"of shape \(5, 5\); give frame_stack=4$"):
         Preflight(settings_of(speed="15"), 1).filter_setup_failures(result(0, message))
 
 

@@ -28,7 +28,7 @@ from highway_env.envs.parking_env import ParkingEnv
 from highway_env.vehicle.objects import Obstacle, RoadObject
 
 from crashhunt.accelerator import Onlooker, SkippedObservation, kernel, switch_off, switch_on
-from crashhunt.base.boundaries import Party
+from crashhunt.base.boundaries import Boundary, Party
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.base.scalars import number_of, truth_of
 from crashhunt.scenario import argument_values
@@ -37,6 +37,7 @@ from crashhunt.simulators._actions import MetaAction
 from crashhunt.simulators._gymnasium import (
     ObservationForm,
     action_form,
+    action_mask_of,
     as_tables,
     has_nan,
     native,
@@ -72,6 +73,8 @@ __all__ = ["HighwaySimulator"]
 _PACKAGES = frozenset(("highway_env", "gymnasium", "typing", "builtins"))
 _REPLACED_WRAPPERS = (OrderEnforcing, TimeLimit)  # whose work this simulator does itself
 _STEP_FIX = "return one number or bool for each agent from step()"
+_AVAILABLE_NOTICE = "the environment has no action_masks(), so the masks are highway-env's available actions"
+_MASK = Boundary(Party.SIMULATOR, "action mask")
 _LANE_INTERVAL_STEPS = 10  # steps between two scenes that contain the lane of each vehicle
 
 assert highway_env  # importing it registers its environments
@@ -118,7 +121,7 @@ class HighwaySimulator:
         """Create the environment and begin an episode with all agents."""
         try:
             env = self._make((options or {}).get("arguments", {}))
-            shown, _ = env.reset(seed=seed, options={"config": env.config})
+            shown, self._info = env.reset(seed=seed, options={"config": env.config})
         except ScenarioError:
             raise
         except Exception as error:
@@ -176,6 +179,7 @@ class HighwaySimulator:
             )
         with self._skipping:
             shown, reward, terminated, truncated, info = self._env.step(tuple(given) if self._many_act else given[0])
+        self._info = info
         self._steps += 1
         if self._taking_part is not None:
             self._taking_part.remove()
@@ -218,6 +222,16 @@ class HighwaySimulator:
 
     def _notice(self, notice: str) -> None:
         self.notices[notice] = None
+
+    def action_mask(self, agent: str) -> NDArray[np.bool_] | None:
+        """Return the mask of the environment, or else highway-env's available actions; None for other actions."""
+        kind = self._kinds[agent]
+        with _MASK:
+            mask = None if self._many_act else action_mask_of(self._env, self._info, self.actions[agent].space)
+            if mask is None and isinstance(kind, DiscreteMetaAction):
+                mask = np.isin(np.arange(len(kind.actions)), kind.get_available_actions())
+                self._notice(_AVAILABLE_NOTICE)
+        return mask
 
     def scene(self) -> Scene:
         """Return the state of all vehicles and obstacles."""
