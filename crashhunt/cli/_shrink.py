@@ -117,7 +117,7 @@ def _summary_of(found: Shrunk) -> str:
         lines.append(f"  {what}: {why}" if why else f"  {what}")
         lines += [f"  note: {note}" for note in found.notes]
         return in_lines(lines)
-    (before, after), result = found.actors, small.result
+    (before, after), result = found.others, small.result
     moved = "" if found.scripted is None else _replaced_words(found.scripted)
     lines += [
         f"{small.id}: {result.summary}",

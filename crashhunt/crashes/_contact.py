@@ -154,6 +154,10 @@ class ContactRecord:
         samples = first - _SAMPLE_S * np.arange(math.ceil((first - last) / _SAMPLE_S - 1e-6))
         return np.append(samples, last)
 
+    def ago(self, before_s: float) -> str:
+        """Return a time in s before the contact as text, relative to the end of the step, as all texts on a crash."""
+        return f"{before_s + self.scenes[-1].time_s - self.time_s:.1f} s before"
+
     def way(self, actor: str) -> ApproachPath:
         """Return how an actor moved before the contact."""
         return self._ways[actor]

@@ -95,7 +95,7 @@ def _red_light(case: ContactRecord) -> FaultFinding | None:
         if event.kind != "red_light" or event.agent not in (case.agent, case.other) or case.time_s - time_s > _RED_S:
             continue
         if not case.is_past(event, time_s):
-            ran[event.agent] = f"{event.what}, {case.time_s - time_s:.1f} s before"
+            ran[event.agent] = f"{event.what}, {case.ago(case.time_s - time_s)}"
     if not ran:
         return None
     blames = "both" if len(ran) == 2 else _name_of(case, *ran)
@@ -178,7 +178,7 @@ def _lane_change(case: ContactRecord) -> FaultFinding | None:
             changer, int(np.argmin(np.abs(case.times - before)))
         ):
             return None  # it turned off, or was behind all the time: that leaves a lane sideways, too
-        words = f"{changer} changed lanes {before:.1f} s before, to behind {other}, and drove into it"
+        words = f"{changer} changed lanes {case.ago(before)}, to behind {other}, and drove into it"
         return FaultFinding(rule="lane change", blames=_name_of(case, changer), words=words, source=source)
     return _cut_in(case, changer, before, source)
 
@@ -189,7 +189,7 @@ def _into_changed_vehicle(case: ContactRecord, changer: str, source: str) -> Fau
     since = case.changed_s(other)
     if since is None or since < _RESPONSE_S - 1e-6 or case.turned(since) > SAME_WAY:
         return None  # the other may have been about to change as well, or came there in a bend
-    words = f"{changer} moved sideways into {other}, which had changed to the lane next to it {since:.1f} s before"
+    words = f"{changer} moved sideways into {other}, which had changed to the lane next to it {case.ago(since)}"
     return FaultFinding(rule="lane change", blames=_name_of(case, changer), words=words, source=source)
 
 
@@ -201,7 +201,7 @@ def _cut_in(case: ContactRecord, changer: str, before: float, source: str) -> Fa
         return None  # it was ahead, and left
     gap = case.gap_m(changer, back)
     safe = safe_gap_m(float(case.way(other).speeds[back]), float(case.way(changer).speeds[back]))
-    words = f"{changer} changed lanes {before:.1f} s before, {max(0.0, gap):.1f} m ahead of {other}"
+    words = f"{changer} changed lanes {case.ago(before)}, {max(0.0, gap):.1f} m ahead of {other}"
     if gap >= safe:
         return None
     if before > _AT_ONCE_S and case.slowed(other, before - _RESPONSE_S) < _RSS_MIN_BRAKING_MPS2:
@@ -229,7 +229,7 @@ def _rear_end(case: ContactRecord) -> FaultFinding | None:
     back = int(np.argmin(np.abs(case.times - min(ahead_s, _FOLLOWS_S))))
     gap, safe = max(0.0, case.gap_m(leader, back)), safe_gap_m(float(follow.speeds[back]), float(lead.speeds[back]))
     words = f"{follower} drove into the back of {leader}, which had been ahead of it for at least {_FOLLOWS_S:g} s"
-    words += f"; {case.times[back]:.1f} s before, the gap was {gap:.1f} m, and {safe:.1f} m is safe (RSS)"
+    words += f"; {case.ago(case.times[back])}, the gap was {gap:.1f} m, and {safe:.1f} m is safe (RSS)"
     return FaultFinding(
         rule="rear end",
         blames=_name_of(case, follower),
@@ -252,7 +252,7 @@ def _turns_off(case: ContactRecord) -> FaultFinding | None:
         lead = case.way(leader)
         if case.hardest_braking(leader) > _IMPOSSIBLE_BRAKING_MPS2 or float(lead.speeds.min()) < -STANDS_MPS:
             continue
-        words = f"{follower} drove straight on into {leader}, which had been ahead of it until {left_s:.1f} s before"
+        words = f"{follower} drove straight on into {leader}, which had been ahead of it until {case.ago(left_s)}"
         words += " and was turning"
         return FaultFinding(
             rule="rear end", blames=_name_of(case, follower), words=words, source="Vienna, article 13 (5); StVO § 4 (1)"
@@ -274,7 +274,7 @@ def _steps_out(case: ContactRecord) -> FaultFinding | None:
     stops = speed * _RESPONSE_S + speed * speed / (2 * _RSS_MAX_BRAKING_MPS2)
     if gap >= stops or speed < _WALKING_SPEED_MPS or float(np.max(case.times[:inside], initial=0.0)) < _STANDS_S:
         return None
-    words = f"{person} came onto the road {case.times[inside]:.1f} s before, {max(0.0, gap):.1f} m ahead of {driver}"
+    words = f"{person} came onto the road {case.ago(case.times[inside])}, {max(0.0, gap):.1f} m ahead of {driver}"
     words += f", which needs {stops:.1f} m to stop"
     return FaultFinding(
         rule="steps out", blames=_name_of(case, person), words=words, source="Vienna, article 20 (6); StVO § 25 (3)"

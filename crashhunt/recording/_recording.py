@@ -149,6 +149,18 @@ class Recording:
             raise IndexError(f"no scene of step {step}; the recording has the steps 0 to {self.steps}")
         return found
 
+    def before_end_s(self, step: int) -> float:
+        """Return the time from the end of a step to the end of the last step, in s.
+
+        This is the clock of all texts on crashes: a crash is at the end of the step that found it, whenever within the
+        step the actors touched.
+
+        Raises:
+            IndexError: the recording has no such step.
+        """
+        last = next(record.scene for record in reversed(self.all_steps) if record.scene is not None)
+        return last.time_s - self.scene(step).time_s
+
     def scenes(self) -> list[Scene]:
         """All scenes of the episode, in order."""
         return [step.scene for step in self.all_steps if step.scene is not None]

@@ -131,7 +131,7 @@ class Story:
         result, recording = self.bundle.result, self.recording
         end = recording.steps
         scenes = recording.scenes()
-        lasted = self._end_s - scenes[0].time_s if scenes else 0.0
+        lasted = recording.before_end_s(0) if scenes else 0.0
         sentences = [f"{result.summary}, {lasted:.1f} s after the episode began."]
         sentences += about_disturbances(recording, result, self._first)
         if self.encounter is not None and self.nearest is not None:
@@ -240,14 +240,16 @@ class Story:
         agent, other = encounter.agent, encounter.other
         sentences = []
         # Moments after the contact do not explain how the crash came about.
-        before = [moment for moment in encounter.moments if moment.time_s < self._end_s - 1e-9]
+        recording = self.recording
+        before = [moment for moment in encounter.moments if moment.step < recording.steps]
         shown = [moment for moment in before if moment.step >= self._first]
         if shown:
             earlier = shown[0]
-            middle = next((moment for moment in reversed(shown) if self._end_s - moment.time_s >= 1.0), earlier)
+            ago_s = {moment.step: recording.before_end_s(moment.step) for moment in shown}
+            middle = next((moment for moment in reversed(shown) if ago_s[moment.step] >= 1.0 - 1e-6), earlier)
             sentences = [
-                f"{self._end_s - earlier.time_s:.1f} s before, {about_gap(encounter, earlier)}.",
-                f"{self._end_s - middle.time_s:.1f} s before, {about_place(encounter, middle)}.",
+                f"{ago_s[earlier.step]:.1f} s before, {about_gap(encounter, earlier)}.",
+                f"{ago_s[middle.step]:.1f} s before, {about_place(encounter, middle)}.",
             ]
         own, its = self._speeds_at_contact()
         if math.isfinite(own) and math.isfinite(its):
@@ -310,24 +312,11 @@ class Story:
             f"{self.other} had moved as recorded. This is a calculation, not a run."
         )
 
-    def before_contact_s(self, step: int) -> float:
-        """Return how long before the contact, or else before the end of the episode, a step ended, in s."""
-        return self._end_s - self.recording.scene(step).time_s
-
     def _ago(self, step: int) -> str:
-        return f"{self.before_contact_s(step):.1f} s before, after step {step}"
+        return f"{self.recording.before_end_s(step):.1f} s before, after step {step}"
 
     def _at(self, step: int) -> str:
         return f"{self.recording.scene(min(step, self.recording.steps)).time_s:.1f} s"
-
-    @property
-    def _end_s(self) -> float:
-        """Simulation time of the contact, in s; if unknown, the end of the step of the contact."""
-        hit = self.bundle.result.collision
-        if hit is not None and math.isfinite(hit.time_s):
-            return hit.time_s
-        scenes = self.recording.scenes()
-        return scenes[-1].time_s if scenes else self.bundle.result.sim_time_s
 
     def _last_lane_change(self) -> tuple[int, str] | None:
         names = self._names()

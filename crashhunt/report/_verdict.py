@@ -16,6 +16,7 @@ from crashhunt.world import is_person, lane_jump
 
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, ContactRecord, Encounter, Judgement, Omission
+    from crashhunt.recording import Recording
     from crashhunt.world import DangerousMoment
 
 __all__ = ["describe_contact", "verdict_of"]
@@ -38,6 +39,7 @@ class CrashFacts(Protocol):
 
     Attributes:
         bundle: the crash or near miss.
+        recording: its recording.
         agent: the controlled vehicle.
         other: the actor that the agent touched or nearly touched; empty if there is none.
         contact: record of the first contact with this actor; None if the two did not touch.
@@ -47,16 +49,13 @@ class CrashFacts(Protocol):
     """
 
     bundle: Bundle
+    recording: Recording
     agent: str
     other: str
     contact: ContactRecord | None
     nearest: DangerousMoment | None
     encounter: Encounter | None
     judgement: Judgement | None
-
-    def before_contact_s(self, step: int) -> float:
-        """Return how long before the contact a step ended, in s."""
-        ...
 
 
 def verdict_of(story: CrashFacts) -> str:
@@ -112,7 +111,7 @@ def describe_contact(contact: ContactRecord, omission: Omission | None = None) -
     if changer in contact.jumpers:
         return f"{changer} {lane} into {partner}{gap}"
     what = _what_touched(contact)
-    when = f"{since:.1f} s before" if since is not None else "just before"
+    when = contact.ago(since) if since is not None else "just before"
     if what.startswith(f"{changer} "):
         return f"{changer} {lane} {when} and {what.removeprefix(f'{changer} ')}{gap}"
     return f"{changer} {lane} {when}, and {what}{gap}"
@@ -225,7 +224,7 @@ def _avoided(story: CrashFacts, omission: Omission | None) -> str:
 def _if_it(story: CrashFacts, how: str, step: int, changed: tuple[str, ...]) -> str:
     """Return that a run with changes from a step on avoids the crash, and the agent's other changes in that run."""
     also = "".join(f" and {each.removeprefix(f'{story.agent} ')}" for each in changed)
-    return f"if {story.agent} {how} {story.before_contact_s(step):.1f} s before{also}, this crash does not happen"
+    return f"if {story.agent} {how} {story.recording.before_end_s(step):.1f} s before{also}, this crash does not happen"
 
 
 def _omitted(agent: str, omission: Omission) -> str:

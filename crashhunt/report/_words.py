@@ -215,8 +215,8 @@ def about_disturbances(recording: Recording, result: TrialResult, first_step: in
     recent = [one for one in result.disturbances if one.step + one.how_long / step_length_s >= first_step]
     earlier = len(result.disturbances) - len(recent)
     sentences = [
-        f"{max(0, recording.steps - one.step + 1) * step_length_s:.1f} s before, from step {one.step} on: {one.words}"
-        f"{_place_words(one)}."
+        f"{recording.before_end_s(min(one.step - 1, recording.steps)):.1f} s before, from step {one.step} on: "
+        f"{one.words}{_place_words(one)}."
         for one in recent
     ]
     if earlier:
@@ -296,7 +296,6 @@ def about_events(recording: Recording, first_step: int, *, besides: Event | None
         first_step: first step to describe.
         besides: the event that ended the trial; it is excluded because another text describes it.
     """
-    end = recording.steps * recording.prologue.step_length_s
     found = [
         (step.step, event)
         for step in recording.all_steps[first_step:]
@@ -305,7 +304,7 @@ def about_events(recording: Recording, first_step: int, *, besides: Event | None
         if event != besides
     ]
     return [
-        f"{end - step * recording.prologue.step_length_s:.1f} s before, at step {step}: {event.what}."
+        f"{recording.before_end_s(step):.1f} s before, at step {step}: {event.what}."
         for step, event in found[-_MAX_LISTED_EVENTS:]
     ]
 

@@ -47,6 +47,7 @@ class Shrunk:
         small: the minimized crash; None if nothing was removed.
         why: the reason for the end, as text.
         actors: number of actors in the scenes before and after the minimization, including agents.
+        agents: number of agents in the scenes.
         trials: number of runs.
         steps: total number of simulated steps in these runs.
         removed: the removed actors and disturbances.
@@ -61,12 +62,19 @@ class Shrunk:
     small: Bundle | None = None
     why: str = ""
     actors: tuple[int, int] = (0, 0)
+    agents: int = 0
     trials: int = 0
     steps: int = 0
     removed: tuple[str, ...] = ()
     changed: Mapping[str, tuple[Value | None, Value | None]] = field(default_factory=dict)
     steps_cut: int = 0
     notes: tuple[str, ...] = ()
+
+    @property
+    def others(self) -> tuple[int, int]:
+        """The number of actors other than the agents, before and after the minimization."""
+        before, after = self.actors
+        return before - self.agents, after - self.agents
 
     @property
     def scripted(self) -> tuple[str, ...] | None:
@@ -179,6 +187,7 @@ def shrink(
             small=None,
             why=why,
             actors=search.actors(None),
+            agents=search.agents,
             trials=runs.count,
             steps=runs.steps,
             notes=(*rerun.warnings, *search.notes),
@@ -191,6 +200,7 @@ def shrink(
             small=None,
             why=why,
             actors=search.actors(None),
+            agents=search.agents,
             trials=runs.count,
             steps=runs.steps,
             notes=(*rerun.warnings, *search.notes),
@@ -204,6 +214,7 @@ def shrink(
         small=small,
         why=why,
         actors=search.actors(small.recording()),
+        agents=search.agents,
         trials=runs.count,
         steps=runs.steps,
         removed=search.removed(),

@@ -103,7 +103,7 @@ class Minimizer:
         """Simplify arguments first, which takes few trials, then remove actors, which may take hundreds of trials."""
         self._everybody = self._runs.entered(replace(self.best, only=(ALL_AGENTS,)))  # of the crash as it was
         self._left_out = bool(self._everybody)
-        if not self._left_out and _actors(self._rerun.recorded) > len(self._rerun.recorded.agents):
+        if not self._left_out and _actors(self._rerun.recorded) - set(self._rerun.recorded.agents):
             self.notes.append("all others stay: the simulator, or the crashhunt of the snapshot, cannot exclude actors")
         self._plainer_arguments()
         self._until_nothing_helps(self._fewer_others)
@@ -358,9 +358,14 @@ class Minimizer:
     # What came of it
 
     def actors(self, after: Recording | None) -> tuple[int, int]:
-        """Return the number of actors before and after the minimization."""
+        """Return the number of actors before and after the minimization, with the agents."""
         before = _actors(self._rerun.recorded)
-        return before, before if after is None else _actors(after)
+        return len(before), len(before if after is None else _actors(after))
+
+    @property
+    def agents(self) -> int:
+        """The number of agents in the scenes."""
+        return len(_actors(self._rerun.recorded) & set(self._rerun.recorded.agents))
 
     @property
     def steps_cut(self) -> int:
@@ -403,8 +408,8 @@ class Minimizer:
         return {name: (left, right) for name, (left, right) in pairs.items() if left != right}
 
 
-def _actors(recording: Recording) -> int:
-    return len({actor.id for scene in recording.scenes() for actor in scene.roster.actors})
+def _actors(recording: Recording) -> set[str]:
+    return {actor.id for scene in recording.scenes() for actor in scene.roster.actors}
 
 
 def _nearest(recording: Recording, agent: str) -> list[str]:

@@ -374,7 +374,7 @@ def action_mask_of(env: Env[Any, Any], info: Mapping[str, Any], space: Space[Any
     size = _number_of_choices(space)
     if mask.dtype.kind not in "biuf" or mask.size != size:
         name = f"{_MASK_METHOD}()" if is_method else f"info[{_MASK_KEY!r}]"
-        raise ValueError(f"{name} is {describe_action(given)}; it must have {size} values for actions in {space}")
+        raise ValueError(f"{name} is {describe_value(given)}; it must have {size} values for actions in {space}")
     return mask.astype(bool)
 
 

@@ -7,6 +7,7 @@ is None for an intervention that holds from the start.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol, get_args
 
@@ -251,7 +252,7 @@ def step_before(bundle: Bundle, seconds: float) -> int:
         UsageError: the time lies before the start, or not before the crash.
     """
     length_s, steps = bundle.recording().prologue.step_length_s, bundle.result.steps
-    step = steps - round(seconds / length_s) if 0 < seconds < 1e9 else -1
+    step = steps - math.ceil(seconds / length_s - 1e-6) if 0 < seconds < 1e9 else -1
     if not 0 <= step < steps:
         allowed = f"give {length_s:g} to {steps * length_s:g}"
         raise UsageError(f"--before is {seconds:g}, but the trial lasts only {steps * length_s:g} s", fix=allowed)

@@ -461,7 +461,7 @@ def test_options_out_of_range_are_named(words, message):
 
 def shrunk(**more):
     usual = {
-        "bundle": crash(), "verdict": "minimized", "ended": "done", "small": None, "why": "", "actors": (9, 2),
+        "bundle": crash(), "verdict": "minimized", "ended": "done", "small": None, "why": "", "others": (8, 1),
         "trials": 40, "steps_cut": 0, "notes": (), "scripted": None, "changed": {}, "to_json": lambda: {"trials": 40},
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **more})
@@ -521,7 +521,7 @@ def test_minimized_crash_is_described():
     assert lines == [
         "000003-collision: it crashed",
         "000003-collision.small: it crashed",
-        "other actors: 9 before, 2 now; steps: 50 before, 20 now",
+        "other actors: 8 before, 1 now; steps: 50 before, 20 now",
         "a, b are moved as recorded, independent of the agent",
         "the first 5 steps are removed",
         "speed was 9.5 and is 10",

@@ -59,12 +59,34 @@ def test_table_has_the_last_steps_in_aligned_columns(rear_end):
 def test_sentences_have_the_distances_speeds_and_times_of_the_crash(rear_end):
     words = Story(rear_end).words()
     found = {sentence.partition(",")[0]: numbers(sentence) for sentence in words}
-    assert found["ego drove into leader at step 52"] == ["52", "5.1"]
-    assert found["4.9 s before"] == ["4.9", "29.9", "0.6", "7.3", "6.7"]
+    assert found["ego drove into leader at step 52"] == ["52", "5.2"]
+    assert found["5.0 s before"] == ["5.0", "29.9", "0.6", "7.3", "6.7"]
     assert found["When they touched"] == ["14.5", "6.7"]
     assert "1.0 s before, leader was ahead of ego, going the same way." in words
-    assert numbers(words[4])[:3] == ["8", "0.5", "46"]
+    assert numbers(words[4])[:3] == ["8", "0.6", "46"]
     assert words[5].startswith("At fault: ego, by the rule 'rear end': ")
+
+
+@pytest.mark.parametrize("braking", [None, 4.0])
+def test_all_texts_have_the_clock_of_the_recording(rear_end, braking):
+    """The actors touch within a step, and each text refers to the end of that step, as the table of steps does."""
+    story = Story(rear_end, braking=braking)
+    times = {record.step: record.scene.time_s for record in story.recording.all_steps}
+    last = max(times)
+    assert story.bundle.result.collision.time_s < times[last] - 0.01
+    text = story.describe()
+    (lasted,) = re.findall(r", ([\d.]+) s after the episode began", text)
+    assert lasted == f"{times[last] - times[0]:.1f}"
+    ago = re.findall(r"([\d.]+) s before, (?:after|at) step (\d+)", text)
+    assert ago
+    assert ago == [(f"{times[last] - times[int(step)]:.1f}", step) for _, step in ago]
+    rows = re.findall(r"^ *(\d+) +(\d+\.\d) ", text, re.MULTILINE)
+    assert len(rows) > 10
+    assert rows == [(step, f"{times[int(step)]:.1f}") for step, _ in rows]
+    assert [story.recording.before_end_s(step) for step in (0, last)] == [times[last] - times[0], 0.0]
+    gap = dict(re.findall(r"([\d.]+) s before, they were ([\d.]+) m apart", text))
+    moments = {f"{times[last] - moment['time_s']:.1f}": moment for moment in story.to_json()["moments"]}
+    assert gap == {ago_s: f"{moments[ago_s]['gap_to_other_m']:.1f}" for ago_s in gap}
 
 
 def test_calculated_braking_is_reported_as_a_calculation(rear_end):
@@ -76,7 +98,7 @@ def test_calculated_braking_is_reported_as_a_calculation(rear_end):
     assert calculated["braking"] == {"by": "calculation", "changed": [], "why_not": ""} | how
     assert (ran["full_braking"], calculated["full_braking"]) == pytest.approx((8.0, 4.0))
     (sentence,) = (words for words in Story(rear_end, braking=4.0).words() if "calculation" in words)
-    assert numbers(sentence) == ["4", "1.0", "41"]
+    assert numbers(sentence) == ["4", "1.1", "41"]
     (harder,) = (words for words in Story(rear_end, braking=20.0).words() if "calculation" in words)
     assert "with at most 8.0" in harder  # the run could not brake so hard
 

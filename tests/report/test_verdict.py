@@ -118,7 +118,7 @@ def story(judgement=None, escape=None, poses=None):
         agent="ego",
         other="x",
         encounter=None,
-        before_contact_s=lambda step: (40 - step) * DT,
+        recording=SimpleNamespace(before_end_s=lambda step: (40 - step) * DT),
     )
 
 

@@ -79,7 +79,7 @@ def test_what_is_left_is_written_next_to_it_and_confirmed(crash):
     told = found.to_json()
     assert (told["crash"], told["path"], told["verdict"]) == (crash.id, str(small.path), "shrunk")
     assert (told["steps_before"], told["steps_after"]) == (52, small.result.steps)
-    assert (told["actors_before"], told["actors_after"]) == (2, 2)
+    assert (told["actors_before"], told["actors_after"], found.others) == (2, 2, (1, 1))
     assert (told["signature_kept"], told["confirmed"], told["scripted"], told["steps_cut"]) == (True, True, None, 0)
     assert told["trials_run"] == found.trials > 3
     assert told["steps_run"] == found.steps > 52
