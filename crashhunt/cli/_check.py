@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line, count_of
 from crashhunt.cli._common import add_json, say
@@ -69,10 +68,10 @@ def _check(options: argparse.Namespace, _words: list[str]) -> int:
 
 def _describe(found: Checked) -> str:
     parts = [count_of(len(found.trials), "trial")] if found.kind == "hunt" else []
-    minimized = sum(name.endswith(layout.SMALL) for name in found.crashes) if found.kind == "hunt" else 0
-    crashes = len(found.crashes) - minimized
-    parts.append(f"{crashes} crash{'' if crashes == 1 else 'es'}")
+    near, crashes, minimized = len(found.near_misses), found.crash_count, found.minimized
+    parts += [f"{crashes} crash{'' if crashes == 1 else 'es'}"] if crashes or not near or found.kind == "hunt" else []
     parts += [f"{minimized} minimized crash{'' if minimized == 1 else 'es'}"] if minimized else []
+    parts += [f"{near} near miss{'' if near == 1 else 'es'}"] if near else []
     listed = " and ".join(", ".join(parts).rsplit(", ", 1))
     lines = [f"{command_line(found.dir)}: {listed} {'are' if found.kind == 'hunt' else 'is'} intact"]
     if not found.fine:

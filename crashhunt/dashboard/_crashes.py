@@ -79,7 +79,10 @@ class CrashList:
         return found
 
     def rows(self) -> JsonObject:
-        """Return ``crashes``, with one entry for each crash, and ``pending``, the number of crashes not yet analysed.
+        """Return ``crashes``, with one entry for each crash or near miss, and how many there are.
+
+        ``count`` is the number of crashes, and ``pending`` the number of crashes that are not analysed yet.
+        ``near_misses`` and ``pending_near_misses`` are the same numbers of near misses.
 
         Reading the log of a crash takes 50 ms or more, so a separate thread reads the logs.
         """
@@ -96,7 +99,15 @@ class CrashList:
             if unknown and (self._thread is None or not self._thread.is_alive()):
                 self._thread = threading.Thread(target=self._analyse, args=(unknown,), daemon=True)
                 self._thread.start()
-            return {"crashes": rows, "pending": len(unknown), "count": len(folders)}
+            near = sum(_is_near_miss(folder) for folder in folders.values())
+            pending_near = sum(_is_near_miss(folder) for _, folder in unknown)
+            return {
+                "crashes": rows,
+                "pending": len(unknown) - pending_near,
+                "pending_near_misses": pending_near,
+                "count": len(folders) - near,
+                "near_misses": near,
+            }
 
     def _row(self, name: str, folder: Path) -> JsonObject:
         written = _written(folder / layout.CRASH)
@@ -106,7 +117,7 @@ class CrashList:
         try:
             row = _summary(self._read(folder))
         except BundleError as error:
-            row = {"id": name, "damaged": str(error), "near_miss": folder.parent.name == layout.NEAR_MISSES}
+            row = {"id": name, "damaged": str(error), "near_miss": _is_near_miss(folder)}
         self._entries[name] = _Entry(written, row)
         return row
 
@@ -239,6 +250,10 @@ class CrashList:
                     if row.get("x") is not None
                 ],
             }
+
+
+def _is_near_miss(folder: Path) -> bool:
+    return folder.parent.name == layout.NEAR_MISSES
 
 
 def _written(path: Path) -> tuple[int, int]:

@@ -66,6 +66,7 @@ class Checked:
         trials: the numbers of the trials whose rows are unchanged since they were written.
         damaged_trials: reason for each damaged trial.
         crashes: the names of the bundles that are unchanged since they were written.
+        near_misses: the names of the bundles of near misses among them, and those beside the crashes of a hunt.
         damaged_crashes: reason for each damaged crash.
         findings: the problems that were found.
         dropped: the trials whose bundles were deleted, because shorter crashes of their type were kept.
@@ -77,9 +78,20 @@ class Checked:
     trials: set[int] = field(default_factory=set)
     damaged_trials: set[int] = field(default_factory=set)
     crashes: list[str] = field(default_factory=list)
+    near_misses: list[str] = field(default_factory=list)
     damaged_crashes: list[str] = field(default_factory=list)
     findings: list[CheckFinding] = field(default_factory=list)
     dropped: set[int] = field(default_factory=set)
+
+    @property
+    def minimized(self) -> int:
+        """The number of minimized crashes, which lie beside the crash that they were made from."""
+        return sum(name.endswith(layout.SMALL) for name in self.crashes) if self.kind == "hunt" else 0
+
+    @property
+    def crash_count(self) -> int:
+        """The number of unchanged crashes, without minimized crashes and near misses."""
+        return len(set(self.crashes) - set(self.near_misses)) - self.minimized
 
     @property
     def fine(self) -> bool:
@@ -287,6 +299,7 @@ def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
         found.damaged_crashes.append(folder.name)
     else:
         found.crashes.append(folder.name)
+        found.near_misses += [folder.name] if bundle.is_near_miss else []
     return bundle
 
 
@@ -300,6 +313,7 @@ def _check_other_bundles(found: Checked, hunt: Path) -> list[Bundle]:
             bundle = _check_bundle(one, folder)
             if bundle is not None:
                 whole.append(bundle)
+                found.near_misses += one.near_misses
             fix = f"remove it: the same hunt with {option} makes it again"
             lost = f"the near miss {folder.name}" if place == layout.NEAR_MISSES else f"{place}/{folder.name}"
             for finding in one.findings:
@@ -426,14 +440,14 @@ def salvage(found: Checked, to: Path) -> dict[str, int]:
         if to.exists() and not is_empty_folder(to):
             if not _is_same(found, settings, to):
                 raise HuntDirectoryError("the directory exists already", fix="give a new directory", where=str(to))
-            return {"trials": len(_copied_trials(found, settings)), "crashes": len(found.crashes)}
+            return {"trials": len(_copied_trials(found, settings)), "crashes": found.crash_count}
         with new_folder(to) as building:
             trials = _copy(found, settings, building, to)
         sync_folder(to.absolute().parent, to)
     except (OSError, shutil.Error) as error:
         wrong = error if not isinstance(error, shutil.Error) else OSError(0, str(error.args[0][0][2]))
         raise cannot_write(to, wrong) from error
-    return {"trials": trials, "crashes": len(found.crashes)}
+    return {"trials": trials, "crashes": found.crash_count}
 
 
 def _copy(found: Checked, settings: HuntSettings, building: Path, to: Path) -> int:

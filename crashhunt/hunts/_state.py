@@ -220,7 +220,8 @@ class HuntState(Serializable):
         nodes: the machines of the hunt's last run, with the fields of `NodeFigures`; None if it used only this machine.
         kinds: crash types, the most frequent first, with the fields of `KindData`; None if the hunt ends at its first
             crash.
-        newest_kind_s: time since the last new crash type was found, in s; None if it is unknown.
+        newest_kind_s: time from the last new crash type until now, or until the last trial ended, in s; None if it is
+            unknown.
         types_by_cause: number of crash types by cause; None without ``--by-cause``.
     """
 
@@ -356,7 +357,9 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
     run = sum(outcomes.values())
     planned = int(facts.get("planned", 0))
     here = run - int(facts.get("done_before", 0))
-    lasted = _duration_s(facts, time.time() if state == "running" and not facts.get("phase") else last)
+    # The clocks of a hunt stand still after its last trial.
+    until = time.time() if state == "running" and not facts.get("phase") else last
+    lasted, newest = _duration_s(facts, until), facts.get("newest_kind")
     rate = here / lasted if lasted > 0 and here > 0 else 0.0
     return HuntState(
         dir=str(directory),
@@ -376,7 +379,7 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
         kinds=facts.get("kinds"),
         types_by_cause=facts.get("types_by_cause"),
         rate=facts.get("running_rate"),
-        newest_kind_s=max(0.0, time.time() - newest) if (newest := facts.get("newest_kind")) is not None else None,
+        newest_kind_s=None if newest is None or until is None else max(0.0, until - newest),
     )
 
 

@@ -636,7 +636,8 @@ def test_crash_is_described_for_as_long_as_is_asked(opened, monkeypatch, capsys)
 def checked(**more):
     usual = {
         "dir": "h", "kind": "hunt", "trials": [1, 2], "crashes": ["000001-collision"], "damaged_trials": [],
-        "damaged_crashes": [], "findings": (), "fine": True, "to_json": lambda: {"dir": "h"},
+        "damaged_crashes": [], "findings": (), "fine": True, "to_json": lambda: {"dir": "h"}, "near_misses": [],
+        "minimized": 0, "crash_count": 1,
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **more})
 
@@ -645,10 +646,13 @@ def test_check_names_what_is_intact_damaged_and_lost():
     finding = SimpleNamespace(damaged=True, where="ledger.sqlite", what="cut off", lost="trial 3", fix="salvage it")
     note = SimpleNamespace(damaged=False, where="run.log", what="missing", lost="", fix="")
     assert _check._describe(checked()) == "h: 2 trials and 1 crash are intact"
-    assert _check._describe(checked(trials=[1], crashes=[])) == "h: 1 trial and 0 crashes are intact"
-    minimized = checked(crashes=["000001-collision", "000001-collision.small"])  # as many crashes as in status
-    assert _check._describe(minimized) == "h: 2 trials, 1 crash and 1 minimized crash are intact"
+    assert _check._describe(checked(trials=[1], crash_count=0)) == "h: 1 trial and 0 crashes are intact"
+    assert _check._describe(checked(minimized=1)) == "h: 2 trials, 1 crash and 1 minimized crash are intact"
+    near = checked(near_misses=["000002-survived", "000003-survived"])
+    assert _check._describe(near) == "h: 2 trials, 1 crash and 2 near misses are intact"
     assert _check._describe(checked(kind="crash")) == "h: 1 crash is intact"
+    alone = checked(kind="crash", crash_count=0, near_misses=["000002-survived"])
+    assert _check._describe(alone) == "h: 1 near miss is intact"
     damaged = checked(fine=False, damaged_trials=[3, 4], damaged_crashes=[5], findings=(finding, note))
     assert _check._describe(damaged).splitlines() == [
         "h: 2 trials and 1 crash are intact; damaged: 2 trials, 1 crashes",

@@ -315,7 +315,8 @@ def test_crashes_are_listed_once_and_their_logs_read_by_one_thread(crashes, tmp_
     assert [(row["id"], row["near_miss"], row["type"]) for row in found["crashes"]] == [
         ("000001-collision", False, None), ("000002-collision", False, None), ("000004-survived", True, None)
     ]  # fmt: skip
-    assert (found["pending"], found["count"]) == (3, 3)
+    assert (found["count"], found["pending"]) == (2, 2)
+    assert (found["near_misses"], found["pending_near_misses"]) == (1, 1)
     assert crashes.rows() == found
     assert crashes.read == ["000001-collision", "000002-collision", "000004-survived"]  # each once
     (thread,) = crashes.threads
@@ -341,7 +342,7 @@ def test_crashes_are_listed_once_and_their_logs_read_by_one_thread(crashes, tmp_
     assert crashes.rows()["crashes"][2]["near_miss"] is True
     monkeypatch.setattr(_crashes, "_MAX_LISTED", 2)
     found = crashes.rows()
-    assert (len(found["crashes"]), found["count"]) == (2, 3)
+    assert (len(found["crashes"]), found["count"], found["near_misses"]) == (2, 2, 1)
 
 
 def test_folder_of_a_minimized_crash_is_found_by_its_own_name(crashes, tmp_path):

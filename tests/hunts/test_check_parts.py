@@ -61,6 +61,17 @@ def signed(file, **change):
     file.write_text(json.dumps(data | {"integrity": digest_of_data(data)}))
 
 
+def test_near_misses_and_minimized_crashes_are_no_crashes(hunt):
+    near = hunt / "near-misses" / "000001-survived"
+    shutil.copytree(hunt / "crashes" / CRASH, near)
+    signed(near / "crash.json", outcome="survived", collision=None)
+    shutil.copytree(hunt / "crashes" / CRASH, hunt / "crashes" / f"{CRASH}.small")
+    found = found_in(hunt)
+    assert (found.crash_count, found.minimized, found.near_misses) == (2, 1, ["000001-survived"])
+    alone = found_in(near)
+    assert (alone.crash_count, alone.near_misses) == (0, ["000001-survived"])
+
+
 def test_what_is_whole_is_fine(hunt):
     assert found_in(hunt).to_json() == {
         "dir": str(hunt), "kind": "hunt", "fine": True, "protected": True, "trials": 4, "damaged_trials": [],

@@ -124,7 +124,7 @@ def test_what_not_every_hunt_has_is_in_its_json_only_where_it_has_it(hunt):
     assert more.keys() - plain.keys() == {"disturbed", "core", "kinds", "newest_kind_s", "types_by_cause"}
     assert more["types_by_cause"] == 3
     assert (more["disturbed"], more["core"], more["kinds"]) == (0, "used", [kind])
-    assert more["newest_kind_s"] == pytest.approx(30, abs=5)
+    assert more["newest_kind_s"] == 0.0  # its clock has ended with its last trial, before this time
 
 
 def test_hunt_that_fails_before_its_first_trial_has_the_facts_of_a_hunt_that_ran(tmp_path, monkeypatch):

@@ -55,6 +55,19 @@ def test_running_hunt_has_its_rate_and_the_time_to_its_last_trial():
     assert state(running(newest_kind=NOW + 5)).newest_kind_s == 0.0
 
 
+@pytest.mark.parametrize("said", ["crash", "all_trials", "interrupted"])
+def test_clocks_stand_still_after_the_last_trial(said, monkeypatch):
+    ended = running(state=said, newest_kind=930.0)
+    found = state(ended)
+    assert found.newest_kind_s == 20.0
+    confirming = running(newest_kind=930.0, phase={"name": "confirming", "done": 0, "total": 1, "seconds_left": None})
+    assert state(confirming).newest_kind_s == 20.0
+    monkeypatch.setattr(_state.time, "time", lambda: NOW + 3600)
+    later = state(ended)
+    assert (later.newest_kind_s, later.rate_per_s) == (found.newest_kind_s, found.rate_per_s)
+    assert state(ended, last=None).newest_kind_s is None
+
+
 @pytest.mark.parametrize(
     ("facts", "left"),
     [

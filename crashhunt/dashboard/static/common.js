@@ -14,6 +14,8 @@ const TAGS = new Map();
 let ahead = 0;
 /* The time of the server, in s: the clock of another machine may differ. */
 export const now = () => Date.now() / 1000 - ahead;
+/* The time since the last new crash type in s, which stands still after the last trial; null if it is unknown. */
+export const sinceNewestKind = (row) => (row.newest_kind_at === null ? null : row.state === "running" && !row.phase ? Math.max(0, now() - row.newest_kind_at) : row.newest_kind_s);
 export class Refused extends Error {
   constructor(status, error) {
     super([error.message, error.fix].filter((part) => part).join("; "));

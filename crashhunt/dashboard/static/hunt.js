@@ -1,5 +1,5 @@
 /* The page of one hunt. */
-import { $, PALETTE, Refused, between, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, spelled, tell } from "/static/common.js";
+import { $, PALETTE, Refused, between, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, sinceNewestKind, spelled, tell } from "/static/common.js";
 
 const ID = location.pathname.split("/")[2], API = `/api/hunts/${ID}`;
 const NOT_DECIDED = "nobody can tell"; // the verdict of the API
@@ -61,12 +61,12 @@ function showHunt() {
   setText($("detail"), problems.join("\n"));
   $("progress").hidden = !(hunt.trials_planned >= hunt.trials_run && hunt.trials_planned) || hunt.state !== "running";
   $("progress").value = hunt.trials_planned ? hunt.trials_run / hunt.trials_planned : 0;
-  const rate = hunt.rate, newest = hunt.newest_kind_at;
+  const rate = hunt.rate, newest = sinceNewestKind(hunt);
   const tiles = [
     ["trials", hunt.trials_planned >= hunt.trials_run && hunt.trials_planned ? `${count(hunt.trials_run)} of ${count(hunt.trials_planned)}` : count(hunt.trials_run)],
     ["crashed trials", count(hunt.crashed_trials)],
     ...(hunt.kinds_count === null ? [] : [["crash types", count(hunt.kinds_count)]]),
-    ...(newest ? [["since the last new type", seconds(Math.max(0, now() - newest))]] : []),
+    ...(newest === null ? [] : [["since the last new type", seconds(newest)]]),
     ["trials/s", hunt.rate_per_s ? hunt.rate_per_s.toFixed(1) : "-"],
     ...(hunt.seconds_left === null ? [] : [["time left", seconds(hunt.seconds_left)]]),
     ...(rate?.certain ? [["crash rate per trial, certain interval", between(rate)]] : []),
@@ -95,8 +95,9 @@ function showHunt() {
 }
 
 function showKinds() {
-  const kinds = hunt.kinds ?? [...Map.groupBy(crashes.filter((one) => one.type), (one) => one.type)].map(([type, members]) => ({ words: type, count: members.length, first: members[0].id, shortest: [...members].sort((a, b) => a.steps - b.steps)[0].id }));
-  const faults = new Map([...Map.groupBy(crashes.filter((one) => one.type), (one) => one.type)].map(([type, members]) => [type, [...new Set(members.map((one) => faultOf(one)))].join(", ")]));
+  const crashed = crashes.filter((one) => !one.near_miss);
+  const kinds = hunt.kinds ?? [...Map.groupBy(crashed.filter((one) => one.type), (one) => one.type)].map(([type, members]) => ({ words: type, count: members.length, first: members[0].id, shortest: [...members].sort((a, b) => a.steps - b.steps)[0].id }));
+  const faults = new Map([...Map.groupBy(crashed.filter((one) => one.type), (one) => one.type)].map(([type, members]) => [type, [...new Set(members.map((one) => faultOf(one)))].join(", ")]));
   const kept = new Set(crashes.map((one) => one.id));
   $("kinds-section").hidden = !kinds.length;
   const lines = kinds.map((kind) => [kind.words, kind.count, kind.first, kind.shortest, faults.get(kind.words) ?? ""]);
@@ -127,7 +128,7 @@ function showCrashes() {
 }
 
 /* Charts */
-const firstNumbers = () => (hunt.kinds ?? crashes.filter((one) => one.type).map((one) => ({ first: one.id, words: one.type }))).reduce((found, kind) => found.set(kind.words, Math.min(found.get(kind.words) ?? Infinity, Number.parseInt(kind.first, 10))), new Map());
+const firstNumbers = () => (hunt.kinds ?? crashes.filter((one) => one.type && !one.near_miss).map((one) => ({ first: one.id, words: one.type }))).reduce((found, kind) => found.set(kind.words, Math.min(found.get(kind.words) ?? Infinity, Number.parseInt(kind.first, 10))), new Map());
 function drawProgress() {
   $("progress-section").hidden = !hunt.parts.length;
   if (!hunt.parts.length) return;
@@ -489,8 +490,8 @@ async function refresh() {
     const found = await (crashesAsked ?? getCrashes());
     if (found) {
       crashes = found.crashes;
-      setText($("pending"), found.pending ? `${plural(found.pending, "crash is", "crashes are")} still being analysed` : "");
-      if (!found.pending && !crashesAsked) crashesSeen = key;
+      setText($("pending"), found.pending ? `${plural(found.pending, "crash is", "crashes are")} still being analysed` : found.pending_near_misses ? `${plural(found.pending_near_misses, "near miss is", "near misses are")} still being analysed` : "");
+      if (!found.pending && !found.pending_near_misses && !crashesAsked) crashesSeen = key;
       showCrashes();
       showKinds();
       changed = true;

@@ -1,5 +1,5 @@
 /* The page of all hunts. */
-import { $, ago, between, count, get, make, now, plural, poll, seconds, setText, sparkline } from "/static/common.js";
+import { $, ago, between, count, get, make, now, plural, poll, seconds, setText, sinceNewestKind, sparkline } from "/static/common.js";
 
 const COLUMNS = [
   { key: "name", label: "Hunt", text: (row) => row.name },
@@ -11,7 +11,7 @@ const COLUMNS = [
   { key: "crashes", label: "Crashes", number: true, value: (row) => row.crashed_trials },
   { key: "types", label: "Types", number: true, value: (row) => row.kinds_count ?? -1 },
   { key: "rate", label: "Crash rate per trial", number: true, value: (row) => row.rate?.certain?.high ?? -1 },
-  { key: "newest", label: "Last new type", number: true, value: (row) => -(newestAge(row) ?? Infinity) },
+  { key: "newest", label: "Last new type", number: true, value: (row) => -(sinceNewestKind(row) ?? Infinity) },
   { key: "curve", label: "Discovery" },
   { key: "active", label: "Last active", number: true, value: (row) => row.active_at },
 ];
@@ -34,7 +34,6 @@ function remember() {
   history.replaceState(null, "", words.size ? `?${words}` : location.pathname);
 }
 
-const newestAge = (row) => (row.newest_kind_at === null ? null : Math.max(0, now() - row.newest_kind_at));
 
 /* The table is made once; a row that changes keeps its node, and the focus in it. */
 const table = make("table"), head = make("thead"), body = make("tbody");
@@ -118,7 +117,7 @@ function fill(row) {
 
 function fillTimes() {
   for (const row of rows.values()) {
-    const { cells } = nodeOf(row), age = newestAge(row);
+    const { cells } = nodeOf(row), age = sinceNewestKind(row);
     setText(cells.newest, age === null ? "-" : ago(age));
     setText(cells.active, row.active_at ? ago(now() - row.active_at) : "-");
   }
