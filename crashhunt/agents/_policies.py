@@ -60,8 +60,8 @@ class StableBaselines3:
         action_masks: function that returns which actions are possible now; None if the simulator has no masks.
 
     Raises:
-        ValueError: the file or the algorithm does not exist, the file is not a model of this algorithm, or the model
-            was trained with other observations or actions, with statistics, or with masks that are missing.
+        ValueError: the file or the algorithm does not exist, or the file is not a model of this algorithm. The model
+            was trained with other observations or actions, or with statistics or masks that are missing.
     """
 
     libraries = ("stable_baselines3", "sb3_contrib")  # imported before any trial's time runs

@@ -24,7 +24,7 @@ class Agent(Protocol):
     arguments as keywords, once per trial and vehicle. A parameter named ``observation_space`` or ``action_space``
     receives the Gymnasium space. A parameter named ``step_length_s`` receives the time from one step to the next, in s.
     A parameter named ``action_masks`` receives a function that returns which discrete actions are possible in the next
-    step, or None if the environment has no masks; if the simulator knows no masks, the parameter receives None.
+    step, or None if the environment has no masks. If the simulator knows no masks, the parameter receives None.
 
     Optional capabilities are separate protocols: `DrawsPanels` and `Closes`, and `NeedsLibraries` for the factory of an
     agent. An object has a capability if it has the methods or attributes of the protocol.

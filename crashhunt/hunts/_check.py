@@ -66,7 +66,7 @@ class Checked:
         trials: the numbers of the trials whose rows are unchanged since they were written.
         damaged_trials: reason for each damaged trial.
         crashes: the names of the bundles that are unchanged since they were written.
-        near_misses: the names of the bundles of near misses among them, and those beside the crashes of a hunt.
+        near_misses: the names of the bundles of near misses among them, and of a hunt.
         damaged_crashes: reason for each damaged crash.
         findings: the problems that were found.
         dropped: the trials whose bundles were deleted, because shorter crashes of their type were kept.
@@ -85,7 +85,7 @@ class Checked:
 
     @property
     def minimized(self) -> int:
-        """The number of minimized crashes, which lie beside the crash that they were made from."""
+        """The number of minimized crashes, which lie next to their original crashes."""
         return sum(name.endswith(layout.SMALL) for name in self.crashes) if self.kind == "hunt" else 0
 
     @property

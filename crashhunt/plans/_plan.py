@@ -353,13 +353,13 @@ def _with_notes(scenario: Scenario, run: RunSettings) -> Scenario:
 
 
 def _notes_on_statistics(settings: HuntSettings, signatures: Mapping[str, Signature]) -> Iterator[str]:
-    """Yield a note for each file beside a policy that may contain its statistics of `VecNormalize`, but is not used."""
+    """Yield a note for each unused file next to a policy that may contain its statistics of `VecNormalize`."""
     for agent, chosen in settings.agents.items():
         path = chosen.arguments["path"].distribution if "path" in chosen.arguments else None
         is_asked = "normalize" in signatures[agent].arguments and "normalize" not in chosen.arguments
         if is_asked and isinstance(path, Constant) and isinstance(path.value, str):
             for file in sorted(Path(path.value).parent.glob("*.pkl")):
-                yield f"{file.name} is beside the policy and is not used; if VecNormalize wrote it: normalize={file}"
+                yield f"{file.name} is next to the policy and is not used; if VecNormalize wrote it: normalize={file}"
 
 
 def core_of(scenario: Scenario, run: RunSettings) -> str | None:

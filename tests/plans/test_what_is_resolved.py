@@ -234,7 +234,7 @@ def test_a_survey_sees_what_was_asked_and_its_scenario_is_planned(folder):
     assert plan(asked(), survey=lambda scenario, *_: scenario)[1] == plan(asked())[1]
 
 
-def test_statistics_beside_a_policy_that_are_not_used_are_a_note(folder, tmp_path):
+def test_unused_statistics_next_to_a_policy_are_a_note(folder, tmp_path):
     for name in ("model.zip", "norm.pkl", "other.txt"):
         (tmp_path / name).touch()
     asked_for = {"path": str(tmp_path / "model.zip")}
@@ -244,7 +244,7 @@ def test_statistics_beside_a_policy_that_are_not_used_are_a_note(folder, tmp_pat
     given = {"agents": {"ego": "drives_by_model:Agent"}}
     scenario, _ = plan(asked(arguments=asked_for, **given))
     (note,) = [note for note in scenario.notes if "norm.pkl" in note]
-    assert note.startswith("norm.pkl is beside the policy and is not used")
+    assert note.startswith("norm.pkl is next to the policy and is not used")
     assert note.endswith(f"normalize={tmp_path / 'norm.pkl'}")
     scenario, _ = plan(asked(arguments={**asked_for, "normalize": "none"}, **given))
     assert not any("norm.pkl" in note for note in scenario.notes)
