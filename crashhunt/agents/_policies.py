@@ -81,7 +81,11 @@ class StableBaselines3:
         module, _, name = algorithm.rpartition(":")
         if not module and name not in _ALGORITHMS:
             raise ValueError(f"algorithm {algorithm!r} is unknown (allowed: {', '.join(_ALGORITHMS)}, module:Class)")
-        kind = getattr(_library(module or "stable_baselines3", "sb3"), name, None)
+        kind = getattr(
+            _library(module or "stable_baselines3", "sb3-contrib" if module == "sb3_contrib" else "'crashhunt[sb3]'"),
+            name,
+            None,
+        )
         if kind is None:
             raise ValueError(f"algorithm {algorithm!r}: {module} has no class {name!r}")
         file = _existing(path)
@@ -283,7 +287,7 @@ class TorchPolicy(_Network):
     libraries = ("torch",)  # imported before any trial's time runs
 
     def _load(self, path: str) -> None:
-        self._torch = _library("torch", "torch")
+        self._torch = _library("torch", "'crashhunt[torch]'")
         file = _existing(path)
         if file.suffix == ".pt2":
             self._module = self._torch.export.load(file).module()
@@ -323,7 +327,7 @@ class OnnxPolicy(_Network):
     libraries = ("onnxruntime",)  # imported before any trial's time runs
 
     def _load(self, path: str) -> None:
-        runtime = _library("onnxruntime", "onnx")
+        runtime = _library("onnxruntime", "'crashhunt[onnx]'")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         self._session = runtime.InferenceSession(_existing(path), options, providers=["CPUExecutionProvider"])
@@ -337,11 +341,11 @@ class OnnxPolicy(_Network):
         return answer
 
 
-def _library(name: str, extra: str) -> ModuleType:
+def _library(name: str, package: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise ValueError(f"the agent needs the package {name}: pip install 'crashhunt[{extra}]' ({error})") from error
+        raise ValueError(f"the agent needs the package {name}: pip install {package} ({error})") from error
 
 
 def _existing(path: str) -> Path:

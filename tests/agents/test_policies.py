@@ -263,6 +263,9 @@ def test_what_is_not_installed_or_not_there_is_said(kind, tmp_path, monkeypatch)
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ValueError, match="pip install 'crashhunt"):
         kind(str(tmp_path / "no.zip"))
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+    with pytest.raises(ValueError, match="pip install sb3-contrib"):
+        StableBaselines3(str(tmp_path / "no.zip"), algorithm="sb3_contrib:TQC")
 
 
 def test_an_algorithm_that_no_one_knows_is_refused():

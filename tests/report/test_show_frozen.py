@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from crashhunt.crashes import find_bundle, open_archive
+from crashhunt.report._page import _crash
 from crashhunt.report._show import Story, _steps_around, _thinned
+from crashhunt.whatif import step_before
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages"
 TABLE = """\
@@ -65,6 +67,21 @@ def test_sentences_have_the_distances_speeds_and_times_of_the_crash(rear_end):
     assert "1.0 s before, leader was ahead of ego, going the same way." in words
     assert numbers(words[4])[:3] == ["8", "0.6", "46"]
     assert words[5].startswith("At fault: ego, by the rule 'rear end': ")
+
+
+def test_player_of_the_report_has_the_clock_of_the_recording(rear_end):
+    story = Story(rear_end)
+    data = _crash(rear_end, story)
+    times = [scene.time_s for scene in story.recording.scenes()]
+    assert data["steps"] == len(times)
+    assert [data["time0"] + step * data["dt"] for step in range(len(times))] == pytest.approx(times, abs=1e-9)
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.25, 0.3, 0.35, 1.0])
+def test_time_before_a_crash_is_at_least_as_long_as_asked(rear_end, seconds):
+    recording, step = rear_end.recording(), step_before(rear_end, seconds)
+    assert recording.before_end_s(step + 1) < seconds - 1e-6
+    assert recording.before_end_s(step) >= seconds - 1e-6
 
 
 @pytest.mark.parametrize("braking", [None, 4.0])

@@ -177,7 +177,9 @@ def test_highway_env_masks_what_is_not_available(tmp_path):
         assert np.flatnonzero(mask).tolist() == sorted(made._env.unwrapped.get_available_actions())
         seen.add(mask.tobytes())
     assert len(seen) > 1
-    assert [*made.notices] == ["the environment has no action_masks(), so the masks are highway-env's available actions"]
+    assert [*made.notices] == [
+        "the environment has no action_masks(), so the masks are highway-env's available actions"
+    ]
     made._env.action_masks = lambda: np.array([True, False, False, False, True])
     assert made.action_mask("ego").tolist() == [True, False, False, False, True]
 
