@@ -24,6 +24,7 @@ __all__ = [
     "count_of",
     "did_you_mean",
     "encodable",
+    "format_time",
     "in_lines",
     "listed",
     "near_path",
@@ -66,6 +67,16 @@ def _visible_character(character: str) -> str:
 def one_line(text: str) -> str:
     """Return a text as one line without control characters."""
     return visible(_LINE_BREAKS.sub(" ", text.rstrip())).replace("\t", " ")
+
+
+def format_time(seconds: float, step_length_s: float) -> str:
+    """Return a time in s as text, with two decimals if steps are no multiples of 0.1 s.
+
+    >>> format_time(3.25, 0.1), format_time(3.25, 0.05)
+    ('3.2 s', '3.25 s')
+    """
+    tenths = 10 * step_length_s
+    return f"{seconds:.{1 if abs(tenths - round(tenths)) < 1e-6 else 2}f} s"
 
 
 def count_of(number: int, noun: str) -> str:

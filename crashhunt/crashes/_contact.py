@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.base import layout
+from crashhunt.base.text import format_time
 from crashhunt.crashes._lanes import LaneMap
 from crashhunt.world import MAX_CONTACT_GAP_M, STANDS_MPS, contact_at, is_person, lane_jump, poses_between
 
@@ -156,7 +157,9 @@ class ContactRecord:
 
     def ago(self, before_s: float) -> str:
         """Return a time in s before the contact as text, relative to the end of the step, as all texts on a crash."""
-        return f"{before_s + self.scenes[-1].time_s - self.time_s:.1f} s before"
+        last_s = self.scenes[-1].time_s
+        step_s = last_s - self.scenes[-2].time_s if len(self.scenes) > 1 else 0.1
+        return f"{format_time(before_s + last_s - self.time_s, step_s)} before"
 
     def way(self, actor: str) -> ApproachPath:
         """Return how an actor moved before the contact."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from crashhunt.base.errors import BundleError
-from crashhunt.base.text import one_of
+from crashhunt.base.text import format_time, one_of
 from crashhunt.recording._blackbox import digest_of, is_evidence
 from crashhunt.recording._reading import Prologue, Reading
 from crashhunt.recording._values import is_opaque
@@ -160,6 +160,10 @@ class Recording:
         """
         last = next(record.scene for record in reversed(self.all_steps) if record.scene is not None)
         return last.time_s - self.scene(step).time_s
+
+    def ago(self, step: int) -> str:
+        """Return as text how long before the end of the last step a step ended, such as ``0.4 s before``."""
+        return f"{format_time(self.before_end_s(step), self.prologue.step_length_s)} before"
 
     def scenes(self) -> list[Scene]:
         """All scenes of the episode, in order."""

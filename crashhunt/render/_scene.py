@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image, ImageDraw
 
+from crashhunt.base.text import format_time
 from crashhunt.panels import FAINT, INK, as_array, font
 from crashhunt.world import corners, is_person
 
@@ -207,7 +208,11 @@ class SceneView:
         """Write time, step and speed, and the text of a marked step: as much of the former as there is room for."""
         margin, top = self._pixels(12), self._pixels(10)
         speed = f"{scene.speeds[row]:.1f} m/s" if row is not None else "gone" if self._recording.actors else ""
-        parts = [f"{scene.time_s:.1f} s", f"step {step}", f"{self._agent} {speed}"]
+        parts = [
+            format_time(scene.time_s, self._recording.prologue.step_length_s),
+            f"step {step}",
+            f"{self._agent} {speed}",
+        ]
         mark, large, plain = self._marked(step), self._font(26), self._font(15)
         room = float(self.width - 2 * margin)
         if mark:

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from crashhunt.base.text import count_of, in_lines
+from crashhunt.base.text import count_of, format_time, in_lines
 from crashhunt.crashes import (
     Encounter,
     contact_record,
@@ -132,7 +132,7 @@ class Story:
         end = recording.steps
         scenes = recording.scenes()
         lasted = recording.before_end_s(0) if scenes else 0.0
-        sentences = [f"{result.summary}, {lasted:.1f} s after the episode began."]
+        sentences = [f"{result.summary}, {self._time(lasted)} after the episode began."]
         sentences += about_disturbances(recording, result, self._first)
         if self.encounter is not None and self.nearest is not None:
             sentences += about_nearest(self.encounter, self.nearest)
@@ -190,7 +190,7 @@ class Story:
             scene = step.scene
             row = scene.roster.index.get(self.agent) if scene is not None else None
             speed = f"{scene.speeds[row]:.1f}" if scene is not None and row is not None else "-"
-            time_s = f"{scene.time_s:.1f}" if scene is not None else "-"
+            time_s = self._time(scene.time_s).removesuffix(" s") if scene is not None else "-"
             cells = [str(step.step), time_s, speed, *self._decision(step.step)]
             if self.encounter is not None:
                 moment = moments.get(step.step)
@@ -248,8 +248,8 @@ class Story:
             ago_s = {moment.step: recording.before_end_s(moment.step) for moment in shown}
             middle = next((moment for moment in reversed(shown) if ago_s[moment.step] >= 1.0 - 1e-6), earlier)
             sentences = [
-                f"{ago_s[earlier.step]:.1f} s before, {about_gap(encounter, earlier)}.",
-                f"{ago_s[middle.step]:.1f} s before, {about_place(encounter, middle)}.",
+                f"{recording.ago(earlier.step)}, {about_gap(encounter, earlier)}.",
+                f"{recording.ago(middle.step)}, {about_place(encounter, middle)}.",
             ]
         own, its = self._speeds_at_contact()
         if math.isfinite(own) and math.isfinite(its):
@@ -313,10 +313,13 @@ class Story:
         )
 
     def _ago(self, step: int) -> str:
-        return f"{self.recording.before_end_s(step):.1f} s before, after step {step}"
+        return f"{self.recording.ago(step)}, after step {step}"
 
     def _at(self, step: int) -> str:
-        return f"{self.recording.scene(min(step, self.recording.steps)).time_s:.1f} s"
+        return self._time(self.recording.scene(min(step, self.recording.steps)).time_s)
+
+    def _time(self, seconds: float) -> str:
+        return format_time(seconds, self.recording.prologue.step_length_s)
 
     def _last_lane_change(self) -> tuple[int, str] | None:
         names = self._names()

@@ -224,7 +224,7 @@ def _avoided(story: CrashFacts, omission: Omission | None) -> str:
 def _if_it(story: CrashFacts, how: str, step: int, changed: tuple[str, ...]) -> str:
     """Return that a run with changes from a step on avoids the crash, and the agent's other changes in that run."""
     also = "".join(f" and {each.removeprefix(f'{story.agent} ')}" for each in changed)
-    return f"if {story.agent} {how} {story.recording.before_end_s(step):.1f} s before{also}, this crash does not happen"
+    return f"if {story.agent} {how} {story.recording.ago(step)}{also}, this crash does not happen"
 
 
 def _omitted(agent: str, omission: Omission) -> str:

@@ -215,8 +215,7 @@ def about_disturbances(recording: Recording, result: TrialResult, first_step: in
     recent = [one for one in result.disturbances if one.step + one.how_long / step_length_s >= first_step]
     earlier = len(result.disturbances) - len(recent)
     sentences = [
-        f"{recording.before_end_s(min(one.step - 1, recording.steps)):.1f} s before, from step {one.step} on: "
-        f"{one.words}{_place_words(one)}."
+        f"{recording.ago(min(one.step - 1, recording.steps))}, from step {one.step} on: {one.words}{_place_words(one)}."
         for one in recent
     ]
     if earlier:
@@ -303,10 +302,7 @@ def about_events(recording: Recording, first_step: int, *, besides: Event | None
         for event in step.scene.events
         if event != besides
     ]
-    return [
-        f"{recording.before_end_s(step):.1f} s before, at step {step}: {event.what}."
-        for step, event in found[-_MAX_LISTED_EVENTS:]
-    ]
+    return [f"{recording.ago(step)}, at step {step}: {event.what}." for step, event in found[-_MAX_LISTED_EVENTS:]]
 
 
 # Whether a collision could have been avoided, in words. Every sentence reports runs, not calculations.

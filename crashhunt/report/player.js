@@ -451,7 +451,7 @@ function tellStep(event) {
   const at = Math.min(Math.max(0, Math.round(((event.clientX - box.left - 34) / (box.width - 88)) * (crash.steps - 1))), crash.steps - 1);
   const number = (value, unit) => (Number.isFinite(value) ? `${value.toFixed(1)} ${unit}` : "-");
   const [ttcWith, gapTo] = partners(crash, at);
-  const parts = [`step ${at}, ${(crash.time0 + at * crash.dt).toFixed(1)} s`, `speed ${number(crash.speeds[at], "m/s")}`, `time to collision${ttcWith && ` with ${ttcWith}`} ${number(crash.ttcs[at], "s")}`, `gap${gapTo && ` to ${gapTo}`} ${number(crash.gaps[at], "m")}`];
+  const parts = [`step ${at}, ${(crash.time0 + at * crash.dt).toFixed(Math.abs(10 * crash.dt - Math.round(10 * crash.dt)) < 1e-6 ? 1 : 2)} s`, `speed ${number(crash.speeds[at], "m/s")}`, `time to collision${ttcWith && ` with ${ttcWith}`} ${number(crash.ttcs[at], "s")}`, `gap${gapTo && ` to ${gapTo}`} ${number(crash.gaps[at], "m")}`];
   if (crash.dangers) parts.push(`criticality ${share(crash.dangers[at])}, rear criticality ${share(crash.behinds[at])}`);
   showTip(event.clientX, event.clientY, parts.join("\n"));
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,16 @@ def test_player_of_the_report_has_the_clock_of_the_recording(rear_end):
     times = [scene.time_s for scene in story.recording.scenes()]
     assert data["steps"] == len(times)
     assert [data["time0"] + step * data["dt"] for step in range(len(times))] == pytest.approx(times, abs=1e-9)
+
+
+def test_times_of_short_steps_have_two_decimals(rear_end):
+    story = Story(rear_end)
+    prologue = replace(story.recording.prologue, step_length_s=0.05)
+    story.recording.__dict__["prologue"] = prologue
+    last = story.recording.steps
+    assert story.recording.ago(last - 1) == f"{story.recording.before_end_s(last - 1):.2f} s before"
+    assert re.search(r" \d+\.\d\d s after the episode began", story.describe())
+    assert re.search(rf"^ *{last} +\d+\.\d\d ", story.describe(), re.MULTILINE)
 
 
 @pytest.mark.parametrize("seconds", [0.1, 0.25, 0.3, 0.35, 1.0])

@@ -118,7 +118,7 @@ def story(judgement=None, escape=None, poses=None):
         agent="ego",
         other="x",
         encounter=None,
-        recording=SimpleNamespace(before_end_s=lambda step: (40 - step) * DT),
+        recording=SimpleNamespace(ago=lambda step: f"{(40 - step) * DT:.1f} s before"),
     )
 
 
