@@ -23,6 +23,7 @@ __all__ = [
     "cached",
     "forget",
     "frame_of",
+    "is_intact",
     "is_known",
     "look",
     "methods_of",
@@ -143,13 +144,22 @@ def forget() -> None:
     watches.clear()
 
 
+def is_intact(what: str) -> bool:
+    """Return whether the accelerator is on, and the functions of highway-env are unchanged that a watch observes.
+
+    Another thread may switch the accelerator on or off at any time.
+    """
+    watch = watches.get(what)
+    return watch is not None and watch.intact
+
+
 def prepared(road: Road) -> Prepared | None:
     """Return the cached data of a road whose vehicles may be searched; None if its lanes are unknown."""
     found = _roads.get(id(road))
     if found is None or not found.network.is_of(road.network):
         found = _roads[id(road)] = Prepared(road)
-        while len(_roads) > _MAX_ROADS:  # each episode has a new road
-            del _roads[next(iter(_roads))]
+        for key in [*_roads][:-_MAX_ROADS]:  # each episode has a new road
+            _roads.pop(key, None)  # another thread may have removed it
     return found if found.network.plain else None
 
 
@@ -203,8 +213,7 @@ def _kind_of(road: Road) -> _RoadKind:
 def _is_usual(road: Road) -> bool:
     """Return whether no function of highway-env and no method of this road has been replaced."""
     return (
-        bool(watches)
-        and watches["roads"].intact
+        is_intact("roads")
         and type(road.vehicles) is list
         and type(road.objects) is list
         and _ROAD_METHODS.isdisjoint(vars(road))

@@ -319,7 +319,7 @@ class SkippedObservation:
         things = [*road.vehicles, *road.objects]
         return (
             _is_genuine(self._env)
-            and all(watch.intact for watch in watches.values())
+            and all(watch.intact for watch in [*watches.values()])
             and all(kind.describes and kind.is_of(thing) for kind, thing in zip(kinds_of(things), things, strict=True))
         )
 

@@ -34,6 +34,7 @@ from crashhunt.accelerator._observe import (
 from crashhunt.accelerator._roads import (
     forget,
     frame_of,
+    is_intact,
     look,
     methods_of,
     network_of,
@@ -109,7 +110,7 @@ def is_on() -> bool:
 
 def why_not() -> str:
     """Return why the accelerator currently has no effect; empty if it has an effect or is switched off."""
-    return next((watch.reason for watch in watches.values() if watch.reason), "")
+    return next((watch.reason for watch in [*watches.values()] if watch.reason), "")
 
 
 def _act(self: Road) -> None:
@@ -265,7 +266,7 @@ def _fill_road_layer_by_lanes(
 def _compute_ttc_grid(
     env: AbstractEnv, time_quantization: float, horizon: float, vehicle: MDPVehicle | None = None
 ) -> object:
-    is_usual = watches and watches["observations"].intact and isinstance(env.road, Road)
+    is_usual = is_intact("observations") and isinstance(env.road, Road)
     state = look(env.road) if is_usual else None
     if state is not None:
         observer = vehicle if vehicle is not None else env.vehicle
@@ -280,8 +281,7 @@ def _is_plain(observation: KinematicObservation | OccupancyGridObservation, kind
     """Return whether an observation has a known class, observes a road, and has no replaced method."""
     return bool(
         type(observation) is kind
-        and watches
-        and watches["observations"].intact
+        and is_intact("observations")
         and isinstance(observation.env.road, Road)
         and _OBSERVATION_METHODS[kind].isdisjoint(vars(observation))
     )

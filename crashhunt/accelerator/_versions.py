@@ -100,10 +100,12 @@ class Watch:
     @property
     def intact(self) -> bool:
         """Return whether no member has changed; each changed member is logged once."""
-        if self._snapshot is None:
-            self._snapshot = snapshot_of([(place.owner, place.members) for place in self._places])
+        snapshot = self._snapshot
+        if snapshot is None:
+            # Another thread may read both attributes at any time, so the sizes exist before the snapshot.
             self._sizes = [place.size for place in self._places]
-        while (number := self._snapshot.first_changed(self._sizes)) >= 0:
+            self._snapshot = snapshot = snapshot_of([(place.owner, place.members) for place in self._places])
+        while (number := snapshot.first_changed(self._sizes)) >= 0:
             place = self._places[number]
             changed = place.changed()
             if changed:

@@ -418,6 +418,46 @@ def test_threads_do_not_disturb_each_other():
         assert list(pool.map(lambda seed: played(seed, 5), range(8))) == slow
 
 
+def test_second_thread_may_look_for_replaced_functions_while_the_first_one_begins_to():
+    assert not switch_on()
+    watch, found = _roads.watches["roads"], []
+
+    class Interrupted(list):
+        def __iter__(self):  # another thread runs whenever Python chooses, for example here
+            if watch._snapshot is not None:
+                with ThreadPoolExecutor(1) as other:
+                    found.append(other.submit(lambda: watch.intact).result())
+            return super().__iter__()
+
+    watch._places = Interrupted(watch._places)
+    assert watch.intact
+    assert all(found)
+
+
+def test_two_threads_may_discard_the_same_road(monkeypatch):
+    class Discarded(dict):
+        def __iter__(self):
+            return iter(["discarded by another thread", *super().__iter__()])
+
+    assert not switch_on()
+    monkeypatch.setattr(_roads, "_roads", Discarded())
+    monkeypatch.setattr(_roads, "_MAX_ROADS", 1)
+    roads = [crowded(1), crowded(2)]
+    assert all(_roads.look(road) is not None for road in roads)
+    assert _roads.cached(roads[0]) is None
+    assert _roads.cached(roads[1]) is not None
+
+
+@pytest.mark.parametrize("watched", ["roads", "observations"])
+def test_another_thread_may_switch_the_accelerator_off_meanwhile(watched):
+    assert not switch_on()
+    road = crowded(1)
+    assert _roads.is_intact(watched)
+    del _roads.watches[watched]
+    assert not _roads.is_intact(watched)
+    assert (_roads.look(road) is None) == (watched == "roads")
+
+
 def test_fork_computes_the_same_bits():
     assert not switch_on()
     road = crowded(4)
