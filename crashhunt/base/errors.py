@@ -15,6 +15,7 @@
     ├── BundleError                a crash bundle or log that is damaged or incomplete
     ├── SnapshotError              the code of a hunt cannot be captured: too large, unreadable
     ├── RecorderError              a trial could not be recorded: a full disk
+    ├── HostError                  a folder that trials need is gone, or a disk is full; no result of a trial
     ├── WorkerError                the process of a trial refused it, or ended before it began
     ├── InternalError              crashhunt itself failed, not the code of a user
     └── EpisodeError               raised inside an episode; becomes the trial's outcome
@@ -44,6 +45,7 @@ __all__ = [
     "CallError",
     "CrashhuntError",
     "EpisodeError",
+    "HostError",
     "HuntDirectoryError",
     "InternalError",
     "InvalidEpisodeError",
@@ -166,6 +168,10 @@ class SnapshotError(CrashhuntError):
 
 class RecorderError(CrashhuntError):
     """A trial could not be recorded."""
+
+
+class HostError(CrashhuntError):
+    """A condition on this machine under which trials can run no longer holds, such as the existence of a folder."""
 
 
 class WorkerError(CrashhuntError):

@@ -41,6 +41,7 @@ __all__ = [
     "RUN_LOG",
     "SCENARIO",
     "SCENARIO_FILES",
+    "SCRATCH",
     "SHOWN",
     "SMALL",
     "SNAPSHOTS",
@@ -105,6 +106,9 @@ MAP: Final = "map.json"
 NOTICES: Final = "notices.txt"
 JOB: Final = "job.json"
 ANSWER: Final = "answer.json"
+
+SCRATCH: Final = ".scratch"
+"""What the name of the folder in a hunt begins with into which running trials write."""
 
 SMALL: Final = ".small"
 """What the name of a bundle ends with that another one was made smaller to."""

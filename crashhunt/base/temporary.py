@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 __all__ = [
     "OwnerProcess",
     "TemporaryFolder",
+    "folder_for_temporary_files",
     "has_ended",
     "new_folder",
     "owner_in",
@@ -535,7 +536,7 @@ def _remove_of_owner(path: Path, pid: int) -> None:
 
 def _base_folder() -> tuple[Path, str]:
     """Return the folder that contains the temporary folders of all processes of this user, and their name prefix."""
-    usual = _temporary_files()
+    usual = folder_for_temporary_files()
     place = usual / f"crashhunt-temporary-{os.getuid()}"
     try:
         found = place.lstat()
@@ -547,7 +548,7 @@ def _base_folder() -> tuple[Path, str]:
     return (place, "") if ours else (usual, "crashhunt-temporary-")  # another user made one with this name
 
 
-def _temporary_files() -> Path:
+def folder_for_temporary_files() -> Path:
     """Return the folder for temporary files that `tempfile` would choose, without the slow import of `tempfile`."""
     named = (os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))
     for path in (*named, "/tmp", "/var/tmp", "/usr/tmp"):

@@ -5,6 +5,7 @@ from ._fresh import (
     run_alone as run_alone,
     snapshot_executor as snapshot_executor,
 )
+from ._host_conditions import HostConditions as HostConditions
 from ._pool import PoolExecutor as PoolExecutor
 from ._postmortem import read_map as read_map
 from ._protocol import (

@@ -29,6 +29,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill, resume
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import WorkerSettings, require_origin, seal
+from crashhunt.executors._host_conditions import HostConditions
 from crashhunt.executors._supervisor import be_supervisor
 from crashhunt.executors._time_limits import ImportWatch, await_imports, import_died
 from crashhunt.executors._zygote import be_zygote, import_nothing, import_parts
@@ -63,6 +64,7 @@ def main() -> None:
     except CrashhuntError as error:
         _send(control, error.to_json())
         return
+    conditions = HostConditions(settings)
     prepare(TrialResult)  # here, or the processes of each trial do it again
     gc.freeze()
     orders, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -76,7 +78,7 @@ def main() -> None:
         finally:
             os._exit(1)
     theirs.close()
-    _Server(control, orders, template, settings).serve()
+    _Server(control, orders, template, settings, conditions).serve()
 
 
 class _Server:
@@ -87,9 +89,18 @@ class _Server:
         orders: connection to the template.
         template: process of the template.
         settings: settings of the hunt.
+        conditions: the conditions under which trials can run, as they were before the first trial.
     """
 
-    def __init__(self, control: socket.socket, orders: socket.socket, template: int, settings: WorkerSettings) -> None:
+    def __init__(
+        self,
+        control: socket.socket,
+        orders: socket.socket,
+        template: int,
+        settings: WorkerSettings,
+        conditions: HostConditions,
+    ) -> None:
+        self._conditions = conditions
         self._control, self._orders, self._template, self._settings = control, orders, template, settings
         self._slots: dict[int, int] = {}  # process to slot
         self._ends: dict[int, int] = {}  # process to the descriptor by which the kernel reports its end
@@ -162,7 +173,7 @@ class _Server:
                 for number in _IGNORED_SIGNALS:
                     signal.signal(number, signal.SIG_DFL)
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
-                be_supervisor(pool, zygote, self._settings, server)
+                be_supervisor(pool, zygote, self._settings, self._conditions, server)
         self._slots[pid] = message["slot"]
         with suppress(AttributeError, OSError):
             self._ends[pid] = os.pidfd_open(pid)

@@ -25,6 +25,7 @@ from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
 from crashhunt.executors._fork_server import fork_zygote
+from crashhunt.executors._host_conditions import HostConditions
 from crashhunt.executors._pool import PoolExecutor
 from crashhunt.executors._postmortem import TrialAttempt, damaged, hung, result_of_death, where_it_is
 from crashhunt.executors._protocol import Notes, has_fork_server, run_trials, snapshot_environment
@@ -240,11 +241,12 @@ def _run(job: FreshJob, answer: Callable[[Answer], None]) -> int:
         settings = WorkerSettings.from_json(job["settings"])
         require_origin("crashhunt", settings.code)
         seal(settings)
+        conditions = HostConditions(settings)
         try:
-            supervisor = Supervisor(settings, fork_zygote(settings))
+            supervisor = Supervisor(settings, fork_zygote(settings), conditions)
             ended = supervisor.run(spec)
         except UnfitZygoteError:
-            supervisor = Supervisor(settings, fork_zygote(settings, late=True))
+            supervisor = Supervisor(settings, fork_zygote(settings, late=True), conditions)
             ended = supervisor.run(spec)
         answer({"result": ended.result.to_json()})  # which counts, whatever becomes of what follows
         found = with_escape(supervisor, settings, ended)

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError, remedy
+from crashhunt.base.errors import BundleError, CrashhuntError, HostError, RecorderError, remedy
 from crashhunt.base.processes import die_with, resume
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import describe_death, is_sent_from_outside
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Borders
     from crashhunt.episode import WorkerSettings
+    from crashhunt.executors._host_conditions import HostConditions
     from crashhunt.executors._protocol import Answer, Done, FromZygote, KillTrial
     from crashhunt.executors._trial_process import Job
     from crashhunt.trial import TrialResult
@@ -90,13 +91,18 @@ class Supervisor:
     Args:
         settings: settings of the hunt.
         zygote: connection to the zygote of this slot.
+        conditions: the conditions under which trials can run, as they were before the first trial; None to skip the
+            check of these conditions.
 
     Attributes:
         retires: whether the zygote may run no further trial.
     """
 
-    def __init__(self, settings: WorkerSettings, zygote: socket.socket) -> None:
+    def __init__(
+        self, settings: WorkerSettings, zygote: socket.socket, conditions: HostConditions | None = None
+    ) -> None:
         self._settings = settings
+        self._conditions = conditions
         self._zygote = zygote
         self._received = bytearray()
         self._zygote_pid = 0  # once it is ready
@@ -112,8 +118,27 @@ class Supervisor:
         Raises:
             LostTrialError: the process of the trial was killed from outside, or its zygote has ended.
             UnfitZygoteError: the zygote cannot fork.
+            HostError: the trial failed, and a folder that it needs was deleted, or the disk is full.
             CrashhuntError: the disk is full, or the simulator cannot be created.
         """
+        try:
+            ended = self._run(spec)
+        except (LostTrialError, CrashhuntError, OSError) as error:
+            self._check_host(error)
+            raise
+        if ended.result.failure is not None:
+            self._check_host()
+        return ended
+
+    def _check_host(self, cause: Exception | None = None) -> None:
+        """Raise a `HostError` if trials can no longer run on this machine, so that their failures are no results."""
+        try:
+            if self._conditions is not None:
+                self._conditions.check()
+        except HostError as error:
+            raise error from cause
+
+    def _run(self, spec: TrialSpec) -> EndedTrial:
         self._await_zygote()
         box, folder = self._prepare(spec)
         key = secrets.token_bytes(KEY_BYTES)
@@ -305,7 +330,8 @@ class Supervisor:
         self._made += 1
         folder = self._settings.scratch / f"new-{os.getpid()}-{self._made}"
         _remove(folder)
-        folder.mkdir(parents=True)
+        self._restore_scratch()
+        folder.mkdir()
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
         self._output = os.open(folder / layout.RUN_LOG, flags, 0o644)
         self._stack = os.open(folder / layout.STACK, flags, 0o644)
@@ -336,11 +362,18 @@ class Supervisor:
                     _remove(folder / entry.name)  # a file there has a meaning, and this one is not ours
             return
         _remove(folder)
-        folder.mkdir(parents=True)
+        self._restore_scratch()
+        folder.mkdir()
         assert self._box is not None
         self._box.copy_to(folder / layout.BLACK_BOX)
         for name, descriptor in ((layout.RUN_LOG, self._output), (layout.STACK, self._stack)):
             (folder / name).write_bytes(os.pread(descriptor, _MAX_RESTORED_OUTPUT_BYTES, 0))
+
+    def _restore_scratch(self) -> None:
+        """Create the scratch folder again if an agent has deleted it, but not the directory of a deleted hunt."""
+        if not self._settings.scratch.is_dir():
+            self._check_host()
+            self._settings.scratch.mkdir(parents=True)
 
 
 def _remove(path: Path) -> None:
@@ -350,20 +383,23 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def be_supervisor(pool: socket.socket, zygote: socket.socket, settings: WorkerSettings, parent: int) -> NoReturn:
+def be_supervisor(
+    pool: socket.socket, zygote: socket.socket, settings: WorkerSettings, conditions: HostConditions, parent: int
+) -> NoReturn:
     """Run trials until the pool has no more trials; this function does not return.
 
     Args:
         pool: connection to the pool.
         zygote: connection to the zygote of this slot.
         settings: settings of the hunt.
+        conditions: the conditions under which trials can run, as they were before the first trial.
         parent: the process that started this process; this process ends when its parent ends.
     """
     code = 1
     try:
         os.setsid()  # what a terminal or a batch system sends to everybody is for the hunt
         die_with(parent)
-        supervisor = Supervisor(settings, zygote)
+        supervisor = Supervisor(settings, zygote, conditions)
         with pool.makefile("rb") as specs:
             for line in specs:
                 answer = _answer(supervisor, settings, TrialSpec.from_json(json.loads(line)))

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NoReturn, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.capabilities import supports
-from crashhunt.base.errors import CrashhuntError, RecorderError
+from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
 from crashhunt.base.exceptions import is_users
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.shared_state import SharedState
@@ -182,12 +182,12 @@ class TrialProcess:
         settings, folder = self._settings, Path(job["folder"])
         self._pid = os.getpid()
         os.setsid()  # what a trial sends to its whole process group is for itself
-        os.chdir(self._home)
         if self._shared is not None and reset is None:
             self._shared.separate()
         self._redirect(folder)
         spec = TrialSpec.from_json(job["spec"])
         self._box = box = BlackBox(folder / layout.BLACK_BOX, begun=job["reserved"])
+        self._enter_home()
         began = time.monotonic()
         try:
             simulator = self.make_simulator()
@@ -226,6 +226,17 @@ class TrialProcess:
         report = self._report(replace(result, wall_s=wall_s, setup_s=setup_s), simulator, job)
         box.report(encode_report(report, bytes.fromhex(job["key"]), result.digest, dumps=_dumps))
         return 0
+
+    def _enter_home(self) -> None:
+        """Enter the folder in which the process was after its imports; an import may have changed it."""
+        try:
+            os.chdir(self._home)
+        except OSError as error:
+            raise HostError(
+                f"the folder in which trials run cannot be entered: {error.strerror}",
+                fix="restore it, and run the same command again",
+                where=str(self._home),
+            ) from error
 
     def _is_mistake(self, error: BaseException) -> bool:
         """Return whether an error is a mistake in the scenario, which appears before the trial begins."""

@@ -33,7 +33,6 @@ __all__ = ["CheckFinding", "Checked", "check", "intact_snapshots", "salvage"]
 
 _MAX_SHOWN = 5
 _MAX_OPEN_FILES = 4  # at a time: a folder, and the ledger with its write-ahead log and shared memory
-_SCRATCH = ".scratch"  # of a hunt, which does not run where its leftovers are looked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,11 +401,11 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
         (hunt / layout.CRASHES).glob(".*"),
         *((hunt / place).glob(".*") for place in layout.BESIDE),
         (hunt / layout.SNAPSHOTS).glob(".*"),
-        hunt.glob(f"{_SCRATCH}*"),
+        hunt.glob(f"{layout.SCRATCH}*"),
     )
     for path in sorted({path for place in places for path in place}):
         owner = owner_in(path.name)
-        if owner is not None and not has_ended(owner) and not path.name.startswith(_SCRATCH):
+        if owner is not None and not has_ended(owner) and not path.name.startswith(layout.SCRATCH):
             continue  # shrink may be writing it, here or on another host
         remembers = path.name.endswith(f"{layout.SMALL}.jsonl")
         why = "shrink resumes from it" if remembers else "its writer was killed"

@@ -10,13 +10,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 from crashhunt.base import layout
-from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, ScenarioError, remedy
+from crashhunt.base.errors import CrashhuntError, HostError, HuntDirectoryError, ScenarioError, remedy
+from crashhunt.base.exceptions import in_words
 from crashhunt.base.signals import stop_requests
 from crashhunt.base.temporary import release_shared_memory, remove_at_once, remove_scratch
 from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import internal_error, scratch_of
-from crashhunt.executors import SharedExecutors, make_executor, read_map
+from crashhunt.executors import HostConditions, SharedExecutors, make_executor, read_map
 from crashhunt.hunts._crashes import prune_bundles, tally_crashes
 from crashhunt.hunts._fork_results import ForkCrashes, keep_near_misses, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace, Trials, Unanswered, settings_of_workers
@@ -107,6 +108,7 @@ class Hunt:
         self._pace = Pace(partner) if partner is not None else None
         self._stops: Sequence[int] = ()
         self._new_snapshot: Path | None = None  # that this run has added
+        self._conditions: HostConditions | None = None  # once there is a snapshot
         self._progress: Progress | None = None  # once the ledger says that the hunt runs
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
@@ -127,25 +129,29 @@ class Hunt:
             ledger = Ledger(self.directory / layout.LEDGER, writable=True)
             try:
                 return self._run(ledger, watch or (lambda _: None))
-            except CrashhuntError as error:
-                self._fail(ledger, str(error))
-                raise
-            except OSError as error:
-                self._fail(ledger, f"{error.strerror or error}: {error.filename or self.directory}")
-                if not (fix := remedy(error)):
-                    raise internal_error(error) from error
-                raise HuntDirectoryError(
-                    f"{error.strerror or error}", fix=fix, where=str(error.filename or self.directory)
-                ) from error
             except Exception as error:
-                self._fail(ledger, f"{type(error).__name__}: {error}")
-                raise
+                problem = self._problem_behind(error)
+                self._fail(ledger, str(problem) if isinstance(problem, CrashhuntError) else in_words(problem))
+                raise problem from (None if problem is error else error)
             finally:
                 if self._place.has_begun:
                     with suppress(CrashhuntError):
                         ledger.note(owner=None, heartbeat=time.time())
                 ledger.close()
                 remove_scratch(self._place.scratch)  # while requests to stop are only collected
+
+    def _problem_behind(self, error: Exception) -> Exception:
+        """Return the error to report: if trials can no longer run on this machine, this explains every error."""
+        try:
+            if self._conditions is not None:
+                self._conditions.check()
+        except HostError as found:
+            return found
+        if not isinstance(error, OSError):
+            return error
+        if not (fix := remedy(error)):
+            return internal_error(error)
+        return HuntDirectoryError(f"{error.strerror or error}", fix=fix, where=str(error.filename or self.directory))
 
     def _fail(self, ledger: Ledger, why: str) -> None:
         """Record why the hunt ends, if the ledger can still be written.
@@ -191,6 +197,7 @@ class Hunt:
         progress.rate = bar_watch(settings, ledger, held_out)
         (lag, lag_grows), alike = self._result_lag(before), not finished or draws_independently(before, settings)
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
+        self._conditions = HostConditions(worker_settings)
         self._audits_left = PendingAudits(ledger, before, worker_settings)
         again = self._unanswered.specs
         trials = Trials(
@@ -512,7 +519,10 @@ class Hunt:
 
         Raises:
             HuntDirectoryError: another file has replaced the ledger, or the directory was removed.
+            HostError: the directory or the snapshot of the hunt was deleted.
         """
+        if self._conditions is not None:
+            self._conditions.check_hunt()
         if ledger.restore():
             note = "ledger.sqlite was removed while the hunt ran, and was written anew with everything that was in it"
             ledger.remark(note)

@@ -520,8 +520,7 @@ _OWN_FILES = (
     "ledger.sqlite-shm",
     layout.HUNT,
 )
-_SCRATCH = ".scratch"
-_PERMITTED_FILES = (".lock", _SCRATCH, ".hunt.")  # what may be there before: of a hunt that could not begin
+_PERMITTED_FILES = (".lock", layout.SCRATCH, ".hunt.")  # what may be there before: of a hunt that could not begin
 
 
 class HuntDirectory:
@@ -537,6 +536,7 @@ class HuntDirectory:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._absolute = path.absolute()  # now, because the current folder may be deleted while the hunt runs
         self.has_begun = False
         self._settings_before: bytes | None = None
 
@@ -546,7 +546,7 @@ class HuntDirectory:
 
         A resumed hunt has another folder, because processes of a killed hunt may still write for a moment.
         """
-        return self.path.absolute() / f"{_SCRATCH}-{this_process().token}"
+        return self._absolute / f"{layout.SCRATCH}-{this_process().token}"
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -640,7 +640,7 @@ class HuntDirectory:
                     fix="give the same settings to resume it, another directory, or --overwrite to begin again",
                     where=str(self.path),
                 )
-        for left in self.path.glob(f"{_SCRATCH}*"):  # with the lock of the hunt, no other hunt uses it
+        for left in self.path.glob(f"{layout.SCRATCH}*"):  # with the lock of the hunt, no other hunt uses it
             remove_scratch(left)
         for folder in (self.path, *(self.path / name for name in (layout.CRASHES, *layout.BESIDE))):
             remove_ended(folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import threading
@@ -15,7 +16,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base import layout
-from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.errors import CrashhuntError, HostError
 from crashhunt.episode import Parts, WorkerSettings, run_episode, scratch_of
 from crashhunt.executors import _supervisor
 from crashhunt.executors._postmortem import encode_report
@@ -372,17 +373,54 @@ def test_supervisor_serves_until_it_retires_or_has_no_result(settings, monkeypat
     monkeypatch.setattr(os, "_exit", leave)
     monkeypatch.setattr(os, "setsid", lambda: died.append("own session"))
     monkeypatch.setattr(_supervisor, "die_with", died.append)
-    monkeypatch.setattr(_supervisor, "Supervisor", lambda given, zygote: found)
+    monkeypatch.setattr(_supervisor, "Supervisor", lambda given, zygote, conditions: found)
     monkeypatch.setattr(_supervisor, "_answer", answer)
     with ours, theirs:
         for number in range(3):
             ours.sendall(json.dumps(spec(number).to_json()).encode() + b"\n")
         ours.shutdown(socket.SHUT_WR)
         with pytest.raises(Left) as caught:
-            _supervisor.be_supervisor(theirs, None, settings, 77)
+            _supervisor.be_supervisor(theirs, None, settings, None, 77)
         assert caught.value.args == (0,)
         assert died == ["own session", 77]
         expected = 3 if last == "end" else 2
         assert said == list(range(expected))
         theirs.close()
         assert len(ours.makefile("rb").read().splitlines()) == expected
+
+
+class Conditions:
+    """The conditions of a host that begin to fail when they are told to."""
+
+    broken = False
+
+    def check(self):
+        if self.broken:
+            raise HostError("the current folder was deleted", fix="restore it")
+
+
+def test_failure_of_a_trial_is_no_result_if_the_host_is_the_cause(zygote, settings):
+    conditions = Conditions()
+    supervisor = Supervisor(settings, zygote.start({"ready": 99}).ours, conditions)
+    fails = lambda folder, box: True  # noqa: E731
+    zygote.harms, zygote.says = dict.fromkeys((3, 4), fails), {3: {"ended": 3}, 4: {"ended": 3}}
+    assert supervisor.run(spec(3)).result.outcome is Outcome.PROCESS_DIED
+    conditions.broken = True
+    with pytest.raises(HostError):
+        supervisor.run(spec(4))
+    assert supervisor.run(spec(5)).result.outcome is Outcome.SURVIVED  # it did not need the folder
+    zygote.theirs.shutdown(socket.SHUT_RDWR)
+    with pytest.raises(HostError):  # instead of a lost trial
+        supervisor.run(spec(6))
+
+
+def test_supervisor_does_not_create_the_directory_of_a_deleted_hunt(zygote, settings):
+    conditions = Conditions()
+    supervisor = Supervisor(settings, zygote.start({"ready": 99}).ours, conditions)
+    shutil.rmtree(settings.scratch)
+    assert supervisor.run(spec(3)).result.outcome is Outcome.SURVIVED  # an agent may have deleted it
+    conditions.broken = True
+    shutil.rmtree(settings.scratch)
+    with pytest.raises(HostError):
+        supervisor.run(spec(4))
+    assert not settings.scratch.exists()

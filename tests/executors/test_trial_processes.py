@@ -334,7 +334,7 @@ def test_trial_runs_in_its_folder_and_reports(process, monkeypatch, tmp_path):
            "tries_copy": True}  # fmt: skip
     assert found._run(job, None) == 0
     expected = [
-        "own session", ("in", tmp_path), "separate", ("redirect", tmp_path), ("box", tmp_path / layout.BLACK_BOX, 64),
+        "own session", "separate", ("redirect", tmp_path), ("box", tmp_path / layout.BLACK_BOX, 64), ("in", tmp_path),
         ("begin", os.getpid(), 3), ("arm", 9.0, "stack"), "block",
     ]  # fmt: skip
     assert called[:-1] == expected

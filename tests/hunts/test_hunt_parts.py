@@ -183,7 +183,11 @@ def test_hunt_that_fails_records_why(hunt, monkeypatch):
     ("error", "raised", "why"),
     [
         (CrashhuntError("no map", fix="draw one"), CrashhuntError, "no map; draw one"),
-        (OSError(28, "No space left", "/h/box"), HuntDirectoryError, "No space left: /h/box"),
+        (
+            OSError(28, "No space left", "/h/box"),
+            HuntDirectoryError,
+            "/h/box: No space left; free some space or make the folder writable, and run the same command again",
+        ),
         (ValueError("odd"), ValueError, "ValueError: odd"),
     ],
 )
