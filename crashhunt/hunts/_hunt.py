@@ -7,6 +7,7 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from crashhunt.base import layout
@@ -62,6 +63,7 @@ _TICK_S = 0.1  # how late a stop, a heartbeat or the screen may be
 # Trials, or seconds of work, that a hunt is ahead of its partner. Results that `Preflight` holds back are not in
 # the ledger, so the lead must be longer: otherwise, two hunts could wait for each other.
 _MAX_LEAD_PER_WORKER, _MAX_LEAD_S = 8, 5.0
+_QUIET_WAIT_S, _MAX_WAIT_S = 3.0, 600.0  # for another program that locks the ledger
 _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker waits for the hunt
 
 
@@ -249,6 +251,7 @@ class Hunt:
             progress.rare.read(trials.upcoming)
         self._progress = progress
         ledger.note(**progress.noted())  # so that a hunt that fails before the first heartbeat has the same facts
+        ledger.wait_while_locked(partial(self._wait_for_ledger, progress, watch))
         runs_again = TrialReruns(
             place=self._place,
             ledger=ledger,
@@ -334,6 +337,25 @@ class Hunt:
             tally=progress.tally,
             rate=_rate_of(self.directory, progress.rate, stopped),
         )
+
+    def _wait_for_ledger(self, progress: Progress, watch: Callable[[HuntStatus], None], waited_s: float) -> None:
+        """Report that another program locks the ledger; stop waiting at a request to stop or after minutes.
+
+        Raises:
+            HuntDirectoryError: the hunt waits no longer.
+        """
+        if waited_s < _QUIET_WAIT_S:
+            return
+        if self._stops or waited_s > _MAX_WAIT_S:
+            raise HuntDirectoryError(
+                f"another program has locked the ledger for {waited_s:.0f} s",
+                fix="close the program that has it open, and run the same command again",
+                where=str(self.directory / layout.LEDGER),
+            )
+        note = "the hunt waited for another program that had locked ledger.sqlite; no trial was lost"
+        if note not in progress.notes:
+            progress.notes.append(note)
+        watch(self._status(progress, "waiting"))
 
     def _show_phase(
         self, ledger: Ledger, progress: Progress, watch: Callable[[HuntStatus], None]

@@ -156,7 +156,8 @@ class HuntStatus:
     """The progress of a hunt, for the status screen.
 
     Args:
-        phase: the current phase: ``hunting``, ``saving``, ``auditing``, ``done``, or a name of `PhaseStatus`.
+        phase: the current phase: ``hunting``, ``saving``, ``auditing``, ``done``, or a name of `PhaseStatus`. During
+            ``waiting``, another program locks the ledger.
         planned: total number of trials; 0 if only the time is limited.
         done: number of finished trials, including those of earlier runs of the hunt.
         outcomes: number of trials with each outcome.

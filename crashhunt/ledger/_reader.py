@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.json_types import Plain
-    from crashhunt.ledger._schema import Shape
+    from crashhunt.ledger._schema import PatientConnection, Shape
 
 
 __all__ = ["Facts", "HuntOwner", "KindData", "LedgerReader", "Noted", "Seal", "Turn", "UntilRate"]
@@ -249,7 +249,7 @@ class LedgerReader:
         shape: columns of the ledger's tables.
     """
 
-    def __init__(self, database: sqlite3.Connection, path: Path, shape: Shape) -> None:
+    def __init__(self, database: PatientConnection, path: Path, shape: Shape) -> None:
         self._database = database
         self._path = path
         self._shape = shape

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import sqlite3
+import time
 from contextlib import closing, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ __all__ = [
     "SEAL",
     "VERSION",
     "WITH_EVENTS",
+    "PatientConnection",
     "Row",
     "Shape",
     "checked",
@@ -387,7 +389,38 @@ def is_untouched() -> bool:
     return _untouched.get()
 
 
-def opened(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
+_BUSY_S = 10.0  # for another process to release its lock on the file
+_RETRY_S = 0.05
+_LOOK_EVERY_S = 1.0  # how late a request to stop waiting may be
+
+
+class PatientConnection(sqlite3.Connection):
+    """A connection that can wait for minutes while another process, such as a backup, locks the file.
+
+    Attributes:
+        wait: function called about once a second with the time that a statement has waited, in s. It may raise an error
+            to stop waiting. The default waits for ten seconds.
+    """
+
+    wait: Callable[[float], None] | None = None
+
+    def execute(self, statement: str, *given: Any) -> sqlite3.Cursor:
+        """Run a statement; a statement that could not begin, because the file is locked, is run again."""
+        began = time.monotonic()
+        while True:
+            try:
+                return super().execute(statement, *given)
+            except sqlite3.OperationalError as error:
+                waited_s = time.monotonic() - began
+                # A transaction whose snapshot is too old has another code: it cannot be run again.
+                if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or (self.wait is None and waited_s > _BUSY_S):
+                    raise
+                if self.wait is not None:
+                    self.wait(waited_s)
+                time.sleep(_RETRY_S)  # SQLite itself does not wait in every case
+
+
+def opened(path: Path, *, read_only: bool = False) -> PatientConnection:
     """Open a ledger.
 
     Args:
@@ -396,12 +429,19 @@ def opened(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
             read, and the last reader of a killed hunt merges one of them into the ledger.
     """
     if not read_only:
-        return sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
+        return _connect(path)
     log = path.with_name(f"{path.name}-wal")
     # Without a write-ahead log, nothing writes to the file. With one, readers need the shared memory next to it.
     mode = "mode=ro" if has_content(log) else "mode=ro&immutable=1"
     uri = f"{path.absolute().as_uri()}?{mode}"
-    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False, timeout=10.0)
+    return _connect(uri, uri=True)
+
+
+def _connect(database: Path | str, *, uri: bool = False) -> PatientConnection:
+    return sqlite3.connect(
+        database, uri=uri, isolation_level=None, check_same_thread=False, timeout=_LOOK_EVERY_S,
+        factory=PatientConnection,
+    )  # fmt: skip
 
 
 def has_content(path: Path) -> bool:

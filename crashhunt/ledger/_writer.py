@@ -34,7 +34,7 @@ from crashhunt.ledger._schema import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from crashhunt.ledger._reader import Facts, Noted
@@ -90,6 +90,15 @@ class Ledger(LedgerReader):
                 failed.pop_all()
         except sqlite3.Error as error:
             raise explained(path, error) from error
+
+    def wait_while_locked(self, wait: Callable[[float], None]) -> None:
+        """Wait without a limit from now on while another process, such as a backup, locks the file.
+
+        Args:
+            wait: function called about once a second with the time that a statement has waited, in s. It may raise an
+                error to stop waiting.
+        """
+        self._database.wait = wait
 
     def record(self, result: TrialResult, *, snapshot: str) -> None:
         """Add a finished trial. If the trial was run again, the new row replaces the old row.
@@ -221,8 +230,10 @@ class Ledger(LedgerReader):
         """
         if not removed(self._path, self._file):
             return False
+        wait = self._database.wait
         rewrite(self._database, self._path)
         self._database = opened(self._path)
+        self._database.wait = wait
         self._prepare()
         return True
 

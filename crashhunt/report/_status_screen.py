@@ -250,6 +250,7 @@ _PHASES = {
     "hunting": "running",
     "confirming": "confirming",
     "auditing": "auditing",
+    "waiting": "waiting for another program that has locked ledger.sqlite",
     "causes": "finding causes",
     "near misses": "confirming near misses",
     "probes": "confirming crashes of probes",
@@ -314,9 +315,9 @@ def _progress(status: HuntStatus) -> tuple[str, int, int] | None:
 
 def _line(status: HuntStatus) -> str:
     outcomes = ", ".join(f"{name} {count}" for name, count in sorted(status.outcomes.items()))
-    if (after := status.progress) is not None:
+    if (after := status.progress) is not None and status.phase != "waiting":
         return describe_phase(after.name, after.done, after.total, after.seconds_left)
-    phase = "running" if status.phase == "hunting" else status.phase
+    phase = _PHASES.get(status.phase, status.phase)
     line = f"{phase}: {out_of(status.done, status.planned)} trials finished" + (f" ({outcomes})" if outcomes else "")
     if status.phase == "hunting" and status.done:
         line += f", {format_pace(status.rate_per_s)}, {format_seconds(status.seconds_left)} left"

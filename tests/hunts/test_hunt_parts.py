@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import queue
+import signal
 import threading
 import time
 from contextlib import closing, contextmanager
@@ -224,6 +225,22 @@ def test_error_of_a_hunt_is_in_its_ledger(hunt, monkeypatch, error, raised, why)
     assert (noted[1], removed) == ("closed", ["scratch"])
     monkeypatch.setattr(found, "_run", lambda given, watch: "report")
     assert found.run() == "report"
+
+
+def test_hunt_waits_for_a_locked_ledger_and_says_so(hunt, monkeypatch):
+    found, shown = hunt(), []
+    progress = SimpleNamespace(notes=[])
+    monkeypatch.setattr(found, "_status", lambda given, phase: phase)
+    for waited_s in (1.0, 2.0, 3.5, 60.0):
+        found._wait_for_ledger(progress, shown.append, waited_s)
+    assert shown == ["waiting", "waiting"]
+    assert progress.notes == ["the hunt waited for another program that had locked ledger.sqlite; no trial was lost"]
+    with pytest.raises(HuntDirectoryError, match="has locked the ledger for 601 s; close the program"):
+        found._wait_for_ledger(progress, shown.append, 601.0)
+    found._stops = (signal.SIGINT,)
+    found._wait_for_ledger(progress, shown.append, 1.0)
+    with pytest.raises(HuntDirectoryError, match="has locked the ledger for 4 s"):
+        found._wait_for_ledger(progress, shown.append, 4.0)
 
 
 def test_trial_is_written_recorded_and_counted(hunt, monkeypatch):

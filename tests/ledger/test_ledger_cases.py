@@ -14,7 +14,7 @@ import pytest
 from columns import FEWER_COLUMNS
 
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.ledger import Ledger, Turn, has_begun
+from crashhunt.ledger import Ledger, Turn, _schema, has_begun
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -257,7 +257,7 @@ def test_in_a_ledger_without_digests_two_places_may_not_contradict_each_other(pa
         Ledger(path, writable=True)
 
 
-def test_what_sqlite_states_is_said_in_our_words(path, tmp_path):
+def test_what_sqlite_states_is_said_in_our_words(path, monkeypatch, tmp_path):
     with pytest.raises(HuntDirectoryError, match="is not the directory of a hunt") as caught:
         Ledger(path)
     assert "give the directory" in caught.value.fix
@@ -275,6 +275,7 @@ def test_what_sqlite_states_is_said_in_our_words(path, tmp_path):
         ledger = Ledger(path, writable=True)
         ledger._database.execute("PRAGMA busy_timeout = 1")
         ledger.record(result(0), snapshot="")
+        monkeypatch.setattr(_schema, "_BUSY_S", 0.0)
         busy.execute("BEGIN IMMEDIATE")
         for act in (
             lambda: ledger.record(result(0), snapshot=""),
@@ -291,6 +292,60 @@ def test_what_sqlite_states_is_said_in_our_words(path, tmp_path):
         with pytest.raises(HuntDirectoryError, match="may not be read"):
             Ledger(path)
         path.chmod(stat.S_IRUSR | stat.S_IWUSR)
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda ledger: ledger.record(result(1), snapshot=""),
+        lambda ledger: ledger.note(detail="x"),
+        lambda ledger: ledger.remark("x"),
+        lambda ledger: ledger.replace([0]),
+        lambda ledger: ledger.propose([Turn((), result(2).spec)]),
+        lambda ledger: ledger.close(),
+    ],
+)
+def test_writer_waits_while_a_backup_locks_the_ledger(path, monkeypatch, act):
+    monkeypatch.setattr(_schema, "_LOOK_EVERY_S", 0.001)
+    Ledger(path, writable=True).close()
+    with closing(sqlite3.connect(path, isolation_level=None)) as backup:
+        with closing(Ledger(path, writable=True)) as ledger:
+            waited = []
+
+            def wait(waited_s):
+                waited.append(waited_s)
+                if len(waited) == 3:
+                    backup.execute("ROLLBACK")
+
+            ledger.wait_while_locked(wait)
+            with ledger.together():
+                ledger.record(result(0), snapshot="")
+            backup.execute("BEGIN EXCLUSIVE")
+            act(ledger)
+            assert len(waited) == 3
+            assert waited == sorted(waited)
+        with closing(Ledger(path)) as reader:
+            assert 0 in reader.finished() or reader.replaced_count() == 1
+
+
+def test_writer_of_trials_may_stop_waiting_and_loses_no_earlier_one(path, monkeypatch):
+    monkeypatch.setattr(_schema, "_LOOK_EVERY_S", 0.001)
+    ledger = Ledger(path, writable=True)
+    ledger.record(result(0), snapshot="")
+    with closing(sqlite3.connect(path, isolation_level=None)) as backup:
+        backup.execute("BEGIN EXCLUSIVE")
+
+        def wait(waited_s):
+            raise HuntDirectoryError("locked for too long")
+
+        ledger.wait_while_locked(wait)
+        with pytest.raises(HuntDirectoryError, match="locked for too long"), ledger.together():
+            ledger.record(result(1), snapshot="")
+        backup.execute("ROLLBACK")
+        assert ledger.finished() == {0}
+        ledger.record(result(1), snapshot="")
+        assert ledger.finished() == {0, 1}
+        ledger.close()
 
 
 def test_reads_are_the_same_in_pieces(path, monkeypatch):

@@ -173,6 +173,12 @@ def test_where_not_all_fit_it_states_how_many_more():
     assert lines[4].startswith("nearest miss: trial 123, least TTC 0.42")
 
 
+def test_locked_ledger_is_in_the_line_in_every_phase():
+    progress = PhaseStatus(name="causes", done=1, total=4, seconds_left=None)
+    for found in (replace(status(2), phase="waiting"), replace(status(2), phase="waiting", progress=progress)):
+        assert _line(found).startswith("waiting for another program that has locked ledger.sqlite: ")
+
+
 def test_nodes_are_on_the_screen_and_in_the_line():
     nodes = tuple(NodeFigures(f"n{number}", 4, 10 * number, 1.25) for number in range(9))
     for shown, expected in (
