@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,7 +30,7 @@ from crashhunt.executors._pool import PoolExecutor
 from crashhunt.executors._postmortem import TrialAttempt, damaged, hung, result_of_death, where_it_is
 from crashhunt.executors._protocol import Notes, has_fork_server, run_trials, snapshot_environment
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError, with_escape
-from crashhunt.executors._time_limits import START_UP_S, ImportKilledError, has_hung, import_died
+from crashhunt.executors._time_limits import START_UP_S, ImportKilledError, PauseMeter, has_hung, import_died
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ class _Running:
     answer: Path
     began: float
     killed: bool = False
+    pauses: PauseMeter = field(default_factory=PauseMeter)
 
 
 class FreshProcessExecutor:
@@ -145,7 +146,7 @@ class FreshProcessExecutor:
             del self._running[number]
             running.kept.end()
             return self._result(running, exit_code)
-        limit_s = self._settings.timeout_s
+        limit_s, paused_s = self._settings.timeout_s, running.pauses.paused_s()
         if running.answer.exists():  # what is left to do is to find its escape, in trials that have limits of their own
             limit_s = _ESCAPE_S + 2 * limit_s
         header = where_it_is(self._settings.scratch, number)
@@ -153,7 +154,7 @@ class FreshProcessExecutor:
         # imports, where they hang; so what is left for this one is a supervisor that hangs itself.
         supervised = self._has_supervisor and (header is None or header.pid in children_of(running.kept.process.pid))
         begun = header is not None and not supervised
-        limit_s += START_UP_S if supervised else 0.0
+        limit_s += paused_s + (START_UP_S if supervised else 0.0)
         has_words = partial(_has_words, scratch_of(self._settings.scratch, number) / layout.STACK)
         if has_hung(header, begun=begun, given_at=running.began, limit_s=limit_s, has_words=has_words):
             running.killed = True

@@ -27,7 +27,7 @@ from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import internal_error, scratch_of
 from crashhunt.executors._postmortem import KEY_BYTES, Report, check_report, damaged, died, hung, read_map, read_tail
-from crashhunt.executors._time_limits import START_UP_S, has_hung
+from crashhunt.executors._time_limits import START_UP_S, PauseMeter, has_hung
 from crashhunt.recording import BlackBoxFile, Recording, read_black_box
 from crashhunt.simulators import FullBraking
 from crashhunt.trial import Escape, TrialSpec
@@ -242,25 +242,27 @@ class Supervisor:
 
     def _wait(self, box: BlackBoxFile, given_at: float) -> tuple[FromZygote, bool]:
         """Wait for the end of a trial's process, and kill it if it hangs; return whether it hung."""
-        was_killed = False
+        was_killed, pauses = False, PauseMeter()
         while True:
             message = self._next(_LOOK_EVERY_S)
+            paused_s = pauses.paused_s()
             if message is not None and "ended" in message:
                 return message, was_killed
             if message is None:
                 resume(self._zygote_pid)  # which an agent may have stopped
-            if not was_killed and self._has_hung(box, given_at):
+            if not was_killed and self._has_hung(box, given_at, paused_s):
                 was_killed = True
                 self._send({"kill": True})
 
-    def _has_hung(self, box: BlackBoxFile, given_at: float) -> bool:
+    def _has_hung(self, box: BlackBoxFile, given_at: float, paused_s: float = 0.0) -> bool:
         header = box.header()
         begun = header is not None and header.pid != os.getpid()
+        limit_s = self._settings.timeout_s + paused_s
         has_words = lambda: os.fstat(self._stack).st_size > 0  # noqa: E731
-        return has_hung(header, begun=begun, given_at=given_at, limit_s=self._settings.timeout_s, has_words=has_words)
+        return has_hung(header, begun=begun, given_at=given_at, limit_s=limit_s, has_words=has_words)
 
     def _await_zygote(self) -> None:
-        deadline = time.monotonic() + START_UP_S + self._settings.timeout_s
+        deadline, pauses = time.monotonic() + START_UP_S + self._settings.timeout_s, PauseMeter()
         while not self._zygote_pid:
             message = self._next(_LOOK_EVERY_S)
             if message is not None and "error" in message:
@@ -268,7 +270,7 @@ class Supervisor:
             if message is not None and message.get("unfit"):
                 raise UnfitZygoteError
             self._zygote_pid = message.get("ready", 0) if message is not None else 0
-            if not self._zygote_pid and time.monotonic() > deadline:
+            if not self._zygote_pid and time.monotonic() > deadline + pauses.paused_s():
                 raise CrashhuntError(
                     f"the simulator cannot be created: its start takes more than "
                     f"{START_UP_S + self._settings.timeout_s:g} s",

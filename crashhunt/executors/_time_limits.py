@@ -21,12 +21,33 @@ if TYPE_CHECKING:
     from crashhunt.recording import BlackBoxHeader
 
 
-__all__ = ["START_UP_S", "ImportKilledError", "ImportWatch", "await_imports", "has_hung", "import_died"]
+__all__ = ["START_UP_S", "ImportKilledError", "ImportWatch", "PauseMeter", "await_imports", "has_hung", "import_died"]
 
 
 START_UP_S = 60.0  # for Python and the agent to be imported and the simulator to be made, before a trial's time runs
+_PAUSE_S = 2.0  # without a look, after which a process was suspended; a busy machine delays it less
 _LAST_WORDS_S = 0.2  # after its time limit, for a hung process to write down where it is stuck
 _NO_WORDS_S = 3.0  # the same, on a machine that has no time for it at once
+
+
+class PauseMeter:
+    """Measures how long this process, and with it every process of the hunt, was suspended.
+
+    A container or a batch system suspends all processes of a job at once. This time does not count for time limits. The
+    owner calls `paused_s` many times a second, so a longer time between two calls is a suspension.
+    """
+
+    def __init__(self) -> None:
+        self._looked_at = time.monotonic()
+        self._paused_s = 0.0
+
+    def paused_s(self) -> float:
+        """Return the total time for which this process was suspended, in s."""
+        now = time.monotonic()
+        if now - self._looked_at > _PAUSE_S:
+            self._paused_s += now - self._looked_at
+        self._looked_at = now
+        return self._paused_s
 
 
 def has_hung(
@@ -90,6 +111,7 @@ class ImportWatch:
         self.importing = "what trials need cannot be imported"
         self._limit_s = START_UP_S + timeout_s
         self._ends_at = time.monotonic() + self._limit_s
+        self._pauses = PauseMeter()
 
     def begin(self, importing: object) -> None:
         """Record the import that the process begins."""
@@ -98,7 +120,7 @@ class ImportWatch:
     @property
     def has_hung(self) -> bool:
         """Return whether the imports take too long."""
-        return bool(self.importing) and time.monotonic() > self._ends_at
+        return bool(self.importing) and time.monotonic() > self._ends_at + self._pauses.paused_s()
 
     def hung(self) -> CrashhuntError:
         """Return the error of an import that takes too long."""

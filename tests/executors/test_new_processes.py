@@ -224,7 +224,7 @@ def test_new_process_answers_before_it_searches_for_an_escape(settings, monkeypa
     monkeypatch.setattr(_fresh, "require_origin", lambda name, code: sealed.append((name, code)))
     monkeypatch.setattr(_fresh, "seal", lambda given: sealed.append(given.scratch == settings.scratch))
     monkeypatch.setattr(_fresh, "fork_zygote", fork)
-    monkeypatch.setattr(_fresh, "Supervisor", lambda given, zygote: SimpleNamespace(run=run, zygote=zygote))
+    monkeypatch.setattr(_fresh, "Supervisor", lambda given, zygote, conditions: SimpleNamespace(run=run, zygote=zygote))
     monkeypatch.setattr(_fresh, "with_escape", lambda supervisor, given, ended: escaped)
     job = {"settings": settings.to_json(), "spec": spec(0).to_json()}
     assert _fresh._run(job, answers.append) == 0

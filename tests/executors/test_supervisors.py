@@ -18,7 +18,7 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HostError
 from crashhunt.episode import Parts, WorkerSettings, run_episode, scratch_of
-from crashhunt.executors import _supervisor
+from crashhunt.executors import _supervisor, _time_limits
 from crashhunt.executors._postmortem import encode_report
 from crashhunt.executors._supervisor import EndedTrial, LostTrialError, Supervisor, UnfitZygoteError
 from crashhunt.recording import BlackBox, Recording, read_black_box
@@ -236,11 +236,37 @@ def test_trial_that_hangs_is_killed_once_and_a_stopped_zygote_resumes(zygote, se
     messages = iter([None, {"ready": 99}, None, {"ended": -9, "pid": PID}])
     monkeypatch.setattr(_supervisor, "resume", resumed.append)
     monkeypatch.setattr(supervisor, "_next", lambda timeout_s: next(messages))
-    monkeypatch.setattr(supervisor, "_has_hung", lambda box, given_at: next(hangs))
+    monkeypatch.setattr(supervisor, "_has_hung", lambda box, given_at, paused_s: next(hangs))
     monkeypatch.setattr(supervisor, "_send", sent.append)
     assert supervisor._wait(None, 0.0) == ({"ended": -9, "pid": PID}, True)
     assert sent == [{"kill": True}]
     assert resumed == [99, 99]
+
+
+def test_time_in_which_all_processes_are_suspended_does_not_count(zygote, settings, monkeypatch):
+    supervisor, asked, now = Supervisor(settings, zygote.ours), [], 100.0
+    clock = SimpleNamespace(monotonic=lambda: now)
+
+    def look(timeout_s):
+        nonlocal now
+        now += next(steps)
+        return None if len(asked) < 4 else {"ended": 0, "pid": PID}
+
+    steps = iter([0.1, 500.0, 0.1, 30.0, 0.1])  # a container that is suspended twice
+    monkeypatch.setattr(_time_limits, "time", clock)
+    monkeypatch.setattr(_supervisor, "resume", lambda pid: None)
+    monkeypatch.setattr(supervisor, "_next", look)
+    monkeypatch.setattr(supervisor, "_has_hung", lambda box, given_at, paused_s: asked.append(paused_s))
+    assert supervisor._wait(None, 100.0) == ({"ended": 0, "pid": PID}, False)
+    assert asked == [0.0, 500.0, 500.0, 530.0]
+    watch = _time_limits.ImportWatch(1.0)
+    watch.begin("x")
+    now += 1000.0
+    assert not watch.has_hung
+    for _ in range(62):
+        assert not watch.has_hung
+        now += 1.0
+    assert watch.has_hung
 
 
 def test_time_limit_of_a_trial_begins_with_its_own_recording(settings, zygote, monkeypatch, tmp_path):
