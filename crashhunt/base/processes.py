@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = [
     "adopt_orphans",
     "children_of",
+    "descendants_of",
     "die_with",
     "end_descendants",
     "exits_refused",
@@ -93,6 +94,12 @@ def children_of(pid: int) -> list[int]:
     except OSError:
         pass  # it ended meanwhile
     return found
+
+
+def descendants_of(pid: int) -> list[int]:
+    """Return the process ids of all processes below a process; empty if the system does not report them."""
+    found = children_of(pid)
+    return [*found, *(below for child in found for below in descendants_of(child))]
 
 
 def end_descendants(spared: frozenset[int] = frozenset()) -> bool:

@@ -23,6 +23,7 @@ from crashhunt.base.exceptions import is_users
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.shared_state import SharedState
 from crashhunt.base.signals import block_signals
+from crashhunt.base.temporary import begin_records, end_records
 from crashhunt.base.text import command_line
 from crashhunt.episode import (
     BUDGET,
@@ -181,6 +182,7 @@ class TrialProcess:
     def _run(self, job: Job, reset: Reset | None) -> int:
         settings, folder = self._settings, Path(job["folder"])
         self._pid = os.getpid()
+        begin_records()
         os.setsid()  # what a trial sends to its whole process group is for itself
         if self._shared is not None and reset is None:
             self._shared.separate()
@@ -219,6 +221,7 @@ class TrialProcess:
             if os.getpid() != self._pid:  # this is a fork that an agent made, and it has ended
                 _leave(0)
         block_signals()  # whose handlers are those of agents, and the episode is over
+        end_records()
         for runner in self._fork_runners:
             if runner.why_not:
                 self._notices.append(f"{runner.what}{_EXCLUDED_FROM_HERE_WORDS}{runner.why_not}")

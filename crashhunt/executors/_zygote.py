@@ -25,6 +25,7 @@ from crashhunt.base.forks import ended
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.processes import adopt_orphans, children_of, die_with, end_descendants, kill
 from crashhunt.base.resources import FREE, free_memory, limit_behind
+from crashhunt.base.temporary import SharedMemoryWatch
 from crashhunt.episode import generators, message_of_error, options_of, seed_everything, set_generators, stage_of
 from crashhunt.executors._trial_process import TrialProcess, loaded
 from crashhunt.simulators import CountsSetUp
@@ -282,6 +283,7 @@ def _traffic_key(spec: TrialSpec) -> str:
     return json.dumps([spec.seed, dict(spec.scenario_arguments), spec.only, script], sort_keys=True)
 
 
+_SEGMENTS_EVERY_S = 0.1  # whether the trial uses new shared memory, which its death would hide
 _LOOK_EVERY_S = 0.005  # where the kernel does not report when a process ends
 
 
@@ -389,6 +391,7 @@ class _Zygote:
         self._stage = stage_of(settings.scratch, os.getpid())
         self._staged = 0  # when the folder was last changed
         self._makes_simulator = imported.makes_simulator
+        self._segments = SharedMemoryWatch()
 
     def serve(self) -> None:
         """Carry out the requests of the supervisor until it has ended."""
@@ -424,11 +427,12 @@ class _Zygote:
     def _run(self, job: Job) -> tuple[int, int]:
         """Run a trial, and return its process and the exit code, which is negative for a signal."""
         spared = frozenset[int]()
+        self._segments = SharedMemoryWatch()
         if self._warm is not None:
             found = self._warm.run(job, self._wait)
             spared = self._warm.processes
             if found is not None:
-                end_descendants(spared)
+                self._end_descendants(spared)
                 return found
         zygote, pid = os.getpid(), os.fork()
         if pid == 0:
@@ -448,21 +452,28 @@ class _Zygote:
             self._wait(end, killed)
             os.close(end)
             code = ended(pid)
-        end_descendants(spared)
+        self._end_descendants(spared)
         if not self._makes_simulator:
             shutil.rmtree(stage_of(self._scratch, pid), ignore_errors=True)
         return pid, code
+
+    def _end_descendants(self, spared: frozenset[int]) -> None:
+        """Kill the processes that a trial has left behind, and remove their shared memory."""
+        self._segments.look()
+        end_descendants(spared)
+        self._segments.remove()
 
     def _wait(self, end: int | None, kill_trial: Callable[[], None]) -> None:
         """Wait until a descriptor can be read; without a descriptor, wait a moment."""
         while True:
             watched = [self._control.fileno(), *([end] if end is not None else [])]
-            ready, _, _ = select.select(watched, [], [], _LOOK_EVERY_S if end is None else None)
+            ready, _, _ = select.select(watched, [], [], _LOOK_EVERY_S if end is None else _SEGMENTS_EVERY_S)
+            self._segments.look()
             if self._control.fileno() in ready:
                 message = self._next()
                 if message is None:  # the supervisor is gone
                     kill_trial()
-                    end_descendants()
+                    self._end_descendants(frozenset())
                     self._leave(0)
                 elif "kill" in message:
                     kill_trial()

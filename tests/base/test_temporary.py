@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import errno
 import gc
+import mmap
 import os
+import shutil
 import signal
 import stat
 import subprocess
 import sys
 import threading
+import time
+import uuid
 import weakref
 from contextlib import contextmanager, suppress
 from multiprocessing import shared_memory
@@ -560,7 +564,7 @@ def test_shared_memory_of_a_trial_goes_and_that_of_others_stays(tmp_path):
         again = shared_memory.SharedMemory(create=True, size=8)
         again.close()
         Path("/dev/shm", again.name).unlink()
-        Path("/dev/shm", again.name).touch()  # another program has taken the name
+        subprocess.run(["touch", f"/dev/shm/{again.name}"], check=True)  # another program has taken the name
         names.write_text(f"{mine.name} {again.name}")
         die()
 
@@ -585,12 +589,120 @@ def test_shared_memory_of_a_trial_goes_and_that_of_others_stays(tmp_path):
         theirs.unlink()
 
 
+def in_trial(scratch, act):
+    """Return the exit code of a process that acts as a trial does."""
+
+    def run():
+        segments.record_shared_memory(scratch)
+        segments.begin_records()
+        act()
+        segments.end_records()
+        os._exit(0)
+
+    return in_child(run)
+
+
+@pytest.fixture
+def name():
+    """The beginning of names in /dev/shm; what is left of them is removed."""
+    found = f"crashhunt-test-{os.getpid()}-{uuid.uuid4().hex}"
+    yield found
+    for path in Path("/dev/shm").glob(f"{found}*"):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def left(name):
+    return sorted(path.name.removeprefix(name) for path in Path("/dev/shm").glob(f"{name}*"))
+
+
+def test_files_that_a_trial_opened_in_shared_memory_go(tmp_path, name):
+    Path(f"/dev/shm/{name}-theirs").write_text("x")
+
+    def act():
+        Path(f"/dev/shm/{name}-opened").write_text("x")
+        os.close(os.open(f"/dev/shm/{name}-made".encode(), os.O_CREAT | os.O_WRONLY))
+        Path(f"/dev/shm/{name}-folder").mkdir()
+        Path(f"/dev/shm/{name}-folder/part").touch()
+        Path(f"/dev/shm/{name}-theirs").write_text("y")
+        in_child(lambda: Path(f"/dev/shm/{name}-fork").write_text("x") and os._exit(0))
+        segments.release_shared_memory(tmp_path, of_ended=True)
+        assert "-fork" in left(name)  # the trial may read what its worker has written
+
+    assert in_trial(tmp_path, act) == 0
+    assert left(name) == ["-folder", "-fork", "-made", "-opened", "-theirs"]
+    segments.release_shared_memory(tmp_path, of_ended=True)
+    assert left(name) == ["-theirs"]
+
+
+def test_later_file_with_the_name_of_a_trials_file_stays(tmp_path, name):
+    path = Path(f"/dev/shm/{name}")
+    record = tmp_path / f"shared-memory-{ended().token}.txt"
+    for time_ns, stays in ((time.time_ns() + 10**10, True), (time.time_ns() - 10**10, False)):
+        path.touch()
+        record.write_text(f"opened {time_ns} {name}\n")
+        segments.release_shared_memory(tmp_path)
+        assert path.exists() == stays
+
+
+SHM_OPEN = """
+import ctypes, mmap, os, sys
+kept = []
+for name in sys.argv[1:]:
+    kept.append(ctypes.CDLL(None).shm_open(name.encode(), os.O_RDWR | os.O_CREAT, 0o600))
+print("there", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_shared_memory_of_programs_that_a_trial_started_goes_and_that_of_others_stays(tmp_path, name, monkeypatch):
+    def start(*names):
+        program = subprocess.Popen([sys.executable, "-c", SHM_OPEN, *names], stdin=subprocess.PIPE,
+                                   stdout=subprocess.PIPE, text=True)  # fmt: skip
+        programs.append(program)
+        assert program.stdout.readline() == "there\n"
+        return program
+
+    programs = []
+    try:
+        start(f"/{name}-before")
+        watch = segments.SharedMemoryWatch()
+        ours = start(f"/{name}-before", f"/{name}-ours", f"/{name}-both")
+        other = start(f"/{name}-theirs", f"/{name}-both")
+        below = [program.pid for program in programs if program is not other]
+        monkeypatch.setattr(temporary, "descendants_of", lambda pid: below if pid == os.getpid() else [])
+        watch.look()
+        ours.kill()
+        ours.wait()
+        watch.remove()
+        assert left(name) == ["-before", "-both", "-theirs"]
+    finally:
+        for program in programs:
+            program.kill()
+            program.communicate()
+
+
+@pytest.mark.parametrize(("writes", "remaining"), [(True, []), (False, [""])])
+def test_shared_memory_that_a_trial_has_mapped_at_its_end_goes_if_it_is_written(tmp_path, name, writes, remaining):
+    def act():
+        subprocess.run(["truncate", "-s", "4096", f"/dev/shm/{name}"], check=True)  # C code creates it
+        flags, access = (os.O_RDWR, mmap.ACCESS_WRITE) if writes else (os.O_RDONLY, mmap.ACCESS_READ)
+        file = os.open(f"/dev/shm/{name}", flags)
+        kept.append(mmap.mmap(file, 4096, access=access))
+        os.close(file)
+
+    kept = []
+    assert in_trial(tmp_path, act) == 0
+    segments.release_shared_memory(tmp_path)
+    assert left(name) == remaining
+
+
 def test_a_record_that_an_agent_forged_removes_no_file_elsewhere(tmp_path):
     file = tmp_path / "thesis.tex"
     file.touch()
     found = file.lstat()
     record = tmp_path / f"shared-memory-{ended().token}.txt"
-    lines = [f"{found.st_dev} {found.st_ino} ../..{file}", "x y z", "1 2", f"{found.st_dev} {found.st_ino} .", "\xff"]
+    lines = [f"{found.st_dev} {found.st_ino} ../..{file}", "x y z", "1 2", f"{found.st_dev} {found.st_ino} .", "\xff",
+             f"opened 0 ../..{file}", f"used {found.st_ino} ../..{file}", "opened x y"]  # fmt: skip
     record.write_bytes("\n".join(lines).encode("latin-1"))
     segments.release_shared_memory(tmp_path)
     assert file.exists()

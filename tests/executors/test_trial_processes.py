@@ -322,6 +322,8 @@ def test_trial_runs_in_its_folder_and_reports(process, monkeypatch, tmp_path):
     monkeypatch.setattr(_trial_process, "run_episode", run_episode)
     monkeypatch.setattr(_trial_process, "block_signals", lambda: called.append("block"))
     monkeypatch.setattr(_trial_process.watchdog, "arm", lambda *given: called.append(("arm", *given)))
+    monkeypatch.setattr(_trial_process, "begin_records", lambda: None)
+    monkeypatch.setattr(_trial_process, "end_records", lambda: None)
     monkeypatch.setattr(os, "setsid", lambda: called.append("own session"))
     monkeypatch.setattr(os, "chdir", lambda path: called.append(("in", path)))
     monkeypatch.setattr(found, "_redirect", lambda folder: called.append(("redirect", folder)))

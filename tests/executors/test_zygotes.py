@@ -313,7 +313,7 @@ def test_zygote_without_a_supervisor_ends_its_trial(zygote):
     with pytest.raises(Left, match="0"):
         zygote._wait(None, lambda: killed.append(True))
     assert killed
-    assert zygote.test.spared == [None]  # all of them
+    assert zygote.test.spared == [frozenset()]
 
 
 def test_copies_are_spared_when_a_trial_has_ended(zygote, monkeypatch):
@@ -345,7 +345,7 @@ def server(monkeypatch):
     """A fork server whose forks are made up; `pool` and `template` are the other ends of its connections."""
     pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2)]
     (pool, control), (template, orders) = pairs
-    found = _fork_server._Server(control, orders, 55, SimpleNamespace(timeout_s=9.0))
+    found = _fork_server._Server(control, orders, 55, SimpleNamespace(timeout_s=9.0), "conditions")
     found.test = SimpleNamespace(
         pool=pool, template=template, killed=[], waits=[], resumed=[], spared=[], own_kills=[], signals=[]
     )
@@ -691,6 +691,7 @@ def test_fork_server_begins_with_its_job(template, monkeypatch, tmp_path, sys_pa
     monkeypatch.setattr(_fork_server.sys, "path", ["before"])
     monkeypatch.setattr(_fork_server.WorkerSettings, "from_json", lambda plain: plain == "plain" and settings)
     monkeypatch.setattr(_fork_server, "require_origin", lambda *given: began.append(("origin", *given)))
+    monkeypatch.setattr(_fork_server, "HostConditions", lambda given: given)
     monkeypatch.setattr(_fork_server, "seal", lambda given: began.append(("sealed", given)))
     monkeypatch.setattr(_fork_server._Server, "serve", lambda self: began.append((self._template, self._settings)))
     template.forked = PID
@@ -723,8 +724,8 @@ def test_fork_server_begins_with_its_job(template, monkeypatch, tmp_path, sys_pa
 def test_supervisor_has_the_connections_of_its_slot_only(server, monkeypatch):
     became = []
 
-    def become(pool, zygote, settings, parent):
-        became.append((pool.fileno() >= 0, zygote.fileno() >= 0, settings, parent))
+    def become(pool, zygote, settings, conditions, parent):
+        became.append((pool.fileno() >= 0, zygote.fileno() >= 0, settings, conditions, parent))
         leave("supervisor")
 
     monkeypatch.setattr(os, "fork", lambda: 0)
@@ -734,7 +735,7 @@ def test_supervisor_has_the_connections_of_its_slot_only(server, monkeypatch):
     server._ends[77] = read
     with pytest.raises(Left, match="supervisor"):
         start(server, 3)
-    assert became == [(True, True, server._settings, os.getpid())]
+    assert became == [(True, True, server._settings, "conditions", os.getpid())]
     assert (server._control.fileno(), server._orders.fileno()) == (-1, -1)
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.close(server._ends.pop(77))

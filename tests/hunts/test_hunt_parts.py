@@ -227,7 +227,7 @@ def test_error_of_a_hunt_is_in_its_ledger(hunt, monkeypatch, error, raised, why)
     assert found.run() == "report"
 
 
-def test_hunt_waits_for_a_locked_ledger_and_says_so(hunt, monkeypatch):
+def test_hunt_waits_for_a_locked_ledger_and_reports_it(hunt, monkeypatch):
     found, shown = hunt(), []
     progress = SimpleNamespace(notes=[])
     monkeypatch.setattr(found, "_status", lambda given, phase: phase)
