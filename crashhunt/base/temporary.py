@@ -328,8 +328,8 @@ def _shared_memory_of(processes: Iterable[int], *, written: bool) -> frozenset[t
             for entry in entries:
                 with suppress(OSError):
                     target = os.readlink(entry)  # noqa: PTH115 - there may be hundreds
-                    rights = entry.stat(follow_symlinks=False).st_mode
-                    if target.startswith(prefix) and (rights & stat.S_IWUSR or not written):
+                    may_write = entry.stat(follow_symlinks=False).st_mode & stat.S_IWUSR
+                    if target.startswith(prefix) and (may_write or not written):
                         found.add((target.removeprefix(prefix), entry.stat().st_ino))
     return frozenset(found)
 
