@@ -110,7 +110,7 @@ def read_log(path: Path) -> Recording:
                 for schema, channel, sequence, data in messages_of(file, reader, validate_crcs=True)
                 if schema is not None and sequence and schema.name.startswith(NAMESPACE)
             ]
-            evidence.sort(key=itemgetter(0))
+            evidence.sort(key=itemgetter(0), reverse=True)  # so that each message is freed as soon as it was read
             return Recording(_read_evidence(evidence), compact)
     except OSError as error:
         raise refuse(f"cannot be read: {error.strerror}", "give the path of a log.mcap") from None
@@ -193,12 +193,14 @@ def _times_ns(records: Sequence[Record]) -> list[int]:
     return times_ns
 
 
-def _read_evidence(messages: Sequence[_Message]) -> Iterator[Record]:
+def _read_evidence(messages: list[_Message]) -> Iterator[Record]:
+    """Yield the records of messages in reverse order, which are removed from the list."""
     channels = {
         kind.topic: _Channel(tag=tag, aux=0, topic=kind.topic, form=kind.form) for tag, kind in RECORD_TYPES.items()
     }
     prologue: Prologue | None = None
-    for expected, message in enumerate(messages, 1):
+    for expected in range(1, len(messages) + 1):
+        message = messages.pop()
         if message.sequence != expected:
             raise BundleError(f"message {expected} of the log is missing", fix="get an undamaged copy of the log")
         channel = channels.get(message.topic)
