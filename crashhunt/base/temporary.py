@@ -204,6 +204,7 @@ _OPENED, _USED = "opened", "used"  # first words of lines in records; the line o
 _CLOCK_NS = 20_000_000  # the time of a file is that of the last tick of the kernel's clock
 _recording_owner: list[OwnerProcess] = []  # of this process and its forks; else each process records for itself
 _records: list[Callable[[object, object, str], None]] = []  # writes a line of a record
+_listed: list[tuple[int, frozenset[tuple[str, int]]]] = []  # time of the last change of the folder, and its files
 _before: list[frozenset[tuple[str, int]]] = []  # name and inode of the files before the trial of this process
 
 
@@ -303,9 +304,16 @@ class SharedMemoryWatch:
 
 
 def _shared_memory() -> frozenset[tuple[str, int]]:
-    """Return name and inode of all files in ``/dev/shm``."""
-    with suppress(OSError), os.scandir(_SHARED_MEMORY_FOLDER) as entries:
-        return frozenset((entry.name, entry.inode()) for entry in entries)
+    """Return name and inode of all files in ``/dev/shm``; without a change, this takes a few microseconds."""
+    with suppress(OSError):
+        changed_ns = _SHARED_MEMORY_FOLDER.stat().st_mtime_ns
+        if _listed and _listed[0][0] == changed_ns:
+            return _listed[0][1]
+        with os.scandir(_SHARED_MEMORY_FOLDER) as entries:
+            found = frozenset((entry.name, entry.inode()) for entry in entries)
+        # A later change within the same tick of the kernel's clock would not be seen.
+        _listed[:] = [(changed_ns, found)] if time.time_ns() - changed_ns > _CLOCK_NS else []
+        return found
     return frozenset()
 
 
