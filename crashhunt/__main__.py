@@ -21,4 +21,6 @@ def main() -> NoReturn:
 
 
 if __name__ == "__main__":
+    if not sys.flags.safe_path:
+        del sys.path[0]  # the current folder, which may be a stranger's, and whose modules only the user may name
     main()

@@ -10,6 +10,7 @@ import sys
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import metadata
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,12 +20,14 @@ from crashhunt.base.text import did_you_mean, one_of
 
 if TYPE_CHECKING:
     import types
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from importlib.machinery import ModuleSpec
     from importlib.metadata import Distribution, EntryPoint
 
 __all__ = [
     "Group",
     "ImportedModules",
+    "add_current_folder",
     "distributions",
     "import_module",
     "is_foreign",
@@ -85,7 +88,7 @@ def _changed_at(place: str) -> int:
 def locate(group: Group, name: str) -> Any:
     """Return the object with a registered name or a ``module:attribute``.
 
-    Modules are also searched for in the current directory, as with ``python -m``.
+    The module of a ``module:attribute`` may lie in the current folder.
 
     Raises:
         PluginError: the object does not exist, or its import failed.
@@ -96,7 +99,7 @@ def locate(group: Group, name: str) -> Any:
     if not colon or not module_name or not attribute:
         fix = f"{one_of(name, points, none='(none)')}, or module:attribute"
         raise PluginError(f"{name!r} is not a registered name of {group}", fix=fix)
-    return load_object(target, shown=name)
+    return load_object(target, shown=name, installed=name in points)
 
 
 def is_foreign(group: Group, name: str) -> bool:
@@ -170,17 +173,18 @@ class ImportedModules:
         }  # fmt: skip
 
 
-def load_object(target: str, *, shown: str = "") -> Any:
+def load_object(target: str, *, shown: str = "", installed: bool = False) -> Any:
     """Import the class or function that a ``module:attribute`` names, and return it.
 
     Args:
         target: the module and the class or function in it.
         shown: name of the value in error messages.
+        installed: whether an installed package names the module, so that the current folder is not searched.
 
     Raises:
         PluginError: the object does not exist, or its import failed.
     """
-    found = load_attribute(target, shown=shown)
+    found = load_attribute(target, shown=shown, installed=installed)
     if not callable(found):
         raise PluginError(
             f"{shown or target!r} is a {type(found).__name__}, which cannot be called", fix="name a class or function"
@@ -188,46 +192,51 @@ def load_object(target: str, *, shown: str = "") -> Any:
     return found
 
 
-def load_attribute(target: str, *, shown: str = "") -> Any:
+def load_attribute(target: str, *, shown: str = "", installed: bool = False) -> Any:
     """Import the object of any kind that a ``module:attribute`` names, and return it.
 
     Args:
         target: the module and the attribute.
         shown: name of the value in error messages.
+        installed: whether an installed package names the module, so that the current folder is not searched.
 
     Raises:
         PluginError: the object does not exist, or its import failed.
     """
     name = shown or target
     module_name, _, attribute = target.partition(":")
-    module = import_module(module_name, shown=name)
+    module = import_module(module_name, shown=name, installed=installed)
     found: object = module
     for part in attribute.split("."):
         try:
             found = getattr(found, part)
         except AttributeError:
             public = [name for name in vars(found) if not name.startswith("_")] if hasattr(found, "__dict__") else []
-            raise PluginError(
-                f"{name!r}: {module_name} has no attribute {attribute!r}",
-                fix=did_you_mean(part, public) or "correct the name",
-            ) from None
+            message = f"{name!r}: {module_name} has no attribute {attribute!r}"
+            fix = _hidden(module_name) or did_you_mean(part, public) or "correct the name"
+            raise PluginError(message, fix=fix) from None
         except Exception as error:  # of a lazy module, which imports what is asked of it
             raise _not_imported(module_name, name, error) from error
     return found
 
 
-def import_module(name: str, *, shown: str = "") -> types.ModuleType:
-    """Import a module, which may lie in the current directory, and return it.
+def import_module(name: str, *, shown: str = "", installed: bool = False) -> types.ModuleType:
+    """Import a module, which may lie in the current folder, and return it.
+
+    The current folder may be a stranger's: no command imports a module from it that the user has not named. Once the
+    user has named a module of this folder, the folder comes first, as with ``python -m``, for the modules that the
+    named module imports.
 
     Args:
         name: name of the module.
         shown: name of the value in error messages.
+        installed: whether an installed package names the module, so that the current folder is not searched.
 
     Raises:
         PluginError: the import of the module failed.
     """
-    if os.getcwd() not in sys.path and "" not in sys.path:  # noqa: PTH109 - sys.path holds strings
-        sys.path.insert(0, os.getcwd())  # noqa: PTH109
+    if not installed:
+        add_current_folder().prefer(name)
     try:
         return importlib.import_module(name)
     except KeyboardInterrupt:
@@ -238,6 +247,71 @@ def import_module(name: str, *, shown: str = "") -> types.ModuleType:
 
 _DESKTOP_LIBRARIES = ("libGL.so.1", "libX11.so.6", "libXext.so.6", "libXrender.so.1", "libatomic.so.1")
 """System libraries that simulators with a window link to, and that servers and containers often lack."""
+
+
+def add_current_folder(*, always_last: bool = False) -> CurrentFolder:
+    """From now on, import from the current folder the modules that are found nowhere else.
+
+    Args:
+        always_last: whether other places also come first for the modules that the user names.
+    """
+    made = next((finder for finder in sys.meta_path if isinstance(finder, CurrentFolder)), None)
+    if made is None:
+        sys.meta_path.append(made := CurrentFolder(always_last=always_last))
+    made.folder = os.getcwd()  # noqa: PTH109 - sys.path holds strings
+    return made
+
+
+class CurrentFolder:
+    """Finds modules in the current folder that neither Python nor crashhunt's dependencies have, installed or not.
+
+    Args:
+        always_last: whether `prefer` has no effect.
+    """
+
+    def __init__(self, *, always_last: bool) -> None:
+        self._always_last = always_last
+        self.folder = ""
+
+    def find_spec(self, name: str, path: Sequence[str] | None = None, _target: object = None) -> ModuleSpec | None:
+        """Return where a module is found; None if it is not a module of the folder."""
+        is_reserved = path is not None or name in sys.stdlib_module_names or name in _dependencies()
+        return None if is_reserved else PathFinder.find_spec(name, [self.folder])
+
+    def prefer(self, name: str) -> None:
+        """Make the folder the first place for all modules if it has this one, which is not yet imported.
+
+        A folder without code counts as a module only if no other place has a module of this name.
+        """
+        top = name.partition(".")[0]
+        if self._always_last or top in sys.modules or "" in sys.path or self.folder in sys.path:
+            return
+        found = PathFinder.find_spec(top, [self.folder])
+        if found is not None and (found.origin is not None or PathFinder.find_spec(top) is None):
+            sys.path.insert(0, self.folder)
+
+
+@lru_cache(maxsize=1)
+def _dependencies() -> frozenset[str]:
+    """Return the names of the modules that crashhunt's dependencies have, also those that are not installed."""
+    try:
+        needed = metadata.requires("crashhunt") or ()
+    except metadata.PackageNotFoundError:
+        needed = ()
+    names = {re.split(r"[^\w.-]", requirement, maxsplit=1)[0].lower() for requirement in needed}
+    known = {"eclipse-sumo": "sumo", "pillow": "PIL", "protobuf": "google", "mcap-protobuf-support": "mcap_protobuf"}
+    return frozenset(known.get(name, name.replace("-", "_")) for name in names)
+
+
+def _hidden(name: str) -> str:
+    """Return the fix if the current folder has a module of the same name as an imported one; empty if it has none."""
+    here = os.getcwd()  # noqa: PTH109
+    top = name.partition(".")[0]
+    found, imported = PathFinder.find_spec(top, [here]), sys.modules.get(top)
+    if found is None or found.origin is None or found.origin == getattr(imported, "__file__", None):
+        return ""
+    place = os.path.relpath(found.origin, here)
+    return f"rename {place}, because Python already has a module {top!r}"
 
 
 def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:

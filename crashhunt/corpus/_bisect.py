@@ -154,7 +154,7 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> tuple[Got, 
     """Run a case with the code of a work tree, in a new process; return its status, and why it cannot run."""
     environment = import_environment(folder, tree)
     for module in sorted(modules):
-        place = [sys.executable, "-c", _ORIGIN_SCRIPT, module]
+        place = [sys.executable, "-P", "-c", _ORIGIN_SCRIPT, module]
         found = run_to_end(place, folder, environment)
         origin = found.stdout.strip()
         if found.returncode == 0 and not Path(origin).resolve().is_relative_to(tree):
@@ -165,7 +165,7 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> tuple[Got, 
         if found.returncode != 0:
             last = next(iter(found.stderr.strip().splitlines()[-1:]), "")
             return "cannot_run", f"{module!r} cannot be imported: {last}"
-    command = [sys.executable, "-m", "crashhunt", "corpus", "run", str(case), "--json"]
+    command = [sys.executable, "-P", "-m", "crashhunt", "corpus", "run", str(case), "--json"]
     done = run_to_end(command, folder, environment)
     try:
         report = json.loads(done.stdout)["cases"][0]

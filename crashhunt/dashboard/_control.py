@@ -104,7 +104,7 @@ class Jobs:
         """
         if name not in COMMANDS:
             raise UsageError(f"there is no job {name!r}", fix=one_of(name, COMMANDS))
-        words = [sys.executable, "-m", "crashhunt", COMMANDS[name], "--crash", crash, "--", str(path)]
+        words = [sys.executable, "-P", "-m", "crashhunt", COMMANDS[name], "--crash", crash, "--", str(path)]
         with self._changed:
             if sum(job.state == "waiting" for job in self._jobs) >= _MAX_WAITING:
                 raise UsageError(f"too many jobs are waiting: {_MAX_WAITING}", fix="wait until some of them have ended")

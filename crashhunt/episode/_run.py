@@ -19,7 +19,7 @@ from crashhunt.agents import NeedsLibraries
 from crashhunt.base.boundaries import Boundary, Party, is_ours
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.plugins import import_module, locate
+from crashhunt.base.plugins import add_current_folder, import_module, locate
 from crashhunt.base.sandbox import confine
 from crashhunt.base.temporary import record_shared_memory
 from crashhunt.episode._blame import internal_error
@@ -202,9 +202,9 @@ class Parts:
     def __init__(self, settings: WorkerSettings) -> None:
         self._settings = settings
         self._factories: dict[str, tuple[Any, tuple[str, ...]]] = {}
-        if settings.code:
-            # What the snapshot does not have may come from where the hunt was started, as it did then.
-            sys.path[:0] = [*settings.code, str(Path.cwd())]
+        sys.path[:0] = settings.code
+        # What the snapshot does not have may come from where the hunt was started, as it did then.
+        add_current_folder(always_last=bool(settings.code))
         self._oracles = [parse_oracle(text) for text in settings.oracles]
         self.reporting_agents: list[ReportsNotices] = []
         """The agents that were created in this process and that may report notices to the user."""

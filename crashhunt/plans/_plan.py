@@ -109,9 +109,13 @@ _SIGNATURE_TIMEOUT_S = 60.0
 # Whatever the module prints when it is imported is not the answer. No crashhunt is needed: it may be an older one.
 _SIGNATURE_SCRIPT = """
 import importlib, inspect, json, os, sys
+from importlib.machinery import PathFinder
 answer = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)
 module, _, attribute = sys.argv[1].partition(":")
+filled, home, *code = sys.argv[2:]
+is_there = PathFinder.find_spec(module.partition(".")[0], [home]) is not None
+sys.path[:] = [*code, home, *sys.path] if is_there else [*code, *sys.path, home]
 found = importlib.import_module(module)
 for part in attribute.split("."):
     found = getattr(found, part)
@@ -121,7 +125,7 @@ except (TypeError, ValueError):
     names, is_open, defaults = [], True, {}
 else:
     kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    names = [known.name for known in parameters if known.kind in kinds and known.name not in sys.argv[2:]]
+    names = [known.name for known in parameters if known.kind in kinds and known.name not in filled.split(',')]
     is_open = any(known.kind is known.VAR_KEYWORD for known in parameters)
     defaults = {known.name: known.default for known in parameters if type(known.default) in (bool, int, float, str)}
 json.dump([names, is_open, defaults], answer)
@@ -250,11 +254,11 @@ def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None)
     points = registered("agents")
     target = points[locator].value if locator in points else locator
     home = str(folder or Path.cwd())
-    paths = os.pathsep.join(filter(None, (*code, home, os.environ.get("PYTHONPATH"))))
-    environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
     try:
         done = subprocess.run(
-            [sys.executable, "-P", "-c", _SIGNATURE_SCRIPT, target, *FILLED_BY_NAME], env=environment, cwd=home,
+            [sys.executable, "-P", "-c", _SIGNATURE_SCRIPT, target, ",".join(FILLED_BY_NAME), home, *code],
+            env=environment, cwd=home,
             stdin=subprocess.DEVNULL, capture_output=True, timeout=_SIGNATURE_TIMEOUT_S, check=True,
         )  # fmt: skip
         names, is_open, defaults = json.loads(done.stdout)

@@ -597,7 +597,7 @@ def backend_of(name: str) -> Backend | None:
     point = _plugin_backends().get(name)
     if point is None:
         return None
-    found = load_attribute(point.value, shown=name)
+    found = load_attribute(point.value, shown=name, installed=True)
     if not isinstance(found, Backend):
         message = f"the backend {name!r} is a {type(found).__name__}, not a Backend"
         raise PluginError(message, fix="make it a crashhunt.scenario.Backend", where=point.value)

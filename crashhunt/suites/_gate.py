@@ -499,7 +499,7 @@ class _Run:
             if not cases:
                 message = f"--corpus {gate.corpus} has no case in which the agent {gate.head.word} drives"
                 raise UsageError(message, fix="omit --corpus, or give a corpus with crashes of this agent")
-        command = [sys.executable, "-m", "crashhunt", "corpus", "run", *map(str, cases), "--json"]
+        command = [sys.executable, "-P", "-m", "crashhunt", "corpus", "run", *map(str, cases), "--json"]
         command += ["--parallel", str(slots_of(gate.parallel))]
         if gate.trusted or tree is not None:  # a commit's corpus is trusted as its code is
             command.append("--trust")
@@ -719,7 +719,7 @@ def _modules_of(run: RunRequest) -> set[str]:
 
 def _origin_of(module: str, folder: Path, environment: Mapping[str, str]) -> Path:
     """Return the file from which a module is imported in a work tree; the tree's folder if it cannot be found."""
-    done = run_to_end([sys.executable, "-c", _ORIGIN_SCRIPT, module], folder, environment)
+    done = run_to_end([sys.executable, "-P", "-c", _ORIGIN_SCRIPT, module], folder, environment)
     return Path(done.stdout.strip()).resolve() if done.returncode == 0 else folder
 
 

@@ -67,7 +67,7 @@ class BackendContract:
 
     def test_it_is_known_without_the_simulator(self, name: str, scenario: Path) -> None:
         """Commands that only read a scenario import neither slow libraries nor libraries that run once per process."""
-        command = [sys.executable, "-c", _IMPORTED, name, str(scenario)]
+        command = [sys.executable, "-P", "-c", _IMPORTED, name, str(scenario)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.stdout.strip() == "False", done.stderr
 

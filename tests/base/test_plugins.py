@@ -3,12 +3,15 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import re
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import pytest
 
-from crashhunt.base.plugins import locate, registered
+import crashhunt
+from crashhunt.base.plugins import import_module, locate, registered
 from crashhunt.errors import ArgumentError, PluginError
 from crashhunt.space import Argument, Range
 from crashhunt.trial import signature_of
@@ -113,6 +116,37 @@ def test_what_leads_nowhere_states_why(tmp_path, monkeypatch, content, name, say
     sys.modules.pop("broken", None)
     assert says in str(caught.value)
     assert caught.value.fix
+
+
+def test_module_with_the_name_of_another_one_is_named(tmp_path, monkeypatch):
+    (tmp_path / "random.py").write_text("class Agent: pass")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(PluginError, match=r"no attribute 'Agent'; rename random\.py, because Python already"):
+        locate("agents", "random:Agent")
+
+
+def test_every_python_that_crashhunt_starts_ignores_the_current_folder():
+    starts = 0
+    for file in Path(crashhunt.__file__).parent.rglob("*.py"):
+        for options in re.findall(r"\[\s*sys\.executable,\s*([^\s,]+)", file.read_text()):
+            starts += 1
+            assert options == '"-P"' or options.startswith("str(self.home"), (
+                f"{file}: {options}"
+            )  # the file's own folder
+    assert starts > 5
+
+
+def test_named_module_of_the_current_folder_comes_before_installed_ones(tmp_path, monkeypatch):
+    for folder in ("here", "installed"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "utils_of_both.py").write_text(f"def place(): return {folder!r}")
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place] + [str(tmp_path / "installed")])
+    monkeypatch.delitem(sys.modules, "utils_of_both", raising=False)
+    assert import_module("utils_of_both", installed=True).place() == "installed"
+    del sys.modules["utils_of_both"]
+    assert locate("agents", "utils_of_both:place")() == "here"
+    del sys.modules["utils_of_both"]
 
 
 @pytest.mark.parametrize(

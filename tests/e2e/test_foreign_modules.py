@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import csv
+import re
+import subprocess
+import sys
+from importlib import metadata
 
 import pytest
 
@@ -112,3 +116,33 @@ def test_a_module_of_an_agent_changes_nothing_in_the_process_of_the_command(toy)
     assert "imported" not in done.out + done.err
     code = [path.name for path in (toy.folder / "h" / "snapshots").glob("*/code/*")]
     assert "harmful.py" in code
+
+
+# The current folder may be a stranger's. Each name there that Python or a package could import writes down that it ran.
+
+
+@pytest.fixture
+def strange_folder(shell):
+    needed = [re.split(r"[^\w-]", requirement)[0] for requirement in metadata.requires("crashhunt") or ()]
+    names = {*sys.stdlib_module_names, *metadata.packages_distributions(), *(name.replace("-", "_") for name in needed)}
+    for name in names - {"crashhunt"}:
+        tells = "import pathlib; pathlib.Path(__file__).with_suffix('.ran').touch(); raise SystemExit('ran')"
+        (shell.folder / f"{name}.py").write_text(tells)
+    return shell.folder
+
+
+def test_no_command_imports_from_the_current_folder_what_the_user_has_not_named(strange_folder, shell):
+    for words in (
+        ["agents"], ["oracles"], ["run", "out", "1", "30", "100", "--scenario", "highway"],
+        ["replay", "out", "--code", "current"], ["replay", "out", "--set", "initial_spacing=2"], ["report", "out"],
+    ):  # fmt: skip
+        shell.process(*words, expect=None)
+        assert not list(strange_folder.glob("*.ran")), words
+    assert (strange_folder / "out" / "report.html").is_file()
+
+
+def test_python_m_imports_no_package_from_the_current_folder(strange_folder, shell):
+    for name in sys.stdlib_module_names:  # some of which Python itself imports before it runs crashhunt
+        (strange_folder / f"{name}.py").unlink(missing_ok=True)
+    subprocess.run([sys.executable, "-m", "crashhunt", "oracles"], cwd=strange_folder, capture_output=True, check=True)
+    assert not list(strange_folder.glob("*.ran"))
