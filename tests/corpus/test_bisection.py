@@ -150,7 +150,7 @@ def judge(monkeypatch, tmp_path):
 
         def run_to_end(command, folder, environment):
             ran.append((command[1:], folder, environment))
-            is_import = command[1] == "-c"
+            is_import = command[2] == "-c"
             place = tmp_path / origin if not origin.startswith("/") else origin
             return SimpleNamespace(
                 returncode=code if is_import else 1, stdout=f"{place}\n" if is_import else printed, stderr="x" * 400
@@ -169,7 +169,7 @@ def test_case_runs_with_the_code_of_the_work_tree(judge, tmp_path):
     got, ran = judge('{"cases": [{"got": "fixed"}]}')
     assert got == "fixed"
     assert [command[-1] for command, _, _ in ran] == ["agents.driver", "z", "--json"]
-    assert ran[2][0] == ["-m", "crashhunt", "corpus", "run", str(tmp_path / "case"), "--json"]
+    assert ran[2][0] == ["-P", "-m", "crashhunt", "corpus", "run", str(tmp_path / "case"), "--json"]
     assert {folder for _, folder, _ in ran} == {tmp_path / "agents"}
     assert {environment["PATHS"] for _, _, environment in ran} == {f"{tmp_path / 'agents'} {tmp_path}"}
     assert judge("", code=1)[0] == "cannot_run"  # a revision without the module

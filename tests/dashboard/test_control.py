@@ -76,10 +76,10 @@ class Forked:
     """A command of the page in a fork, as far as the page's jobs use a `subprocess.Popen`."""
 
     def __init__(self, words, environment, **streams):
-        assert words[:3] == [sys.executable, "-m", "crashhunt"]
+        assert words[:4] == [sys.executable, "-P", "-m", "crashhunt"]
         assert streams == {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
         out, write = os.pipe()
-        self._begun = _commands().begin(words[3:], Path.cwd(), environment, terminal=write, streams=(1, 2))
+        self._begun = _commands().begin(words[4:], Path.cwd(), environment, terminal=write, streams=(1, 2))
         os.close(write)
         self.stdout = os.fdopen(out, "rb")
 

@@ -54,7 +54,7 @@ def work(tmp_path, monkeypatch):
 
     def run_to_end(command, folder, environment):
         found.ran.append((command, folder, environment))
-        if command[1] == "-c":
+        if command[2] == "-c":
             origin = found.answers["origin"] or folder / "mine.py"
             return SimpleNamespace(stdout=f"{origin}\n", returncode=found.answers["code"])
         return SimpleNamespace(stdout=found.answers["corpus"], stderr="crashhunt: it  does\nnot run", returncode=2)
@@ -279,7 +279,7 @@ def test_corpus_of_a_commit_runs_with_its_code(corpus, tmp_path):
     ]  # fmt: skip
     command, folder, environment = corpus.ran[-1]
     assert command == [
-        sys.executable, "-m", "crashhunt", "corpus", "run", "x/1", "x/2", "--json", "--parallel", "3", "--trust",
+        sys.executable, "-P", "-m", "crashhunt", "corpus", "run", "x/1", "x/2", "--json", "--parallel", "3", "--trust",
     ]  # fmt: skip
     assert folder == corpus.trees["head"] / "sub"
     assert environment == {"FOLDER": str(folder), "TREE": str(corpus.trees["head"])}
@@ -304,7 +304,7 @@ def test_corpus_of_an_agent_has_its_cases_only(corpus, tmp_path):
     (corpus.folder / "cases").mkdir()
     run._run_corpus()
     command, folder, environment = corpus.ran[-1]
-    assert command[4:] == ["run", "x/1", "--json", "--parallel", "1"]
+    assert command[5:] == ["run", "x/1", "--json", "--parallel", "1"]
     assert folder == corpus.folder
     assert environment["PATH"]
     run = started(replace(asked, trusted=True), tmp_path / "g3")
