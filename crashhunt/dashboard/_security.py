@@ -7,7 +7,8 @@ access (`Guard`):
   rebinding) sends its own name.
 - If the server does not listen on a loopback address, a token is needed. The token is compared in constant time, and
   kept in a cookie that scripts cannot read and other sites cannot send.
-- Requests of other sites are refused by the headers Sec-Fetch-Site and Origin, which scripts cannot set.
+- Requests of other sites are refused by the headers Sec-Fetch-Site and Origin, which scripts cannot set. A request
+  that has one of these headers twice is refused.
 - The size of requests and the number of requests at a time are bounded.
 - Each response forbids scripts, styles, connections and frames of other sites.
 """
@@ -16,10 +17,11 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import re
 import socket
 from http.cookies import CookieError, SimpleCookie
 from typing import TYPE_CHECKING, Final
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import parse_qsl, urlencode
 
 from starlette.responses import JSONResponse, RedirectResponse, Response
 
@@ -41,6 +43,10 @@ MAX_REQUESTS: Final = 64
 MIN_TOKEN: Final = 16
 """Characters of a token that the user chooses, at least."""
 
+_SINGLE = ("host", "origin", "sec-fetch-site", "sec-fetch-mode", "x-crashhunt", "authorization", "content-length")
+# A name or an IPv4 address, or an IPv6 address in brackets, and a port (RFC 9110). A user name, as in user@host, is not
+# part of it.
+_HOST = re.compile(r"(?:\[(?P<address>[0-9a-fA-F:.]+)\]|(?P<name>[^\s@:/?#\[\]\\]+))(?::[0-9]{0,5})?")
 _COOKIE = "crashhunt-token"
 _CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; connect-src 'self'; img-src 'self' data: blob:; "
@@ -134,6 +140,8 @@ class Guard:
             return _refused(414, "the address is too long", f"give at most {MAX_TARGET} characters")
         if headers.size > MAX_HEADERS:
             return _refused(431, "the headers are too large", f"send at most {MAX_HEADERS} bytes")
+        if headers.repeated:
+            return _refused(400, f"the header {headers.repeated} occurs twice", "send it once")
         host = headers.only("host")
         if host is None or not self._is_ours(host):
             fix = "open the address that crashhunt dashboard printed"
@@ -148,10 +156,9 @@ class Guard:
         return self._without_token(scope, headers) if self._token else None
 
     def _is_ours(self, host: str) -> bool:
-        try:
-            name = urlsplit(f"//{host}").hostname or ""
-        except ValueError:
+        if not (found := _HOST.fullmatch(host)):
             return False
+        name = (found["address"] or found["name"]).lower()
         if name in self._names:
             return True
         try:
@@ -167,7 +174,7 @@ class Guard:
         if site in ("cross-site", "same-site") and not (is_page and headers.only("sec-fetch-mode") == "navigate"):
             return True
         origin = headers.only("origin")
-        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+        if origin is not None and origin.lower() not in (f"http://{host.lower()}", f"https://{host.lower()}"):
             return True
         # A form of another site cannot set this header, and a script of it would have to ask first.
         return scope["method"] == "POST" and headers.only("x-crashhunt") != "1"
@@ -195,7 +202,10 @@ class Guard:
 
 
 class _Headers:
-    """The headers of a request. Headers that occur twice are ignored."""
+    """The headers of a request, of which those that the guard reads must occur once.
+
+    Proxies and browsers differ in which of two they follow. A cookie may come in several headers (RFC 9113).
+    """
 
     def __init__(self, raw: Iterable[tuple[bytes, bytes]]) -> None:
         self._found: dict[str, list[str]] = {}
@@ -203,6 +213,11 @@ class _Headers:
         for name, value in raw:
             self.size += len(name) + len(value)
             self._found.setdefault(name.decode("latin-1").lower(), []).append(value.decode("latin-1"))
+
+    @property
+    def repeated(self) -> str:
+        """The name of a header that occurs twice and must not; empty if there is none."""
+        return next((name for name in _SINGLE if len(self._found.get(name, ())) > 1), "")
 
     def only(self, name: str) -> str | None:
         """Return the value of a header; None if the header is missing or occurs twice."""
