@@ -22,7 +22,9 @@ __all__ = [
     "commit_of",
     "environment_of_git",
     "git",
+    "git_directory",
     "import_environment",
+    "query",
     "run_to_end",
     "top_of",
     "tracked_files",
@@ -49,17 +51,17 @@ def work_tree(folder: Path) -> Path | None:
 
     Git refuses a work tree that belongs to another user. The result is then None as well.
     """
-    found = _run_git(folder, "rev-parse", "--show-toplevel")
+    found = query(folder, "rev-parse", "--show-toplevel")
     return Path(os.path.realpath(os.fsdecode(found.rstrip(b"\n")))) if found else None
 
 
 def tracked_files(top: Path) -> frozenset[str]:
     """Return the names of all files that git tracks in a work tree, relative to its root, with ``/`` as separator."""
-    found = _run_git(top, "rev-parse", "--absolute-git-dir")
-    if not found:
+    found = git_directory(top)
+    if found is None:
         return frozenset()
     try:
-        status = os.stat(os.path.join(found.rstrip(b"\n"), b"index"))  # noqa: PTH116, PTH118 - bytes of any encoding
+        status = (found / "index").stat()
     except OSError:
         return frozenset()
     return _tracked_files(top, (status.st_ino, status.st_size, status.st_mtime_ns))
@@ -71,13 +73,25 @@ def _tracked_files(top: Path, _index: tuple[int, int, int]) -> frozenset[str]:
 
     The list is cached until git's index changes, because a corpus may have hundreds of cases.
     """
-    found = _run_git(top, "ls-files", "-z") or b""
+    found = query(top, "ls-files", "-z") or b""
     return frozenset(map(os.fsdecode, filter(None, found.split(b"\0"))))
 
 
-def _run_git(folder: Path, *words: str) -> bytes | None:
-    # The configuration of a repository may name a program that watches its files: do not run it.
-    command = ["git", "--no-optional-locks", "-c", "core.fsmonitor=false", "-C", str(folder), *words]
+def git_directory(top: Path) -> Path | None:
+    """Return the folder of a work tree's repository, with symbolic links resolved; None if there is none."""
+    found = query(top, "rev-parse", "--absolute-git-dir")
+    return Path(os.path.realpath(os.fsdecode(found.rstrip(b"\n")))) if found else None
+
+
+def query(folder: Path, *words: str) -> bytes | None:
+    """Return the output of a git command that changes nothing; None if git or the repository is missing.
+
+    The configuration of a repository may name programs, such as one that watches its files. None of them runs, except
+    the filters of files that git compares.
+    """
+    safe = ("core.fsmonitor=false", f"core.hooksPath={os.devnull}")
+    options = [word for setting in safe for word in ("-c", setting)]
+    command = ["git", "--no-optional-locks", *options, "-C", str(folder), *words]
     try:
         done = subprocess.run(
             command, capture_output=True, stdin=subprocess.DEVNULL, check=False, timeout=_TIMEOUT_S,

@@ -29,12 +29,12 @@ def add_trust_command(commands: Commands) -> None:
         description="Trust the code of hunts, crashes and corpora that you did not make on this machine, such as "
         "folders from your other machine or hunts of an earlier version of crashhunt. Commands then run this code "
         "without asking. Prints what the trusted code would run: the agent, the version of crashhunt, and the "
-        "snapshot. If the code changes, it is no longer trusted. Runs no code. Without DIR, lists everything that you "
-        "trust.",
+        "snapshot. If the code changes, it is no longer trusted. If DIR is the root of a git work tree, trusts the "
+        "crashes that git tracks there, now and later. Runs no code. Without DIR, lists everything that you trust.",
     )
     trust.add_argument(
         "places", metavar="DIR", type=Path, nargs="*",
-        help="directory of a hunt, a suite, a crash or a corpus, or a file that crashhunt export wrote",
+        help="directory of a hunt, suite, crash, corpus or git work tree, or a file that crashhunt export wrote",
     )  # fmt: skip
     trust.add_argument(
         "--remove", metavar="ORIGIN", action="append", default=[],
@@ -78,8 +78,9 @@ def _trust_place(place: Path) -> list[TrustedOrigin]:
     Raises:
         BundleError: the place has no code to run, or is damaged.
     """
+    from crashhunt.base.git import work_tree
     from crashhunt.corpus import find_cases
-    from crashhunt.crashes import open_archive
+    from crashhunt.crashes import open_archive, trust_repository
     from crashhunt.hunts import find_hunts
     from crashhunt.suites import trust_hunt
 
@@ -88,6 +89,8 @@ def _trust_place(place: Path) -> list[TrustedOrigin]:
             return trust_hunt(archive.directory, place)
     if not place.is_dir():
         raise BundleError(f"{str(place)!r} does not exist", fix=f"{near_path(place, '.zip')}give a folder or a file")
+    if not any((place / name).exists() for name in (layout.CRASH, layout.HUNT)) and place.resolve() == work_tree(place):
+        return [trust_repository(place.resolve())]
     hunts: set[Path] = set()
     if (place / layout.CRASH).is_file():
         hunts = {place.absolute().parent.parent}

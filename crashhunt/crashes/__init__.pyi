@@ -84,6 +84,8 @@ from ._trust import (
     refuse_side_effects as refuse_side_effects,
     refuse_untrusted as refuse_untrusted,
     remove_trusted as remove_trusted,
+    trust_repositories as trust_repositories,
+    trust_repository as trust_repository,
     trust_snapshot as trust_snapshot,
 )
 from ._types import (

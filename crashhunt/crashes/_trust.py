@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 import json
 import os
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.files import whole_file
-from crashhunt.base.git import tracked_files, work_tree
+from crashhunt.base.git import git_directory, tracked_files, work_tree
 from crashhunt.base.integrity import parse_object, state_folders, user_key
 from crashhunt.base.plugins import registered
 from crashhunt.base.text import command_line
@@ -49,6 +50,8 @@ __all__ = [
     "refuse_untrusted",
     "remove_trusted",
     "signature",
+    "trust_repositories",
+    "trust_repository",
     "trust_snapshot",
 ]
 
@@ -194,8 +197,7 @@ def is_bundle_trusted(bundle: Bundle, *, faults: Sequence[str] | None = None) ->
                 return True
     except CrashhuntError:  # what cannot be read cannot be known
         return False
-    decisive = (bundle.path / layout.CRASH, bundle.hunt / layout.HUNT, snapshot.path / layout.MANIFEST)
-    return _is_of_this_repository(decisive)
+    return _is_of_this_repository(_decisive(bundle, snapshot))
 
 
 def is_snapshot_trusted(snapshot: Snapshot) -> bool:
@@ -278,6 +280,12 @@ def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> U
             proof = f"it says that {made_by} made it; {changed}"
     elif made_by:
         proof = f"it says that {made_by} made it"
+    elif (top := _repository_of(_decisive(bundle, snapshot))) is not None:
+        proof = f"it belongs to the repository {top}, of which you have run no code on this machine"
+        fix = (
+            f"if you trust all that git tracks there, run {command_line('crashhunt', 'trust', str(top))} once, or add "
+        )
+        fix += "--trust"
     elif bundle.authentication_code:
         proof = "you did not make it on this machine, or it has changed since"
     else:
@@ -342,21 +350,61 @@ def _texts(distributions: Iterable[Distribution | None]) -> set[str]:
     return {value for value in values if isinstance(value, str)}
 
 
+def _decisive(bundle: Bundle, snapshot: Snapshot) -> tuple[Path, ...]:
+    return bundle.path / layout.CRASH, bundle.hunt / layout.HUNT, snapshot.path / layout.MANIFEST
+
+
 def _is_of_this_repository(files: Iterable[Path]) -> bool:
     """Return whether files belong to the project in which the user works, whose tests could run the same code anyway.
 
-    Such files are tracked by git in the work tree of the current folder. Without a work tree, as in a container without
-    ``.git``, such files are below the current folder of a CI job.
+    Such files are tracked by git in the work tree of the current folder, which this user has trusted: anybody can put a
+    ``.git`` into a folder. A CI job trusts its work tree, or its current folder if there is none, as in a container
+    without ``.git``.
     """
+    here, is_ci = Path(os.path.realpath(os.curdir)), bool(os.environ.get("CI"))
+    if is_ci and work_tree(here) is None:
+        return all(Path(os.path.realpath(file)).is_relative_to(here) for file in files)
+    top = _repository_of(files)
+    return top is not None and (is_ci or is_fingerprint_trusted(_fingerprint_of_repository(top)))
+
+
+def _repository_of(files: Iterable[Path]) -> Path | None:
+    """Return the work tree of the current folder if git tracks all files in it; else None."""
+    top = work_tree(Path(os.path.realpath(os.curdir)))
     resolved = [Path(os.path.realpath(file)) for file in files]
-    here = Path(os.path.realpath(os.curdir))
-    top = work_tree(here)
-    if top is None:
-        return bool(os.environ.get("CI")) and all(file.is_relative_to(here) for file in resolved)
-    if not all(file.is_relative_to(top) for file in resolved):
-        return False
+    if top is None or not all(file.is_relative_to(top) for file in resolved):
+        return None
     tracked = tracked_files(top)
-    return all(file.relative_to(top).as_posix() in tracked for file in resolved)
+    return top if all(file.relative_to(top).as_posix() in tracked for file in resolved) else None
+
+
+def trust_repository(top: Path) -> TrustedOrigin:
+    """Trust the files that git tracks in a work tree, in their present and later states, and return the new entry.
+
+    Args:
+        top: root of the work tree, with symbolic links resolved.
+
+    Raises:
+        HuntDirectoryError: the entry cannot be stored in any folder.
+    """
+    return add_trusted(_fingerprint_of_repository(top), path=str(top), runs="all that git tracks there")
+
+
+def trust_repositories(tops: Iterable[str]) -> None:
+    """Trust the work trees whose code this user runs in a hunt."""
+    for top in map(Path, tops):
+        with suppress(HuntDirectoryError):  # a user without a state is asked in each command
+            if not is_fingerprint_trusted(_fingerprint_of_repository(top)):
+                trust_repository(top)
+
+
+def _fingerprint_of_repository(top: Path) -> str:
+    """Return the fingerprint of a work tree, which consists of paths, and not of anything that lies in the work tree.
+
+    A repository may claim the work tree of another one (``core.worktree``), and a work tree the repository of another
+    one (a file ``.git``).
+    """
+    return hashlib.sha256(f"repository\0{top}\0{git_directory(top)}".encode("utf-8", "surrogateescape")).hexdigest()
 
 
 # Whose a bundle is: an archive that this user made on this machine is signed, and every other one is a stranger's.

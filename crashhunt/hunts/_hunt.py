@@ -16,7 +16,7 @@ from crashhunt.base.exceptions import in_words
 from crashhunt.base.signals import stop_requests
 from crashhunt.base.temporary import release_shared_memory, remove_at_once, remove_scratch
 from crashhunt.base.text import encodable
-from crashhunt.crashes import list_bundles, write_bundle, write_trial
+from crashhunt.crashes import list_bundles, trust_repositories, write_bundle, write_trial
 from crashhunt.episode import internal_error, scratch_of
 from crashhunt.executors import HostConditions, SharedExecutors, make_executor, read_map
 from crashhunt.hunts._crashes import prune_bundles, tally_crashes
@@ -176,6 +176,8 @@ class Hunt:
         known = {path.name for path in snapshots.glob(layout.SHOWN)}
         snapshot = take_snapshot(snapshots, self.scenario, settings, self._snapshot_options, imported=self._imported)
         self._new_snapshot = snapshot.path if snapshot.path.name not in known else None
+        roots = self._snapshot_options.roots if self._snapshot_options is not None else ()
+        trust_repositories(snapshot.environment().get("git", {}).keys() - {str(root.resolve()) for root in roots})
         sampler = sampler_of(settings)
         self._disturber = disturber_apart(self.scenario, settings)
         progress = Progress()

@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import stat
-import subprocess
 import sysconfig
 from dataclasses import dataclass, field
 from functools import cache
@@ -18,7 +17,7 @@ from crashhunt.base import layout
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import BundleError, SnapshotError, UsageError, remedy
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree
-from crashhunt.base.git import environment_of_git
+from crashhunt.base.git import query
 from crashhunt.base.integrity import describe_files, digest_of_content, digest_of_data, digest_of_file
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, load_order_of, write_settings
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from crashhunt.snapshots._snapshot import Manifest
 
 
-__all__ = ["SnapshotOptions", "Sources", "find_sources", "git", "take_snapshot"]
+__all__ = ["SnapshotOptions", "Sources", "find_sources", "take_snapshot"]
 
 
 # The code that a hunt runs: the agents' own projects, found through the imported modules.
@@ -103,16 +102,6 @@ def find_sources(imported: ImportedModules, *, roots: Sequence[Path] = (), witho
     for odd in [name for name in found.files if "\\" in name]:
         found.excluded.append(f"{found.files.pop(odd)}: its name has a backslash, which elsewhere parts folders")
     return found
-
-
-def git(folder: Path, *arguments: str) -> bytes | None:
-    """Return the output of a git command that does not change the index; None if git or the repository is missing."""
-    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
-    try:
-        done = subprocess.run(command, capture_output=True, check=False, timeout=60, env=environment_of_git())
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout if done.returncode == 0 else None
 
 
 def _not_installed(places: Mapping[str, Path | None]) -> set[str]:
@@ -187,7 +176,7 @@ def _walk(folder: Path) -> Iterator[str]:
 
 def _work_tree_of(folder: Path) -> Path | None:
     """Return the git work tree that contains a folder, or None."""
-    top = git(folder, "rev-parse", "--show-toplevel")
+    top = query(folder, "rev-parse", "--show-toplevel")
     return None if top is None else Path(os.fsdecode(top.rstrip(b"\n"))).resolve()
 
 
@@ -204,7 +193,7 @@ def _listing_that_has(tree: Path, path: Path, found: Sources) -> tuple[Path, lis
 
 def _listed(tree: Path) -> Iterator[str]:
     """Yield tracked files and untracked, not ignored files, without generated files; also those of submodules."""
-    output = git(tree, "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--deduplicate") or b""
+    output = query(tree, "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--deduplicate") or b""
     for entry in filter(None, output.split(b"\0")):
         name = os.fsdecode(entry).rstrip("/")
         path = tree / name
@@ -511,9 +500,9 @@ def _describe_trees(trees: Sequence[Path], diff: Path) -> dict[str, str]:
     """Write the uncommitted changes of work trees to a file; return the revisions of the work trees."""
     revisions = {}
     for tree in trees:
-        revision = git(tree, "rev-parse", "HEAD")
+        revision = query(tree, "rev-parse", "HEAD")
         if revision is not None:
             revisions[str(tree)] = revision.decode().strip()
             with diff.open("ab") as file:
-                file.write(git(tree, "diff", "HEAD", "--no-ext-diff", "--no-textconv", "--binary") or b"")
+                file.write(query(tree, "diff", "HEAD", "--no-ext-diff", "--no-textconv", "--binary") or b"")
     return revisions

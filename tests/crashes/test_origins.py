@@ -23,8 +23,11 @@ from crashhunt.crashes import (
     is_hunt_trusted,
     list_trusted,
     open_archive,
+    refuse_untrusted,
     remove_trusted,
     snapshot_of,
+    trust_repositories,
+    trust_repository,
     trust_snapshot,
 )
 from crashhunt.errors import UntrustedError, UsageError
@@ -350,6 +353,12 @@ def test_what_the_repository_of_the_current_folder_tracks_is_trusted(place, monk
     monkeypatch.chdir(repository)
     assert not is_bundle_trusted(bundle)  # unpacked there, and not committed
     git(repository, "-c", "core.fsmonitor=false", "add", "--all")
+    assert not is_bundle_trusted(bundle)  # the .git may have come with the folder
+    assert f"run crashhunt trust {repository} once" in refuse_untrusted(bundle).fix
+    monkeypatch.setenv("CI", "true")
+    assert is_bundle_trusted(bundle)
+    monkeypatch.delenv("CI")
+    assert trust_repository(repository).path == str(repository)
     assert is_bundle_trusted(bundle)
     assert is_hunt_trusted(repository / "kept", snapshot_of(bundle))
     (repository / "below").mkdir()
@@ -364,6 +373,31 @@ def test_what_the_repository_of_the_current_folder_tracks_is_trusted(place, monk
     git(repository, "-c", "core.fsmonitor=false", "rm", "-r", "--cached", "--quiet", "kept/crashes")
     assert not is_bundle_trusted(bundle)
     assert not (place / "ran").exists()
+
+
+def test_repository_is_known_by_its_place_and_not_by_what_it_contains(place, monkeypatch):
+    mine, other = place / "repository", place / "repository" / "unpacked"
+    mine.mkdir()
+    git(mine, "init", "--quiet")
+    trust_repositories([str(mine)])
+    shutil.copytree(place / "theirs", other / "kept")
+    bundle = crash_of(other / "kept")
+    git(other, "init", "--quiet")
+    git(other, "add", "--all")
+    monkeypatch.chdir(other)
+    assert not is_bundle_trusted(bundle)
+    (other / ".git").rename(other / "its-git")
+    git(other, "--git-dir", "its-git", "config", "core.worktree", str(mine))  # claims the work tree of this user
+    git(mine, "--git-dir", str(other / "its-git"), "--work-tree", ".", "add", "--all")
+    (other / "its-git").rename(other / ".git")
+    assert not is_bundle_trusted(bundle)
+    (other / ".git").rename(other / "its-git")
+    (other / ".git").write_text(f"gitdir: {mine}/.git\n")  # uses the repository of this user
+    git(mine, "--work-tree", "unpacked", "add", "--all")
+    assert not is_bundle_trusted(bundle)
+    (other / ".git").unlink()
+    git(mine, "add", "--all", "--force")
+    assert is_bundle_trusted(bundle)
 
 
 def test_job_of_a_ci_trusts_its_folder_where_there_is_no_repository(place, monkeypatch):

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from crashhunt.base.git import query
 from crashhunt.base.plugins import ImportedModules
-from crashhunt.snapshots._take import _cannot_make, find_sources, git
+from crashhunt.snapshots._take import _cannot_make, find_sources
 
 
 def test_crashhunt_comes_along_without_the_pages_of_its_guide():
@@ -23,7 +24,7 @@ def test_in_a_hook_of_another_repository_a_folder_is_still_of_its_own(tmp_path, 
     for name in ("here", "elsewhere"):
         subprocess.run(["git", "init", "-q", str(tmp_path / name)], check=True)
     monkeypatch.setenv("GIT_DIR", str(tmp_path / "elsewhere" / ".git"))
-    assert git(tmp_path / "here", "rev-parse", "--absolute-git-dir") == f"{tmp_path}/here/.git\n".encode()
+    assert query(tmp_path / "here", "rev-parse", "--absolute-git-dir") == f"{tmp_path}/here/.git\n".encode()
 
 
 def test_git_is_asked_once_for_each_folder_of_a_project(tmp_path, monkeypatch):
@@ -36,9 +37,9 @@ def test_git_is_asked_once_for_each_folder_of_a_project(tmp_path, monkeypatch):
     def counting(folder, *arguments):
         if folder == tmp_path:  # other tests have imported modules from their own folders
             asked.append(arguments[0])
-        return git(folder, *arguments)
+        return query(folder, *arguments)
 
-    monkeypatch.setattr("crashhunt.snapshots._take.git", counting)
+    monkeypatch.setattr("crashhunt.snapshots._take.query", counting)
     kept = find_sources(ImportedModules.here([], ["driver_one", "driver_two"])).files
     base = f"code/@{tmp_path.name}"
     assert {f"{base}/driver_one.py", f"{base}/driver_two.py"} <= set(kept)
