@@ -17,7 +17,7 @@ from contextlib import suppress
 from errno import ELOOP, ENXIO
 from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, TypeVar, cast, get_args, get_origin
 
 from crashhunt.base import layout
 
@@ -39,8 +39,10 @@ __all__ = [
     "digest_of_row",
     "is_authentic",
     "parse_object",
+    "read_bounded",
     "read_object",
     "state_folders",
+    "too_large",
     "typed",
     "user_key",
 ]
@@ -56,10 +58,13 @@ class FileEntry(TypedDict):
     Args:
         size: size in bytes.
         blake2b: the digest of its content, in hexadecimal.
+        executable: 1 if the owner may execute the file, such as a planner that an agent starts; else missing. No other
+            permission is recorded.
     """
 
     size: int
     blake2b: str
+    executable: NotRequired[int]
 
 
 def digest_of_row(values: tuple[object, ...]) -> int:
@@ -128,7 +133,48 @@ def changed_file(path: str | Path, entry: FileEntry) -> str:
     except OSError as error:
         # A link and a socket cannot be opened like this.
         return "is missing" if error.errno in (ELOOP, ENXIO) else f"cannot be read ({error.strerror})"
+    if same and "executable" in entry and not status.st_mode & stat.S_IXUSR:
+        return "is no longer executable"
     return "" if same else "has changed"
+
+
+# The largest sizes of files of a hunt that are read as a whole: usual ones have some KB, and 1 MB of JSON takes 20 ms
+# and 3 MB of memory. A hunt may be a stranger's, so archives, folders and the dashboard have the same limits.
+_MAX_BYTES = {
+    layout.HUNT: 4 << 20,
+    layout.SCENARIO: 4 << 20,
+    layout.CRASH: 16 << 20,
+    layout.PARAMS: 16 << 20,
+    layout.MANIFEST: 32 << 20,  # of 100,000 files
+    layout.ARCHIVE_INDEX: 32 << 20,
+}
+_MAX_BYTES_OF_OTHERS = 64 << 20
+
+
+def too_large(name: str, size: int) -> str:
+    """Return how the size of a file exceeds the limit of files of its name; empty if it does not, or has no limit.
+
+    Args:
+        name: name of the file, without its folder.
+        size: size of the file in bytes.
+    """
+    most = _MAX_BYTES.get(name)
+    return f"{name} has {size:,} bytes (allowed: {most:,})" if most is not None and size > most else ""
+
+
+def read_bounded(path: Path) -> bytes:
+    """Read a file of a hunt as a whole.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: the file is larger than files of its name may be.
+    """
+    most = _MAX_BYTES.get(path.name, _MAX_BYTES_OF_OTHERS)
+    with path.open("rb") as file:
+        content = file.read(most + 1) if (size := os.fstat(file.fileno()).st_size) <= most else b""
+    if size > most or len(content) > most:
+        raise ValueError(f"the file has {max(size, len(content)):,} bytes (allowed: {most:,})")
+    return content
 
 
 def read_object(path: Path, shape: type[T]) -> T:
@@ -140,9 +186,9 @@ def read_object(path: Path, shape: type[T]) -> T:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file contains no JSON object; the message is one line.
+        ValueError: the file contains no JSON object, or is too large; the message is one line.
     """
-    return parse_object(path.read_bytes(), shape)
+    return parse_object(read_bounded(path), shape)
 
 
 def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the type checker

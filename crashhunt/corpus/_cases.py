@@ -18,6 +18,7 @@ from crashhunt.base import layout
 from crashhunt.base.codec import known_part
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.files import cannot_write, sync_folder, sync_tree, whole_file
+from crashhunt.base.integrity import read_bounded
 from crashhunt.base.temporary import remove_ended, temporary_beside
 from crashhunt.base.text import near_path
 from crashhunt.base.validation import validate
@@ -165,7 +166,7 @@ def read_case(path: Path) -> Case:
     """
     file = path / layout.CASE
     try:
-        data = tomllib.loads(file.read_text(encoding="utf-8"))
+        data = tomllib.loads(read_bounded(file).decode())
     except (ValueError, RecursionError) as error:
         raise BundleError(f"not valid TOML: {error}", fix="correct the file", where=str(file)) from None
     except OSError as error:

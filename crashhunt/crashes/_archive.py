@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
-from crashhunt.base.integrity import FILES, parse_object, typed
+from crashhunt.base.integrity import FILES, parse_object, too_large, typed
 from crashhunt.base.progress import watched
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes._bundle import ArchiveIndex, is_bundle_made_here
@@ -37,6 +37,7 @@ __all__ = ["Archive", "export_crash", "open_archive"]
 SCHEMA = 1
 _MAX_BYTES = 4 * 10**9  # unpacked size, because a small zip file can contain terabytes
 _MAX_FILES = 100_000  # so many make a file system slow
+_PARTS_OF_A_DESCRIPTION = 3  # snapshots/DIGEST/manifest.json; below are files of any name
 _CHUNK_BYTES = 1 << 20  # bytes at a time, so that a large file needs little memory
 
 
@@ -87,7 +88,11 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
                 name = path.relative_to(hunt).as_posix()
                 data = path.read_bytes()
                 entries[name] = {"size": len(data), "blake2b": _hash(data)}
-                archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
+                info = zipfile.ZipInfo(name)
+                if path.stat().st_mode & stat.S_IXUSR:
+                    entries[name]["executable"] = 1
+                    info.external_attr = (stat.S_IFREG | 0o755) << 16  # for users who unpack it themselves
+                archive.writestr(info, data, zipfile.ZIP_DEFLATED)
         index: ArchiveIndex = {
             "schema": SCHEMA,
             "crash": bundle.id,
@@ -134,8 +139,8 @@ def open_archive(path: Path) -> Iterator[Archive]:
 def _read_index(archive: zipfile.ZipFile, path: Path) -> ArchiveIndex:
     try:
         info = archive.getinfo(layout.ARCHIVE_INDEX)
-        if info.file_size > 50 * 10**6:
-            raise _refusal(path, f"its {layout.ARCHIVE_INDEX} is too large")
+        if why := too_large(layout.ARCHIVE_INDEX, info.file_size):
+            raise _refusal(path, why)
         index = parse_object(archive.read(info), ArchiveIndex)
         typed(index, {"schema": int})
         if index["schema"] != SCHEMA:
@@ -170,6 +175,9 @@ def _checked(archive: zipfile.ZipFile, index: ArchiveIndex, path: Path) -> list[
         kind = stat.S_IFMT(entry.external_attr >> 16)
         if kind not in (0, stat.S_IFREG) or name.endswith("/"):
             raise _refusal(path, f"{name!r} is not a file")
+        is_of_the_agent = parts[0] == layout.SNAPSHOTS and len(parts) > _PARTS_OF_A_DESCRIPTION
+        if not is_of_the_agent and (why := too_large(parts[-1], entry.file_size)):
+            raise _refusal(path, why)
         if name not in index["files"]:
             raise _refusal(path, f"{name!r} is not listed in its {layout.ARCHIVE_INDEX}")
     for name in index["files"]:
@@ -191,6 +199,9 @@ def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, directory: Path, 
             copy.write(chunk)
     if size != listed["size"] or digest.hexdigest() != listed["blake2b"]:
         raise _refusal(path, f"{entry.filename!r} has changed since it was exported")
+    if "executable" in listed:
+        mode = target.stat().st_mode
+        target.chmod(mode | (mode & 0o444) >> 2)  # by all who may read it
 
 
 def _user() -> str:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.integrity import too_large
 from crashhunt.hunts import is_case, is_hunt
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ _OWN_FILES = (
     layout.HUNT, layout.LEDGER, f"{layout.LEDGER}-wal", f"{layout.LEDGER}-shm", layout.REQUEST, layout.CRASHES,
     *layout.BESIDE, layout.SNAPSHOTS, layout.RUN_LOG, layout.ERROR_LOG,
 )  # fmt: skip
-_MAX_BYTES = {layout.HUNT: 4 << 20, layout.CRASH: 16 << 20}
-"""The largest size of files that are read as a whole. Usual ones have some KB, and 1 MB takes 20 ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,8 +163,8 @@ def unreadable(folder: Path, root: Path, names: Iterable[str] = _OWN_FILES) -> s
             continue
         if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
             return f"{name} is neither a file nor a folder"
-        if (most := _MAX_BYTES.get(name)) is not None and found.st_size > most:
-            return f"{name} has {found.st_size:,} bytes (allowed: {most:,})"
+        if why := too_large(name, found.st_size):
+            return why
     return ""
 
 

@@ -59,6 +59,7 @@ __all__ = [
 
 VERSION = 5  # of the tables, as PRAGMA user_version
 _MIN_READER_VERSION = 3  # the least version of a crashhunt that reads what this one writes
+_MAX_CELL_BYTES = 64 << 20  # of a ledger that may be a stranger's; the state of a sampler has some MB
 _FILES_OF_LEDGER = 3  # that SQLite opens: the ledger, its write-ahead log and its shared memory
 _FIRST_VERSION_WITH_DIGESTS = 2  # the first version in which every row has a digest of its content
 _FIRST_VERSION_WITH_PROPOSALS = 3  # the first version that has proposals
@@ -434,7 +435,9 @@ def opened(path: Path, *, read_only: bool = False) -> PatientConnection:
     # Without a write-ahead log, nothing writes to the file. With one, readers need the shared memory next to it.
     mode = "mode=ro" if has_content(log) else "mode=ro&immutable=1"
     uri = f"{path.absolute().as_uri()}?{mode}"
-    return _connect(uri, uri=True)
+    database = _connect(uri, uri=True)
+    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_CELL_BYTES)
+    return database
 
 
 def _connect(database: Path | str, *, uri: bool = False) -> PatientConnection:

@@ -14,6 +14,7 @@ from crashhunt.base.calls import clear_constructor
 from crashhunt.base.codec import known_part, merged, slip
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.files import whole_file
+from crashhunt.base.integrity import read_bounded
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.text import command_line, near_path
 from crashhunt.oracles import DEFAULT_ORACLES
@@ -239,7 +240,7 @@ def read_settings(path: Path) -> HuntSettings:
     from crashhunt.base.validation import validate
 
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(read_bounded(path).decode())
     except FileNotFoundError:
         place = str(path.parent)
         what = "is not the directory of a hunt: it has no hunt.toml" if path.parent.is_dir() else "does not exist"
@@ -263,7 +264,7 @@ def read_settings(path: Path) -> HuntSettings:
 def _changed_settings(path: Path) -> Plain:
     """Return the keys that a later version has added to an existing file."""
     try:
-        later: Plain = known_part(HuntSettings, tomllib.loads(path.read_text(encoding="utf-8")))[1]
+        later: Plain = known_part(HuntSettings, tomllib.loads(read_bounded(path).decode()))[1]
     except (OSError, ValueError, RecursionError):
         return {}
     return later

@@ -8,6 +8,7 @@ from operator import attrgetter
 from typing import IO, TYPE_CHECKING
 
 import numpy as np
+import zstandard
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
@@ -56,6 +57,7 @@ __all__ = [
     "write_views",
 ]
 
+_MAX_CHUNK_BYTES = 256 << 20  # unpacked; crashhunt begins a new chunk after 1 MB, and the log may be a stranger's
 _MAP_REACH_M = 300.0  # around where anybody drove; a town's whole map is too much for a viewer
 _HEIGHT_M = 1.5  # of a car of unknown height
 _PERSON_HEIGHT_M = 1.7  # likewise
@@ -380,7 +382,10 @@ def messages_of(
         if index.message_index_offsets and wanted.isdisjoint(index.message_index_offsets):
             continue
         file.seek(index.chunk_start_offset + _RECORD_HEAD.size)
-        stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(file)), validate_crc=validate_crcs)
+        packed = Chunk.read(ReadDataStream(file))
+        if (unpacked := _unpacked_size(packed)) > _MAX_CHUNK_BYTES:
+            raise McapError(f"a chunk has {unpacked:,} bytes when it is unpacked (allowed: {_MAX_CHUNK_BYTES:,})")
+        stream, size = get_chunk_data_stream(packed, validate_crc=validate_crcs)
         chunk, at = stream.read(size), 0
         while at < size:
             kind, length = _RECORD_HEAD.unpack_from(chunk, at)
@@ -393,6 +398,15 @@ def messages_of(
                 if number in wanted:
                     schema = summary.schemas[channel.schema_id] if channel.schema_id else None
                     yield schema, channel, sequence, chunk[start + _MESSAGE_HEAD.size : at]
+
+
+def _unpacked_size(chunk: Chunk) -> int:
+    """Return the number of bytes to which a chunk would be unpacked, as its header or its frame states it."""
+    if chunk.compression == "zstd":
+        stated: int = zstandard.get_frame_parameters(chunk.data).content_size
+        if stated != zstandard.CONTENTSIZE_UNKNOWN:  # then the header is the limit of what is unpacked
+            return max(stated, chunk.uncompressed_size)
+    return chunk.uncompressed_size if chunk.compression != "lz4" else _MAX_CHUNK_BYTES + 1  # which has no limit
 
 
 class LogWriter:

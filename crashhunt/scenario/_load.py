@@ -14,6 +14,7 @@ from crashhunt.base import layout
 from crashhunt.base.codec import known_part
 from crashhunt.base.errors import ArgumentError, HuntDirectoryError, ScenarioError
 from crashhunt.base.files import cannot_write
+from crashhunt.base.integrity import read_bounded
 from crashhunt.base.layout import PACKAGE, SCENARIO
 from crashhunt.base.plugins import registered
 from crashhunt.base.text import any_of, did_you_mean, listed, near_path, one_of
@@ -354,7 +355,7 @@ def _configuration(path: Path) -> Configuration:
 
 def _load_toml(path: Path, *, kept: bool) -> Scenario:
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(read_bounded(path).decode())
     except (ValueError, RecursionError) as error:
         raise ScenarioError(f"not valid TOML: {error}", fix="correct the file", where=str(path)) from None
     except OSError as error:

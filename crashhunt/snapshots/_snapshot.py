@@ -23,6 +23,7 @@ from crashhunt.base.integrity import (
     digest_of_data,
     is_authentic,
     parse_object,
+    read_bounded,
     read_object,
     typed,
 )
@@ -93,7 +94,7 @@ class Snapshot:
         """
         file = self.path / layout.MANIFEST
         try:
-            return _parse_manifest(file.read_bytes())
+            return _parse_manifest(read_bounded(file))
         except _UnsupportedError as error:
             raise BundleError(
                 str(error), fix="use the version of crashhunt that wrote the trial", where=str(file)
@@ -176,8 +177,8 @@ class Snapshot:
         found = hashlib.sha256(json.dumps(_authenticated(self.manifest), sort_keys=True).encode())
         for name in (layout.HUNT, layout.ENVIRONMENT):  # the manifests of the earliest versions do not list these files
             content = b""
-            with suppress(OSError):
-                content = (self.path / name).read_bytes()
+            with suppress(OSError, ValueError):
+                content = read_bounded(self.path / name)
             found.update(len(content).to_bytes(8, "little") + content)
         return found.hexdigest()
 
@@ -333,7 +334,7 @@ def without_code(snapshot: Snapshot, snapshots: Path) -> Snapshot:
             fix = "get an undamaged copy of the hunt's directory"
             raise BundleError(f"the snapshot is damaged: {name} {wrong}", fix=fix, where=str(snapshot.path))
         (final / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(snapshot.path / name, final / name)
+        shutil.copy(snapshot.path / name, final / name)
     shutil.copyfile(snapshot.path / layout.HUNT, final / layout.HUNT)
     environment = json.dumps(environment_of_simulation(snapshot.environment()), indent=1)
     (final / layout.ENVIRONMENT).write_text(environment, encoding="utf-8")

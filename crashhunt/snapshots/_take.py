@@ -267,6 +267,7 @@ def _take_root(root: Path, imported: ImportedModules, found: Sources, without: P
 
 _MEGABYTE = 10**6
 _SMALL_FILE_BYTES = 1 << 20  # bytes
+_COPIED_PERMISSIONS = 0o755
 
 
 @clear_constructor
@@ -380,7 +381,12 @@ def _build(
     digest = digest_of_described(stored, plain_data=[found.paths, argument_files])
     final = building.with_name(digest)
     # The digest is too short to prove that two snapshots are the same, so use only a snapshot of this user.
-    if final.exists() and not _is_damaged(Snapshot(final)) and Snapshot(final).is_made_here:
+    if (
+        final.exists()
+        and not _is_damaged(same := Snapshot(final))
+        and same.manifest["files"] == stored
+        and same.is_made_here
+    ):
         return Snapshot(final)
     write_settings(building / layout.HUNT, settings, ["crashhunt", "run", "as resolved"])
     facts: Environment = {**around, "git": _describe_trees(found.trees, building / layout.GIT_DIFF)}
@@ -454,21 +460,27 @@ def _size(path: str) -> int:
 
 
 def _store(path: str, copy: str) -> FileEntry | None:
-    """Copy a file with its permissions; return None if the file has been deleted in the meantime."""
+    """Copy a file, executable if it is; return None if the file has been deleted in the meantime.
+
+    A copy is never a program with the rights of its owner (set-user-ID), and only its owner can write to it.
+    """
     try:
         with open(path, "rb", buffering=0) as file:
             status = os.fstat(file.fileno())
             content = file.readall() if status.st_size < _SMALL_FILE_BYTES else None
         if content is None:
-            shutil.copy(path, copy)
-            return {"size": _size(copy), "blake2b": digest_of_file(Path(copy))}
+            shutil.copyfile(path, copy)
     except FileNotFoundError:
         return None
     # A hunt copies hundreds of modules, so write the content that was read, without shutil and Path.
-    with open(copy, "wb") as file:
-        file.write(content)
-        os.fchmod(file.fileno(), stat.S_IMODE(status.st_mode))
-    return {"size": len(content), "blake2b": digest_of_content(content)}
+    with open(copy, "r+b" if content is None else "wb") as file:
+        if content is not None:
+            file.write(content)
+        os.fchmod(file.fileno(), status.st_mode & _COPIED_PERMISSIONS | stat.S_IRUSR | stat.S_IWUSR)
+    entry: FileEntry = {"size": _size(copy), "blake2b": digest_of_file(Path(copy))} if content is None else {
+        "size": len(content), "blake2b": digest_of_content(content)
+    }  # fmt: skip
+    return {**entry, "executable": 1} if status.st_mode & stat.S_IXUSR else entry
 
 
 def _store_scenario(scenario: Scenario, building: Path) -> dict[str, FileEntry | None]:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.files import exchange, put_in_place, whole_file
-from crashhunt.base.integrity import authentication_code, is_authentic
+from crashhunt.base.integrity import authentication_code, is_authentic, read_bounded
 from crashhunt.base.signals import stop_requests
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.text import command_line
@@ -100,7 +100,7 @@ class RunRequest:
             HuntDirectoryError: the file is missing or damaged.
         """
         try:
-            data = json.loads(file.read_text(encoding="utf-8"))
+            data = json.loads(read_bounded(file))
             given = data["request"]
             run = RunSettings(**given.pop("run"))
             snapshot = {name: data[name] for name in fields_of(SnapshotChoices) if name in data}

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.files import whole_file
-from crashhunt.base.integrity import parse_object, typed
+from crashhunt.base.integrity import parse_object, read_bounded, typed
 from crashhunt.snapshots import Snapshot
 from crashhunt.training._split import is_test_traffic
 
@@ -100,7 +100,7 @@ def read_trained_on(path: Path) -> TrainedOn:
         HuntDirectoryError: the file is missing or damaged.
     """
     try:
-        data: dict[str, Any] = parse_object(path.read_bytes(), dict)
+        data: dict[str, Any] = parse_object(read_bounded(path), dict)
         typed(data, {"schema": int, "seeds": list[int], "hunt_seeds": list[int]})
         test = float(data["test"])
         if data["schema"] != _SCHEMA or not 0 <= test < 1:
@@ -168,7 +168,7 @@ def _records_of(snapshot: Snapshot) -> list[TrainedOn]:
     a record.
     """
     with suppress(OSError, ValueError):
-        text = (snapshot.path / layout.MANIFEST).read_bytes()
+        text = read_bounded(snapshot.path / layout.MANIFEST)
         if layout.TRAINED_ON.encode() not in text and parse_object(text, dict):
             return []
     names = snapshot.manifest["argument_files"].values()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import socket
 
 import pytest
@@ -13,6 +14,9 @@ from crashhunt.base.integrity import (
     digest_of_content,
     digest_of_data,
     digest_of_file,
+    read_bounded,
+    read_object,
+    too_large,
     typed,
 )
 
@@ -82,3 +86,30 @@ def test_only_a_regular_file_is_the_recorded_one(tmp_path, monkeypatch):
 def test_the_digest_of_data_does_not_depend_on_the_order_of_keys():
     assert digest_of_data({"a": 1, "b": [1, 2]}) == digest_of_data({"b": [1, 2], "a": 1})
     assert digest_of_data({"a": 1, "b": [1, 2]}) != digest_of_data({"a": 1, "b": [2, 1]})
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"), [("hunt.toml", 4 << 20), ("crash.json", 16 << 20), ("params.json", 16 << 20),
+                        ("manifest.json", 32 << 20), ("environment.json", 64 << 20)],
+)  # fmt: skip
+def test_file_of_a_hunt_that_is_too_large_is_not_read(tmp_path, name, limit):
+    file = tmp_path / name
+    file.write_bytes(b"{}")
+    assert read_bounded(file) == b"{}"
+    os.truncate(file, limit + 1)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match=rf"the file has {limit + 1:,} bytes \(allowed: {limit:,}\)"):
+        read_object(file, dict)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 4096  # KB
+    assert bool(too_large(name, limit + 1)) == (name != "environment.json")
+    assert not too_large(name, limit)
+
+
+def test_program_that_can_no_longer_run_has_changed(tmp_path):
+    file = tmp_path / "planner"
+    file.write_bytes(b"x")
+    file.chmod(0o700)
+    entry = {**describe_files(tmp_path)["planner"], "executable": 1}
+    assert changed_file(file, entry) == ""
+    file.chmod(0o644)
+    assert changed_file(file, entry) == "is no longer executable"

@@ -12,7 +12,7 @@ import zipfile
 import pytest
 from episodes import Episode, write
 
-from crashhunt.base import layout
+from crashhunt.base import integrity, layout
 from crashhunt.base.errors import BundleError, HuntDirectoryError
 from crashhunt.crashes import (
     _archive as archives,
@@ -303,3 +303,22 @@ def test_an_index_is_asked_for(tmp_path):
     assert "damaged, or not a zip file" in says()
     path.unlink()
     assert "cannot be unpacked: No such file" in says()
+
+
+def test_only_the_permission_to_execute_travels(tmp_path):
+    listed = {"hunt.toml": described(b"1"), "snapshots/x/code/planner": {**described(b"2"), "executable": 1}}
+    path = written(tmp_path / "good.zip", {"hunt.toml": b"1", "snapshots/x/code/planner": b"2"}, listed=listed)
+    with open_archive(path) as archive:
+        modes = [(archive.directory / name).stat().st_mode for name in listed]
+    assert [mode & 0o7133 for mode in modes] == [0, 0o111]
+
+
+@pytest.mark.parametrize("name", ["crashes/x/crash.json", "hunt.toml", "snapshots/x/manifest.json"])
+def test_archive_has_the_limits_of_a_folder(tmp_path, monkeypatch, name):
+    path = written(tmp_path / "big.zip", {"hunt.toml": b"1", name: b"12345"})
+    monkeypatch.setitem(integrity._MAX_BYTES, name.rpartition("/")[2], 4)
+    with pytest.raises(BundleError, match=r"has 5 bytes \(allowed: 4\)"), open_archive(path):
+        pass
+    path = written(tmp_path / "good.zip", {"hunt.toml": b"1", f"snapshots/x/code/{name}": b"12345"})
+    with open_archive(path) as archive:  # an agent names its files as it likes
+        assert (archive.directory / "snapshots" / "x" / "code" / name).exists()

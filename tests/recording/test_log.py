@@ -18,7 +18,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import HealthCheck, given, settings, strategies as st
 from mcap.reader import SeekingReader, make_reader
 from mcap.stream_reader import get_chunk_data_stream
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from crashhunt.errors import BundleError
 from crashhunt.recording import _foxglove, _log, foxglove_layout, read_log, write_log
@@ -250,3 +250,13 @@ def test_an_independent_reader_agrees(tmp_path):
     assert theirs == ours
     assert theirs["/scene"]["count"] == 26
     assert theirs["/agents/ego/action"]["count"] == 25
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_chunk_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch, compression):
+    kind = getattr(CompressionType, compression.upper())
+    monkeypatch.setattr(_log, "Writer", functools.partial(Writer, compression=kind))
+    monkeypatch.setattr(_foxglove, "_MAX_CHUNK_BYTES", 1000)
+    write_log(tmp_path / "log.mcap", record(Episode(["ego"], 40, 3), tmp_path / "box"))
+    with pytest.raises(BundleError, match=r"a chunk has [\d,]+ bytes when it is unpacked \(allowed: 1,000\)"):
+        read_log(tmp_path / "log.mcap")

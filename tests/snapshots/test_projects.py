@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 
 import pytest
 from repositories import git, make_repository
@@ -13,7 +14,7 @@ from crashhunt.base.errors import BundleError, SnapshotError
 from crashhunt.base.plugins import ImportedModules
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.snapshots import SnapshotOptions, take_snapshot
+from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 
 BASE = "code/@my project"
 
@@ -170,3 +171,17 @@ def test_what_is_missing_new_or_changed_is_named(take, tmp_path):
         change()
         with pytest.raises(BundleError, match="manifest"):
             type(snapshot)(snapshot.path).verify()
+
+
+def test_program_stays_executable_and_nothing_more(project, take):
+    for name, mode in (("program", 0o6775), ("large", 0o6775), ("private", 0o600), ("read_only", 0o444)):
+        (project / name).write_bytes(bytes(2 << 20 if name == "large" else 2))
+        (project / name).chmod(mode)
+    snapshot = take()
+    for name, mode in (("program", 0o755), ("large", 0o755), ("private", 0o600), ("read_only", 0o644)):
+        assert stat.S_IMODE((snapshot.path / BASE / name).stat().st_mode) == mode
+        assert ("executable" in snapshot.manifest["files"][f"{BASE}/{name}"]) == (mode == 0o755)
+    (project / "private").chmod(0o700)
+    assert os.access(take().path / BASE / "private", os.X_OK)  # although no content has changed
+    (snapshot.path / BASE / "program").chmod(0o644)
+    assert Snapshot(snapshot.path).changes() == [f"{BASE}/program is no longer executable"]
