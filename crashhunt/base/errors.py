@@ -33,6 +33,8 @@ from typing import TYPE_CHECKING
 from crashhunt.base.text import command_line, one_line
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from crashhunt.base.json_types import ErrorData
 
 __all__ = [
@@ -95,6 +97,11 @@ class CrashhuntError(Exception):
         where = self.where if one_line(self.where) == self.where else command_line(self.where)
         text = f"{where}: {self.message}" if where else self.message
         return f"{text}; {self.fix}" if self.fix else text
+
+    def explain(self, fix: str, shown: Callable[[str], str]) -> None:
+        """Replace the fix, unless the new one is empty, and convert message and place for the user."""
+        self.message, self.fix, self.where = shown(self.message), fix or self.fix, shown(self.where)
+        self.args = (self.message, self.fix, self.where)
 
     def __reduce__(self) -> tuple[object, ...]:
         """Keep the three parts when the error crosses a process boundary."""

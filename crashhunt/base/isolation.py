@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from crashhunt.base import errors
 from crashhunt.base.errors import CrashhuntError, PluginError
 from crashhunt.base.forks import CannotForkError, Copy, ends, held, threads
+from crashhunt.base.opened_files import OpenedFiles
 from crashhunt.base.processes import die_with, end_descendants
 
 if TYPE_CHECKING:
@@ -36,13 +37,14 @@ if TYPE_CHECKING:
 
     Report: TypeAlias = Callable[[str], None]
 
-__all__ = ["OWN_THREAD", "ServerApart", "work_apart"]
+__all__ = ["OWN_THREAD", "ServerApart", "files_read_apart", "work_apart"]
 
 C = TypeVar("C", bound=Copy)
 
 OWN_THREAD = "crashhunt"
 """Prefix of the names of threads of crashhunt, which work that imports something does not need."""
 
+_opened: OpenedFiles | None = None
 _KEEPER_S = 3.0  # for the keeper to end the programs that the work has started
 _LOOK_EVERY_S = 0.002  # between two checks of whether the keeper has ended
 _TASK = 1 << 10  # bytes of the words for what the work does
@@ -71,6 +73,8 @@ def work_apart(work: Callable[[Report], Plain], *, task: str, timeout_s: float) 
     begun = _Task(task)
 
     def answer() -> Plain:
+        global _opened
+        _opened = OpenedFiles()
         try:
             return {"result": work(begun.write)}
         except CrashhuntError as error:
@@ -81,6 +85,11 @@ def work_apart(work: Callable[[Report], Plain], *, task: str, timeout_s: float) 
     except CannotForkError:
         return work(lambda _: None)
     return _result(keeper.answer(timeout_s + _KEEPER_S), keeper, begun.read(), _MODULE)
+
+
+def files_read_apart() -> list[str]:
+    """Return the files that the work of `work_apart` has read in its fork; nothing in another process."""
+    return [] if _opened is None else _opened.inputs()
 
 
 class ServerApart:

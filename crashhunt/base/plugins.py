@@ -124,6 +124,7 @@ class ImportedModules:
         named: the top-level modules that were imported explicitly by name.
         agents: the files of the modules that contain agents.
         variables: the environment variables, which modules may have changed.
+        read: the files that the modules have read when they were imported, including their own.
     """
 
     places: Mapping[str, tuple[str | None, tuple[str, ...]]]
@@ -131,6 +132,7 @@ class ImportedModules:
     named: frozenset[str] = frozenset()
     agents: tuple[str, ...] = ()
     variables: Mapping[str, str] = field(default_factory=dict)
+    read: tuple[str, ...] = ()
 
     @classmethod
     def here(cls, locators: Iterable[str] = (), modules: Iterable[str] = ()) -> ImportedModules:
@@ -163,13 +165,16 @@ class ImportedModules:
     def from_json(cls, data: Mapping[str, Any]) -> ImportedModules:
         """Return the modules that `to_json` has described."""
         places = {name: (file, tuple(folders)) for name, (file, folders) in data["places"].items()}
-        return cls(places, tuple(data["path"]), frozenset(data["named"]), tuple(data["agents"]), data["variables"])
+        return cls(
+            places, tuple(data["path"]), frozenset(data["named"]), tuple(data["agents"]), data["variables"],
+            tuple(data["read"]),
+        )  # fmt: skip
 
     def to_json(self) -> dict[str, object]:
         """Return a description of the modules as JSON-compatible data."""
         return {
             "places": dict(self.places), "path": self.path, "named": sorted(self.named), "agents": self.agents,
-            "variables": dict(self.variables),
+            "variables": dict(self.variables), "read": self.read,
         }  # fmt: skip
 
 

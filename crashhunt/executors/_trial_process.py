@@ -21,6 +21,7 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
 from crashhunt.base.exceptions import is_users
 from crashhunt.base.forks import copying, watchdog
+from crashhunt.base.opened_files import OpenedFiles
 from crashhunt.base.shared_state import SharedState
 from crashhunt.base.signals import block_signals
 from crashhunt.base.temporary import begin_records, end_records
@@ -53,6 +54,7 @@ from crashhunt.simulators import (
     SupportsExclusion,
     SupportsFullBraking,
 )
+from crashhunt.snapshots import Snapshot, describe_unsaved
 from crashhunt.trial import Outcome, TrialSpec
 
 if TYPE_CHECKING:
@@ -113,6 +115,8 @@ class TrialProcess:
         self._home = Path.cwd()
         self._notices: list[str] = []
         self._modules = frozenset(sys.modules)
+        self._made_at = time.time()
+        self._opened: OpenedFiles | None = None
         self._reference: ReferenceDriver | None = None
         self._fork_runners: tuple[ForkRunner, ...] = ()  # of copies of the trial
         # Line by line, so that what a dying process printed last is in the file.
@@ -188,6 +192,8 @@ class TrialProcess:
             self._shared.separate()
         self._redirect(folder)
         spec = TrialSpec.from_json(job["spec"])
+        if job["tries_copy"] and settings.code and settings.sealed is None:  # the first trial, which stands for all
+            self._opened = OpenedFiles()
         self._box = box = BlackBox(folder / layout.BLACK_BOX, begun=job["reserved"])
         self._enter_home()
         began = time.monotonic()
@@ -278,6 +284,10 @@ class TrialProcess:
         for agent in self._parts.reporting_agents if self._parts is not None else ():
             report["notices"] += agent.notices
         report["notices"] += notices_of_late_imports(self._modules, settings.code)
+        if self._opened is not None:
+            with suppress(Exception):  # the code of a trial may have replaced any function
+                snapshot = Snapshot(Path(settings.code[0]).parent)
+                report["notices"] += describe_unsaved(self._opened.paths(), snapshot, since=self._made_at)
         kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
         kept = kept or settings.is_audited(result)
         wants_map = (kept or job["wants_map"]) and result.outcome is not Outcome.INVALID

@@ -39,7 +39,14 @@ from crashhunt.hunts._verification import Audit, Confirmation, PendingAudits, Tr
 from crashhunt.ledger import Ledger
 from crashhunt.plans import core_of, disturber_apart, parallel_here, sampler_of
 from crashhunt.rates import make_rate
-from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
+from crashhunt.snapshots import (
+    Snapshot,
+    SnapshotOptions,
+    describe_missing,
+    describe_unsaved,
+    take_snapshot,
+    with_original_paths,
+)
 from crashhunt.training import held_out_traffics
 from crashhunt.trial import Outcome, TrialResult
 
@@ -251,6 +258,10 @@ class Hunt:
         progress.counted = progress.rate or rate_watch(settings, ledger, held_out)
         if progress.rare is not None:
             progress.rare.read(trials.upcoming)
+        if self._imported is not None and snapshot.has_code:
+            own = {file for file, _ in self._imported.places.values()}
+            read = [file for file in self._imported.read if file not in own]
+            progress.notes += describe_unsaved(read, snapshot, since=math.inf)
         self._progress = progress
         ledger.note(**progress.noted())  # so that a hunt that fails before the first heartbeat has the same facts
         ledger.wait_while_locked(partial(self._wait_for_ledger, progress, watch))
@@ -462,6 +473,7 @@ class Hunt:
             if progress.last_wanted is not None:
                 return progress.why_stopped(keep_going=run.keep_going)
         except CrashhuntError as error:  # name the file that the user can correct
+            error.explain(describe_missing(error.message, snapshot), partial(with_original_paths, snapshot=snapshot))
             mine, theirs = worker_settings.scenario.origin, self.scenario.origin
             if mine not in error.where:
                 raise

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, SimulatorError, UsageError
+from crashhunt.base.exceptions import is_users
 from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import is_sent_from_outside, stop_requests
 from crashhunt.base.temporary import temporary_folder
@@ -62,7 +63,8 @@ class Preflight:
         code: Sequence[str] = (), listen: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
         self._settings = settings
-        self._names = {there: here for here, there in files.items()} | {f"{folder}/": "" for folder in code}
+        self._files = {there: here for here, there in files.items()}
+        self._ours = tuple(f"{folder}/{layout.PACKAGE.name}/" for folder in code)
         self._enough = min(_ENOUGH_CANDIDATES, planned)
         self._held: list[TrialResult] = []
         self._passed = False
@@ -107,13 +109,15 @@ class Preflight:
     def _refusal(self, result: TrialResult) -> ArgumentError:
         failure = result.failure
         assert failure is not None
-        message, trace = self._refusal_as_requested(failure.message), self._refusal_as_requested(failure.traceback)
+        # The hunt replaces the other paths of the snapshot.
+        message, trace = _replaced(failure.message, self._files), _replaced(failure.traceback, self._files)
         kind = "" if failure.kind in ("ValueError", "invalid") else f"{failure.kind}: "
         given = result.spec.arguments.get(failure.agent, {})
         # The user may have given an argument or not, so name no option.
         names = ", ".join(f"{name}={value}" for name, value in given.items() if isinstance(value, str))
         frames = re.findall(r'^  File "([^"]+)", line (\d+)', trace, re.MULTILINE)
-        places = [frame for frame in frames if not frame[0].startswith(f"{layout.PACKAGE}/")]
+        places = [frame for frame in frames if not frame[0].startswith((f"{layout.PACKAGE}/", *self._ours))]
+        places = [frame for frame in places if is_users(frame[0])] or places
         message, _, fix = message.partition(" Fix: ")  # which crashhunt's own agents name
         usual = f"correct the agent or its arguments {names}" if names else "correct the agent"
         fix = fix.rstrip(".") or usual
@@ -125,11 +129,11 @@ class Preflight:
             where=":".join(places[-1]) if kind and places else f"agent {failure.agent}",
         )
 
-    def _refusal_as_requested(self, text: str) -> str:
-        """Return the result with the file names that the user gave, instead of those in the snapshot."""
-        for there, here in self._names.items():
-            text = text.replace(there, here)
-        return text
+
+def _replaced(text: str, names: Mapping[str, str]) -> str:
+    for there, here in names.items():
+        text = text.replace(there, here)
+    return text
 
 
 class WorkerNotices:

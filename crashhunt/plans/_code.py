@@ -9,10 +9,10 @@ executor module that ends or stops its process has been refused.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.base.isolation import work_apart
+from crashhunt.base.isolation import files_read_apart, work_apart
 from crashhunt.base.plugins import ImportedModules, is_foreign, is_foreign_module, locate
 from crashhunt.disturbances import described_model, modules_of_models, parse_rates
 from crashhunt.oracles import described_oracle, modules_of, oracle_name
@@ -133,7 +133,7 @@ def _import(locators: Sequence[str], modules: Sequence[str], report: Callable[[s
             report(f"{name!r} cannot be imported")
             yield name
 
-    return ImportedModules.here(each(locators), each(modules))
+    return replace(ImportedModules.here(each(locators), each(modules)), read=tuple(files_read_apart()))
 
 
 def _is_of_optuna(name: str) -> bool:

@@ -12,3 +12,8 @@ from ._snapshot import (
     without_code as without_code,
 )
 from ._take import SnapshotOptions as SnapshotOptions, take_snapshot as take_snapshot
+from ._unsaved import (
+    describe_missing as describe_missing,
+    describe_unsaved as describe_unsaved,
+    with_original_paths as with_original_paths,
+)

@@ -6,10 +6,13 @@ import platform
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base.plugins import ImportedModules, distributions as installed
 from crashhunt.scenario import installed_backends
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 __all__ = ["Environment", "environment", "environment_changes", "environment_of_simulation", "processor", "versions"]
 
@@ -18,8 +21,9 @@ class Environment(TypedDict):
     """The contents of ``environment.json``: everything besides code on which a result depends.
 
     The entry ``git`` has the revision of each work tree. The entry ``core`` is whether the simulator's compiled core
-    was used, which does not change results. If results depend on an order at load, ``load_order`` is ``fixed`` or
-    ``not fixed: REASON``. Snapshots of earlier versions have no ``load_order``.
+    was used, which does not change results. The entry ``origins`` has folders of the snapshot and the user's folders
+    that they copy. If results depend on an order at load, ``load_order`` is ``fixed`` or ``not fixed: REASON``.
+    Snapshots of earlier versions have no ``load_order``.
     """
 
     schema: int
@@ -35,6 +39,7 @@ class Environment(TypedDict):
     core: NotRequired[str]
     load_order: NotRequired[str]
     git: NotRequired[dict[str, str]]
+    origins: NotRequired[Sequence[tuple[str, str]]]
 
 
 _VERSIONED = ("crashhunt", "numpy")  # besides those of simulators
@@ -158,4 +163,4 @@ def environment_of_simulation(found: Environment) -> Environment:
     """Return the environment without distributions that were not loaded, and without the user's folders."""
     loaded = set(found["loaded"])
     distributions = {name: version for name, version in found["distributions"].items() if name in loaded}
-    return {**found, "distributions": distributions, "variables": {}, "git": {}}
+    return {**found, "distributions": distributions, "variables": {}, "git": {}, "origins": []}

@@ -52,12 +52,14 @@ class Sources:
         paths: The folders of the snapshot from which modules are imported, in the order of ``sys.path``.
         trees: The git work trees that are part of the snapshot.
         excluded: The files that were not taken, each with the reason.
+        origins: The original folder of each folder of the snapshot that is the copy of one; ``code`` may have several.
     """
 
     files: dict[str, str] = field(default_factory=dict)
     paths: list[str] = field(default_factory=lambda: [layout.CODE])
     trees: list[Path] = field(default_factory=list)
     excluded: list[str] = field(default_factory=list)
+    origins: list[tuple[str, str]] = field(default_factory=list)
 
 
 def find_sources(imported: ImportedModules, *, roots: Sequence[Path] = (), without: Path | None = None) -> Sources:
@@ -146,11 +148,13 @@ def _take_module(name: str, imported: ImportedModules, found: Sources) -> None:
             found.paths.append(place)
         return
     for folder in map(Path, folders):
+        found.origins.append((f"{layout.CODE}/{name}", str(folder)))
         for path in _walk(folder):
             found.files[f"{layout.CODE}/{name}/{path}"] = f"{folder}/{path}"
         return
     if file is not None:
         found.files[f"{layout.CODE}/{Path(file).name}"] = file
+        found.origins.append((layout.CODE, str(Path(file).parent)))
 
 
 def _archive_of(file: str) -> Path | None:
@@ -212,6 +216,7 @@ def _take_tree(
     else:
         found.trees.append(tree)
         base = _base_of(tree, found)
+        found.origins.append((base, str(tree)))
         hunts = [str(Path(name).parent) for name in names if Path(name).name == layout.HUNT]
         hunts = [f"{hunt}/" for hunt in hunts if (tree / hunt / layout.LEDGER).exists() and hunt != "."]
         if without is not None and without.resolve().is_relative_to(tree) and without.resolve() != tree:
@@ -256,11 +261,21 @@ def _resolved(tree: Path, name: str, listed: Sequence[str], found: Sources) -> I
 
 def _take_root(root: Path, imported: ImportedModules, found: Sources, without: Path | None) -> None:
     path = root.resolve()
+    if not path.exists():
+        raise SnapshotError(f"--snapshot-root {str(root)!r} does not exist", fix="correct the path")
+    # The code finds a file at its place in the project, such as a library that git ignores.
+    homes = [(origin, place) for place, origin in found.origins if path.is_relative_to(origin) and str(path) != origin]
+    if homes and _work_tree_of(path if path.is_dir() else path.parent) != path:
+        origin, place = max(homes, key=lambda home: len(home[0]))
+        base = f"{place}/{path.relative_to(origin).as_posix()}"
+        below = {base: str(path)} if path.is_file() else {f"{base}/{name}": f"{path}/{name}" for name in _walk(path)}
+        found.files |= below
+        if path.is_dir() and below and base not in found.paths:
+            found.paths.append(base)
+        return
     if path.is_file():
         found.files[f"{layout.CODE}/@{path.parent.name}/{path.name}"] = str(path)
         return
-    if not path.is_dir():
-        raise SnapshotError(f"--snapshot-root {str(root)!r} does not exist", fix="correct the path")
     names = list(_listed(path)) or list(_walk(path))
     _take_tree(path, names, found, imports=[path, *map(Path, imported.path)], without=without)
 
@@ -389,7 +404,9 @@ def _build(
     ):
         return Snapshot(final)
     write_settings(building / layout.HUNT, settings, ["crashhunt", "run", "as resolved"])
-    facts: Environment = {**around, "git": _describe_trees(found.trees, building / layout.GIT_DIFF)}
+    facts: Environment = {
+        **around, "git": _describe_trees(found.trees, building / layout.GIT_DIFF), "origins": found.origins,
+    }  # fmt: skip
     if (core := core_of(scenario, settings.run)) is not None:
         facts["core"] = core
     if (load_order := load_order_of(scenario)) is not None:

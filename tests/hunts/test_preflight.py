@@ -34,7 +34,7 @@ def test_what_fails_in_every_trial_in_the_same_way_is_refused():
         ArgumentError, match="KeepLaneWithSpeed does not start: KeyError: there is no file 'x'"
     ) as caught:
         preflight.filter_setup_failures(result(3, kind="KeyError"))
-    assert caught.value.where == "my.py:7"
+    assert caught.value.where == "/s/code/my.py:7"  # the hunt names the original
     assert caught.value.exit_code == 2
 
 
