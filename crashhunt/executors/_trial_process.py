@@ -192,7 +192,7 @@ class TrialProcess:
             self._shared.separate()
         self._redirect(folder)
         spec = TrialSpec.from_json(job["spec"])
-        if job["tries_copy"] and settings.code and settings.sealed is None:  # the first trial, which stands for all
+        if job["tries_copy"] and settings.code and settings.sealed is None:  # later trials pay nothing
             self._opened = OpenedFiles()
         self._box = box = BlackBox(folder / layout.BLACK_BOX, begun=job["reserved"])
         self._enter_home()

@@ -147,6 +147,7 @@ class ReplayData(TypedDict):
     outcome_recorded: str
     outcome_replayed: str
     reason: str
+    code_differences: list[str] | None
     edits: list[str]
     warnings: list[str]
     times: int

@@ -16,7 +16,7 @@ from crashhunt.episode import WorkerSettings
 from crashhunt.plans import load_order_change, read_settings, with_recorded_load_order, with_settings
 from crashhunt.replays._edits import edited_spec
 from crashhunt.scenario import argument_values, load_scenario
-from crashhunt.snapshots import Snapshot, environment_changes, processor
+from crashhunt.snapshots import Snapshot, code_differences, environment_changes, processor
 from crashhunt.trial import SENSOR_KINDS
 
 if TYPE_CHECKING:
@@ -119,6 +119,13 @@ class Rerun:
     warnings: tuple[str, ...]
     other_traffic: tuple[str, ...] = ()
     elsewhere: bool = False
+
+    @property
+    def code_differences(self) -> list[str] | None:
+        """The files of today's code that differ from the snapshot; None if today's code does not run."""
+        if self.code != "current":
+            return None
+        return code_differences(self.snapshot, [setup.agent for setup in self.worker.scenario.agents.values()])
 
     @property
     def defaults(self) -> dict[tuple[str, str], Value | None]:

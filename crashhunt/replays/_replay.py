@@ -86,6 +86,7 @@ class ReplayReport:
             "outcome_replayed": str(self.replayed.outcome),
             "reason": self.reason,
             "edits": list(self.rerun.edits),
+            "code_differences": self.rerun.code_differences,
             "warnings": list(self.rerun.warnings),
             "times": sum(self.verdicts.values()),
             "agreed": self.verdicts.get("reproduced", 0),

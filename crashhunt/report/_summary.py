@@ -223,6 +223,7 @@ def describe_replay(report: ReplayReport) -> str:
         f"  {format_inputs(was)}",
         f"  driven by {drivers[rerun.code]}",
     ]
+    lines += [f"  {line}" for line in _describe_differences(rerun.code_differences)]
     lines += [f"  warning: {warning}" for warning in rerun.warnings]
     lines += [f"  no longer the recorded trial: {edit}" for edit in rerun.edits]
     lines += _verdict(report)
@@ -234,6 +235,15 @@ def describe_replay(report: ReplayReport) -> str:
         counts = ", ".join(f"{count} {verdict.replace('_', ' ')}" for verdict, count in report.verdicts.items())
         lines.append(f"of {times} runs: {counts}")
     return in_lines(lines)
+
+
+def _describe_differences(files: list[str] | None) -> list[str]:
+    if files is None:
+        return []
+    if not files:
+        return ["no file of the code differs from the snapshot"]
+    more = f" and {len(files) - _MAX_SHOWN} more" if len(files) > _MAX_SHOWN else ""
+    return [f"differs from the snapshot: {', '.join(files[:_MAX_SHOWN])}{more}"]
 
 
 def _verdict(report: ReplayReport) -> list[str]:

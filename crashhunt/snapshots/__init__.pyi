@@ -1,3 +1,4 @@
+from ._differences import code_differences as code_differences
 from ._environment import (
     Environment as Environment,
     environment as environment,

@@ -217,8 +217,7 @@ def _take_tree(
         found.trees.append(tree)
         base = _base_of(tree, found)
         found.origins.append((base, str(tree)))
-        hunts = [str(Path(name).parent) for name in names if Path(name).name == layout.HUNT]
-        hunts = [f"{hunt}/" for hunt in hunts if (tree / hunt / layout.LEDGER).exists() and hunt != "."]
+        hunts = _hunts_in(tree, names)
         if without is not None and without.resolve().is_relative_to(tree) and without.resolve() != tree:
             hunts.append(f"{without.resolve().relative_to(tree).as_posix()}/")
         listed = [name for name in names if not name.startswith(tuple(hunts))]
@@ -231,6 +230,19 @@ def _take_tree(
             place = base if below == "." else f"{base}/{below}"
             if place not in found.paths and any(file.startswith(f"{place}/") for file in found.files):
                 found.paths.append(place)
+
+
+def _hunts_in(tree: Path, names: Iterable[str]) -> list[str]:
+    """Return the directories of hunts in a work tree, each with a slash at its end."""
+    hunts = [str(Path(name).parent) for name in names if Path(name).name == layout.HUNT]
+    return [f"{hunt}/" for hunt in hunts if (tree / hunt / layout.LEDGER).exists() and hunt != "."]
+
+
+def code_of_tree(tree: Path) -> list[str]:
+    """Return the names of the Python files that a snapshot of a work tree would contain, relative to its root."""
+    names = list(_listed(tree))
+    hunts = tuple(_hunts_in(tree, names))
+    return [name for name in names if name.endswith(".py") and not name.startswith(hunts) and (tree / name).is_file()]
 
 
 def _base_of(tree: Path, found: Sources) -> str:

@@ -114,7 +114,12 @@ def test_a_replay_that_cannot_be_set_up_is_an_error_with_the_reason(monkeypatch)
 
 def report(verdict, result=CRASH, divergence=None):
     rerun = SimpleNamespace(
-        bundle=BUNDLE, code="snapshot", edits=("speed was 5",), warnings=("numpy",), recorded=SimpleNamespace(steps=30)
+        code_differences=None,
+        bundle=BUNDLE,
+        code="snapshot",
+        edits=("speed was 5",),
+        warnings=("numpy",),
+        recorded=SimpleNamespace(steps=30),
     )
     recording = SimpleNamespace(steps=29)
     return ReplayReport(rerun=rerun, verdict=verdict, replayed=result, recording=recording, divergence=divergence)

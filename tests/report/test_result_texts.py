@@ -116,7 +116,8 @@ FINE = replace(CRASH, outcome=Outcome.SURVIVED, steps=90, collision=None)
 def replayed(verdict, now, *, code="current", **more):
     rerun = SimpleNamespace(
         code=code, snapshot=SimpleNamespace(path="here"), warnings=["numpy differs"], edits=["speed 9"],
-        elsewhere=False, recorded=SimpleNamespace(steps=30), other_traffic=more.pop("other_traffic", False),
+        code_differences=more.pop("code_differences", None), elsewhere=False, recorded=SimpleNamespace(steps=30),
+        other_traffic=more.pop("other_traffic", False),
     )  # fmt: skip
     bundle = SimpleNamespace(id="000004-collision", result=CRASH, is_near_miss=False)
     given = {
@@ -150,6 +151,14 @@ def test_a_replay_states_its_verdict_with_what_was_and_what_is(verdict, now, say
     assert "runs:" not in text
     several = replayed(verdict, now, verdicts={verdict: 2, "cannot_run": 1})
     assert f"of 3 runs: 2 {verdict.replace('_', ' ')}, 1 cannot run" in several
+
+
+def test_files_that_differ_from_the_snapshot_are_named():
+    assert "differ" not in replayed("reproduced", CRASH).replace("numpy differs", "")
+    assert "no file of the code differs from the snapshot" in replayed("reproduced", CRASH, code_differences=[])
+    text = replayed("fixed", FINE, code_differences=[f"{name}.py has changed" for name in "abcdefghijkl"])
+    assert "differs from the snapshot: a.py has changed, b.py has changed" in text
+    assert "j.py has changed and 2 more" in text
 
 
 def test_where_a_replay_first_differs_the_steps_around_are_shown():

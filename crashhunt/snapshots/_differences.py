@@ -1,0 +1,84 @@
+"""The files of today's code that differ from a snapshot, for a replay with today's code."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.base.exceptions import shown_path
+from crashhunt.base.integrity import changed_file
+from crashhunt.base.plugins import registered
+from crashhunt.snapshots._take import code_of_tree
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from crashhunt.snapshots._snapshot import Snapshot
+
+__all__ = ["code_differences"]
+
+
+def code_differences(snapshot: Snapshot, locators: Iterable[str]) -> list[str] | None:
+    """Return the files of today's code that differ from their copies in a snapshot; None if none can be compared.
+
+    Files are compared by content, not by time. A file that the snapshot lacks is reported only if it is a Python file
+    of a work tree.
+
+    Args:
+        snapshot: the snapshot of the crash, which the caller has verified.
+        locators: locators of the agents, whose modules are found as an import from the current folder finds them.
+    """
+    if not snapshot.has_code:
+        return None
+    files, folders = snapshot.manifest["files"], _folders_of_today(snapshot, locators)
+    found, compared = [], False
+    for base, folder in folders.items():
+        below = {name: folder / name.removeprefix(f"{base}/") for name in files if name.startswith(f"{base}/")}
+        below |= {base: folder} if base in files else {}
+        changes = {name: why for name, file in below.items() if (why := changed_file(file, files[name]))}
+        if folder == layout.PACKAGE:
+            found += [f"crashhunt itself ({len(changes)} files)"] if changes else []
+            continue
+        compared = True
+        found += [f"{shown_path(str(below[name]))} {why}" for name, why in changes.items()]
+        if base.startswith(f"{layout.CODE}/@"):
+            new = [name for name in code_of_tree(folder) if f"{base}/{name}" not in files]
+            found += [f"{shown_path(str(folder / name))} is new" for name in new]
+    for value, place in snapshot.manifest["argument_files"].items():
+        if place in files and (why := changed_file(value, files[place])):
+            found.append(f"{value} {why}")
+    return sorted(found) if compared else None
+
+
+def _folders_of_today(snapshot: Snapshot, locators: Iterable[str]) -> dict[str, Path]:
+    """Return for each folder or module in the snapshot the folder or file from which today's code is imported."""
+    files = snapshot.manifest["files"]
+    found = {f"{layout.CODE}/{layout.PACKAGE.name}": layout.PACKAGE}
+    for place, original in snapshot.environment().get("origins", ()):
+        if place != layout.CODE:
+            if os.path.isdir(original):  # noqa: PTH112
+                found.setdefault(place, Path(original))
+            continue
+        for file in Path(original).glob("*.py"):
+            if f"{place}/{file.name}" in files:
+                found[f"{place}/{file.name}"] = file
+    points = registered("agents")
+    for locator in locators:
+        top = (points[locator].value if locator in points else locator).partition(":")[0].partition(".")[0]
+        spec = PathFinder.find_spec(top, [os.getcwd(), *sys.path])  # noqa: PTH109 - sys.path holds strings
+        if top == layout.PACKAGE.name or spec is None or spec.origin is None:
+            continue
+        for path in snapshot.manifest["paths"]:
+            name = next((name for name in (f"{path}/{top}.py", f"{path}/{top}/__init__.py") if name in files), None)
+            if name is None:
+                continue
+            parts = name.split("/")
+            size = 2 if parts[1].startswith("@") or len(parts) > 2 else len(parts)
+            today = Path(spec.origin).resolve()
+            found["/".join(parts[:size])] = today.parents[len(parts) - size - 1] if len(parts) > size else today
+            break
+    return found
