@@ -184,7 +184,7 @@ def test_of_several_replays_the_first_that_deviates_is_shown(replays):
         "crash": "000004-collision", "verdict": "reproduced", "code": "snapshot", "steps_recorded": 30,
         "steps_replayed": 29, "digest_recorded": CRASH.digest, "digest_replayed": CRASH.digest, "divergence": None,
         "outcome_recorded": "collision", "outcome_replayed": "collision", "reason": "", "edits": ["speed was 5"],
-        "warnings": ["numpy"], "times": 1, "agreed": 1, "verdicts": {"reproduced": 1},
+        "code_differences": None, "warnings": ["numpy"], "times": 1, "agreed": 1, "verdicts": {"reproduced": 1},
     }  # fmt: skip
     with pytest.raises(UsageError, match="--times is 0"):
         _replay.replay(BUNDLE, ReplayOptions(times=0))
