@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from importlib.metadata import Distribution, EntryPoint
 
 __all__ = [
+    "CurrentFolder",
     "Group",
     "ImportedModules",
     "add_current_folder",
@@ -254,28 +255,26 @@ _DESKTOP_LIBRARIES = ("libGL.so.1", "libX11.so.6", "libXext.so.6", "libXrender.s
 """System libraries that simulators with a window link to, and that servers and containers often lack."""
 
 
-def add_current_folder(*, always_last: bool = False) -> CurrentFolder:
+def add_current_folder(*, always_last: bool | None = None) -> CurrentFolder:
     """From now on, import from the current folder the modules that are found nowhere else.
 
     Args:
-        always_last: whether other places also come first for the modules that the user names.
+        always_last: whether other places also come first for the modules that the user names; None for no change.
     """
     made = next((finder for finder in sys.meta_path if isinstance(finder, CurrentFolder)), None)
     if made is None:
-        sys.meta_path.append(made := CurrentFolder(always_last=always_last))
+        sys.meta_path.append(made := CurrentFolder())
+    if always_last is not None:
+        made.always_last = always_last
     made.folder = os.getcwd()  # noqa: PTH109 - sys.path holds strings
     return made
 
 
 class CurrentFolder:
-    """Finds modules in the current folder that neither Python nor crashhunt's dependencies have, installed or not.
+    """Finds modules in the current folder that neither Python nor crashhunt's dependencies have, installed or not."""
 
-    Args:
-        always_last: whether `prefer` has no effect.
-    """
-
-    def __init__(self, *, always_last: bool) -> None:
-        self._always_last = always_last
+    def __init__(self) -> None:
+        self.always_last = False  # then `prefer` has no effect
         self.folder = ""
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, _target: object = None) -> ModuleSpec | None:
@@ -289,7 +288,7 @@ class CurrentFolder:
         A folder without code counts as a module only if no other place has a module of this name.
         """
         top = name.partition(".")[0]
-        if self._always_last or top in sys.modules or "" in sys.path or self.folder in sys.path:
+        if self.always_last or top in sys.modules or "" in sys.path or self.folder in sys.path:
             return
         found = PathFinder.find_spec(top, [self.folder])
         if found is not None and (found.origin is not None or PathFinder.find_spec(top) is None):

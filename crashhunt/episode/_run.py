@@ -330,7 +330,8 @@ def require_origin(module: str, code: tuple[str, ...]) -> None:
     file = getattr(sys.modules[module], "__file__", None)
     for folder in code:
         if (Path(folder) / top).is_dir() or (Path(folder) / f"{top}.py").is_file():
-            if file is not None and not Path(file).resolve().is_relative_to(folder):
+            # A submodule may be a project of its own and a folder of another project, and has a copy in each.
+            if file is not None and not any(Path(file).resolve().is_relative_to(place) for place in code):
                 raise CrashhuntError(
                     f"the module {module!r} was imported from {file}, not from the snapshot",
                     fix="remove it from PYTHONPATH and from start-up files such as sitecustomize",

@@ -278,12 +278,12 @@ def _take_root(root: Path, imported: ImportedModules, found: Sources, without: P
     # The code finds a file at its place in the project, such as a library that git ignores.
     homes = [(origin, place) for place, origin in found.origins if path.is_relative_to(origin) and str(path) != origin]
     if homes and _work_tree_of(path if path.is_dir() else path.parent) != path:
-        origin, place = max(homes, key=lambda home: len(home[0]))
-        base = f"{place}/{path.relative_to(origin).as_posix()}"
-        below = {base: str(path)} if path.is_file() else {f"{base}/{name}": f"{path}/{name}" for name in _walk(path)}
-        found.files |= below
-        if path.is_dir() and below and base not in found.paths:
-            found.paths.append(base)
+        for origin, place in [home for home in homes if home[1] != layout.CODE] or homes[:1]:  # a submodule has two
+            base = f"{place}/{path.relative_to(origin).as_posix()}"
+            names = [""] if path.is_file() else [f"/{name}" for name in _walk(path)]
+            found.files |= {f"{base}{name}": f"{path}{name}" for name in names}
+            if path.is_dir() and names and base not in found.paths:
+                found.paths.append(base)
         return
     if path.is_file():
         found.files[f"{layout.CODE}/@{path.parent.name}/{path.name}"] = str(path)

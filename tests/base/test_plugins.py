@@ -11,7 +11,7 @@ from typing import Annotated
 import pytest
 
 import crashhunt
-from crashhunt.base.plugins import import_module, locate, registered
+from crashhunt.base.plugins import CurrentFolder, import_module, locate, registered
 from crashhunt.errors import ArgumentError, PluginError
 from crashhunt.space import Argument, Range
 from crashhunt.trial import signature_of
@@ -141,6 +141,7 @@ def test_named_module_of_the_current_folder_comes_before_installed_ones(tmp_path
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "utils_of_both.py").write_text(f"def place(): return {folder!r}")
     monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setattr(sys, "meta_path", [one for one in sys.meta_path if not isinstance(one, CurrentFolder)])
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place] + [str(tmp_path / "installed")])
     monkeypatch.delitem(sys.modules, "utils_of_both", raising=False)
     assert import_module("utils_of_both", installed=True).place() == "installed"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import random
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.plugins import CurrentFolder, locate
 from crashhunt.episode import Parts, WorkerSettings, _run, require_origin, seal
 from crashhunt.scenario import load_scenario
 
@@ -43,6 +45,7 @@ agent = "{module}:Plain"
 def made(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "meta_path", [one for one in sys.meta_path if not isinstance(one, CurrentFolder)])
     # Later tests in this process replace functions of crashhunt, which is then taken for an agent's doing.
     monkeypatch.setattr(_run, "record_originals", lambda: None)
     before = set(sys.modules)
@@ -97,7 +100,13 @@ def test_notices_are_read_from_agents_of_crashhunt_only(made):
 
 def test_the_snapshot_comes_before_where_the_hunt_was_started(made, tmp_path):
     parts = made()
-    assert sys.path[:2] == [str(tmp_path / "code"), str(tmp_path)]
+    assert sys.path[0] == str(tmp_path / "code")
+    for name in ("only_here", "snapshot_agent", "torch"):
+        (tmp_path / f"{name}.py").write_text("")
+    assert importlib.util.find_spec("only_here").origin == str(tmp_path / "only_here.py")
+    assert importlib.util.find_spec("torch") is None or "site-packages" in importlib.util.find_spec("torch").origin
+    assert locate("agents", "snapshot_agent:Driver").__module__ == "snapshot_agent"
+    assert sys.modules["snapshot_agent"].__file__ == str(tmp_path / "code" / "snapshot_agent.py")
     (oracle,), (another,) = parts.oracles(), parts.oracles()
     assert oracle.name == "overlap"
     assert oracle is not another  # what one remembers of a trial is nobody's business in the next
@@ -132,7 +141,8 @@ def test_a_module_of_the_snapshot_may_come_from_nowhere_else(made, tmp_path):
     require_origin("elsewhere_agent", (str(elsewhere),))
     require_origin("elsewhere_agent", (str(tmp_path),))  # which does not have it
     with pytest.raises(CrashhuntError, match="not from the snapshot"):
-        require_origin("elsewhere_agent", (str(tmp_path), str(tmp_path / "code")))
+        require_origin("elsewhere_agent", (str(tmp_path / "other"), str(tmp_path / "code")))
+    require_origin("elsewhere_agent", (str(tmp_path), str(tmp_path / "code")))  # a submodule has a copy in each project
     package = tmp_path / "packages" / "elsewhere_agent"
     package.mkdir(parents=True)
     with pytest.raises(CrashhuntError, match="not from the snapshot"):

@@ -185,3 +185,9 @@ def test_program_stays_executable_and_nothing_more(project, take):
     assert os.access(take().path / BASE / "private", os.X_OK)  # although no content has changed
     (snapshot.path / BASE / "program").chmod(0o644)
     assert Snapshot(snapshot.path).changes() == [f"{BASE}/program is no longer executable"]
+
+
+def test_root_inside_a_project_is_kept_at_its_place_although_git_ignores_it(project, take):
+    for root, names in (("build", ["build/big.bin"]), ("token.secret", ["token.secret"])):
+        files = take(roots=(project / root,)).manifest["files"]
+        assert [name for name in files if name.endswith((".bin", ".secret"))] == [f"{BASE}/{name}" for name in names]
