@@ -146,3 +146,10 @@ def test_python_m_imports_no_package_from_the_current_folder(strange_folder, she
         (strange_folder / f"{name}.py").unlink(missing_ok=True)
     subprocess.run([sys.executable, "-m", "crashhunt", "oracles"], cwd=strange_folder, capture_output=True, check=True)
     assert not list(strange_folder.glob("*.ran"))
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(metadata.packages_distributions().get("ray") is None, reason="needs ray")
+def test_workers_of_ray_import_nothing_from_the_current_folder(strange_folder, shell):
+    shell.process("run", "out", "1", "2", "20", "--scenario", "highway", "--executor", "ray")
+    assert not list(strange_folder.glob("*.ran"))

@@ -218,6 +218,20 @@ class Lost(Exception):  # noqa: N818 - it is no fault
     """The node was lost, or the actor on it was lost."""
 
 
+def _job_without_folder() -> Any:
+    """Return the configuration of a Ray job whose workers do not search the current folder for modules.
+
+    Ray puts the current folder first on their path, where a numpy.py would run, unless the job brings a folder along.
+    """
+    from ray.job_config import JobConfig
+
+    class WithoutFolder(JobConfig):
+        def _runtime_env_has_working_dir(self) -> bool:
+            return True
+
+    return WithoutFolder()
+
+
 class UnreachableError(UsageError):
     """The cluster cannot be reached, either temporarily or permanently."""
 
@@ -271,7 +285,7 @@ class Cluster:
         else:
             _check_protocol(address)
         try:
-            ray.init(address=address or "local", **options)
+            ray.init(address=address or "local", job_config=_job_without_folder(), **options)
         except Exception as error:
             raise UnreachableError(
                 f"the Ray cluster at {self.address} cannot be used: {_first_line(error)}",
