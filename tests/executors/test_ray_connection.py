@@ -41,6 +41,7 @@ class RayTaskError(RayError):
 @pytest.fixture
 def ray(monkeypatch):
     """Ray, as far as it is used; it notes what it is asked for."""
+    monkeypatch.setattr(_cluster, "_job_without_folder", lambda: "without the folder")
     found = SimpleNamespace(
         inits=[], options=[], killed=[], waits=[], puts=[], error=None, nodes=[], free={}, actors={}, named={}
     )
@@ -105,6 +106,7 @@ def cluster(ray):
 
 def test_own_cluster_has_so_many_cpus_and_a_folder(ray, cluster, monkeypatch):
     (options,) = ray.inits
+    assert options.pop("job_config") == "without the folder"
     assert {name: options[name] for name in ("address", "num_cpus", "_temp_dir", "include_dashboard")} == {
         "address": "local", "num_cpus": 3, "_temp_dir": "/tmp/here", "include_dashboard": False,
     }  # fmt: skip
