@@ -60,6 +60,7 @@ def process(tmp_path, monkeypatch):
         found._box, found._pid, found._has_begun, found._shared = None, 0, False, None
         found._simulator = found._parts = None
         found._modules = frozenset(sys.modules)
+        found._opened = None
         found._home = tmp_path
         return found
 
