@@ -225,7 +225,7 @@ def _job_without_folder() -> Any:
     """
     from ray.job_config import JobConfig
 
-    class WithoutFolder(JobConfig):
+    class WithoutFolder(JobConfig):  # type: ignore[misc]
         def _runtime_env_has_working_dir(self) -> bool:
             return True
 
