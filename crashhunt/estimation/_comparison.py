@@ -352,6 +352,7 @@ def _share(hunt: HuntResults, rate: CrashRate) -> float:
         return rate.estimate
     run = hunt.settings.run
     is_whole = hunt.state.state in ("finished", "crashed") and run.keep_going and not run.distinct
+    is_whole = is_whole and not hunt.facts.get("replanned")
     # A grid has a share as well, but no interval.
     if rate.certain is None and is_whole and not hunt.settings.rare and rate.trials and rate.per == "trial":
         return rate.crashes / rate.trials

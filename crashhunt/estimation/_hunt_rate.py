@@ -22,7 +22,16 @@ from crashhunt.base.text import one_of
 from crashhunt.crashes import fault_of, signature_of
 from crashhunt.hunts import HuntResults, counting_rule, why_no_interval
 from crashhunt.ledger import Ledger
-from crashhunt.rates import PERS, RateCounter, RatePart, UnitSequence, check_confidence, facts_of_plain, make_rate
+from crashhunt.rates import (
+    PERS,
+    WHY_NOT_UNTIL_RATE,
+    RateCounter,
+    RatePart,
+    UnitSequence,
+    check_confidence,
+    facts_of_plain,
+    make_rate,
+)
 from crashhunt.training import held_out_traffics
 from crashhunt.trial import Choice, Range
 
@@ -92,7 +101,7 @@ def measure_rates(
                 trial = facts_of_plain(data, settings.crash_on, (divide.tag(data),))
                 units += sequence.add(trial)
     against = why_no_interval(settings, facts)
-    open_end = _why_no_estimate(settings, sequence, decided)
+    open_end = _why_no_estimate(settings, facts, sequence)
     found = []
     for each in PERS if per is None else (per,):
         counter = RateCounter(rule, each)
@@ -146,7 +155,7 @@ def rate_of_counts(
         counter.add_counted(trials=valid, crashes=crashes, steps=steps)
     found = make_rate(
         str(directory), "trial", counter, sequence, confidence=confidence,
-        why_no_interval=why_no_interval(settings, facts), why_no_estimate=_why_no_estimate(settings, sequence, None),
+        why_no_interval=why_no_interval(settings, facts), why_no_estimate=_why_no_estimate(settings, facts, sequence),
     )  # fmt: skip
     return replace(found, excluded=found.excluded | ({"after_unfinished": excluded} if excluded else {}))
 
@@ -179,21 +188,26 @@ def rate_of_trials(
                 counter.add(unit)
     return make_rate(
         str(directory), "trial", counter, sequence, confidence=confidence,
-        why_no_interval=why_no_interval(settings, facts), why_no_estimate=_why_no_estimate(settings, sequence, decided),
+        why_no_interval=why_no_interval(settings, facts), why_no_estimate=_why_no_estimate(settings, facts, sequence),
     )  # fmt: skip
 
 
-def _why_no_estimate(settings: HuntSettings, sequence: UnitSequence, decided: int | None) -> str:
+def _why_no_estimate(settings: HuntSettings, facts: Facts, sequence: UnitSequence) -> str:
     """Return why crashes divided by exposure would be biased; empty if the number of units is independent of them."""
     run = settings.run
-    if decided is not None:
-        return ""
+    if run.until_rate:
+        return WHY_NOT_UNTIL_RATE
     if not run.keep_going:
         return "the hunt stops at its first crash, so crashes by trials would be too high; run with --keep-going"
     if run.distinct:
         return f"the hunt stops at {run.distinct} kinds of crashes, so crashes by trials would be too high"
     if not settings.trials:
         return "the number of trials was not fixed ahead"
+    if facts.get("replanned"):
+        return (
+            "TRIALS was changed after results were known, so crashes by trials may be too high or too low; run a new "
+            "hunt and keep its TRIALS"
+        )
     units = settings.seeds or settings.trials
     if sequence.position < units:
         what = "traffics" if settings.seeds else "trials"

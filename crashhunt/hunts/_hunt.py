@@ -38,7 +38,7 @@ from crashhunt.hunts._state import (
 from crashhunt.hunts._verification import Audit, Confirmation, PendingAudits, TrialReruns, VerificationRuns, is_settled
 from crashhunt.ledger import Ledger
 from crashhunt.plans import core_of, disturber_apart, parallel_here, sampler_of
-from crashhunt.rates import make_rate
+from crashhunt.rates import WHY_NOT_UNTIL_RATE, make_rate
 from crashhunt.snapshots import (
     Snapshot,
     SnapshotOptions,
@@ -223,7 +223,6 @@ class Hunt:
             unanswered=again,
             forcings=forcings_of(settings, ledger, self._disturber),
         )
-        progress.rare = rare_watch(settings, ledger, self._disturber)
         if not progress.is_done:
             trials.require_same_version()
         ledger.enter(
@@ -256,6 +255,7 @@ class Hunt:
         )
         self._place.has_begun = True
         progress.counted = progress.rate or rate_watch(settings, ledger, held_out)
+        progress.rare = rare_watch(settings, ledger, self._disturber)
         if progress.rare is not None:
             progress.rare.read(trials.upcoming)
         if self._imported is not None and snapshot.has_code:
@@ -348,7 +348,7 @@ class Hunt:
             unconfirmed=sum(not is_settled(bundle) for bundle in crashes) if self._stops else 0,
             rare=rare,
             tally=progress.tally,
-            rate=_rate_of(self.directory, progress.rate, stopped),
+            rate=_rate_of(self.directory, progress.rate),
         )
 
     def _wait_for_ledger(self, progress: Progress, watch: Callable[[HuntStatus], None], waited_s: float) -> None:
@@ -635,14 +635,13 @@ class Hunt:
         )
 
 
-def _rate_of(directory: Path, watch: BarWatch | None, stopped: StoppedBecause) -> CrashRate | None:
+def _rate_of(directory: Path, watch: BarWatch | None) -> CrashRate | None:
     """Return the final crash rate of a hunt that compares its rate with a threshold."""
     if watch is None:
         return None
-    why_not = "" if stopped in ("rate", "all_trials") else "the number of trials was not fixed ahead"
     found = make_rate(
         str(directory), watch.per, watch.counter, watch.sequence, confidence=100 * (1 - watch.alpha),
-        why_no_estimate=why_not, bar=watch.bar,
+        why_no_estimate=WHY_NOT_UNTIL_RATE, bar=watch.bar,
     )  # fmt: skip
     excluded = found.excluded
     if watch.decided_at is not None:  # which later trials have ended depends on the workers

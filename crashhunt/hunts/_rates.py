@@ -103,6 +103,8 @@ def why_no_interval(settings: HuntSettings, facts: Facts) -> str:
             return f"the sampler {settings.sampler} does not draw trials independently"
         if settings.trials < settings.seeds:
             return "no number of trials was fixed ahead for each traffic (--seeds): TRIALS must be at least --seeds"
+        if facts.get("replanned"):
+            return "TRIALS was changed after results were known, and with --seeds it decides what counts as a unit"
         return ""
     if facts.get("independent", settings.sampler == "random") or facts.get("plain_origin"):
         return ""
@@ -212,12 +214,14 @@ class RareWatch:
         weightiest: the greatest weights of roots with a crashed copy, in descending order.
         is_met: whether the interval is narrow enough; no further trial is then read.
         refusal: reason why the hunt is of no use according to its first trials; empty if it is of use.
+        is_replanned: whether TRIALS was changed after results were known.
     """
 
     def __init__(self, settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler | None) -> None:
         self.weightiest: list[TrialResult] = []
         self.is_met = False
         self.refusal = ""
+        self.is_replanned = False
         self._settings, self._ledger = settings, ledger
         self._hazard = 1.0
         if sampler is not None:
@@ -283,8 +287,17 @@ class RareWatch:
         return [one.outcome in self._settings.crash_on for one in valid], len(plain) - len(valid)
 
     def estimate(self) -> RareEstimate:
-        """Return the estimate from the trials that were read."""
-        return self._counter.estimate()
+        """Return the estimate from the trials that were read.
+
+        If TRIALS was changed after results were known, it may have been changed because of a crash. An interval needs
+        many crashes, so only an estimate with an interval remains.
+        """
+        found = self._counter.estimate()
+        if not found.estimate or found.estimated is not None or not self.is_replanned:
+            return found
+        return replace(
+            found, estimate=None, why_not=f"TRIALS was changed after results were known, and {found.why_not}"
+        )
 
     def running(self, *, now: bool = False) -> RunningRate:
         """Return the current crash rate.
@@ -413,7 +426,9 @@ def rare_watch(settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampl
     """Return the object that estimates the crash rate; None if the hunt is not in rare mode."""
     if not settings.rare:
         return None
-    return SplittingWatch(settings, ledger) if settings.splitting else RareWatch(settings, ledger, sampler)
+    watch = SplittingWatch(settings, ledger) if settings.splitting else RareWatch(settings, ledger, sampler)
+    watch.is_replanned = bool(ledger.facts().get("replanned"))
+    return watch
 
 
 def crashed_copies(result: TrialResult) -> Iterator[ForcedCopy]:

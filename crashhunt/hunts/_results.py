@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from crashhunt.agents import Agent
     from crashhunt.base.codec import JsonObject
+    from crashhunt.ledger import Facts
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Outcome, TrialResult, Value
 
@@ -238,8 +239,7 @@ class HuntResults:
         settings = read_settings(self.directory / layout.HUNT)
         if not has_begun(self.directory / layout.LEDGER):
             return settings
-        with closing(self._ledger()) as ledger:
-            seed = ledger.facts().get("hunt_seed", settings.seed)
+        seed = self.facts.get("hunt_seed", settings.seed)
         if seed != settings.seed:
             raise HuntDirectoryError(
                 f"hunt.toml has seed {settings.seed}, but the trials have seed {seed}",
@@ -249,16 +249,20 @@ class HuntResults:
         return settings
 
     @cached_property
+    def facts(self) -> Facts:
+        """The facts about the hunt in its ledger, as they are when this attribute is first read."""
+        with closing(self._ledger()) as ledger:
+            return ledger.facts()
+
+    @cached_property
     def independent(self) -> bool:
         """Whether every trial was drawn independently, so that the share of crashes estimates the crash rate."""
-        with closing(self._ledger()) as ledger:
-            return draws_independently(ledger.facts(), self.settings)
+        return draws_independently(self.facts, self.settings)
 
     @cached_property
     def plain_origin(self) -> str:
         """The origin of the independently drawn trials, if only a part of the trials is independent; else empty."""
-        with closing(self._ledger()) as ledger:
-            return ledger.facts().get("plain_origin") or ""
+        return self.facts.get("plain_origin") or ""
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
@@ -267,8 +271,7 @@ class HuntResults:
         If the hunt has disturbances, the columns also contain ``disturbances`` and ``log_likelihood``; with probes,
         those in `STRESS`; with branches, those in `BRANCHES`.
         """
-        with closing(self._ledger()) as ledger:
-            origins = ORIGINS if ledger.facts().get("origins") else ()
+        origins = ORIGINS if self.facts.get("origins") else ()
         stress = STRESS if self.settings.probe else ()
         disturbances = DISTURBANCES if self.settings.disturb else ()
         branches = BRANCHES if self.settings.branch else ()

@@ -34,6 +34,7 @@ from ._rate import (
     make_rate as make_rate,
 )
 from ._running import (
+    WHY_NOT_UNTIL_RATE as WHY_NOT_UNTIL_RATE,
     BarWatch as BarWatch,
     Paced as Paced,
     RateWatch as RateWatch,

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from crashhunt.rates._units import CountingRule, Per, TrialFacts, Unit
     from crashhunt.trial import TrialResult
 
-__all__ = ["BarWatch", "Paced", "RateWatch"]
+__all__ = ["WHY_NOT_UNTIL_RATE", "BarWatch", "Paced", "RateWatch"]
+
+WHY_NOT_UNTIL_RATE = "--until-rate ends the hunt by its crashes, so crashes by trials would be biased"
+"""Why a hunt that is compared with a threshold has no estimate."""
 
 _MAX_SHARE_OF_TIME = 0.05  # that running intervals may take
 _LONGEST_PAUSE_S = 10.0  # the first interval takes long, because it imports SciPy

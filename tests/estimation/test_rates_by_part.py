@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import closing
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import pytest
 from test_comparison import hunt
 
 from crashhunt.errors import HuntDirectoryError, UsageError
-from crashhunt.estimation import measure_rates
+from crashhunt.estimation import compare, measure_rates
 from crashhunt.estimation._hunt_rate import _bins, _division, rate_of_counts, rate_of_trials
 from crashhunt.hunts import HuntResults
 from crashhunt.ledger import Ledger
@@ -143,6 +144,36 @@ def test_estimate_is_withheld_if_crashes_decide_the_number_of_trials(tmp_path, g
     assert 0 < rate.certain.low < rate.certain.high <= 1
 
 
+@pytest.mark.parametrize("seeds", [0, 8])
+def test_estimate_is_withheld_where_trials_were_changed_after_results(tmp_path, seeds):
+    path = hunt(tmp_path / "h", 10, seeds=seeds)
+    (before,) = measure_rates(path, per="trial", by="gap_m:2")
+    assert before.estimate == 0.25
+    with closing(Ledger(path / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(replanned=True)
+    (rate,) = measure_rates(path, per="trial", by="gap_m:2")
+    assert rate.estimate is None
+    assert rate.why_not.startswith("TRIALS was changed after results were known")
+    assert [part.estimate for part in rate.parts] == [None] * len(rate.parts)
+    # The interval is valid whenever looked at, but TRIALS decides which trials are a unit of --seeds.
+    assert rate.certain == (None if seeds else before.certain)
+    figures = compare(path, hunt(tmp_path / "other", 2)).hunts[0]
+    assert (math.isnan(figures.crash_rate), figures.interval) == (True, None if seeds else tuple(before.certain))
+    found = HuntResults(path)
+    with closing(Ledger(path / "ledger.sqlite")) as ledger:
+        again = rate_of_trials(path, found.settings, found.facts, ledger.plain_results(), HeldOutTraffics(()))
+    assert (again.estimate, again.certain, again.why_not) == (None, rate.certain, rate.why_not)
+
+
+def test_grid_that_was_extended_has_no_share_of_crashes(tmp_path):
+    path = hunt(tmp_path / "h", 10, sampler="grid")
+    other = hunt(tmp_path / "other", 2)
+    assert compare(path, other).hunts[0].crash_rate == 0.25
+    with closing(Ledger(path / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(replanned=True)
+    assert math.isnan(compare(path, other).hunts[0].crash_rate)
+
+
 def test_hunt_whose_trials_are_not_independent_has_no_rate(tmp_path):
     path = hunt(tmp_path / "h", 10, sampler="grid")
     (rate,) = measure_rates(path, per="trial", bar=0.1)
@@ -178,11 +209,13 @@ def test_verdict_on_a_bar_and_its_interval_are_on_the_same_side_whatever_is_roun
 
 
 def test_rate_of_the_trials_up_to_the_decision_of_a_bar(tmp_path):
-    path = hunt(tmp_path / "h", 10)
+    path = hunt(tmp_path / "h", 10, until_rate="0.1/trial")
     with closing(Ledger(path / "ledger.sqlite", writable=True)) as ledger:
         ledger.enter("rate", planned=40, hunt_seed=1, until_rate={"decided_at": 19})
     (rate,) = measure_rates(path, per="trial")
-    assert (rate.trials, rate.crashes, rate.estimate) == (20, 10, 0.5)
+    assert (rate.trials, rate.crashes, rate.estimate) == (20, 10, None)
+    assert rate.why_not.startswith("--until-rate ends the hunt by its crashes")
+    assert rate.certain is not None
 
 
 def test_counts_and_trials_give_the_measured_rate(tmp_path):

@@ -326,7 +326,7 @@ def test_earlier_runs_count_on_the_screen(hunt, monkeypatch):
     assert counts(None, {**probes, "trial": None})[2] is None
 
 
-def test_rate_of_a_hunt_depends_on_why_it_ended(monkeypatch, tmp_path):
+def test_rate_of_a_hunt_with_a_bar_has_no_estimate(monkeypatch, tmp_path):
     made = []
 
     @dataclass(frozen=True)
@@ -342,15 +342,14 @@ def test_rate_of_a_hunt_depends_on_why_it_ended(monkeypatch, tmp_path):
     monkeypatch.setattr(_hunt, "make_rate", make)
     watch = SimpleNamespace(per="trial", counter="c", sequence="s", alpha=0.05, bar=0.1, decided_at=None,
                             verdict="below", why_undecided="few")  # fmt: skip
-    assert _hunt._rate_of(tmp_path, None, "rate") is None
-    found = _hunt._rate_of(tmp_path, watch, "rate")
+    assert _hunt._rate_of(tmp_path, None) is None
+    found = _hunt._rate_of(tmp_path, watch)
     assert (found.verdict, found.why_undecided, found.excluded) == (
         "below", "few", {"after_unfinished": 2, "invalid": 1},
     )  # fmt: skip
     watch.decided_at = 0
-    assert _hunt._rate_of(tmp_path, watch, "all_trials").excluded == {"invalid": 1}
-    _hunt._rate_of(tmp_path, watch, "interrupted")
-    assert [more["why_no_estimate"] for *_, more in made] == ["", "", "the number of trials was not fixed ahead"]
+    assert _hunt._rate_of(tmp_path, watch).excluded == {"invalid": 1}
+    assert [more["why_no_estimate"].partition(" ")[0] for *_, more in made] == ["--until-rate"] * 2
     assert made[0][:4] == (str(tmp_path), "trial", "c", "s")
     assert (made[0][4]["confidence"], made[0][4]["bar"]) == (pytest.approx(95.0), 0.1)
 

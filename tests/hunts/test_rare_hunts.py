@@ -110,8 +110,13 @@ def test_splitting_needs_no_disturbance_and_is_written_as_the_second_word_of_rar
 class Rows(dict):
     """A ledger of roots."""
 
+    replanned = None
+
     def result(self, number):
         return self.get(number)
+
+    def facts(self):
+        return {"replanned": self.replanned}
 
 
 SAMPLER = DisturbanceSampler({"brake": brake()}, {"brake": 1e-3}, ("ego",), 1.0)
@@ -208,6 +213,19 @@ def test_crashes_of_plain_trials_count_for_the_undisturbed_part_and_for_the_cert
     running = rule.running()
     assert running["certain"] == {"low": found.certain[0], "high": found.certain[1]}
     assert (running["method"], running["units"], running["crashes"]) == ("rare", 60, 5)
+
+
+@pytest.mark.parametrize(("roots", "is_kept"), [(4, False), (60, True)])
+def test_estimate_after_a_change_of_trials_needs_an_interval(roots, is_kept):
+    rows = rows_of([root(number, "collision" if number % 2 else "") for number in range(roots)])
+    rows.replanned = True  # perhaps until a fork crashed
+    asked = SimpleNamespace(**vars(settings()) | {"rare": True, "splitting": False})
+    watch = rare_module.rare_watch(asked, rows, SAMPLER)
+    watch.read()
+    found = watch.estimate()
+    assert ((found.estimate is None), found.estimated is None) == (not is_kept, not is_kept)
+    assert found.why_not.startswith("TRIALS was changed after results were known, and ") != is_kept
+    assert (watch.running()["estimate"], found.certain is None) == (found.estimate, False)
 
 
 def test_running_rate_of_splitting_counts_the_pilots():
