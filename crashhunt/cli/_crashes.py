@@ -66,8 +66,8 @@ def add_known(parser: argparse.ArgumentParser) -> None:
 
 def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.crashes import count_causes, group_crashes, join_causes, list_bundles
-    from crashhunt.hunts import dropped_crashes, find_hunts
-    from crashhunt.report import describe_causes, describe_groups
+    from crashhunt.hunts import crashes_by_version, dropped_crashes, find_hunts
+    from crashhunt.report import describe_causes, describe_groups, describe_types_by_version
 
     if options.by_cause is not None and options.by_cause < 1:
         raise UsageError(f"--by-cause is {options.by_cause}", fix="give at least 1")
@@ -79,6 +79,9 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     comparison = _Comparison(found, cases, causes)
     known = comparison.known
     say(describe_groups(found.groups, known), as_json=options.json)
+    versions = crashes_by_version(hunts, found.groups)
+    for line in describe_types_by_version(versions):
+        say(line, as_json=options.json)
     if causes is not None:
         say(describe_causes(found.groups, causes), as_json=options.json)
     for why in found.left_out:
@@ -94,7 +97,8 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
             by_cause = {"types_by_cause": count_causes(joined)[0], "by_cause": [one.to_json() for one in joined]}
             pairs = zip(groups, causes, strict=True)
             groups = [{**one, "causes": [each.to_json() for each in of]} for one, of in pairs]
-        print(json.dumps({"groups": groups, **by_cause, "left_out": list(found.left_out)}))
+        apart = {"code_versions": versions} if versions else {}
+        print(json.dumps({"groups": groups, **by_cause, "left_out": list(found.left_out), **apart}))
     if interrupted:
         say("Interrupted: some causes are not known yet. Run the same command to resume.", as_json=options.json)
     if interrupted:

@@ -160,11 +160,12 @@ def _table(states: Sequence[HuntState], omitted: Sequence[str] = ()) -> Table:
 
 def _facts(state: HuntState) -> list[str]:
     """Return the facts of a hunt that are not in a column, one line each."""
-    from crashhunt.report import describe_running
+    from crashhunt.report import describe_running, describe_versions
 
     crashes = _crashes(state)
     lines = [f"{state.crashes} {'crash' if state.crashes == 1 else 'crashes'}: {crashes}"] if crashes else []
     lines += [describe_running(state.rate) + _not_counted(state)] if state.rate is not None else []
+    lines += [describe_versions(state.code_versions)] if state.code_versions else []
     lines += fork_lines(state)
     lines += [one_line(notice) for notice in state.notices or ()]
     return [*lines, *([f"compiled core {state.core}"] if state.core is not None else [])]
@@ -179,7 +180,7 @@ def _not_counted(state: HuntState) -> str:
     rate = state.rate
     if rate is None or rate["method"] == "rare" or rate["per"] != "trial" or rate["bar"] is not None:
         return ""
-    if rate["certain"] is None or rate["origin"] or rate.get("trained_on"):
+    if rate["certain"] is None or rate["origin"] or rate.get("trained_on") or state.code_versions:
         return ""  # trials are excluded for other reasons
     count = state.trials_run - state.outcomes.get("invalid", 0) - rate["trials"]
     if count <= 0:

@@ -28,6 +28,7 @@ from crashhunt.dashboard._crashes import CrashList
 from crashhunt.dashboard._details import HuntComparer, detail_of, importance_of_points
 from crashhunt.dashboard._hunt import HuntView
 from crashhunt.dashboard._security import Guard
+from crashhunt.hunts import CodeVersions
 from crashhunt.report import argument_units, player_parts
 
 if TYPE_CHECKING:
@@ -135,7 +136,9 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
                     f"{agent}.{name}" if agent and several else name: unit for (agent, name), unit in found.items()
                 }
         points = view.sample.points if view.sample is not None else []
-        return _answer(request, {"importance": importance_of_points(points), "units": units})
+        return _answer(
+            request, {"importance": importance_of_points(points, CodeVersions.of(view.facts).first), "units": units}
+        )
 
     def crashes(request: Request) -> Response:
         found = shown.crashes(request.path_params["hunt"])

@@ -16,7 +16,7 @@ from crashhunt.dashboard._hunt import read_tail
 from crashhunt.estimation import compare
 from crashhunt.ledger import leave_untouched
 from crashhunt.recording import Phase, read_header
-from crashhunt.report import UNCHOSEN, importance_of
+from crashhunt.report import UNCHOSEN, describe_versions, importance_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -64,7 +64,10 @@ def detail_of(view: HuntView) -> JsonObject:
         "workers": _workers(view) if row["state"] == "running" else [],
         "run_log": log,
         "run_log_of": log_name,
-        "problems": view.sample.problems if view.sample is not None else [],
+        "problems": [
+            *([describe_versions(row["code_versions"])] if row.get("code_versions") else []),
+            *(view.sample.problems if view.sample is not None else []),
+        ],
     }
 
 
@@ -136,12 +139,18 @@ def _workers(view: HuntView) -> list[JsonObject]:
     return [found[trial] for trial in sorted(found)]
 
 
-def importance_of_points(points: Sequence[Point]) -> list[JsonObject]:
-    """Return the share of the variation in criticality that each argument explains, as in the report."""
+def importance_of_points(points: Sequence[Point], first: int = 0) -> list[JsonObject]:
+    """Return the share of the variation in criticality that each argument explains, as in the report.
+
+    Args:
+        points: the trials.
+        first: number of the first trial that counts; trials of lower numbers may have run with other code.
+    """
     trials: list[tuple[Mapping[str, Value], float]] = []
     for point in points:
         danger = 1.0 if point["category"] != "no crash" else point["danger"]
-        if point["origin"] in UNCHOSEN and point["parent"] is None and isinstance(danger, float):
+        counts = isinstance(point["number"], int) and point["number"] >= first
+        if counts and point["origin"] in UNCHOSEN and point["parent"] is None and isinstance(danger, float):
             values = point["values"]
             assert isinstance(values, dict)
             trials.append((values, danger))

@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
@@ -16,7 +16,7 @@ from crashhunt.crashes import crash_folders
 from crashhunt.dashboard._catalog import unreadable, unreadable_below
 from crashhunt.dashboard._trials import Sample, TrialCounts
 from crashhunt.estimation import counts_suffice, rate_of_counts, rate_of_trials
-from crashhunt.hunts import HuntState, hunt_state, state_of_facts, sums_of_branches, sums_of_probes
+from crashhunt.hunts import HuntState, count_versions, hunt_state, state_of_facts, sums_of_branches, sums_of_probes
 from crashhunt.ledger import Ledger, damaged, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.training import held_out_traffics
@@ -65,6 +65,7 @@ class HuntView:
         self._last: float | None = None
         self._state: HuntState | None = None
         self._copies: JsonObject = {}
+        self._versions: list[JsonObject] = []
         self._copies_due = 0.0
         self._rate: JsonObject | None = None
         self._rate_key: object = None
@@ -129,6 +130,7 @@ class HuntView:
             state="crashed" if state.state == "finished" and found else state.state,
             crashes=found,
             crashes_saved=saved if saved < found else None,
+            code_versions=self._versions or None,
             **self._copies,
         )
 
@@ -179,6 +181,7 @@ class HuntView:
                     sample = Sample(settings.crash_on)
                     sample.begin(ledger, self.counts.last, self.counts.crashes)
                     self.sample = sample
+                self._versions = [asdict(one) for one in count_versions(ledger, self.facts, settings.crash_on)]
                 self._read_copies(ledger)
         finally:
             ledger.close()

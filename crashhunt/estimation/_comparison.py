@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections import Counter
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, TextIO
@@ -71,13 +72,14 @@ class HuntFigures:
         median_steps_to_crash: median number of steps until a crash; NaN if there was no crash.
         median_time_to_collision_s: median, over trials without a crash, of the least time to collision, in s; infinite
             if most trials had no collision course.
-        outcomes: number of trials with each outcome, over all trials, including invalid trials.
+        outcomes: number of trials with each outcome, over all trials with the newest code, including invalid trials.
         counted: origin of the trials that count, if the search guided all others. Only unguided trials show a crash
             rate. The origin is empty if all trials count.
         disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
         excluded: number of trials that do not count, because a trial with a lower number has not ended.
         exclusions: number of trials that do not count, by reason. Reason ``trained_on``: an agent of this hunt, or of a
-            compared hunt with the same seed, was trained on the traffic of these trials.
+            compared hunt with the same seed, was trained on the traffic of these trials. Reason ``other_code``: the
+            trials ran with earlier code, or had begun when the code changed.
         per: the unit to which rate and interval refer: ``trial``, ``hour`` or ``1000km``.
     """
 
@@ -320,7 +322,11 @@ class _Side:
 
 def _figures(side: _Side) -> HuntFigures:
     hunt, rate = side.hunt, side.rate()
-    table = _table(side)
+    table, outcomes = _table(side), hunt.state.outcomes
+    if hunt.code_versions.are_several:
+        with closing(Ledger(hunt.directory / layout.LEDGER)) as ledger:
+            used = ledger.snapshots()
+        outcomes = dict(sum((Counter(used.get(digest)) for digest in hunt.code_versions.newest), Counter()))
     valid = table[table["valid"]]
     crashed, fine = valid[valid["crash"]], valid[~valid["crash"]]
     return HuntFigures(
@@ -334,7 +340,7 @@ def _figures(side: _Side) -> HuntFigures:
         why_not=rate.why_not if rate.trials or rate.excluded.get("trained_on") else "there is no valid trial",
         median_steps_to_crash=float(np.median(crashed["steps"])) if len(crashed) else float("nan"),
         median_time_to_collision_s=float(np.median(fine["ttc"])) if len(fine) else float("nan"),
-        outcomes=hunt.state.outcomes,
+        outcomes=outcomes,
         counted=hunt.plain_origin,
         disturbed=_disturbed(hunt, set(crashed["number"].tolist())) if hunt.settings.disturb else None,
         excluded=rate.excluded.get("after_unfinished", 0),
@@ -362,16 +368,17 @@ def _share(hunt: HuntResults, rate: CrashRate) -> float:
 def _table(side: _Side) -> NDArray[np.void]:
     """Return number, steps, least time to collision, whether it counts and whether it crashed, for each trial in order.
 
-    If the search guided the hunt, only unguided trials are returned. Trials with training traffic are excluded.
+    If the search guided the hunt, only unguided trials are returned. Trials with training traffic and trials with
+    earlier code are excluded.
     """
-    hunt, held_out = side.hunt, side.held_out
+    hunt, held_out, first = side.hunt, side.held_out, side.hunt.code_versions.first
     crash_on = hunt.settings.crash_on
     fields = [("number", "i8"), ("steps", "i8"), ("ttc", "f8"), ("valid", "?"), ("crash", "?")]
     with closing(Ledger(hunt.directory / layout.LEDGER)) as ledger:
         rows = (
             (number, steps, np.inf if ttc is None else ttc, name != Outcome.INVALID, name in crash_on)
             for number, seed, name, steps, ttc in ledger.table()
-            if held_out.has(seed)
+            if held_out.has(seed) and number >= first
         )
         table = np.fromiter(rows, fields)
     if hunt.plain_origin:

@@ -119,7 +119,7 @@ def measure_rates(
 def counts_suffice(settings: HuntSettings, facts: Facts, held_out: HeldOutTraffics) -> bool:
     """Return whether the rate per trial follows from the counts of the first trials, without reading each trial."""
     rule = counting_rule(settings, facts, held_out)
-    is_each = not rule.traffics and not rule.plain_origin and rule.is_held_out is None
+    is_each = not rule.traffics and not rule.plain_origin and rule.is_held_out is None and not rule.first
     return is_each and not facts.get("until_rate")
 
 

@@ -121,6 +121,7 @@ class RunData(TypedDict):
     copied: NotRequired[str]
     rare: NotRequired[JsonObject]
     rate: NotRequired[RateEntry]
+    code_versions: NotRequired[list[JsonObject]]
 
 
 class DivergenceData(TypedDict):
@@ -319,6 +320,7 @@ class CrashesData(TypedDict):
     types_by_cause: NotRequired[int]
     by_cause: NotRequired[list[JsonObject]]
     left_out: list[str]
+    code_versions: NotRequired[dict[str, dict[str, dict[str, int]]]]
 
 
 class PlainRunData(TypedDict):

@@ -1,7 +1,13 @@
 from ._check import Checked as Checked, CheckFinding as CheckFinding, check as check, salvage as salvage
+from ._code_versions import (
+    CodeVersions as CodeVersions,
+    VersionCounts as VersionCounts,
+    count_versions as count_versions,
+)
 from ._crashes import (
     CrashTally as CrashTally,
     FoundCrashes as FoundCrashes,
+    crashes_by_version as crashes_by_version,
     dropped_crashes as dropped_crashes,
     find_crashes as find_crashes,
 )

@@ -28,16 +28,17 @@ from crashhunt.crashes import (
     signature_of,
     without_chance_lengths,
 )
+from crashhunt.hunts._code_versions import CodeVersions
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, Cause, Signature
-    from crashhunt.ledger import Facts, KindData
+    from crashhunt.ledger import Facts, KindData, Noted
     from crashhunt.trial import TrialResult
 
 __all__ = [
@@ -45,6 +46,7 @@ __all__ = [
     "FoundCrashes",
     "Judged",
     "Kinds",
+    "crashes_by_version",
     "dropped_crashes",
     "find_crashes",
     "outcomes_of_crashes",
@@ -84,18 +86,24 @@ class CrashTally:
             self.log_likelihood = result.log_likelihood
 
 
-def tally_crashes(ledger: Ledger, crash_on: Sequence[str], *, disturbed: bool) -> CrashTally:
+def tally_crashes(
+    ledger: Ledger, crash_on: Sequence[str], *, disturbed: bool, snapshots: Sequence[str] = ()
+) -> CrashTally:
     """Return the counts of the crashes in a ledger.
 
     Args:
         ledger: ledger of the hunt.
         crash_on: the outcomes that count as a crash.
         disturbed: whether the hunt has disturbances, so that crashes with disturbances are counted.
+        snapshots: digests of the snapshots whose trials count; empty for all trials.
     """
-    outcomes = ledger.outcomes()
+    outcomes = Counter(ledger.outcomes())
+    if snapshots:
+        used = ledger.snapshots()
+        outcomes = sum((Counter(used.get(digest)) for digest in snapshots), Counter())
     found = CrashTally(sum(outcomes.get(name, 0) for name in crash_on))
     if disturbed and found.found:
-        found.disturbed, likeliest = ledger.disturbed_crashes(tuple(crash_on))
+        found.disturbed, likeliest = ledger.disturbed_crashes(tuple(crash_on), snapshots)
         if likeliest is not None:
             number, outcome, found.log_likelihood = likeliest
             found.likeliest = layout.crash_folder(number, outcome)
@@ -165,8 +173,15 @@ def find_crashes(directory: Path, limit: int) -> FoundCrashes:
         tally = tally_crashes(ledger, crash_on, disturbed=bool(facts.get("disturb")))
         tally.found = max(tally.found, len(folders) + sum(dropped.values()))  # a bundle is written before its row
         steps = {number: steps for number, _, name, steps, _ in ledger.table() if name in crash_on}
+        versions = CodeVersions.of(facts)
+        apart = ledger.numbers_from(versions.earlier)
     noted = _noted_types(facts)
-    if noted is None or (sum(kind["count"] for kind in noted) != tally.found and len(folders) <= _MAX_READ_LOGS):
+    if apart:  # types are those of the newest code
+        dropped = {words: len(set(numbers) - apart) for words, numbers in (facts.get("dropped") or {}).items()}
+        dropped = {words: count for words, count in dropped.items() if count}
+        bundles = [bundle for bundle in list_bundles(directory) if bundle.snapshot not in versions.earlier]
+        types, shortest = _types_of(bundles, dropped)
+    elif noted is None or (sum(kind["count"] for kind in noted) != tally.found and len(folders) <= _MAX_READ_LOGS):
         types, shortest = _types_of(list_bundles(directory), dropped)
     else:
         types = {kind["words"]: kind["count"] for kind in noted}
@@ -177,7 +192,7 @@ def find_crashes(directory: Path, limit: int) -> FoundCrashes:
         saved=len(folders),
         types=types,
         shortest=shortest,
-        untyped=max(0, tally.found - sum(types.values())),
+        untyped=max(0, tally.found - sum(number in apart for number in steps) - sum(types.values())),
         shown=_listed_crashes(folders, names, shortest, limit),
     )
 
@@ -245,6 +260,7 @@ class Kinds:
         dropped_at_fault: those of the trials in `dropped` whose crashes are the agent's fault.
         dropped_judged: those of the trials in `dropped` whose crashes were judged, with their causes.
         by_cause: number of crashes of each type to judge, so that causes count; 0 if types count.
+        apart: the numbers of trials with other versions of the code, whose crashes do not count.
     """
 
     def __init__(
@@ -258,6 +274,7 @@ class Kinds:
         dropped_at_fault: Sequence[int] = (),
         dropped_judged: Mapping[str, Mapping[str, JsonObject]] | None = None,
         by_cause: int = 0,
+        apart: Collection[int] = frozenset(),
     ) -> None:
         self._by_cause = by_cause
         self._divisions: dict[Signature, Division] = {}
@@ -274,14 +291,19 @@ class Kinds:
         self.newest = newest
         self.newest_trial: int | None = None
         there = {bundle.result.spec.number for bundle in crashes}  # it was killed before it had removed them
-        self.dropped = {
-            words: [number for number in numbers if number not in there] for words, numbers in (dropped or {}).items()
-        }
-        self._dropped_at_fault = {number for number in dropped_at_fault if number not in there}
-        self.dropped_judged = {
-            words: {number: answer for number, answer in answers.items() if int(number) not in there}
-            for words, answers in (dropped_judged or {}).items()
-        }
+        self.dropped, self._dropped_apart = {}, {}
+        for words, numbers in (dropped or {}).items():
+            self.dropped[words] = [number for number in numbers if number not in there and number not in apart]
+            self._dropped_apart[words] = [number for number in numbers if number in apart]
+        self._dropped_at_fault = {number for number in dropped_at_fault if number not in there and number not in apart}
+        self._at_fault_apart = {number for number in dropped_at_fault if number in apart}
+        self.dropped_judged: dict[str, dict[str, JsonObject]] = {}
+        self._judged_apart: dict[str, dict[str, JsonObject]] = {}
+        for words, answers in (dropped_judged or {}).items():
+            for word, answer in answers.items():
+                if int(word) not in there:
+                    judged = self._judged_apart if int(word) in apart else self.dropped_judged
+                    judged.setdefault(words, {})[word] = answer
         for bundle in crashes:
             self._add_signature(bundle)
         for signature in self._seen:
@@ -442,10 +464,16 @@ class Kinds:
         """The trials whose crashes are the agent's fault, also without a bundle; None without ``--only-at-fault``."""
         return tuple(sorted(self._at_fault | self._dropped_at_fault)) if self._only_at_fault else None
 
-    @property
-    def dropped_at_fault(self) -> list[int]:
-        """The trials with deleted bundles whose crashes are the agent's fault."""
-        return sorted(self._dropped_at_fault)
+    def dropped_facts(self) -> Noted:
+        """Return the crashes whose bundles were deleted in the form that the ledger stores, of all versions."""
+        dropped = {words: list(numbers) for words, numbers in self._dropped_apart.items()}
+        judged = {words: dict(answers) for words, answers in self._judged_apart.items()}
+        for words, numbers in self.dropped.items():
+            dropped.setdefault(words, []).extend(numbers)
+        for words, answers in self.dropped_judged.items():
+            judged.setdefault(words, {}).update(answers)
+        at_fault = sorted(self._dropped_at_fault | self._at_fault_apart)
+        return {"dropped": dropped, "dropped_at_fault": at_fault, "dropped_judged": judged or None}
 
     def refresh(self, crashes: Sequence[Bundle]) -> None:
         """Replace the crashes by their confirmed versions."""
@@ -507,12 +535,38 @@ def prune_bundles(
     excess = kinds.drop_excess(keep, final=final) if kinds is not None and keep else []
     if not excess or kinds is None:
         return crashes
-    judged = kinds.dropped_judged or None
-    ledger.note(dropped=kinds.dropped, dropped_at_fault=kinds.dropped_at_fault, dropped_judged=judged)
+    ledger.note(**kinds.dropped_facts())
     for bundle in excess:
         remove_at_once(bundle.path)  # half a bundle would be a damaged one
     gone = {bundle.id for bundle in excess}
     return [bundle for bundle in crashes if bundle.id not in gone]
+
+
+def crashes_by_version(hunts: Iterable[Path], groups: Iterable[Group]) -> dict[str, dict[str, dict[int, int]]]:
+    """Return the number of crashes of each type (as text) with each version of the code, of hunts with several.
+
+    Args:
+        hunts: directories of hunts.
+        groups: the groups of their crashes, one for each crash type.
+    """
+    found: dict[str, dict[str, dict[int, int]]] = {}
+    every = list(groups)
+    for hunt in hunts:
+        if not has_begun(hunt / layout.LEDGER):
+            continue
+        with suppress(HuntDirectoryError), closing(Ledger(hunt / layout.LEDGER)) as ledger:
+            facts = ledger.facts()
+            versions = CodeVersions.of(facts)
+            if not versions.are_several:
+                continue
+            ran = {number: ledger.numbers_from(one) for number, one in enumerate(versions.snapshots, 1)}
+            dropped = facts.get("dropped") or {}
+            for group in every:
+                own = [bundle.result.spec.number for bundle in group.bundles if bundle.hunt == hunt]
+                own += dropped.get(str(group.signature), ())
+                counts = {version: len(numbers.intersection(own)) for version, numbers in ran.items()}
+                found.setdefault(str(hunt), {})[str(group.signature)] = counts
+    return found
 
 
 def dropped_crashes(hunts: Iterable[Path]) -> dict[str, int]:

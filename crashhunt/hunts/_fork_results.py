@@ -352,7 +352,7 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
     directory, ledger, keep = again.place.path, again.ledger, again.settings.run.near_misses
     if not keep or len(again.stops):
         return ()
-    numbers = ledger.most_dangerous(keep)
+    numbers = ledger.most_dangerous(keep, again.newest)
     if not numbers and ledger.numbers_of(("survived", "finished")):
         again.notes.append(
             "no near miss is kept, because no trial without a crash has a criticality above 0, or because the scenario "

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
@@ -19,6 +20,7 @@ from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, trust_repositories, write_bundle, write_trial
 from crashhunt.episode import internal_error, scratch_of
 from crashhunt.executors import HostConditions, SharedExecutors, make_executor, read_map
+from crashhunt.hunts._code_versions import CodeVersions, count_versions, resumed_versions
 from crashhunt.hunts._crashes import prune_bundles, tally_crashes
 from crashhunt.hunts._fork_results import ForkCrashes, keep_near_misses, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace, Trials, Unanswered, settings_of_workers
@@ -36,7 +38,7 @@ from crashhunt.hunts._state import (
     sums_of_probes,
 )
 from crashhunt.hunts._verification import Audit, Confirmation, PendingAudits, TrialReruns, VerificationRuns, is_settled
-from crashhunt.ledger import Ledger
+from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import core_of, disturber_apart, parallel_here, sampler_of
 from crashhunt.rates import WHY_NOT_UNTIL_RATE, make_rate
 from crashhunt.snapshots import (
@@ -71,6 +73,7 @@ _TICK_S = 0.1  # how late a stop, a heartbeat or the screen may be
 # the ledger, so the lead must be longer: otherwise, two hunts could wait for each other.
 _MAX_LEAD_PER_WORKER, _MAX_LEAD_S = 8, 5.0
 _QUIET_WAIT_S, _MAX_WAIT_S = 3.0, 600.0  # for another program that locks the ledger
+_MAX_ADDED_SHOWN = 4  # new files
 _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker waits for the hunt
 
 
@@ -116,8 +119,11 @@ class Hunt:
         self._imported = imported
         self._pace = Pace(partner) if partner is not None else None
         self._stops: Sequence[int] = ()
+        self._snapshot: Snapshot | None = None
         self._new_snapshot: Path | None = None  # that this run has added
         self._conditions: HostConditions | None = None  # once there is a snapshot
+        self._code, self._is_new_code = CodeVersions(), False
+        self._notes: list[str] = []
         self._progress: Progress | None = None  # once the ledger says that the hunt runs
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
@@ -135,6 +141,7 @@ class Hunt:
             self.settings = self._place.claim(
                 self.settings, self._command, overwrite=self._overwrite, seed_given=self._seed_given
             )
+            self._compare_code()
             ledger = Ledger(self.directory / layout.LEDGER, writable=True)
             try:
                 return self._run(ledger, watch or (lambda _: None))
@@ -162,6 +169,46 @@ class Hunt:
             return internal_error(error)
         return HuntDirectoryError(f"{error.strerror or error}", fix=fix, where=str(error.filename or self.directory))
 
+    def _compare_code(self) -> None:
+        """Compare the code with that of the hunt's trials, before anything is written into the ledger.
+
+        Raises:
+            HuntDirectoryError: the code has changed, and the hunt must not or cannot continue.
+        """
+        path = self.directory / layout.LEDGER
+        if not has_begun(path):
+            return
+        taken = self._take_snapshot()
+        try:
+            with closing(Ledger(path)) as ledger:
+                before = CodeVersions.of(ledger.facts())
+                self._code, added = resumed_versions(
+                    self.directory, ledger, taken, self.settings, self._place.settings_before or self.settings,
+                    new_code=self._snapshot_options is not None and self._snapshot_options.new_code,
+                )  # fmt: skip
+        except CrashhuntError:
+            if self._new_snapshot is not None:
+                remove_at_once(self._new_snapshot)
+            raise
+        self._is_new_code = self._code.place != before.place
+        if added:
+            shown = ", ".join(added[:_MAX_ADDED_SHOWN]) + (", …" if len(added) > _MAX_ADDED_SHOWN else "")
+            self._notes.append(f"new since the earlier trials, and not counted as a change of the code: {shown}")
+        if self._code.are_several:
+            os.utime(taken.path)  # `latest_snapshot` finds it, also if the code is an earlier version again
+
+    def _take_snapshot(self) -> Snapshot:
+        """Return the snapshot of this run, which is taken once."""
+        if self._snapshot is None:
+            snapshots = self.directory / layout.SNAPSHOTS
+            known = {path.name for path in snapshots.glob(layout.SHOWN)}
+            taken = take_snapshot(
+                snapshots, self.scenario, self.settings, self._snapshot_options, imported=self._imported
+            )
+            self._new_snapshot = taken.path if taken.path.name not in known else None
+            self._snapshot = taken
+        return self._snapshot
+
     def _fail(self, ledger: Ledger, why: str) -> None:
         """Record why the hunt ends, if the ledger can still be written.
 
@@ -178,16 +225,13 @@ class Hunt:
             ledger.enter("error", encodable(why), **last)
 
     def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
-        settings = self.settings
-        snapshots = self.directory / layout.SNAPSHOTS
-        known = {path.name for path in snapshots.glob(layout.SHOWN)}
-        snapshot = take_snapshot(snapshots, self.scenario, settings, self._snapshot_options, imported=self._imported)
-        self._new_snapshot = snapshot.path if snapshot.path.name not in known else None
+        settings, code = self.settings, self._code
+        snapshot = self._take_snapshot()
         roots = self._snapshot_options.roots if self._snapshot_options is not None else ()
         trust_repositories(snapshot.environment().get("git", {}).keys() - {str(root.resolve()) for root in roots})
         sampler = sampler_of(settings)
         self._disturber = disturber_apart(self.scenario, settings)
-        progress = Progress()
+        progress = Progress(notes=self._notes)
         finished = ledger.finished()
         # It was killed between saving the one and the other. Where the trial is from, only its proposal says.
         unrecorded = [bundle for bundle in list_bundles(self.directory) if bundle.result.spec.number not in finished]
@@ -200,12 +244,17 @@ class Hunt:
         progress.outcomes.update(ledger.outcomes())
         progress.nearest = ledger.nearest_miss()
         before = ledger.facts()
-        progress.resume(list_bundles(self.directory), settings.run, before)
-        progress.tally = tally_crashes(ledger, settings.crash_on, disturbed=self._disturber is not None)
+        apart = ledger.numbers_from(code.earlier)
+        bundles = list_bundles(self.directory)
+        progress.earlier = [bundle for bundle in bundles if bundle.snapshot in code.earlier]
+        progress.resume([one for one in bundles if one not in progress.earlier], settings.run, before, apart)
+        progress.tally = tally_crashes(
+            ledger, settings.crash_on, disturbed=self._disturber is not None, snapshots=code.newest
+        )
         self._resume_counts(ledger, progress, before, settings)
         held_out = held_out_traffics(settings, [self.directory])
         refuse_training_traffic(settings, held_out)
-        progress.rate = bar_watch(settings, ledger, held_out)
+        progress.rate = bar_watch(settings, ledger, held_out, code.first)
         (lag, lag_grows), alike = self._result_lag(before), not finished or draws_independently(before, settings)
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
         self._conditions = HostConditions(worker_settings)
@@ -222,6 +271,7 @@ class Hunt:
             disturber=self._disturber,
             unanswered=again,
             forcings=forcings_of(settings, ledger, self._disturber),
+            apart=apart,
         )
         if not progress.is_done:
             trials.require_same_version()
@@ -233,7 +283,8 @@ class Hunt:
             heartbeat=time.time(),
             elapsed_s=0.0,
             planned=settings.trials,
-            replanned=before.get("replanned") or (bool(finished) and before.get("planned") != settings.trials) or None,
+            replanned=self._is_replanned(before, finished) or None,
+            code_versions=code.noted(),
             until=time.time() + settings.run.duration_s if settings.run.duration else None,
             hunt_seed=settings.seed,
             crash_on=list(settings.crash_on),
@@ -276,6 +327,7 @@ class Hunt:
             executors=SharedExecutors(self._place.scratch / "confirmations", parallel=self._parallel_here),
             phases=PhaseClock(self._show_phase(ledger, progress, watch), self._parallel_here),
             taken=snapshot.digest,
+            newest=code.newest,
         )
         try:
             return self._run_with(runs_again, ledger, trials, snapshot, progress, finished, watch)
@@ -308,6 +360,7 @@ class Hunt:
             ledger, progress.kinds, progress.crashes, settings.run.keep, final=not self._stops
         )
         progress.replace(runs_again.confirm(progress.crashes))
+        runs_again.confirm(progress.earlier)
         if self._audits_left.numbers:
             self._audits_left.finish(runs_again, progress)
         near, (probes, branches) = keep_near_misses(runs_again), verify_fork_results(copies)
@@ -349,6 +402,7 @@ class Hunt:
             rare=rare,
             tally=progress.tally,
             rate=_rate_of(self.directory, progress.rate),
+            code_versions=count_versions(ledger, ledger.facts(), settings.crash_on),
         )
 
     def _wait_for_ledger(self, progress: Progress, watch: Callable[[HuntStatus], None], waited_s: float) -> None:
@@ -369,6 +423,13 @@ class Hunt:
         if note not in progress.notes:
             progress.notes.append(note)
         watch(self._status(progress, "waiting"))
+
+    def _is_replanned(self, before: Facts, finished: set[int]) -> bool:
+        """Return whether TRIALS was changed after results of the present code were known."""
+        if self._is_new_code:
+            return False
+        has_results = any(number >= self._code.first for number in finished)
+        return bool(before.get("replanned")) or (has_results and before.get("planned") != self.settings.trials)
 
     def _show_phase(
         self, ledger: Ledger, progress: Progress, watch: Callable[[HuntStatus], None]
@@ -434,6 +495,7 @@ class Hunt:
                 for spec in [] if stopping else trials.take(min(room, _under_way(executor.capacity) - len(in_flight))):
                     executor.submit(spec)
                     in_flight.add(spec.number)
+                progress.under_way = max(progress.under_way, len(in_flight))
                 if (not in_flight and (room > 0 or stopping)) or precise:
                     break
                 with ledger.together():

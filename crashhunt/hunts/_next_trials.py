@@ -24,7 +24,7 @@ from crashhunt.plans import with_settings
 from crashhunt.trial import KILLED, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
     from pathlib import Path
 
     from crashhunt.disturbances import DisturbanceSampler
@@ -92,7 +92,7 @@ class Trials:
         lag_grows: whether the first trials of a deterministic hunt have a smaller lag (`growing_lag`).
         disturber: object that draws the disturbances of trials; None if trials have no disturbances.
         forcings: object that returns the forcing of each root in rare mode; None in any other hunt.
-
+        apart: the finished trials of other versions of the code, whose results a learning sampler does not receive.
         begun_with: version of the proposals that the hunt already contains; None if it contains none.
 
     Raises:
@@ -112,6 +112,7 @@ class Trials:
         disturber: DisturbanceSampler | None = None,
         unanswered: Sequence[TrialSpec] = (),
         forcings: Forcings | SplittingForcings | None = None,
+        apart: Collection[int] = frozenset(),
     ) -> None:
         self._settings = settings
         self._sampler = sampler
@@ -131,7 +132,7 @@ class Trials:
         self._untold: list[int] = []  # a heap of the trials that have ended
         self._results: dict[int, TrialResult] = {}  # of those, what has ended in this run
         if sampler.learns:
-            self._resume(finished)
+            self._resume(finished, finished.difference(apart))
 
     @property
     def upcoming(self) -> int | None:
@@ -234,18 +235,23 @@ class Trials:
             told.append(number)
         return tuple(told)
 
-    def _resume(self, finished: set[int]) -> None:
-        """Pass earlier results to the sampler in their original order, and find the proposals without a result."""
+    def _resume(self, finished: set[int], known: set[int]) -> None:
+        """Pass earlier results to the sampler in their original order, and find the proposals without a result.
+
+        Args:
+            finished: the numbers of the finished trials.
+            known: those of the trials whose results the sampler receives.
+        """
         told = set()
         for turn in self._ledger.turns():
             for number in turn.told:
-                result = self._ledger.result(number) if number in finished else None
+                result = self._ledger.result(number) if number in known else None
                 if result is not None:  # otherwise it runs again, and the sampler receives that result
                     self._sampler.tell(result)
                     told.add(number)
             if turn.spec.number not in finished:
                 self._proposed[turn.spec.number] = turn.spec
-        self._untold = sorted(finished - told)
+        self._untold = sorted(known - told)
 
 
 class Pace:

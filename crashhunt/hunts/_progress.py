@@ -23,7 +23,7 @@ from crashhunt.hunts._reports import kind_data
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Collection, Iterable, Sequence
 
     from crashhunt.crashes import Bundle
     from crashhunt.executors import Executor, NodeFigures
@@ -237,6 +237,8 @@ class Progress:
     ended_here: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     crashes: list[Bundle] = field(default_factory=list)
+    earlier: list[Bundle] = field(default_factory=list)  # crashes of other versions of the code, which end no hunt
+    under_way: int = 0  # the greatest number of trials at a time
     tally: CrashTally = field(default_factory=CrashTally)
     found: dict[int, TrialResult] = field(default_factory=dict)  # crashes that are not saved yet
     copied: dict[int, Bundle] = field(default_factory=dict)  # what copies of trials have found, run from the start
@@ -258,9 +260,19 @@ class Progress:
     counted_before: set[int] = field(default_factory=set)  # trials that run again, and that the rate has already
     rare: RareWatch | None = None
 
-    def resume(self, crashes: list[Bundle], run: RunSettings, before: Facts) -> None:
-        """Add the crashes that earlier runs have saved."""
+    def resume(
+        self, crashes: list[Bundle], run: RunSettings, before: Facts, apart: Collection[int] = frozenset()
+    ) -> None:
+        """Add the crashes that earlier runs have saved.
+
+        Args:
+            crashes: the saved crashes of the present version of the code.
+            run: options that determine how the hunt runs.
+            before: facts from the hunt's ledger.
+            apart: the numbers of the trials of other versions.
+        """
         self.crashes = crashes
+        self.under_way = before.get("under_way", 0)
         self.failed_steps = before.get("failed_steps", 0)
         if run.keep_going or run.only_at_fault:
             wanted = run.distinct if run.keep_going else 1
@@ -274,6 +286,7 @@ class Progress:
                 dropped_at_fault=before.get("dropped_at_fault") or (),
                 dropped_judged=before.get("dropped_judged"),
                 by_cause=run.by_cause,
+                apart=apart,
             )
 
     def count(self, result: TrialResult, *, crashed: bool, planned: int) -> None:
@@ -407,6 +420,7 @@ class Progress:
         rate: Noted = {"running_rate": self.running_rate(now=now)}
         phase: Noted = {"phase": None if self.phase is None else self.phase.to_json(), "ends_at": self.ends_at}
         beat: Noted = {"heartbeat": time.time(), "elapsed_s": time.monotonic() - self.began}
+        beat["under_way"] = self.under_way
         return {**beat, **audits, **nodes, **kinds, **in_vain, **bar, **phase, **rate}
 
     def about_kinds(self, *, running: bool = False) -> tuple[tuple[Group, ...] | None, float | None, int | None]:

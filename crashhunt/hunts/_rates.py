@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.disturbances import first_forcing
+from crashhunt.hunts._code_versions import CodeVersions
 from crashhunt.plans import rate_of, share_of
 from crashhunt.rates import (
     BLOCK,
@@ -78,6 +79,7 @@ def counting_rule(settings: HuntSettings, facts: Facts, held_out: HeldOutTraffic
         traffics=settings.seeds,
         planned=settings.trials,
         is_held_out=held_out.has if held_out is not None and held_out.records else None,
+        first=CodeVersions.of(facts).first,
     )
 
 
@@ -111,17 +113,12 @@ def why_no_interval(settings: HuntSettings, facts: Facts) -> str:
     return f"the sampler {settings.sampler} does not draw trials independently"
 
 
-def bar_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics) -> BarWatch | None:
+def bar_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics, first: int = 0) -> BarWatch | None:
     """Return an object that compares the rate with the threshold, with earlier trials added; None without threshold."""
     if not settings.run.until_rate:
         return None
     bar, per = rate_of(settings.run.until_rate)
-    rule = CountingRule(
-        max_steps=settings.max_steps,
-        agents=max(1, len(settings.agents)),
-        planned=settings.trials,
-        is_held_out=held_out.has if held_out.records else None,
-    )
+    rule = replace(counting_rule(settings, {"independent": True}, held_out), first=first)
     watch = BarWatch(rule, bar, per, settings.crash_on)
     for data in ledger.plain_results():
         watch.add(data)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.codec import Serializable
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, Group
+    from crashhunt.hunts._code_versions import VersionCounts
     from crashhunt.ledger import KindData
     from crashhunt.plans import HuntSettings
     from crashhunt.rates import CrashRate, RareEstimate
@@ -301,6 +302,8 @@ class HuntReport:
             their confirmation.
         unanswered: number of trials that the same command runs again, because they or their forks were killed.
         rate: the rate, compared with the threshold in ``until_rate``; None if there is no threshold.
+        code_versions: the trials of each version of the code; empty if all trials ran with the same code. Crashes,
+            types and rate are those of the newest version.
     """
 
     directory: Path
@@ -327,6 +330,7 @@ class HuntReport:
     rate: CrashRate | None = None
     rare: RareReport | None = None
     tally: CrashTally = field(default_factory=CrashTally)
+    code_versions: tuple[VersionCounts, ...] = ()
 
     def to_json(self) -> JsonObject:
         """Return the report in the form that ``run --json`` prints."""
@@ -365,4 +369,6 @@ class HuntReport:
             found["rare"] = self.rare.to_json()
         if self.rate is not None:
             found["rate"] = self.rate.to_json()
+        if self.code_versions:
+            found["code_versions"] = list(map(asdict, self.code_versions))
         return found

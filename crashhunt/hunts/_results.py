@@ -22,6 +22,7 @@ from crashhunt.base.temporary import temporary_beside, temporary_folder, tempora
 from crashhunt.base.text import one_of, out_of
 from crashhunt.crashes import Bundle, describe_code, is_hunt_trusted, list_bundles
 from crashhunt.episode import Parts, WorkerSettings
+from crashhunt.hunts._code_versions import CodeVersions
 from crashhunt.hunts._state import HuntState, draws_independently, find_hunts, hunt_state
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import HuntSettings, read_settings, with_settings
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BRANCHES",
+    "CODE_VERSION",
     "DISTURBANCES",
     "FACTS",
     "ORIGINS",
@@ -79,6 +81,9 @@ upper bound of the margin if that was not all of them."""
 
 BRANCHES = ("branches", "branch_crashes", "branches_asked")
 """Further ones, of hunts with branches: number of branches, how many crashed, and how many of all have an answer."""
+
+CODE_VERSION = "code_version"
+"""A further column of hunts whose code has changed: the number of the version with which a trial ran."""
 
 Cell: TypeAlias = "Value | None"
 """What a table has in one place; None if a trial has no such value."""
@@ -269,13 +274,19 @@ class HuntResults:
         """The columns of a table of the trials, with ``parent`` and ``origin`` if the sampler reports them.
 
         If the hunt has disturbances, the columns also contain ``disturbances`` and ``log_likelihood``; with probes,
-        those in `STRESS`; with branches, those in `BRANCHES`.
+        those in `STRESS`; with branches, those in `BRANCHES`. If the code has changed, there is `CODE_VERSION`.
         """
         origins = ORIGINS if self.facts.get("origins") else ()
         stress = STRESS if self.settings.probe else ()
         disturbances = DISTURBANCES if self.settings.disturb else ()
         branches = BRANCHES if self.settings.branch else ()
-        return (*columns_of(self.settings), *disturbances, *stress, *branches, *origins)
+        versions = (CODE_VERSION,) if self.code_versions.are_several else ()
+        return (*columns_of(self.settings), *disturbances, *stress, *branches, *origins, *versions)
+
+    @cached_property
+    def code_versions(self) -> CodeVersions:
+        """The versions of the code with which the trials ran."""
+        return CodeVersions.of(self.facts)
 
     @property
     def crashes(self) -> list[Bundle]:
@@ -296,8 +307,13 @@ class HuntResults:
         """Yield the trials as rows of the table that `trials` returns."""
         names = self.columns
         with closing(self._ledger()) as ledger:
+            ran = [(ledger.numbers_from(one), place) for place, one in enumerate(self.code_versions.snapshots, 1)]
             for data in ledger.plain_results(outcomes=tuple(outcomes)):
-                yield TrialRow(data).cells(names)
+                row = TrialRow(data)
+                cells = row.cells(names)
+                if ran:
+                    cells[CODE_VERSION] = next((version for numbers, version in ran if row.number in numbers), None)
+                yield cells
 
     def trial_rows(self) -> Iterator[TrialRow]:
         """Yield the trials as `TrialRow` objects, which takes a third of the time of `results`."""
@@ -503,7 +519,7 @@ def _kinds(hunt: HuntResults, batch: list[dict[str, Cell]]) -> dict[str, str]:
     kinds = {"number": "Int64", "seed": "Int64", "steps": "Int64", "outcome": "String", "digest": "String"}
     kinds |= dict.fromkeys(EVENTS, "Int64")
     kinds |= {"parent": "Int64", "origin": "String", "disturbances": "Int64"}
-    kinds |= {"stress_asked": "String", "branches_asked": "String"}
+    kinds |= {CODE_VERSION: "Int64", "stress_asked": "String", "branches_asked": "String"}
     columns = hunt.columns
     for name in columns:
         kind = specs[name].kind if name in specs else "float"

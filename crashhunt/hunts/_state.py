@@ -10,7 +10,7 @@ import shutil
 import socket
 import time
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
@@ -22,6 +22,7 @@ from crashhunt.base.integrity import changed_file
 from crashhunt.base.temporary import remove_ended, remove_scratch, temporary_beside, this_process
 from crashhunt.base.text import command_line, near_path
 from crashhunt.crashes import crash_folders, files_of
+from crashhunt.hunts._code_versions import count_versions
 from crashhunt.hunts._crashes import outcomes_of_crashes, tally_crashes
 from crashhunt.ledger import KindData, Ledger, RunningRate, damaged, has_begun
 from crashhunt.plans import HuntSettings, read_settings, write_settings
@@ -223,6 +224,8 @@ class HuntState(Serializable):
         newest_kind_s: time from the last new crash type until now, or until the last trial ended, in s; None if it is
             unknown.
         types_by_cause: number of crash types by cause; None without ``--by-cause``.
+        code_versions: the trials of each version of the code, with the fields of `VersionCounts`; None if all trials
+            ran with the same code. Crash types and rate are those of the newest version.
     """
 
     dir: str
@@ -249,6 +252,7 @@ class HuntState(Serializable):
     probes: ProbeSums | None = field(default=None, metadata=OMIT_DEFAULT)
     branches: BranchSums | None = field(default=None, metadata=OMIT_DEFAULT)
     rate: RunningRate | None = field(default=None, metadata=OMIT_DEFAULT)
+    code_versions: list[dict[str, Any]] | None = field(default=None, metadata=OMIT_DEFAULT)
 
     @property
     def failed(self) -> bool:
@@ -436,6 +440,7 @@ def _with_crashes(state: HuntState, ledger: Ledger, facts: Facts) -> HuntState:
         crashes=found,
         crashes_saved=saved if saved < found else None,
         disturbed=tally.disturbed if tally is not None and disturbs else None,
+        code_versions=[asdict(one) for one in count_versions(ledger, facts, outcomes or ())] or None,
     )
 
 
@@ -532,13 +537,15 @@ class HuntDirectory:
     Attributes:
         has_begun: whether the hunt has begun. Before that, an error deletes a directory that was created for the hunt,
             and restores the settings of a hunt that was to resume.
+        settings_before: settings of a hunt that was to resume; None before `claim`, and for a new hunt.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._absolute = path.absolute()  # now, because the current folder may be deleted while the hunt runs
         self.has_begun = False
-        self._settings_before: bytes | None = None
+        self.settings_before: HuntSettings | None = None
+        self._file_before: bytes | None = None
 
     @property
     def scratch(self) -> Path:
@@ -584,9 +591,9 @@ class HuntDirectory:
                     self._remove_own(".lock")
                     with suppress(OSError):
                         self.path.rmdir()
-                elif self._settings_before is not None and not self.has_begun:
+                elif self._file_before is not None and not self.has_begun:
                     with suppress(CrashhuntError, OSError), whole_file(self.path / layout.HUNT) as temporary:
-                        temporary.write_bytes(self._settings_before)
+                        temporary.write_bytes(self._file_before)
                 raise
 
     def _make(self) -> bool:
@@ -627,9 +634,10 @@ class HuntDirectory:
         if file.exists():
             before = read_settings(file)
             resumed = settings if seed_given else replace(settings, seed=before.seed)
-            differences = before.differences(resumed)
+            # The snapshots show which files of the scenario differ, if there are trials.
+            differences = before.differences(replace(resumed, scenario_digest=before.scenario_digest))
             if not differences:
-                settings = resumed
+                settings, self.settings_before = resumed, before
             elif not self._has_results():  # the hunt ended before its first trial, often by a mistake in the scenario
                 self._remove_own()
             else:
@@ -645,7 +653,7 @@ class HuntDirectory:
         for folder in (self.path, *(self.path / name for name in (layout.CRASHES, *layout.BESIDE))):
             remove_ended(folder)
         try:
-            self._settings_before = file.read_bytes() if file.exists() else None
+            self._file_before = file.read_bytes() if file.exists() else None
             self.scratch.mkdir()
             write_settings(file, settings, command)
         except OSError as error:

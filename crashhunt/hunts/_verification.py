@@ -169,6 +169,7 @@ class TrialReruns:
         executors: the executors that run crashes again.
         phases: object to which the progress of these runs is reported.
         taken: digest of the snapshot that this process has taken; if empty, each snapshot has to be trusted.
+        newest: digests of the snapshots of the newest version of the code; empty if there is only one version.
     """
 
     place: HuntDirectory
@@ -181,6 +182,7 @@ class TrialReruns:
     executors: SharedExecutors
     phases: PhaseClock
     taken: str = ""
+    newest: tuple[str, ...] = ()
 
     def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
         """Yield each trial as it ends, until a stop is requested.

@@ -1,4 +1,5 @@
 from ._reader import (
+    CodeVersionsData as CodeVersionsData,
     Facts as Facts,
     HuntOwner as HuntOwner,
     KindData as KindData,

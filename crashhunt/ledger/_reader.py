@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from crashhunt.ledger._schema import PatientConnection, Shape
 
 
-__all__ = ["Facts", "HuntOwner", "KindData", "LedgerReader", "Noted", "Seal", "Turn", "UntilRate"]
+__all__ = ["CodeVersionsData", "Facts", "HuntOwner", "KindData", "LedgerReader", "Noted", "Seal", "Turn", "UntilRate"]
 
 
 # The shapes of what a ledger says besides trials.
@@ -104,6 +104,21 @@ class RunningRate(TypedDict):
     trained_on: NotRequired[int]
 
 
+class CodeVersionsData(TypedDict):
+    """The versions of the code with which the trials of a hunt ran.
+
+    Args:
+        snapshots: digests of the snapshots of each version, the first version first.
+        newest: position in ``snapshots`` of the version that ran last.
+        first: number of the first trial that counts for figures of this version. No trial from this number on had begun
+            with another version.
+    """
+
+    snapshots: list[list[str]]
+    newest: int
+    first: int
+
+
 class Noted(TypedDict, total=False):
     """The facts about a hunt that are recorded in addition to its state; setting a fact to None removes it.
 
@@ -154,6 +169,8 @@ class Noted(TypedDict, total=False):
         until_rate: the progress towards a threshold: ``bar`` (the threshold as the user gave it), ``decided_at``
             (number of the deciding trial) and ``verdict``; None if the hunt has no threshold.
         running_rate: the current crash rate; None if no rate is known.
+        under_way: the greatest number of trials that were under way at a time, running or queued.
+        code_versions: the versions of the code; None if all trials ran with the same code.
     """
 
     owner: HuntOwner | None
@@ -191,6 +208,8 @@ class Noted(TypedDict, total=False):
     dropped_judged: dict[str, dict[str, JsonObject]] | None
     until_rate: UntilRate | None
     running_rate: RunningRate | None
+    under_way: int
+    code_versions: CodeVersionsData | None
 
 
 class Facts(Noted, total=False):
@@ -326,6 +345,21 @@ class LedgerReader:
         self._compare_seal(seal, "outcomes", found)
         return found
 
+    def snapshots(self) -> dict[str, dict[str, int]]:
+        """Return the number of trials with each outcome for each snapshot, the snapshot that was used first first."""
+        found: dict[str, dict[str, int]] = {}
+        for digest, outcome, count, _ in self._select(
+            "SELECT snapshot, outcome, count(*), min(ended_at) AS since FROM trials GROUP BY snapshot, outcome "
+            "ORDER BY since"
+        ):
+            found.setdefault(digest, {})[outcome] = count
+        return found
+
+    def numbers_from(self, snapshots: Sequence[str]) -> set[int]:
+        """Return the numbers of the trials that ran from the given snapshots."""
+        rows = self._select(f"SELECT number FROM trials WHERE {_among('snapshot', snapshots)}", tuple(snapshots))
+        return {number for (number,) in rows}
+
     def traffic_events(self) -> dict[str, tuple[int, int]]:
         """Return for each type of traffic event the number of events, and the number of trials with such events."""
         rows = self._select(
@@ -347,21 +381,24 @@ class LedgerReader:
         trials = "(SELECT number, iif(json_valid(result), result, '{}') AS data FROM trials)"
         return list(self._select(f"SELECT {what} FROM ({each} FROM {trials})"))
 
-    def disturbed_crashes(self, outcomes: tuple[str, ...]) -> tuple[int, tuple[int, str, float] | None]:
+    def disturbed_crashes(
+        self, outcomes: tuple[str, ...], snapshots: Sequence[str] = ()
+    ) -> tuple[int, tuple[int, str, float] | None]:
         """Return the number of disturbed crashes, and number, outcome and log-likelihood of the likeliest crash.
 
         Args:
             outcomes: the outcomes that count as a crash.
+            snapshots: digests of the snapshots whose trials count; empty for all trials.
         """
-        marks = ",".join("?" * len(outcomes))
+        where = _among("outcome", outcomes) + (f" AND {_among('snapshot', snapshots)}" if snapshots else "")
         (row,) = self._select(
             # Of a query with one max(), SQLite takes what stands bare from the row that has it.
             "SELECT total(disturbed), max(iif(disturbed, likely, NULL)), number, outcome FROM (SELECT number, outcome, "
             "json_extract(data, '$.log_likelihood') AS likely, "
             "coalesce(json_array_length(data, '$.disturbances'), 0) > 0 AS disturbed FROM ("
             "SELECT number, outcome, iif(json_valid(result), result, '{}') AS data FROM trials "
-            f"WHERE outcome IN ({marks})))",
-            outcomes,
+            f"WHERE {where}))",
+            (*outcomes, *snapshots),
         )
         count, likely, number, outcome = row
         return int(count), None if likely is None else (number, outcome, float(likely))
@@ -505,21 +542,26 @@ class LedgerReader:
         ]
         return self.result(min(least)[1]) if least else None
 
-    def most_dangerous(self, count: int) -> list[int]:
+    def most_dangerous(self, count: int, snapshots: Sequence[str] = ()) -> list[int]:
         """Return the numbers of the trials with the greatest criticality but no crash, the greatest criticality first.
 
         Of trials with equal criticality, the trial with the lowest number comes first. Trials without a criticality are
         skipped.
+
+        Args:
+            count: maximum number of trials.
+            snapshots: digests of the snapshots whose trials count; empty for all trials.
         """
         if "danger" not in self._shape.columns["trials"]:
             return []
+        which = f"AND {_among('snapshot', snapshots)} " if snapshots else ""
         found = [
             row
             for outcome in ("survived", "finished")
             for row in self._select(
-                "SELECT -danger, number FROM trials WHERE outcome = ? AND danger > 0 "
+                f"SELECT -danger, number FROM trials WHERE outcome = ? AND danger > 0 {which}"
                 "ORDER BY danger DESC, number LIMIT ?",
-                (outcome, count),
+                (outcome, *snapshots, count),
             )
         ]
         return [number for _, number in sorted(found)[:count]]
@@ -708,6 +750,11 @@ class LedgerReader:
                 yield rows
         except sqlite3.Error as error:
             raise explained(self._path, error) from error
+
+
+def _among(column: str, values: Sequence[str]) -> str:
+    """Return the SQL condition that a column has one of the values, which the query has to bind."""
+    return f"{column} IN ({','.join('?' * len(values))})"
 
 
 def _as_text(rows: list[Row]) -> bytes:

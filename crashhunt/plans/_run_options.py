@@ -355,6 +355,13 @@ class SnapshotChoices(_Options):
         True, "whether the snapshot contains code; without it, a replay runs the current code",
         help="do not save the code; a replay then runs today's code", flag="--no-snapshot", group="kept",
     )  # fmt: skip
+    continue_with_new_code: bool = option(
+        False, "whether a hunt resumes although the code has changed since its trials; the versions of the code are "
+        "kept apart, and the crash rate counts only the trials of the newest version",
+        help="resume the hunt although the agent, the environment, the scenario or a library has changed since its "
+        "trials; the versions are kept apart, and the crash rate counts only the trials of the newest version",
+        unset="refuse to resume with other code", flag="--continue-with-new-code", group="run",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -97,7 +97,7 @@ class PairSequence:
         self._rules, self._is_same = rules, is_same
         self._waiting: tuple[dict[int, TrialFacts], dict[int, TrialFacts]] = ({}, {})
         self._complete: dict[int, Pair] = {}
-        self._next = 0  # trial, or traffic
+        self._next = max(rule.first for rule in rules)  # trial, or traffic
         self._traffics = rules[0].traffics
         self.rounds = min(rule.trials_per_unit for rule in rules) if self._traffics else 1
         self.valid = self.invalid = self.not_random = self.not_same = 0  # pairs of trials

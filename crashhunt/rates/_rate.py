@@ -175,6 +175,7 @@ def make_rate(
         "invalid": sequence.invalid,
         "not_random": sequence.not_random,
         "after_unfinished": sequence.excluded,
+        "other_code": sequence.other_code,
     }
     return CrashRate(
         dir=directory,

@@ -143,6 +143,7 @@ class CountingRule:
         planned: planned number of trials; 0 for no limit.
         is_held_out: function that returns whether no agent was trained on the traffic of a seed; None if no agent was
             trained.
+        first: number of the first trial that counts; trials of lower numbers may have run with other code.
     """
 
     max_steps: int
@@ -151,6 +152,7 @@ class CountingRule:
     traffics: int = 0
     planned: int = 0
     is_held_out: Callable[[int], bool] | None = None
+    first: int = 0
 
     @property
     def trials_per_unit(self) -> int:
@@ -178,8 +180,9 @@ class UnitSequence:
         self._rule = rule
         self._waiting: dict[int, TrialFacts] = {}
         self._traffics: dict[int, list[TrialFacts]] = {}
-        self._next = 0  # trial, or traffic
+        self._next = rule.first  # trial, or traffic
         self.valid = self.invalid = self.not_random = self.trained_on = 0  # of the trials in the sequence
+        self.other_code = 0  # trials before the sequence
         self.hopeless_at: int | None = None  # the first trial with which too many are invalid, see has_too_many_invalid
 
     def add(self, trial: TrialFacts) -> Iterator[Unit]:
@@ -188,6 +191,9 @@ class UnitSequence:
             return
         if self._rule.traffics:
             yield from self._add_to_traffic(trial)
+            return
+        if trial.number < self._rule.first:
+            self.other_code += 1
             return
         self._waiting[trial.number] = trial
         while (found := self._waiting.pop(self._next, None)) is not None:
@@ -250,6 +256,8 @@ class UnitSequence:
                 f"an agent was trained on the traffic of all {self.trained_on} trials; run another --seed, or train "
                 "with a test share"
             )
+        if self.other_code and not self._waiting and not self.invalid:
+            return f"all {self.other_code} trials ran with earlier code, or had begun when the code changed"
         if self._waiting:
             return f"trial {self._next} has not ended, and trials count in the order of their numbers"
         return "no valid trial has finished"

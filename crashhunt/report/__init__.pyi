@@ -62,3 +62,7 @@ from ._table import (
     format_table as format_table,
     steps_table as steps_table,
 )
+from ._words import (
+    describe_types_by_version as describe_types_by_version,
+    describe_versions as describe_versions,
+)

@@ -83,6 +83,8 @@ def describe_comparison(found: Comparison) -> str:
             lines.append(f"{hunt.dir}: {missing}: {hunt.why_not}")
         if trained_on := hunt.exclusions.get("trained_on"):
             lines.append(f"{hunt.dir}: {count_training_trials(trained_on)}")
+        if other_code := hunt.exclusions.get("other_code"):
+            lines.append(f"{hunt.dir}: only the newest code counts: {other_code} trials of earlier code are excluded")
         if hunt.excluded:
             lines.append(f"{hunt.dir}: not counted: {hunt.excluded} trials after one that has not ended")
     for pair in found.pairs:
@@ -143,6 +145,8 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
             said += f", {hunt.disturbed} of them disturbed"
         if trained_on := hunt.exclusions.get("trained_on"):
             said += f", {count_training_trials(trained_on)}"
+        if other_code := hunt.exclusions.get("other_code"):
+            said += f", without {other_code} trials of earlier code"
         bar = f'<span style="left:0;width:{rate * scale:.2f}%;background:{colors[hunt.dir]}"></span>'
         if hunt.counted:
             said += f", only trials of origin {html.escape(hunt.counted)} count, because the search guided all others"
@@ -193,7 +197,7 @@ def _arguments(
     crashed: list[bool] = []
     crash_on = hunt.settings.crash_on
     for row in hunt.rows():
-        if not held_out.has(int(str(row["seed"]))):
+        if not held_out.has(int(str(row["seed"]))) or int(str(row["number"])) < hunt.code_versions.first:
             continue
         if row["outcome"] == Outcome.INVALID or (hunt.plain_origin and row["origin"] != hunt.plain_origin):
             continue

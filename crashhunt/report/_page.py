@@ -10,6 +10,7 @@ import base64
 import json
 import math
 import zlib
+from dataclasses import asdict
 from importlib import resources
 from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
@@ -20,7 +21,7 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.progress import watched
 from crashhunt.base.version import __version__
 from crashhunt.crashes import closest_actors, signature_of
-from crashhunt.hunts import TrialRow, find_crashes
+from crashhunt.hunts import CodeVersions, TrialRow, count_versions, find_crashes
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import is_opaque, read_lanes
@@ -29,7 +30,7 @@ from crashhunt.report._show import Story
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import argument_units
 from crashhunt.report._verdict import verdict_of
-from crashhunt.report._words import by_likelihood, may_be_disturbed, traffic_of
+from crashhunt.report._words import by_likelihood, describe_versions, may_be_disturbed, traffic_of
 from crashhunt.trial import Outcome, steps_of
 from crashhunt.world import approaches
 
@@ -356,7 +357,9 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
         return {**nothing, "importance": [], "weighed": None, "not_fully_asked": 0, "rate": None}
     ledger = Ledger(path)
     try:
-        outcomes = ledger.outcomes()
+        outcomes, facts = ledger.outcomes(), ledger.facts()
+        versions = count_versions(ledger, facts, settings.crash_on)
+        apart = ledger.numbers_from(CodeVersions.of(facts).earlier)
         total = sum(outcomes.values())
         crashes = sum(outcomes.get(str(name), 0) for name in settings.crash_on)
         share, share_of_crashes = _MAX_PLOTTED_TRIALS / max(total - crashes, 1), _MAX_PLOTTED_TRIALS / max(crashes, 1)
@@ -370,7 +373,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
             crashed = outcome.category != "no crash"
             danger = 1.0 if crashed else row.danger
             counts = outcome in settings.crash_on
-            if row.origin in UNCHOSEN and row.parent is None and danger is not None:
+            if row.origin in UNCHOSEN and row.parent is None and danger is not None and row.number not in apart:
                 unchosen_in_all += 1
                 if _is_drawn(number, 2 * _MOST / max(total, 1)):
                     unchosen.append((values_of(row), danger))
@@ -397,21 +400,23 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
             "not_fully_asked": not_fully_asked,
             "drawn": _plot_counts(trials, total, crashes, settings) if len(trials) < total else None,
             "importance": importance_of(unchosen),
-            "rate": _rate(ledger.facts().get("running_rate")),
-            "typesByCause": ledger.facts().get("types_by_cause"),
+            "rate": _rate(facts.get("running_rate"), describe_versions(map(asdict, versions)) if versions else ""),
+            "typesByCause": facts.get("types_by_cause"),
             "weighed": [min(len(unchosen), _MOST), unchosen_in_all] if unchosen_in_all > _MOST else None,
         }
     finally:
         ledger.close()
 
 
-def _rate(rate: RunningRate | None) -> dict[str, object] | None:
+def _rate(rate: RunningRate | None, versions: str) -> dict[str, object] | None:
     """Return the crash rate that the hunt has recorded; None if there is no rate, as in hunts of earlier versions."""
     if rate is None:
-        return None
+        return None if not versions else {"answer": "not known", "words": versions, "certain": None, "estimated": None}
     words = f"The bounds have {rate['confidence']:g} % confidence, valid whenever you look."
     if rate["method"] == "rare":
         words += " The estimate omits failures that no copy has met. The bounds include these failures."
+    if versions:
+        words += f" Here, {versions}."
     return {
         "answer": describe_running(rate).removeprefix("crash rate: "),
         "words": words,

@@ -35,6 +35,7 @@ _REASONS = {
     "invalid": "invalid",
     "not_random": "not drawn at random",
     "after_unfinished": "after a trial that has not ended",
+    "other_code": "of earlier code, or begun when the code changed",
 }
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 60rem; padding: 0 1rem; }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
@@ -15,6 +16,7 @@ from crashhunt.report._words import (
     describe_branches,
     describe_disturbances,
     describe_probes,
+    describe_versions,
     list_disturbances,
 )
 from crashhunt.world import event_counts
@@ -126,6 +128,8 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     lines = [f"{count}, {format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"]
     if report.stopped_because == "no_valid_trial":
         lines.append(f"No trial was valid: {report.reason}")
+    if report.code_versions:
+        lines.append(f"Note: {describe_versions(map(asdict, report.code_versions))}")
     lines += [f"Note: {note}" for note in report.notes]
     lines += _describe_audit(report)
     if report.stopped_because == "distinct":

@@ -1,3 +1,4 @@
+from ._changes import CodeChanges as CodeChanges, code_changes as code_changes
 from ._differences import code_differences as code_differences
 from ._environment import (
     Environment as Environment,

@@ -14,7 +14,15 @@ from crashhunt.scenario import installed_backends
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["Environment", "environment", "environment_changes", "environment_of_simulation", "processor", "versions"]
+__all__ = [
+    "Environment",
+    "differing_versions",
+    "environment",
+    "environment_changes",
+    "environment_of_simulation",
+    "processor",
+    "versions",
+]
 
 
 class Environment(TypedDict):
@@ -148,6 +156,23 @@ def environment_changes(recorded: Environment) -> dict[str, tuple[str, str]]:
         if then != now and name != "crashhunt":  # crashhunt itself comes from the snapshot
             changes[name] = (str(then), now)
     return changes
+
+
+def differing_versions(then: Environment, now: Environment) -> dict[str, tuple[str, str]]:
+    """Return the versions that differ between two recorded environments, each as (then, now), by name.
+
+    Only distributions that the earlier process had loaded count, without crashhunt, whose code is in the snapshot.
+    """
+    found = {}
+    for name in ("python", "implementation", "machine"):
+        was, is_now = str(then.get(name, "")), str(now.get(name, ""))
+        if was and is_now and was != is_now:
+            found[name] = was, is_now
+    before, after = then.get("distributions", {}), now.get("distributions", {})
+    for name in then.get("loaded", ()):
+        if name != "crashhunt" and name in before and before[name] != (is_now := after.get(name, "not installed")):
+            found[name] = before[name], is_now
+    return found
 
 
 def processor() -> str:

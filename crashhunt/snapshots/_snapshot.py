@@ -36,10 +36,13 @@ if TYPE_CHECKING:
 
 
 __all__ = [
+    "SCHEMA_WITHOUT_CONDITIONS",
     "Manifest",
     "Snapshot",
     "code_of_manifest",
+    "digest_of_manifest",
     "latest_snapshot",
+    "may_run",
     "without_code",
 ]
 
@@ -48,8 +51,10 @@ class Manifest(TypedDict):
     """The contents of ``manifest.json``: the files of a snapshot, and the folders from which modules are imported.
 
     ``described`` lists the files that describe the snapshot and do not belong to its digest. The earliest snapshots
-    have neither ``described`` nor ``integrity``. ``authentication_code`` proves to the user who took the snapshot that
-    it is unchanged.
+    have neither ``described`` nor ``integrity``. ``conditions`` are further facts on which trials depend. With
+    ``--no-snapshot``, they are the digests of the files of the code. They may also be the versions that distinguish the
+    snapshot from another snapshot of the same files. ``authentication_code`` proves to the user who took the snapshot
+    that it is unchanged.
     """
 
     schema: int
@@ -60,9 +65,11 @@ class Manifest(TypedDict):
     described: NotRequired[dict[str, FileEntry]]
     authentication_code: NotRequired[str]
     integrity: NotRequired[str]
+    conditions: NotRequired[dict[str, str]]
 
 
-SCHEMA = 2
+SCHEMA = 3
+SCHEMA_WITHOUT_CONDITIONS = 2
 _FIRST_VERSION_WITH_DIGESTS = 2  # the first version with a digest of its manifest and of what describes the rest
 _DESCRIPTION_FILES = (layout.HUNT, layout.ENVIRONMENT, layout.GIT_DIFF)
 _SNAPSHOT_FOLDERS = (layout.CODE, layout.FILES, layout.SCENARIO_FILES)
@@ -109,6 +116,16 @@ class Snapshot:
     def has_code(self) -> bool:
         """Whether the snapshot contains the code."""
         return bool(self.manifest["paths"])
+
+    @property
+    def conditions(self) -> dict[str, str]:
+        """The facts besides the files on which trials depend, see `Manifest`."""
+        return self.manifest.get("conditions", {})
+
+    @property
+    def is_described(self) -> bool:
+        """Whether the snapshot contains the code, or at least its digests."""
+        return self.has_code or any("/" in name for name in self.conditions)
 
     @property
     def code(self) -> tuple[str, ...]:
@@ -190,7 +207,7 @@ class Snapshot:
             wrong = changed_file(f"{self.path}/{name}", entry)  # hundreds of files, and a Path takes as long again
             if wrong:
                 found.append(f"{name} {wrong}")
-        digest = digest_of_described(manifest["files"], plain_data=[manifest["paths"], manifest["argument_files"]])
+        digest = digest_of_manifest(manifest)
         if digest != self.digest:
             found.append(f"its manifest is that of the snapshot {digest}")
         return found
@@ -202,11 +219,11 @@ class Snapshot:
         """
         found = self.changes()
         self.discard_compiled()
-        return found + [f"{name} was not there" for name in self._added() if self._may_run(name)]
+        return found + [f"{name} was not there" for name in self._added() if self._is_module(name)]
 
     def additions(self) -> list[str]:
         """Return the added files that are not modules; an agent may write data into its folder."""
-        return [name for name in self._added() if not self._may_run(name)]
+        return [name for name in self._added() if not self._is_module(name)]
 
     def discard_compiled(self) -> None:
         """Delete compiled files, which Python would run instead of the source files next to them."""
@@ -217,8 +234,8 @@ class Snapshot:
                         with suppress(OSError):  # `faults` then reports the file as added
                             path.unlink()
 
-    def _may_run(self, name: str) -> bool:
-        return (self.path / name).is_symlink() or any(name.endswith(suffix) for suffix in _IMPORTABLE_SUFFIXES)
+    def _is_module(self, name: str) -> bool:
+        return (self.path / name).is_symlink() or may_run(name)
 
     def _added(self) -> list[str]:
         found = []
@@ -249,6 +266,11 @@ class Snapshot:
             )
 
 
+def may_run(name: str) -> bool:
+    """Return whether Python may import a file, or run it at its start, by the file's name."""
+    return name.endswith(tuple(_IMPORTABLE_SUFFIXES))
+
+
 class _UnsupportedError(Exception):
     """The manifest is of another version."""
 
@@ -269,9 +291,18 @@ def _parse_manifest(text: bytes) -> Manifest:
         if digest_of_data(found) != said:
             raise ValueError("the file has changed since it was written")
     found.setdefault("argument_files", {})
-    typed(found, {"argument_files": dict[str, str]})
+    typed(
+        found, {"argument_files": dict[str, str], **({"conditions": dict[str, str]} if "conditions" in found else {})}
+    )
     _check_names(found)
     return found
+
+
+def digest_of_manifest(manifest: Manifest) -> str:
+    """Return the digest of a snapshot, which is the name of its folder."""
+    conditions = manifest.get("conditions")
+    more = [conditions] if conditions else []
+    return digest_of_described(manifest["files"], plain_data=[manifest["paths"], manifest["argument_files"], *more])
 
 
 def code_of_manifest(manifest: Manifest) -> str:
@@ -338,7 +369,13 @@ def without_code(snapshot: Snapshot, snapshots: Path) -> Snapshot:
     shutil.copyfile(snapshot.path / layout.HUNT, final / layout.HUNT)
     environment = json.dumps(environment_of_simulation(snapshot.environment()), indent=1)
     (final / layout.ENVIRONMENT).write_text(environment, encoding="utf-8")
-    manifest: Manifest = {"schema": SCHEMA, "paths": [], "argument_files": {}, "left_out": [], "files": kept}
+    manifest: Manifest = {
+        "schema": SCHEMA_WITHOUT_CONDITIONS,
+        "paths": [],
+        "argument_files": {},
+        "left_out": [],
+        "files": kept,
+    }
     manifest["described"] = describe_files(final)
     manifest["authentication_code"] = code_of_manifest(manifest)
     manifest["integrity"] = digest_of_data(manifest)

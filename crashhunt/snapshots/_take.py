@@ -21,9 +21,15 @@ from crashhunt.base.git import query
 from crashhunt.base.integrity import describe_files, digest_of_content, digest_of_data, digest_of_file
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, load_order_of, write_settings
-from crashhunt.scenario import Scenario, as_plain_data, digest_of_described
-from crashhunt.snapshots._environment import environment
-from crashhunt.snapshots._snapshot import SCHEMA, Snapshot, code_of_manifest
+from crashhunt.scenario import Scenario, as_plain_data
+from crashhunt.snapshots._environment import differing_versions, environment
+from crashhunt.snapshots._snapshot import (
+    SCHEMA,
+    SCHEMA_WITHOUT_CONDITIONS,
+    Snapshot,
+    code_of_manifest,
+    digest_of_manifest,
+)
 from crashhunt.trial import Choice, Constant
 
 if TYPE_CHECKING:
@@ -295,6 +301,7 @@ def _take_root(root: Path, imported: ImportedModules, found: Sources, without: P
 _MEGABYTE = 10**6
 _SMALL_FILE_BYTES = 1 << 20  # bytes
 _COPIED_PERMISSIONS = 0o755
+_WHOLE_FILE_BYTES = 64 << 20  # bytes
 
 
 @clear_constructor
@@ -306,6 +313,7 @@ class SnapshotOptions:
         code: Whether the snapshot contains code; without code, a replay runs the current code.
         roots: Files and folders to include in addition to those found.
         limit_mb: Maximum size of the snapshot, in MB.
+        new_code: Whether a resumed hunt continues although the snapshot differs from that of its trials.
 
     Raises:
         UsageError: The maximum size is not above 0.
@@ -314,6 +322,7 @@ class SnapshotOptions:
     code: bool = True
     roots: tuple[Path, ...] = ()
     limit_mb: float = 500.0
+    new_code: bool = False
 
     def __post_init__(self) -> None:
         if not self.limit_mb > 0:  # also refuses NaN
@@ -326,8 +335,12 @@ class SnapshotOptions:
         Raises:
             UsageError: The maximum size is not above 0.
         """
-        limit_mb = choices.snapshot_limit_mb
-        return cls(code=choices.snapshot_code, roots=tuple(map(Path, choices.snapshot_roots)), limit_mb=limit_mb)
+        return cls(
+            code=choices.snapshot_code,
+            roots=tuple(map(Path, choices.snapshot_roots)),
+            limit_mb=choices.snapshot_limit_mb,
+            new_code=choices.continue_with_new_code,
+        )
 
 
 def take_snapshot(
@@ -356,10 +369,13 @@ def take_snapshot(
     options = options or SnapshotOptions()
     if imported is None:
         imported = imported_by(scenario, settings)
-    found = Sources(paths=[])
-    if options.code:
-        found = find_sources(imported, roots=options.roots, without=snapshots.parent)
-    argument_files = _argument_files(settings) if options.code else {}
+    found = find_sources(imported, roots=options.roots, without=snapshots.parent)
+    argument_files = _argument_files(settings)
+    files = found.files | {place: path for path, place in argument_files.items()}
+    conditions: dict[str, str] = {}
+    if not options.code:
+        conditions = {place: digest for place, path in files.items() if (digest := _digest_of_original(path))}
+        found, argument_files = Sources(paths=[]), {}
     argument_files |= _training_records(imported.agents, argument_files)
     files = found.files | {place: path for path, place in argument_files.items()}
     _check_size(files, options.limit_mb)
@@ -367,7 +383,7 @@ def take_snapshot(
         snapshots.mkdir(exist_ok=True)
         remove_ended(snapshots)
         with temporary_beside(snapshots / layout.MANIFEST, name=f"{layout.BUILDING}{this_process().token}") as building:
-            return _build(building, files, found, argument_files, scenario, settings, environment(imported))
+            return _build(building, files, found, argument_files, scenario, settings, environment(imported), conditions)
     except OSError as error:
         raise _cannot_make(error, snapshots) from error
 
@@ -390,6 +406,7 @@ def _build(
     scenario: Scenario,
     settings: HuntSettings,
     around: Environment,
+    conditions: dict[str, str],
 ) -> Snapshot:
     """Copy all files into a folder and rename it to its digest, unless a snapshot with this digest exists already."""
     building.mkdir()
@@ -399,22 +416,21 @@ def _build(
     entries |= _store_scenario(scenario, building)
     stored = {name: entry for name, entry in entries.items() if entry is not None}
     manifest: Manifest = {
-        "schema": SCHEMA,
+        "schema": SCHEMA_WITHOUT_CONDITIONS,
         "paths": found.paths,
         "argument_files": argument_files,
         "left_out": found.excluded,
         "files": stored,
     }
-    digest = digest_of_described(stored, plain_data=[found.paths, argument_files])
-    final = building.with_name(digest)
-    # The digest is too short to prove that two snapshots are the same, so use only a snapshot of this user.
-    if (
-        final.exists()
-        and not _is_damaged(same := Snapshot(final))
-        and same.manifest["files"] == stored
-        and same.is_made_here
-    ):
-        return Snapshot(final)
+    final = _name(manifest, conditions, building)
+    if _is_usable(final, stored):
+        versions = differing_versions(Snapshot(final).environment(), around)
+        if not versions:
+            return Snapshot(final)
+        # The same files with another NumPy or SUMO are another condition of trials.
+        final = _name(manifest, conditions | {name: now for name, (_, now) in versions.items()}, building)
+        if _is_usable(final, stored):
+            return Snapshot(final)
     write_settings(building / layout.HUNT, settings, ["crashhunt", "run", "as resolved"])
     facts: Environment = {
         **around, "git": _describe_trees(found.trees, building / layout.GIT_DIFF), "origins": found.origins,
@@ -432,6 +448,23 @@ def _build(
     put_in_place(building, final)  # an existing snapshot is equal, damaged, or taken by another user
     sync_folder(final.parent)
     return Snapshot(final)
+
+
+def _name(manifest: Manifest, conditions: dict[str, str], building: Path) -> Path:
+    """Add the conditions to a manifest; return the folder of its snapshot."""
+    if conditions:
+        manifest["schema"], manifest["conditions"] = SCHEMA, conditions
+    return building.with_name(digest_of_manifest(manifest))
+
+
+def _is_usable(final: Path, stored: dict[str, FileEntry]) -> bool:
+    """Return whether a snapshot of these files exists and is intact.
+
+    The digest is too short to prove that two snapshots are the same, so only a snapshot of this user is usable.
+    """
+    if not final.exists() or _is_damaged(same := Snapshot(final)):
+        return False
+    return same.manifest["files"] == stored and same.is_made_here
 
 
 def _is_damaged(snapshot: Snapshot) -> bool:
@@ -479,6 +512,23 @@ def _check_size(files: dict[str, str], limit_mb: float) -> None:
             f"the snapshot would have {total / _MEGABYTE:.3g} MB, above the limit of {limit_mb:g} MB; largest: {names}",
             fix="list unneeded files in .gitignore, raise --snapshot-limit, or give --no-snapshot",
         )
+
+
+def _digest_of_original(path: str) -> str:
+    """Return the digest of a file that is not copied; empty if it cannot be read.
+
+    Of a large file, such as a data set, only the size and both ends count, because a hunt would begin minutes later.
+    """
+    try:
+        size = _size(path)
+        if size <= _WHOLE_FILE_BYTES:
+            return digest_of_file(Path(path))
+        with open(path, "rb") as file:
+            ends = file.read(_SMALL_FILE_BYTES)
+            file.seek(-_SMALL_FILE_BYTES, os.SEEK_END)
+            return digest_of_content(b"%d %b%b" % (size, ends, file.read()))
+    except OSError:
+        return ""
 
 
 def _size(path: str) -> int:

@@ -226,7 +226,7 @@ class Rows:
     def result(self, number):
         return self.rows.get(number)
 
-    def most_dangerous(self, count):
+    def most_dangerous(self, count, snapshots=()):
         return list(self.rows)[:count]
 
     def note(self, **facts):
@@ -435,6 +435,7 @@ def near(tmp_path, monkeypatch):
         again = SimpleNamespace(
             place=SimpleNamespace(path=tmp_path), ledger=Rows(*map(trial, range(6))), notes=[], failed=[],
             settings=SimpleNamespace(run=SimpleNamespace(near_misses=keep)), stops=stops, run=run, phases=clock,
+            newest=(),
         )  # fmt: skip
         return SimpleNamespace(again=again, phases=phases, removed=removed, written=written, kept=kept)
 
@@ -477,7 +478,7 @@ def test_trials_without_a_criticality_leave_no_near_misses_and_a_note(near, monk
     found = near(lambda specs, folder: iter(()))
     for finished, count in (([0], 1), ([], 0)):
         found.again.notes.clear()
-        monkeypatch.setattr(found.again.ledger, "most_dangerous", lambda keep: [])
+        monkeypatch.setattr(found.again.ledger, "most_dangerous", lambda keep, snapshots: [])
         monkeypatch.setattr(found.again.ledger, "numbers_of", lambda outcomes, found=finished: found, raising=False)
         keep_near_misses(found.again)
         assert [note.partition(",")[0] for note in found.again.notes] == ["no near miss is kept"] * count

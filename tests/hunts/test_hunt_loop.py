@@ -527,7 +527,8 @@ def test_trial_that_is_another_one_when_it_runs_again_does_not_end_the_hunt(run)
     found = run(3)
     asked_again = Branches(unanswered=1, may_be_asked_again=True)
     with closing(Ledger(found.path / "ledger.sqlite", writable=True)) as ledger:
-        ledger.record(replace(ledger.result(1), branches=asked_again, digest="f" * 32), snapshot="")
+        snapshot = ledger.snapshot_of(1)
+        ledger.record(replace(ledger.result(1), branches=asked_again, digest="f" * 32), snapshot=snapshot)
         ledger.note(copies=["branches"])
     again = run(3)
     assert [spec.number for spec in again.executor.submitted] == [1]

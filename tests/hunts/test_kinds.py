@@ -120,10 +120,9 @@ def test_what_was_hunted_for_is_kept_before_what_is_shorter(monkeypatch):
     monkeypatch.setattr(_crashes, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id != "c1"))
     kinds = Kinds(1, [crash(1, "KeyError", 4), crash(2, "KeyError", 9), crash(3, "KeyError", 6)], only_at_fault=True)
     assert [bundle.id for bundle in kinds.drop_excess(1)] == ["c2", "c1"]
-    assert (kinds.at_fault, kinds.dropped_at_fault) == ((2, 3), [2])  # with or without a bundle
-    again = Kinds(
-        1, [crash(3, "KeyError", 6)], only_at_fault=True, dropped=kinds.dropped, dropped_at_fault=kinds.dropped_at_fault
-    )
+    noted = kinds.dropped_facts()
+    assert (kinds.at_fault, noted["dropped_at_fault"]) == ((2, 3), [2])  # with or without a bundle
+    again = Kinds(1, [crash(3, "KeyError", 6)], only_at_fault=True, **noted)
     assert (again.until, again.at_fault) == (kinds.until, (2, 3))
 
 
@@ -326,23 +325,39 @@ def test_resumed_hunt_knows_the_causes_of_crashes_whose_bundles_were_deleted(one
     while (chosen := kinds.next_to_judge()) is not None:
         settle(kinds, chosen, causes[chosen.result.spec.number])
     gone = {bundle.id for bundle in kinds.drop_excess(1)}
-    stored = json.loads(json.dumps(kinds.dropped_judged))
+    stored = json.loads(json.dumps(kinds.dropped_facts()))
 
     judged = {number: SimpleNamespace(is_interrupted=False, what=what) for number, what in causes.items() if what}
     monkeypatch.setattr(_crashes, "judgement_of", lambda bundle: judged.get(bundle.result.spec.number))
     monkeypatch.setattr(_crashes, "cause_of", lambda _, judgement: Cause("omission", judgement.what))
     left = [bundle for bundle in crashes if bundle.id not in gone]
-    more = {"dropped": kinds.dropped, "dropped_at_fault": kinds.dropped_at_fault, "only_at_fault": only_at_fault}
-    again = Kinds(1, left, by_cause=4, dropped_judged=stored, **more)
+    more = {**stored, "only_at_fault": only_at_fault}
+    again = Kinds(1, left, by_cause=4, **more)
     assert (again.until, again.types_by_cause, again.count_to_judge()) == (kinds.until, 2, 0)
     for both in (kinds, again):
         both.add(collision(3, 2), 6)
         both.add(collision(12, 1), 7)
     assert [bundle.id for bundle in again.drop_excess(1)] == [bundle.id for bundle in kinds.drop_excess(1)]
-    assert again.dropped_judged == kinds.dropped_judged == stored
+    assert again.dropped_judged == kinds.dropped_judged == stored["dropped_judged"]
     # It was killed before it had deleted them.
-    killed = Kinds(1, crashes, by_cause=4, dropped_judged=stored, **more)
-    assert (killed.until, killed.dropped_judged) == (kinds.until, {"collision": {}})
+    killed = Kinds(1, crashes, by_cause=4, **more)
+    assert (killed.until, any(killed.dropped_judged.values())) == (kinds.until, False)
+
+
+def test_crashes_of_other_code_do_not_count_and_stay_in_the_ledger(one_type, monkeypatch):
+    monkeypatch.setattr(_crashes, "fault_of", lambda *_: SimpleNamespace(is_egos=True))
+    noted = {
+        "dropped": {"collision": [1, 7]}, "dropped_at_fault": [1, 7],
+        "dropped_judged": {"collision": {"1": {"cause": None}, "7": {"cause": None}}},
+    }  # fmt: skip
+    kinds = Kinds(1, [collision(9)], only_at_fault=True, apart={1, 2, 3}, **noted)
+    assert (kinds.until, kinds.at_fault, [group.count for group in kinds.groups()]) == (7, (7, 9), [2])
+    kinds.add(collision(12), 3)
+    assert [bundle.id for bundle in kinds.drop_excess(1)] == ["c12"]
+    facts = kinds.dropped_facts()
+    assert {words: sorted(numbers) for words, numbers in facts["dropped"].items()} == {"collision": [1, 7, 12]}
+    assert facts["dropped_at_fault"] == [1, 7, 12]
+    assert facts["dropped_judged"] == noted["dropped_judged"]
 
 
 def test_software_faults_need_no_runs_for_their_cause():
@@ -386,7 +401,7 @@ def test_deleted_bundles_are_noted_before_they_are_removed(tmp_path, monkeypatch
     crashes = [Saved(f"{number:06d}-collision", tmp_path / str(number)) for number in range(4)]
     kinds = SimpleNamespace(
         drop_excess=lambda keep, *, final: asked.append((keep, final)) or [crashes[2], crashes[0]],
-        dropped={"a": [2, 0]}, dropped_at_fault=[2], dropped_judged={},
+        dropped_facts=lambda: {"dropped": {"a": [2, 0]}, "dropped_at_fault": [2], "dropped_judged": None},
     )  # fmt: skip
     monkeypatch.setattr(_crashes, "remove_at_once", lambda path: calls.append(path.name))
     ledger = SimpleNamespace(note=lambda **facts: calls.append(facts))

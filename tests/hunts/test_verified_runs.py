@@ -411,11 +411,11 @@ def test_resumed_hunt_knows_which_types_it_wants(monkeypatch):
     ):  # fmt: skip
         made.clear()
         progress = Progress()
-        progress.resume(["crash"], run, before)
+        progress.resume(["crash"], run, before, {3})
         assert (progress.crashes, progress.failed_steps) == (["crash"], 7)
         assert progress.kinds == (None if wanted is None else "kinds")
         if wanted is not None:
-            more = {"only_at_fault": run.only_at_fault, "by_cause": 0, **noted}
+            more = {"only_at_fault": run.only_at_fault, "by_cause": 0, "apart": {3}, **noted}
             assert made == [((wanted, ["crash"], 5.0), more)]
 
 
@@ -449,7 +449,7 @@ def test_age_of_the_newest_type_has_trials_and_seconds():
 
 def test_ledger_records_failed_runs_and_the_phase():
     progress = Progress()
-    assert progress.noted().keys() == {"heartbeat", "elapsed_s", "phase", "ends_at", "running_rate"}
+    assert progress.noted().keys() == {"heartbeat", "elapsed_s", "phase", "ends_at", "running_rate", "under_way"}
     progress.failed_steps, progress.failed = 7, [result(1, steps=3), result(2, steps=4)]
     progress.ends_at = 5.0
     progress.rate = SimpleNamespace(noted=lambda: "bar", decided_at=None)
