@@ -107,6 +107,7 @@ def grouped(monkeypatch):
     monkeypatch.setattr("crashhunt.hunts.find_hunts", lambda directory: [f"{directory}/0", f"{directory}/1"])
     monkeypatch.setattr("crashhunt.crashes.list_bundles", lambda hunt: [f"{hunt} crash"])
     monkeypatch.setattr("crashhunt.hunts.dropped_crashes", lambda hunts: len(hunts))
+    monkeypatch.setattr("crashhunt.hunts.crashes_by_version", lambda hunts, groups: {})
     monkeypatch.setattr("crashhunt.crashes.group_crashes", group_crashes)
     monkeypatch.setattr("crashhunt.report.describe_groups", lambda groups, known: f"types; known: {known}")
     monkeypatch.setattr("crashhunt.report.describe_causes", lambda groups, causes: "causes")

@@ -174,7 +174,7 @@ def test_points_of_a_hunt_come_with_the_shares_of_their_sample(made):
 def test_importance_has_the_units_of_arguments_by_their_names(made, monkeypatch):
     units = {("ego", "speed"): "m/s", ("", "cars"): "1"}
     monkeypatch.setattr(_application, "argument_units", lambda path, settings: units)
-    monkeypatch.setattr(_application, "importance_of_points", lambda points: [{"points": len(points)}])
+    monkeypatch.setattr(_application, "importance_of_points", lambda points, first: [{"points": len(points)}])
     view = View(sample=SimpleNamespace(points=[1, 2]), settings=SimpleNamespace(agents={"ego": 1}))
     found = ask(made(view), "/api/hunts/one/importance").json
     assert (found["importance"], found["units"]) == ([{"points": 2}], {"speed": "m/s", "cars": "1"})

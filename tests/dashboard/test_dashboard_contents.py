@@ -133,6 +133,7 @@ def test_workers_are_the_running_trials_of_this_hunt(tmp_path, monkeypatch):
 def test_importance_is_that_of_trials_that_no_search_has_chosen(monkeypatch):
     monkeypatch.setattr(_details, "importance_of", lambda trials: [dict(values, danger=d) for values, d in trials])
     usual = {"category": "no crash", "danger": 0.25, "origin": "random", "parent": None, "values": {"a": 1}}
+    usual["number"] = 7
     points = [
         usual, {**usual, "category": "crash"}, {**usual, "category": "crash", "danger": None},
         {**usual, "danger": None}, {**usual, "parent": 3}, {**usual, "origin": "guided"},
@@ -140,6 +141,8 @@ def test_importance_is_that_of_trials_that_no_search_has_chosen(monkeypatch):
     assert _details.importance_of_points(points) == [
         {"a": 1, "danger": 0.25}, {"a": 1, "danger": 1.0}, {"a": 1, "danger": 1.0}
     ]  # fmt: skip
+    assert len(_details.importance_of_points(points, first=7)) == 3
+    assert _details.importance_of_points(points, first=8) == []  # trials of earlier code
 
 
 @pytest.fixture
