@@ -2,7 +2,7 @@ from ._comparison import (
     Comparison as Comparison,
     HuntFigures as HuntFigures,
     compare as compare,
-    held_out_of as held_out_of,
+    held_out_by_seed as held_out_by_seed,
 )
 from ._hunt_pairs import (
     GateCase as GateCase,

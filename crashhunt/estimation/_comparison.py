@@ -13,6 +13,7 @@ import math
 from collections import Counter
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
@@ -28,14 +29,13 @@ from crashhunt.ledger import Ledger
 from crashhunt.rates import (
     PER_WORDS,
     PERS,
-    CountingRule,
     Interval,
     PairSequence,
     PairTest,
     difference_of_rates,
     facts_of_plain,
 )
-from crashhunt.training import held_out_traffics
+from crashhunt.training import HeldOutTraffics, held_out_traffics
 from crashhunt.trial import Constant, Outcome
 
 if TYPE_CHECKING:
@@ -45,10 +45,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.plans import HuntSettings
-    from crashhunt.rates import CrashRate, Pair as TrialPair, Per, TrialFacts
-    from crashhunt.training import HeldOutTraffics
+    from crashhunt.rates import CountingRule, CrashRate, Pair as TrialPair, Per, TrialFacts
+    from crashhunt.training import TrainedOn
 
-__all__ = ["Comparison", "HuntFigures", "Pair", "compare", "held_out_of", "why_unpaired"]
+__all__ = ["Comparison", "HuntFigures", "Pair", "compare", "held_out_by_seed", "why_unpaired"]
 
 _CONFIDENCE = 0.95
 _ALPHA = 1 - _CONFIDENCE
@@ -278,7 +278,8 @@ def compare(*directories: Path | str, per: Per = "trial") -> Comparison:
     for hunt in hunts:
         if hunt.state.damaged:
             raise HuntDirectoryError(hunt.state.detail)
-    sides = [_Side(hunt, held_out_of(hunt, hunts), per) for hunt in hunts]
+    held_out = held_out_by_seed(hunts)
+    sides = [_Side(hunt, held_out[hunt.settings.seed], per) for hunt in hunts]
     figures = [_figures(side) for side in sides]
     pairs = tuple(
         _pair(sides[0], figures[0], side, figure) for side, figure in zip(sides[1:], figures[1:], strict=True)
@@ -286,20 +287,23 @@ def compare(*directories: Path | str, per: Per = "trial") -> Comparison:
     return Comparison(tuple(figures), pairs)
 
 
-def held_out_of(hunt: HuntResults, compared: Sequence[HuntResults]) -> HeldOutTraffics:
-    """Return the rule that selects a hunt's trials for a comparison; it is the same for all hunts with its seed.
+def held_out_by_seed(compared: Sequence[HuntResults]) -> dict[int, HeldOutTraffics]:
+    """Return for each hunt seed the rule that selects the trials of a comparison; it reads each snapshot once.
 
     Raises:
         HuntDirectoryError: a training record is damaged.
         BundleError: a snapshot is damaged.
     """
-    alike = [other.directory for other in compared if other.settings.seed == hunt.settings.seed]
-    return held_out_traffics(hunt.settings, alike)
+    alike: dict[int, list[HuntResults]] = {}
+    for hunt in compared:
+        alike.setdefault(hunt.settings.seed, []).append(hunt)
+    return {
+        seed: held_out_traffics(hunts[0].settings, [hunt.directory for hunt in hunts]) for seed, hunts in alike.items()
+    }
 
 
-@dataclass(frozen=True, slots=True)
 class _Side:
-    """A hunt in a comparison.
+    """A hunt in a comparison, whose trials are read once for each confidence.
 
     Args:
         hunt: the hunt.
@@ -307,14 +311,26 @@ class _Side:
         per: the unit of its rate.
     """
 
-    hunt: HuntResults
-    held_out: HeldOutTraffics
-    per: Per
+    def __init__(self, hunt: HuntResults, held_out: HeldOutTraffics, per: Per) -> None:
+        self.hunt, self.held_out, self.per = hunt, held_out, per
+        self._rates: dict[float, CrashRate] = {}
 
     def rate(self, confidence: float = 100 * _CONFIDENCE) -> CrashRate:
         """Return the crash rate."""
-        found = measure_rates(self.hunt.directory, per=self.per, confidence=confidence, held_out=self.held_out)
-        return found[0]
+        if confidence not in self._rates:
+            rates = measure_rates(self.hunt.directory, per=self.per, confidence=confidence, held_out=self.held_out)
+            self._rates[confidence] = rates[0]
+        return self._rates[confidence]
+
+    @property
+    def rule(self) -> CountingRule:
+        """The rule by which the trials of the hunt count, without its training records."""
+        return counting_rule(self.hunt.settings, self.hunt.facts)
+
+    @cached_property
+    def own_records(self) -> tuple[TrainedOn, ...]:
+        """The training records of the hunt's own agents."""
+        return held_out_traffics(self.hunt.settings, [self.hunt.directory]).records
 
 
 # One hunt in numbers.
@@ -400,7 +416,7 @@ def _pair(one: _Side, figures: HuntFigures, two: _Side, other: HuntFigures) -> P
     counts = (figures.crashes, figures.trials, other.crashes, other.trials)
     why_not = why_unpaired(first.settings, second.settings)
     if not why_not:
-        sequence, test, trained_on, pairs = _paired(first, second)
+        sequence, test, trained_on, pairs = _paired(one, two)
         if test.pairs and not sequence.why_not:
             found = _by_pairs(one, two, sequence, test, counts, pairs)
             return replace(
@@ -444,7 +460,7 @@ def _by_pairs(
     evidence: float | None = math.exp(min(test.log_evidence, 700.0))  # a float ends soon after
     difference, why_none = test.difference(_ALPHA), ""
     if one.per != "trial":
-        evidence, in_unit = None, difference_of_rates(pairs, (_rule(first), _rule(second)), one.per, _ALPHA)
+        evidence, in_unit = None, difference_of_rates(pairs, (one.rule, two.rule), one.per, _ALPHA)
         difference, why_none = (None, in_unit) if isinstance(in_unit, str) else (in_unit, "")
     p_value = None
     if _is_fixed_ahead(one) and _is_fixed_ahead(two):
@@ -546,34 +562,27 @@ def _by_intervals(one: _Side, two: _Side, why_not: str, counts: tuple[int, int, 
 def _is_fixed_ahead(side: _Side) -> bool:
     """Return whether the number of trials did not depend on crashes, so that a single test at the end is valid."""
     settings = side.hunt.settings
-    with closing(Ledger(side.hunt.directory / layout.LEDGER)) as ledger:
-        replanned = ledger.facts().get("replanned")  # with another TRIALS, perhaps because of the results
-    return not (settings.seeds or settings.run.until_rate or replanned) and side.rate().estimate is not None
+    return not (settings.seeds or settings.run.until_rate) and side.rate().estimate is not None
 
 
-def _paired(first: HuntResults, second: HuntResults) -> tuple[PairSequence, PairTest, int, list[TrialPair]]:
+def _paired(one: _Side, two: _Side) -> tuple[PairSequence, PairTest, int, list[TrialPair]]:
     """Return the pairs, their evidence, how many trials training traffic excludes, and the pairs that count."""
-    hunts = first, second
-    held_out = held_out_traffics(first.settings, [hunt.directory for hunt in hunts])
+    hunts = one.hunt, two.hunt
+    records = dict.fromkeys((*one.own_records, *two.own_records))
+    held_out = HeldOutTraffics(one.hunt.settings.seed, tuple(records))
     trained_on = 0
-    rules = _rule(first), _rule(second)
-    with_arguments = not _same_draws(first, second)
-    sequence = PairSequence(rules, lambda one, other: one.tags == other.tags)
+    with_arguments = not _same_draws(*hunts)
+    sequence = PairSequence((one.rule, two.rule), lambda first, second: first.tags == second.tags)
     test, pairs = PairTest(sequence.rounds), []
     for side in (0, 1):
         for trial in _trials(hunts[side], with_arguments=with_arguments):
             for pair in sequence.add(side, trial):
-                if all(held_out.has(int(one.tags[0])) for one, _ in pair):
+                if all(held_out.has(int(first.tags[0])) for first, _ in pair):
                     test.add(pair)
                     pairs += [pair] if pair else []
                 else:
                     trained_on += len(pair)
     return sequence, test, trained_on, pairs
-
-
-def _rule(hunt: HuntResults) -> CountingRule:
-    with closing(Ledger(hunt.directory / layout.LEDGER)) as ledger:
-        return counting_rule(hunt.settings, ledger.facts())
 
 
 def _trials(hunt: HuntResults, *, with_arguments: bool) -> Iterator[TrialFacts]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from crashhunt.base.files import whole_file
 from crashhunt.base.text import in_lines
-from crashhunt.estimation import held_out_of
+from crashhunt.estimation import held_out_by_seed
 from crashhunt.hunts import FACTS, HuntResults, columns_of
 from crashhunt.rates import PER_WORDS
 from crashhunt.report._rate import count_training_trials, format_rate
@@ -179,8 +179,9 @@ def _argument_plots(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> lis
     values: dict[str, dict[str, tuple[NDArray[np.generic], NDArray[np.generic]]]] = {}
     units: dict[str, str] = {}
     compared = [HuntResults(hunt.dir) for hunt in hunts]
+    held_out = held_out_by_seed(compared)
     for hunt, results in zip(hunts, compared, strict=True):
-        for name, pair in _arguments(results, held_out_of(results, compared)).items():
+        for name, pair in _arguments(results, held_out[results.settings.seed]).items():
             values.setdefault(name, {})[hunt.dir] = pair
         for (agent, name), unit in argument_units(Path(hunt.dir), results.settings).items():
             units[f"{agent or 'scenario'}.{name}"] = unit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from contextlib import closing
 from dataclasses import replace
 
@@ -10,10 +11,12 @@ import pytest
 
 import crashhunt
 from crashhunt.base.errors import UsageError
+from crashhunt.estimation import _comparison
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, write_settings
 from crashhunt.rates import PairTest
 from crashhunt.report import describe_comparison
+from crashhunt.training import _trained_on
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
 
@@ -268,3 +271,20 @@ def test_a_hunt_without_a_last_trial_that_was_to_stop_at_kinds_has_no_crash_rate
     assert "the hunt stops at 2 kinds of crashes" in figures.why_not
     assert math.isnan(figures.crash_rate)
     assert figures.interval is not None
+
+
+def test_each_hunt_of_a_comparison_is_read_a_fixed_number_of_times(tmp_path, monkeypatch):
+    read, opened = [], []
+    records, measured = _trained_on.Snapshot, _comparison.measure_rates
+    monkeypatch.setattr(_trained_on, "Snapshot", lambda path: read.append(path.parents[1].name) or records(path))
+    monkeypatch.setattr(
+        _comparison, "measure_rates", lambda hunt, **given: opened.append(hunt.name) or measured(hunt, **given)
+    )
+    hunts = [hunt(tmp_path / f"h{number}", number) for number in range(6)]
+    for path in hunts:
+        (path / "snapshots" / "0f").mkdir(parents=True)
+        (path / "snapshots" / "0f" / "manifest.json").write_text('{"schema": 2}')
+    crashhunt.compare(*hunts)
+    # For all hunts of its seed, and for its own pairs.
+    assert Counter(read) == Counter({path.name: 2 for path in hunts})
+    assert Counter(opened) == Counter({path.name: 1 for path in hunts})
