@@ -56,7 +56,7 @@ class About:
             repeated.
         named: for an option of the form ``NAME=VALUE``, whether the name is required.
         anywhere: whether ``suite run`` and ``rerun`` have the option as well, for all their hunts. Such an option
-            belongs to the machine that runs a hunt, and not to the hunt itself.
+            belongs to a run of a hunt, and not to the hunt itself.
     """
 
     meaning: str

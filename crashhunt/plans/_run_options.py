@@ -360,7 +360,7 @@ class SnapshotChoices(_Options):
         "kept apart, and the crash rate counts only the trials of the newest version",
         help="resume the hunt although the agent, the environment, the scenario or a library has changed since its "
         "trials; the versions are kept apart, and the crash rate counts only the trials of the newest version",
-        unset="refuse to resume with other code", flag="--continue-with-new-code", group="run",
+        unset="refuse to resume with other code", flag="--continue-with-new-code", group="run", anywhere=True,
     )  # fmt: skip
 
 

@@ -68,6 +68,7 @@ _LOOK_EVERY_S = 0.1  # at processes that may have ended
 _WATCH_EVERY_S = 1.0  # the table of `suite run --watch`
 _BUSY_S = 15.0  # for the process of an earlier run to leave the directory
 _PR_SET_PDEATHSIG = 1
+_NEW_CODE = "continue_with_new_code"  # the option of a run that is none of `RunSettings`
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +137,8 @@ def check_machine(parallel: int, machine: Given | None) -> None:
         PluginError: the executor does not exist.
     """
     slots_of(parallel)
-    executor_of(RunSettings(**(machine or {})).checked().executor)
+    run = {name: value for name, value in (machine or {}).items() if name != _NEW_CODE}
+    executor_of(RunSettings(**run).checked().executor)
 
 
 def run_all(
@@ -279,8 +281,9 @@ def _main(folder: Path, run: Given, parent: int) -> None:
         asked = RunRequest.read(folder / REQUEST)
         options = dict(run)
         partner = Path(other) if (other := options.pop("partner", None)) is not None else None
+        new_code = options.pop(_NEW_CODE, asked.snapshot.continue_with_new_code)
         scenario, settings, imported = _planned(folder, asked.request, options)
-        snapshot = SnapshotOptions.of(asked.snapshot)
+        snapshot = SnapshotOptions.of(replace(asked.snapshot, continue_with_new_code=new_code))
         command = ["crashhunt", "suite", "run"]
         hunt = Hunt(folder, scenario, settings, command=command, snapshot=snapshot, imported=imported, partner=partner)
         deadline = time.monotonic() + _BUSY_S

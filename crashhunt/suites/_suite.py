@@ -163,7 +163,7 @@ class Suite:
         try:
             place.mkdir(exist_ok=True)
             for folder, request in planned.items():
-                if not (folder / REQUEST).exists():
+                if not (folder / REQUEST).exists() or RunRequest.read(folder / REQUEST) != request:
                     folder.mkdir(parents=True, exist_ok=True)
                     write_request(folder, request)
             return list(planned)
@@ -234,6 +234,9 @@ class Suite:
         before = RunRequest.read(folder / REQUEST)
         if entry.seed is None:
             wanted = replace(wanted, request=replace(wanted.request, seed=before.request.seed))
+        # A suite may allow new code later; `plan` then writes the request again.
+        new_code = wanted.snapshot.continue_with_new_code
+        before = replace(before, snapshot=replace(before.snapshot, continue_with_new_code=new_code))
         if before != replace(wanted, folder=before.folder):
             raise HuntDirectoryError(
                 f"the hunt {entry.id!r} was planned in this folder with other settings",

@@ -14,7 +14,7 @@ from crashhunt.base.errors import BundleError, SnapshotError
 from crashhunt.base.plugins import ImportedModules
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
+from crashhunt.snapshots import Snapshot, SnapshotOptions, _take, code_changes, take_snapshot
 
 BASE = "code/@my project"
 
@@ -143,6 +143,46 @@ def test_equal_code_is_stored_once_and_up_to_a_limit(project, take):
         take(limit_mb=2)
     assert "--no-snapshot" in caught.value.fix
     assert f"{BASE}/recording.bin" in take(limit_mb=10).manifest["files"]
+
+
+def test_other_versions_of_libraries_make_another_snapshot(take, monkeypatch):
+    first = take()
+    assert "conditions" not in first.manifest
+    monkeypatch.setattr(_take, "environment", lambda _: {**first.environment(), "python": "9.9"})
+    other = take()
+    assert other.digest != first.digest
+    assert (other.conditions, other.manifest["files"]) == ({"python": "9.9"}, first.manifest["files"])
+    other.verify()
+    assert code_changes(first, other).changed == (f"python {first.environment()['python']} (now 9.9)",)
+    assert take().digest == other.digest
+    monkeypatch.undo()
+    assert take().digest == first.digest
+
+
+def test_code_that_is_not_copied_still_identifies_a_snapshot(project, take):
+    first = take(code=False)
+    assert not first.has_code
+    assert first.is_described
+    assert [place for place in first.manifest["files"] if place.startswith("code/")] == []
+    assert f"{BASE}/src/planner/agents.py" in first.conditions
+    first.verify()
+    (project / "src" / "planner" / "agents.py").write_text("changed = True\n")
+    other = take(code=False)
+    assert other.digest != first.digest
+    assert code_changes(first, other).changed == ("src/planner/agents.py",)
+
+
+def test_large_file_that_is_not_copied_is_known_by_its_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr(_take, "_WHOLE_FILE_BYTES", 100)
+    monkeypatch.setattr(_take, "_SMALL_FILE_BYTES", 10)
+    file = tmp_path / "data.bin"
+    digests = []
+    for content in (bytes(300), bytes(299), bytes(290) + b"1" * 10, b"1" + bytes(299), bytes(300)):
+        file.write_bytes(content)
+        digests.append(_take._digest_of_original(str(file)))
+    assert len(set(digests)) == 4
+    assert digests[0] == digests[-1]
+    assert _take._digest_of_original(str(tmp_path / "gone")) == ""
 
 
 def test_what_is_missing_new_or_changed_is_named(take, tmp_path):

@@ -94,6 +94,10 @@ def test_process_of_a_hunt_waits_for_an_earlier_one(hunt, monkeypatch, capsys):
     busy[:] = [False]
     _processes._main(hunt, {"parallel": 2, "partner": "/other"}, 0)
     assert (made[-1][0], made[-1][1]["partner"]) == (given, Path("/other"))
+    assert made[-1][1]["snapshot"].new_code is False
+    busy[:] = [False]
+    _processes._main(hunt, {"parallel": 2, "continue_with_new_code": True}, 0)
+    assert (made[-1][0], made[-1][1]["snapshot"].new_code) == (given, True)
     monkeypatch.setattr(_processes, "_BUSY_S", -1.0)
     busy[:] = [True]
     _processes._main(hunt, {}, 0)
@@ -358,11 +362,15 @@ def test_plan_of_a_suite_has_a_folder_for_each_run(tmp_path):
     assert caught.value.where == str(folders[0])
     with pytest.raises(HuntDirectoryError):
         found.plan(tmp_path / "no/out")
+    new_code = [replace(entry, continue_with_new_code=True) for entry in found.entries]  # allowed later
+    assert Suite(new_code, folder=tmp_path).plan(tmp_path / "out") == folders
+    assert all(RunRequest.read(folder / REQUEST).snapshot.continue_with_new_code for folder in folders)
+    assert [RunRequest.read(folder / REQUEST).request.seed for folder in folders] == seeds
+    roots = Suite([SuiteEntry(id="a", scenario="loop", snapshot_roots=("code", "/abs"))], folder=tmp_path)
+    assert roots.request(roots.entries[0], 0).snapshot.snapshot_roots == (str(tmp_path / "code"), "/abs")
     (tmp_path / layout.HUNT).touch()
     with pytest.raises(HuntDirectoryError):
         found.plan(tmp_path)
-    roots = Suite([SuiteEntry(id="a", scenario="loop", snapshot_roots=("code", "/abs"))], folder=tmp_path)
-    assert roots.request(roots.entries[0], 0).snapshot.snapshot_roots == (str(tmp_path / "code"), "/abs")
 
 
 def test_hunts_of_a_suite_run_until_they_have_ended(tmp_path, monkeypatch):
