@@ -121,7 +121,13 @@ def count_versions(ledger: Ledger, facts: Facts, crash_on: Collection[str]) -> t
 
 
 def resumed_versions(
-    directory: Path, ledger: Ledger, taken: Snapshot, settings: HuntSettings, before: HuntSettings, *, new_code: bool
+    directory: Path,
+    ledger: Ledger,
+    taken: Snapshot,
+    settings: HuntSettings,
+    before: HuntSettings,
+    *,
+    new_code: bool | None,
 ) -> tuple[CodeVersions, tuple[str, ...]]:
     """Return the versions of the code of a hunt that resumes, and the new files that do not count as a change.
 
@@ -131,7 +137,7 @@ def resumed_versions(
         taken: snapshot from which the next trials run.
         settings: settings of the hunt.
         before: settings of the hunt before it was resumed.
-        new_code: whether the hunt may continue with other code.
+        new_code: whether the hunt may continue with other code; None if the command has no option to allow it.
 
     Raises:
         HuntDirectoryError: the code has changed since the hunt's trials, and the hunt must not or cannot continue.
@@ -156,16 +162,12 @@ def resumed_versions(
     if len(now.changed) > _MAX_SHOWN:
         what += f"; and {len(now.changed) - _MAX_SHOWN} more"
     message = f"the code has changed since the {trials} trials of this hunt: {what}"
-    if why := _why_not(settings):
-        fix = "give a new directory, or restore the code"
-        raise HuntDirectoryError(f"{message}; {why}" if new_code else message, fix=fix, where=str(directory))
-    if not new_code:
-        raise HuntDirectoryError(
-            message,
-            fix="give a new directory to test the new code, restore the code to resume, or add "
-            "--continue-with-new-code, with which the crash rate counts only the trials of the new code",
-            where=str(directory),
-        )
+    why = _why_not(settings)
+    if why or not new_code:
+        fix = "give a new directory to test the new code, or restore the code to resume"
+        if not why and new_code is not None:
+            fix += "; with --continue-with-new-code, this hunt continues and its crash rate counts only the new code"
+        raise HuntDirectoryError(f"{message}; {why}" if why and new_code else message, fix=fix, where=str(directory))
     if settings.trials and settings.trials <= begun:
         raise HuntDirectoryError(
             f"TRIALS is {settings.trials}, but the first {begun} trials belong to earlier code: none is left for the "

@@ -179,12 +179,13 @@ class Hunt:
         if not has_begun(path):
             return
         taken = self._take_snapshot()
+        new_code = self._snapshot_options is not None and self._snapshot_options.new_code
         try:
             with closing(Ledger(path)) as ledger:
                 before = CodeVersions.of(ledger.facts())
                 self._code, added = resumed_versions(
                     self.directory, ledger, taken, self.settings, self._place.settings_before or self.settings,
-                    new_code=self._snapshot_options is not None and self._snapshot_options.new_code,
+                    new_code=None if self._pace is not None else new_code,
                 )  # fmt: skip
         except CrashhuntError:
             if self._new_snapshot is not None:

@@ -16,6 +16,7 @@ from crashhunt.errors import HuntDirectoryError
 from crashhunt.estimation import compare, measure_rates
 from crashhunt.hunts import (
     CodeVersions,
+    Hunt,
     HuntResults,
     check,
     count_versions,
@@ -211,6 +212,15 @@ def test_resumed_hunt_names_new_files_that_do_not_count(agent, tmp_path):
     (tmp_path / "car" / "helper.py").write_text("")
     with pytest.raises(HuntDirectoryError, match=r"car/helper.py \(new\);"):
         run(4)
+
+
+def test_hunt_of_a_gate_names_no_option_that_its_command_lacks(agent, tmp_path, monkeypatch):
+    run(2)
+    agent(1)
+    monkeypatch.setattr("crashhunt.hunts.Hunt", lambda *given, **more: Hunt(*given, **more, partner=tmp_path / "other"))
+    with pytest.raises(HuntDirectoryError, match=REFUSED) as caught:
+        run(4)
+    assert "--" not in caught.value.fix
 
 
 def test_learning_sampler_receives_no_results_of_earlier_code(agent, tmp_path, monkeypatch):
