@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, HuntDirectoryError
 from crashhunt.snapshots import CodeChanges, Snapshot, code_changes
+from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -146,6 +147,7 @@ def resumed_versions(
     known = CodeVersions.of(facts) if facts.get("code_versions") else _versions_of(directory, tuple(used))
     if not known.snapshots:
         return known, ()
+    _refuse_other_limit(directory, ledger, before.run.timeout_s, settings.run.timeout_s)
     begun = len(finished)  # trials that had begun
     if facts.get("state") != "all_trials" or max(finished, default=-1) >= begun:
         begun += facts.get("under_way") or max(2 * settings.run.parallel, _MIN_UNDER_WAY)
@@ -177,6 +179,25 @@ def resumed_versions(
         )
     place = next((place for place, one in enumerate(changes) if not one.changed), len(known.snapshots))
     return _with(known, place, taken.digest, begun), changes[place].added if place < len(changes) else ()
+
+
+def _refuse_other_limit(directory: Path, ledger: Ledger, before_s: float, now_s: float) -> None:
+    """Refuse another time limit of trials, if it would change the outcomes of trials that have ended.
+
+    Raises:
+        HuntDirectoryError: earlier trials hung within the earlier limit, or took longer than the present limit.
+    """
+    if now_s == before_s:
+        return
+    hung = ledger.outcomes().get(Outcome.HANG, 0)
+    count, what = (hung, "hung") if now_s > before_s else (hung + ledger.count_longer(now_s), "took longer or hung")
+    if count:
+        raise HuntDirectoryError(
+            f"--timeout was {before_s:g} and is now {now_s:g}, but {count} of the hunt's trials {what}, and may end "
+            "otherwise with this limit",
+            fix=f"give --timeout {before_s:g}, or a new directory",
+            where=str(directory),
+        )
 
 
 def _with(known: CodeVersions, place: int, digest: str, first: int) -> CodeVersions:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypedDict, cast
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.ledger._schema import OWN_FACTS, SEAL, WITH_EVENTS, Row, checked, damaged, explained, plain_trial
-from crashhunt.trial import KILLED, TrialResult, TrialSpec
+from crashhunt.trial import KILLED, Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -359,6 +359,14 @@ class LedgerReader:
         """Return the numbers of the trials that ran from the given snapshots."""
         rows = self._select(f"SELECT number FROM trials WHERE {_among('snapshot', snapshots)}", tuple(snapshots))
         return {number for (number,) in rows}
+
+    def count_longer(self, wall_s: float) -> int:
+        """Return the number of trials that took longer than a time and did not hang.
+
+        Args:
+            wall_s: the time, in s of wall time.
+        """
+        return self._count(f"trials WHERE wall_s > {float(wall_s)!r} AND outcome <> '{Outcome.HANG}'")
 
     def traffic_events(self) -> dict[str, tuple[int, int]]:
         """Return for each type of traffic event the number of events, and the number of trials with such events."""

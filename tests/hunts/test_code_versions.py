@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 from contextlib import closing
+from dataclasses import replace
 
 import pytest
 
@@ -27,6 +28,7 @@ from crashhunt.hunts import (
 from crashhunt.ledger import Ledger
 from crashhunt.report import describe_hunt, describe_rates
 from crashhunt.samplers import NamedSampler
+from crashhunt.trial import Outcome
 
 TOY = """
 title = "A toy"
@@ -212,6 +214,19 @@ def test_resumed_hunt_names_new_files_that_do_not_count(agent, tmp_path):
     (tmp_path / "car" / "helper.py").write_text("")
     with pytest.raises(HuntDirectoryError, match=r"car/helper.py \(new\);"):
         run(4)
+
+
+@pytest.mark.parametrize(("timeout_s", "says"), [(0.5, "2 of the hunt's trials took longer or hung"), (9, "1 of the")])
+def test_other_time_limit_is_refused_where_earlier_trials_would_end_otherwise(agent, tmp_path, timeout_s, says):
+    run(3, timeout_s=5)
+    run(4, timeout_s=4)  # which changes nothing
+    with closing(Ledger(tmp_path / "h" / "ledger.sqlite", writable=True)) as ledger:
+        snapshot = ledger.snapshot_of(0)
+        for number, outcome in ((0, Outcome.HANG), (1, Outcome.SURVIVED)):
+            ledger.record(replace(ledger.result(number), outcome=outcome, wall_s=3.0), snapshot=snapshot)
+    with pytest.raises(HuntDirectoryError, match=f"--timeout was 4 and is now {timeout_s}, but {says}") as caught:
+        run(5, timeout_s=timeout_s)
+    assert caught.value.fix == "give --timeout 4, or a new directory"
 
 
 def test_hunt_of_a_gate_names_no_option_that_its_command_lacks(agent, tmp_path, monkeypatch):
