@@ -137,9 +137,9 @@ class TrialOptions(_Options):
     crash_on: Sequence[str] = option(
         CRASHES, "outcomes that count as a crash",
         help="the outcomes that count as a crash. By default: collision, off_road, agent_error, simulator_error, "
-        "process_died, hang. Traffic events may also count: red_light, wrong_way, off_route, not_moving (no motion "
-        "for 60 s, or for S seconds with not_moving:S), others_collided, hard_braking (or hard_braking:M/S² for "
-        "another limit), teleport",
+        "process_died, hang. Traffic events may also count: red_light, wrong_way, off_route, stop_missed, not_moving "
+        "(no motion for 60 s, or for S seconds with not_moving:S), others_collided, hard_braking (or "
+        "hard_braking:M/S² for another limit), teleport",
         flag="--crash-on", group="what", metavar="KIND,…", separator=",",
     )  # fmt: skip
     disturb: Sequence[str] = option(

@@ -381,7 +381,9 @@ def action_mask_of(env: Env[Any, Any], info: Mapping[str, Any], space: Space[Any
 def _number_of_choices(space: Space[Any]) -> int:
     if isinstance(space, spaces.MultiBinary):
         return 2 * int(np.prod(space.shape))
-    return int(space.nvec.sum() if isinstance(space, spaces.MultiDiscrete) else getattr(space, "n", 0))
+    if isinstance(space, spaces.MultiDiscrete):
+        return int(space.nvec.sum())
+    return int(space.n) if isinstance(space, spaces.Discrete) else 0
 
 
 # Scenario arguments set entries in the configuration of an environment.

@@ -32,6 +32,7 @@ class Outcome(StrEnum):
     RED_LIGHT = "red_light"
     WRONG_WAY = "wrong_way"
     OFF_ROUTE = "off_route"
+    STOP_MISSED = "stop_missed"
     NOT_MOVING = "not_moving"
     OTHERS_COLLIDED = "others_collided"
     HARD_BRAKING = "hard_braking"

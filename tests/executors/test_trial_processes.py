@@ -296,7 +296,9 @@ def test_trial_runs_in_its_folder_and_reports(process, monkeypatch, tmp_path):
     found = process()
     called, ran = [], []
     simulator = SimpleNamespace(can=())
-    found._parts = SimpleNamespace(simulator=lambda: simulator, agent="make agent", oracles=lambda: "oracles")
+    found._parts = SimpleNamespace(
+        simulator=lambda: simulator, agent="make agent", oracles=lambda: "oracles", reporting_agents=()
+    )
     found._shared = SimpleNamespace(separate=lambda: called.append("separate"))
     found._stack = "stack"
 

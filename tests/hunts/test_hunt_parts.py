@@ -98,13 +98,16 @@ class Notes:
     """In place of a ledger: it notes what it is told."""
 
     def __init__(self):
-        self.remarks, self.facts, self.entered, self.restored = [], [], [], False
+        self.remarks, self.noted, self.entered, self.restored = [], [], [], False
 
     def remark(self, text):
         self.remarks.append(text)
 
     def note(self, **facts):
-        self.facts.append(facts)
+        self.noted.append(facts)
+
+    def facts(self):
+        return {name: value for facts in self.noted for name, value in facts.items()}
 
     def enter(self, state, detail="", **facts):
         self.entered.append((state, detail, facts))
@@ -124,6 +127,7 @@ def test_notices_of_workers_and_differences_of_the_audit_are_noted(hunt):
         found._receive_results("executor", audit, ledger, progress, wait_s=0.25)
     assert ledger.remarks == ["a", "b", "audit: differs"] * 2
     assert progress.notes == ["a", "b"] * 2
+    assert ledger.noted == [{"notices": ["a"]}, {"notices": ["a", "b"]}]  # each once
     assert looks == ["executor"] * 2
     assert counted == [(audit, progress)]
 
@@ -296,7 +300,7 @@ def test_phases_after_the_last_trial_are_shown_and_noted_now_and_then(hunt, monk
         clock.now = 100.0 + now
         show(SimpleNamespace(name=name, done=done))
     assert seen == [("a", 0), ("a", 1), ("a", 2), ("b", 0), ("b", 1)]
-    assert ledger.facts == [{"done": 0}, {"done": 2}, {"done": 0}]
+    assert ledger.noted == [{"done": 0}, {"done": 2}, {"done": 0}]
     assert progress.ends_at is None
 
 

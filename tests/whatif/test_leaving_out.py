@@ -35,7 +35,7 @@ class Recorded:
         self.disturbances = disturbances
 
     def scene(self, number):
-        return SimpleNamespace(frame=(None, np.zeros(1)))
+        return SimpleNamespace(data=np.zeros(1))
 
 
 def told(step, what, vehicle):
