@@ -158,7 +158,8 @@ def _evidence_of_normalization(model: Any) -> Literal["certain", "likely", ""]:
     A model keeps its last observation, and the original of an observation that was normalised. An off-policy model also
     keeps the observation before the last one as an original, if nothing was normalised.
     """
-    original, last = getattr(model, "_last_original_obs", None), getattr(model, "_last_obs", None)
+    original = getattr(model, "_last_original_obs", None)
+    last: Any = getattr(model, "_last_obs", None)
     if original is None:
         return ""
     if not hasattr(model, "replay_buffer_class"):

@@ -313,7 +313,7 @@ def _channels_first(shape: tuple[int, ...]) -> tuple[int, ...]:
     return (shape[2], *shape[:2]) if len(shape) == 3 else ()
 
 
-def _equal(one: NDArray[Any], other: NDArray[Any]) -> bool:
+def _equal(one: NDArray[np.generic], other: NDArray[np.generic]) -> bool:
     return bool(np.allclose(one, other, rtol=1e-5, atol=0.0))  # a space of another type rounds its bounds
 
 
