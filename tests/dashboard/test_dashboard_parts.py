@@ -48,7 +48,7 @@ def ended(jobs, count, hunt="h", crash="c"):
 
 
 def test_jobs_run_one_after_another_and_keep_their_output(jobs, tmp_path):
-    made = jobs('echo "$@"; test "$3" != judge')
+    made = jobs('echo "$@"; test "$4" != judge')
     assert made.add("h", tmp_path, "c", "replay") == {
         "job": 1, "hunt": "h", "crash": "c", "name": "replay", "state": "waiting", "exit_code": None, "output": ""
     }  # fmt: skip
@@ -56,10 +56,10 @@ def test_jobs_run_one_after_another_and_keep_their_output(jobs, tmp_path):
     made.add("h", Path("p"), "c", "judge")
     latest, first = ended(made, 2)
     assert (first["job"], first["state"], first["exit_code"]) == (1, "ended", 0)
-    assert first["output"] == f"-m crashhunt replay --crash c -- {tmp_path}\n"
+    assert first["output"] == f"-P -m crashhunt replay --crash c -- {tmp_path}\n"
     assert (latest["job"], latest["name"], latest["exit_code"]) == (3, "judge", 1)
     (other,) = ended(made, 1, crash="other")
-    assert other["output"] == "-m crashhunt shrink --crash other -- -x\n"
+    assert other["output"] == "-P -m crashhunt shrink --crash other -- -x\n"
     assert made.list("elsewhere", "c") == []
     with pytest.raises(UsageError, match="there is no job 'rm'; give one of replay, judge, shrink"):
         made.add("h", tmp_path, "c", "rm")

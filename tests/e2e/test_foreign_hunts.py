@@ -170,7 +170,7 @@ def test_trust_for_one_command_makes_nothing_ones_own(theirs):
 
 
 def test_hunt_that_continues_runs_no_code_of_another_user(theirs):
-    """What today's code tries is new; what is there already would run from the snapshot of the other user."""
+    """What is there already would run from the snapshot of the other user, and other code is refused."""
     crash = find_bundle(theirs.folder / "h", "0")
     data = json.loads((crash.path / "crash.json").read_text())
     assert data["confirmed"] is True
@@ -179,16 +179,18 @@ def test_hunt_that_continues_runs_no_code_of_another_user(theirs):
     del data["integrity"]
     data["confirmed"] = None
     (crash.path / "crash.json").write_text(json.dumps({**data, "integrity": digest_of_data(data)}))
-    (theirs.folder / "theirs.py").write_text(AGENT.replace("it ran", "mine").replace("RAN", "MINE"))
-    done = theirs.crashhunt(*HUNT, "--near-misses", "2")
+    changed = theirs.folder / "theirs.py"
+    changed.write_text(AGENT.replace("it ran", "mine").replace("RAN", "MINE"))
+    assert "the code has changed" in theirs.crashhunt(*HUNT, "--near-misses", "2", expect=2).err
+    assert not ran(theirs)
+    changed.write_text(AGENT)
+    done = theirs.crashhunt(*HUNT)
     assert f"{crash.id} was not confirmed" in done.out
     assert "crashhunt trust" in done.out
-    assert not ran(theirs)
     assert find_bundle(theirs.folder / "h", "0").confirmed is None
     theirs.crashhunt("trust", "h")
     theirs.crashhunt(*HUNT)
     assert find_bundle(theirs.folder / "h", "0").confirmed is True
-    assert ran(theirs)
 
 
 @pytest.mark.nightly  # by day, cli/test_common.py

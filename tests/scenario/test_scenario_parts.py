@@ -203,12 +203,12 @@ def test_scenario_file_that_cannot_be_read_is_one_line(tmp_path):
 
 
 def test_scenario_file_that_the_system_refuses_is_one_line(tmp_path, monkeypatch):
-    def refused(path, encoding):
+    def refused(path, mode):
         raise PermissionError(13, "Permission denied")
 
     file = tmp_path / "scenario.toml"
     file.touch()
-    monkeypatch.setattr(Path, "read_text", refused)
+    monkeypatch.setattr(Path, "open", refused)
     said, _, where = refusal(load_scenario, file)
     assert (said, where) == ("cannot be read: Permission denied", str(file))
 
@@ -483,7 +483,7 @@ def test_untrusted_option_of_sumo_may_only_change_the_traffic(town, option, harm
 def test_descriptor_of_a_plugin_is_a_backend(monkeypatch):
     plugin, other = Backend(title="mine"), "no descriptor"
     monkeypatch.setattr(_scenario, "_plugin_backends", lambda: {"mine": SimpleNamespace(value="m:B")})
-    monkeypatch.setattr(_scenario, "load_attribute", lambda value, *, shown: (plugin, other)[shown != "mine"])
+    monkeypatch.setattr(_scenario, "load_attribute", lambda value, *, shown, installed: (plugin, other)[shown != "mine"])
     find = getattr(backend_of, "__wrapped__", backend_of)
     assert find("mine") is plugin
     assert find("nobody") is None
