@@ -115,6 +115,7 @@ def test_hunt_without_results_may_change_its_code(agent, tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.long
 def test_versions_are_kept_apart_in_every_figure(agent, tmp_path, capsys):
     hunt = tmp_path / "h"
     first = run(20, keep=1)
@@ -144,9 +145,10 @@ def test_versions_are_kept_apart_in_every_figure(agent, tmp_path, capsys):
     assert [row["code_version"] for row in results.rows()] == [1] * 20 + [2] * 10
     assert results.trials()["code_version"].tolist() == [1] * 20 + [2] * 10
     run(30, "other", keep=1)
-    figures = compare(hunt, "other").hunts[0]
+    comparison = compare(hunt, "other")
+    figures = comparison.hunts[0]
     assert (figures.trials, figures.crashes, figures.crash_rate, figures.outcomes) == (10, 10, 1.0, {"agent_error": 10})
-    (pair,) = compare(hunt, "other").pairs
+    (pair,) = comparison.pairs
     assert (pair.trials, pair.both) == (10, 10)
     groups = group_crashes(list_bundles(hunt), faults=False).groups
     assert [*crashes_by_version([hunt], groups)[str(hunt)].values()] == [{1: failed, 2: 10}]
