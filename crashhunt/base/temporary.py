@@ -235,7 +235,7 @@ def record_shared_memory(scratch: Path) -> None:
                 writes = fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE != os.O_RDONLY
                 if writes and (target := os.readlink(f"/proc/self/fd/{descriptor}")).startswith(prefix):  # noqa: PTH115
                     name, number = target.removeprefix(prefix), os.fstat(descriptor).st_ino
-                    if _before and (name, number) not in _before[0]:
+                    if _before and "/" not in name and (name, number) not in _before[0]:
                         record(_USED, number, name)
         if event not in ("open", "os.mkdir"):
             return

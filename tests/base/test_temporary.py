@@ -696,6 +696,23 @@ def test_shared_memory_that_a_trial_has_mapped_at_its_end_goes_if_it_is_written(
     assert left(name) == remaining
 
 
+def test_file_in_a_folder_of_shared_memory_is_no_segment_of_a_trial(tmp_path, name):
+    """The black box lies in such a folder where TMPDIR is in memory, and a look at all processes takes 15 ms."""
+
+    def act():
+        folder.mkdir()
+        with (folder / "box").open("w+b") as file:
+            file.truncate(4096)
+            kept.append(mmap.mmap(file.fileno(), 4096))
+
+    kept, folder = [], Path("/dev/shm", name)
+    try:
+        assert in_trial(tmp_path, act) == 0
+        assert not any("used" in record.read_text() for record in tmp_path.glob("shared-memory-*.txt"))
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def test_a_record_that_an_agent_forged_removes_no_file_elsewhere(tmp_path):
     file = tmp_path / "thesis.tex"
     file.touch()
