@@ -226,7 +226,8 @@ def _take_tree(
         hunts = _hunts_in(tree, names)
         if without is not None and without.resolve().is_relative_to(tree) and without.resolve() != tree:
             hunts.append(f"{without.resolve().relative_to(tree).as_posix()}/")
-        listed = [name for name in names if not name.startswith(tuple(hunts))]
+        outputs = _own_outputs()
+        listed = [n for n in names if not n.startswith(tuple(hunts)) and f"{tree.resolve()}/{n}" not in outputs]
         for name in listed:
             for place, path in _resolved(tree, name, listed, found):
                 found.files[f"{base}/{place}"] = str(path)
@@ -236,6 +237,11 @@ def _take_tree(
             place = base if below == "." else f"{base}/{below}"
             if place not in found.paths and any(file.startswith(f"{place}/") for file in found.files):
                 found.paths.append(place)
+
+
+def _own_outputs() -> set[str]:
+    """Return the files to which the shell redirects the output of this command: they grow, and are no code."""
+    return {os.path.realpath(f"/proc/self/fd/{stream}") for stream in (1, 2)}
 
 
 def _hunts_in(tree: Path, names: Iterable[str]) -> list[str]:

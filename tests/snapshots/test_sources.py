@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import subprocess
 import sys
 import zipfile
@@ -44,6 +45,20 @@ def test_git_is_asked_once_for_each_folder_of_a_project(tmp_path, monkeypatch):
     base = f"code/@{tmp_path.name}"
     assert {f"{base}/driver_one.py", f"{base}/driver_two.py"} <= set(kept)
     assert asked == ["rev-parse", "ls-files"]
+
+
+def test_a_file_that_takes_the_output_of_the_command_is_no_code(tmp_path):
+    """Otherwise, the same command with `> hunt.txt` could not resume its hunt, because the file has grown."""
+    (tmp_path / "kept.txt").write_text("")
+    earlier = os.dup(2)
+    try:
+        with (tmp_path / "hunt.txt").open("w") as output:
+            os.dup2(output.fileno(), 2)
+            found = find_sources(ImportedModules.here(), roots=[tmp_path])
+    finally:
+        os.dup2(earlier, 2)
+        os.close(earlier)
+    assert [place for place in found.files if place.endswith(".txt")] == [f"code/@{tmp_path.name}/kept.txt"]
 
 
 @pytest.mark.nightly
