@@ -483,7 +483,9 @@ def test_untrusted_option_of_sumo_may_only_change_the_traffic(town, option, harm
 def test_descriptor_of_a_plugin_is_a_backend(monkeypatch):
     plugin, other = Backend(title="mine"), "no descriptor"
     monkeypatch.setattr(_scenario, "_plugin_backends", lambda: {"mine": SimpleNamespace(value="m:B")})
-    monkeypatch.setattr(_scenario, "load_attribute", lambda value, *, shown, installed: (plugin, other)[shown != "mine"])
+    monkeypatch.setattr(
+        _scenario, "load_attribute", lambda value, *, shown, installed: (plugin, other)[shown != "mine"]
+    )
     find = getattr(backend_of, "__wrapped__", backend_of)
     assert find("mine") is plugin
     assert find("nobody") is None
