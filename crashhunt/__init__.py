@@ -22,10 +22,11 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from crashhunt.accelerator import accelerate
     from crashhunt.api import prepare, replay, run, what_if
-    from crashhunt.estimation import compare
-    from crashhunt.hunts import Hunt, load
+    from crashhunt.highway.accelerator import accelerate
+    from crashhunt.hunts import Hunt
+    from crashhunt.results import load
+    from crashhunt.statistics import compare
     from crashhunt.suites import Suite
     from crashhunt.training import make_training_env
 
@@ -39,9 +40,9 @@ __all__ = [
 _HOMES = {
     "Hunt": "crashhunt.hunts",
     "Suite": "crashhunt.suites",
-    "accelerate": "crashhunt.accelerator",
-    "compare": "crashhunt.estimation",
-    "load": "crashhunt.hunts",
+    "accelerate": "crashhunt.highway.accelerator",
+    "compare": "crashhunt.statistics",
+    "load": "crashhunt.results",
     "make_training_env": "crashhunt.training",
 }
 

@@ -13,13 +13,13 @@ from crashhunt.plans import HuntOptions, Spec, hunt_options, request_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from crashhunt.analysis import Counts, Intervention
     from crashhunt.crashes import Bundle
     from crashhunt.hunts import Hunt, HuntReport, HuntStatus
     from crashhunt.plans import HuntSettings, Request
     from crashhunt.replays import Code, ReplayReport
     from crashhunt.scenario import Scenario
     from crashhunt.snapshots import SnapshotOptions
-    from crashhunt.whatif import Counts, Intervention
 
 __all__ = ["HuntCall", "RunCall", "prepare", "replay", "run", "what_if"]
 
@@ -198,7 +198,7 @@ def what_if(
         overrule: the manoeuvre that replaces the agent's actions after the step: ``brake``, ``left``, ``right``,
             ``keep_lane``, ``keep_speed``, ``reference_speed``, ``reference_lanes`` or ``reference``.
         leave_out: ids of actors to remove from the start.
-        interventions: further interventions, from `crashhunt.whatif`.
+        interventions: further interventions, from `crashhunt.analysis`.
         code: the code that drives: the code of the ``snapshot``, or the ``current`` code, which is the default with
             ``agent``.
         times: number of runs; 0 for 50 with ``futures``, else 1.
@@ -213,9 +213,9 @@ def what_if(
         UntrustedError: the code of the crash would run, but the crash is neither made on this machine nor trusted.
         CrashhuntError: the crash cannot be run, or the simulator does not support the change.
     """
+    from crashhunt.analysis import WhatIfOptions, interventions_of, what_if as counted
     from crashhunt.crashes import Bundle, find_bundle
     from crashhunt.plans import spec_words
-    from crashhunt.whatif import WhatIfOptions, interventions_of, what_if as counted
 
     bundle = crash if isinstance(crash, Bundle) else find_bundle(Path(crash), crash_id)
     asked = interventions_of(

@@ -74,7 +74,7 @@ def build(root: Path, folder: Path) -> Path:
 
 def build_kernel(root: Path, folder: Path) -> Path:
     """Compile the kernel for highway-env into a folder; return the file. Raises as `build` does."""
-    source = root / "crashhunt" / "accelerator"
+    source = root / "crashhunt" / "highway" / "accelerator"
     return _compile(source, "kernel.cpp", "_kernel.py", folder / _module("_crashhunt_highway"))
 
 
@@ -106,7 +106,9 @@ def _compile(folder: Path, source: str, interface: str, built: Path) -> Path:
     if match is None:
         raise ValueError(f"{interface} does not say which interface it has")
     words = [*shlex.split(compiler), *FLAGS, *shlex.split(os.environ.get("CXXFLAGS", ""))]
-    build_id = runpy.run_path(str(folder.parent / "native" / "_build_id.py"))["build_id"](folder)
+    build_id = runpy.run_path(str(Path(__file__).parents[1] / "crashhunt" / "native" / "_build_id.py"))["build_id"](
+        folder
+    )
     words += [f"-DCRASHHUNT_INTERFACE={match[1]}", f"-Wl,--build-id=0x{build_id}"]
     words += [f"-I{sysconfig.get_path('include')}", str(folder / source)]
     done = subprocess.run([*words, "-o", str(built), "-ldl"], capture_output=True, text=True, timeout=600, check=False)

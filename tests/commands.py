@@ -44,14 +44,15 @@ CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 IMPORTED = ("cli", "api", "crashes", "executors", "hunts", "plans", "recording", "replays", "report", "snapshots")
 # What these import while they run, and whoever writes, reads and packs hunts; and what one command does that is rare.
 _WHILE_RUNNING = (
-    "crashhunt.agents._protocol", "crashhunt.corpus._cases", "crashhunt.corpus._run", "crashhunt.dashboard._server",
-    "crashhunt.samplers._space_filling", "crashhunt.scenario.backends.sumo._check",
-    "crashhunt.scenario.backends.sumo._files", "crashhunt.suites._gate", "crashhunt.suites._suite",
-    "crashhunt.whatif._engine", "encodings.ascii", "encodings.cp437", "gzip", "numpy.ma", "numpy.random",
+    "crashhunt.agents._protocol", "crashhunt.corpus._cases", "crashhunt.corpus._case_runs",
+    "crashhunt.dashboard._server",
+    "crashhunt.samplers._space_filling", "crashhunt.sumo._setup_check",
+    "crashhunt.sumo._files", "crashhunt.suites._gate_runs", "crashhunt.suites._suite_file",
+    "crashhunt.analysis._whatif_runs", "encodings.ascii", "encodings.cp437", "gzip", "numpy.ma", "numpy.random",
     "pydantic.dataclasses", "rich._emoji_codes", "rich.progress", "tomli_w", "urllib.request",
     "xml.etree.ElementTree", "xml.sax",
 )  # fmt: skip
-_FOR_COMMAND = {"compare": ("crashhunt.estimation", "scipy.stats")}  # the latter takes 0.8 s
+_FOR_COMMAND = {"compare": ("crashhunt.statistics", "scipy.stats")}  # the latter takes 0.8 s
 _MESSAGE = 1 << 20
 _DUMP_S = 20.0  # for a process to dump its threads and end; it takes milliseconds
 _REPOSITORY = Path(__file__).parents[1]

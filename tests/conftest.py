@@ -308,8 +308,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 @pytest.fixture
 def plain_highway_env() -> Iterator[None]:
     """highway-env without the accelerator and with its own classes, before a test and after it, whatever it does."""
-    from crashhunt.accelerator import switch_off
-    from crashhunt.simulators.highway import restore_classes
+    from crashhunt.highway import restore_classes
+    from crashhunt.highway.accelerator import switch_off
 
     switch_off()
     restore_classes()

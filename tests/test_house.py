@@ -9,6 +9,7 @@ import graphlib
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,7 +59,7 @@ def test_nothing_private_is_imported_from_outside_its_package():
 
 
 # What other libraries have in one version and not in another, or in one of their classes.
-_OTHERS = ("recording/_foxglove.py", "accelerator/", "agents/_policies.py", "simulators/highway/")
+_OTHERS = ("recording/_foxglove.py", "agents/_policies.py", "highway/")
 
 
 def asked_by_name(file: Path) -> list[str]:
@@ -81,14 +82,12 @@ def test_optional_faculties_are_protocols():
 
 SIMULATORS = re.compile("sumo|highway|gym(?!nasium)", re.IGNORECASE)  # gymnasium is the library of spaces
 HOMES = (
-    "scenario/backends/",
-    "maps/",
-    "simulators/sumo/",
-    "simulators/highway/",
-    "accelerator/",
-    "simulators/gym.py",
+    "gym/",
+    "highway/",
+    "sumo/",
 )
 NAMED_ALL_THE_SAME = {
+    "scenario/_scenario.py": "knows where the descriptor of each is",
     "__init__.py": "tells Gymnasium of crashhunt/SUMO-v0, which is an id that people write",
     "envs/": "is that environment, which is SUMO and nothing else",
     "base/plugins.py": "knows the names under which dependencies that are not installed are imported",
@@ -260,3 +259,13 @@ def test_objects_with_many_fields_are_made_by_keywords():
 
 def is_dataclass(node: ast.ClassDef) -> bool:
     return any("dataclass" in ast.unparse(one) for one in node.decorator_list)
+
+
+ROLES = frozenset({"_backend", "_disturbances", "_protocol", "_scripted", "_simulator", "_surroundings", "errors"})
+"""Names of files that several packages have, because a file has the same role in each."""
+
+
+def test_a_file_name_stands_once():
+    """The second file of a name is what a first guess misses."""
+    names = Counter(file.stem for file in ROOT.rglob("*.py") if not file.stem.startswith("__"))
+    assert {name for name, count in names.items() if count > 1} <= ROLES | {"_splitting"}

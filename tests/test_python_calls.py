@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 import crashhunt
-from crashhunt import api, crashes, replays, whatif
+from crashhunt import analysis, api, crashes, replays
 from crashhunt.errors import UsageError
 from crashhunt.plans import HuntOptions
 
@@ -33,8 +33,8 @@ def work(monkeypatch):
 
     monkeypatch.setattr(crashes, "find_bundle", find)
     monkeypatch.setattr(replays, "replay", note(calls.replayed, "report"))
-    monkeypatch.setattr(whatif, "interventions_of", note(calls.asked, ("change",)))
-    monkeypatch.setattr(whatif, "what_if", note(calls.counted, "counts"))
+    monkeypatch.setattr(analysis, "interventions_of", note(calls.asked, ("change",)))
+    monkeypatch.setattr(analysis, "what_if", note(calls.counted, "counts"))
     return calls
 
 
@@ -77,8 +77,8 @@ def test_what_if_passes_on_what_is_given(work, monkeypatch):
     assert [words[:2] for words in found] == [("found", ("change",))] * 3
     plain, full, chosen = (words[2] for words in found)
     assert work.found == [(Path("h"), ""), (Path("h"), "3"), (Path("h"), "")]
-    assert plain == whatif.WhatIfOptions(code="snapshot", times=0, time_s=None, parallel=6, trusted=None)
-    assert full == whatif.WhatIfOptions(code="current", times=7, time_s=9.0, parallel=2, trusted=True)
+    assert plain == analysis.WhatIfOptions(code="snapshot", times=0, time_s=None, parallel=6, trusted=None)
+    assert full == analysis.WhatIfOptions(code="current", times=7, time_s=9.0, parallel=2, trusted=True)
     assert chosen.code == "snapshot"
 
 

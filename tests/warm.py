@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 # What Python and its libraries look at when they start.
 _AT_START = ("PYTHON", "LC_", "LANG", "LD_", "COVERAGE", "OMP_", "OPENBLAS_")
 _SET_LATER = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX")
-_OF_SIMULATORS = {"gym": "gymnasium", "highway": "crashhunt.simulators.highway._fast_import", "sumo": "libsumo"}
+_OF_SIMULATORS = {"gym": "gymnasium", "highway": "crashhunt.highway._fast_import", "sumo": "libsumo"}
 _MESSAGE = 1 << 20
 _START_S = 300.0  # a server imports for two seconds; on a loaded machine for longer
 _FREE = 500  # where a process has no files of its own
@@ -64,10 +64,10 @@ _BEGIN_WITH = ("crashhunt.executors._fork_server", "crashhunt.executors._fresh")
 # What these import as soon as they have read what is to be done.
 _ALL = ("crashhunt.scenario._load", "crashhunt.crashes._last_avoidable_step", "crashhunt.recording._foxglove")
 _GO_ON_WITH = {
-    "": (*_ALL, "crashhunt.scenario.backends.toy", "crashhunt.simulators.toy"),
+    "": (*_ALL, "crashhunt.simulators._toy_backend", "crashhunt.simulators.toy"),
     "gym": _ALL,
     "highway": _ALL,  # whose accelerator knows the folder that it was imported from
-    "sumo": (*_ALL, "crashhunt.scenario.backends.sumo._backend", "crashhunt.simulators.sumo._simulator"),
+    "sumo": (*_ALL, "crashhunt.sumo._backend", "crashhunt.sumo._simulator"),
 }
 
 

@@ -214,7 +214,7 @@ def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
         HuntDirectoryError: the directory contains no hunt.
         UsageError: the run does not exist.
     """
-    from crashhunt.hunts import find_searches
+    from crashhunt.results import find_searches
 
     names = {hunt: hunt.relative_to(directory).as_posix() for hunt in find_searches(directory)}
     for run in runs:

@@ -43,9 +43,9 @@ def add_compare(commands: Commands) -> None:
 
 
 def _compare(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.estimation import compare
-    from crashhunt.hunts import find_searches
     from crashhunt.report import comparison_page, describe_comparison
+    from crashhunt.results import find_searches
+    from crashhunt.statistics import compare
 
     hunts = []
     for directory in options.directories:

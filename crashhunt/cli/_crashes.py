@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_crashes", "add_known", "checked_cases", "compare_with_corpus"]
 
-_DEFAULT_RUNS = 8  # `crashhunt.whatif.REPRESENTATIVES`, which takes longer to import than a parser to build
+_DEFAULT_RUNS = 8  # `crashhunt.analysis.REPRESENTATIVES`, which takes longer to import than a parser to build
 
 
 def add_crashes(commands: Commands) -> None:
@@ -66,8 +66,8 @@ def add_known(parser: argparse.ArgumentParser) -> None:
 
 def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.crashes import count_causes, group_crashes, join_causes, list_bundles
-    from crashhunt.hunts import crashes_by_version, dropped_crashes, find_hunts
     from crashhunt.report import describe_causes, describe_groups, describe_types_by_version
+    from crashhunt.results import crashes_by_version, dropped_crashes, find_hunts
 
     if options.by_cause is not None and options.by_cause < 1:
         raise UsageError(f"--by-cause is {options.by_cause}", fix="give at least 1")
@@ -184,8 +184,8 @@ def compare_with_corpus(directory: Path, cases: list[Case], *, as_json: bool) ->
         The types in the form that ``crashes --json`` prints, and whether a type is new or cannot be compared.
     """
     from crashhunt.crashes import group_crashes, list_bundles
-    from crashhunt.hunts import dropped_crashes, find_hunts
     from crashhunt.report import describe_groups
+    from crashhunt.results import dropped_crashes, find_hunts
 
     hunts = find_hunts(directory)
     found = group_crashes((bundle for hunt in hunts for bundle in list_bundles(hunt)), dropped_crashes(hunts))
@@ -198,9 +198,9 @@ def compare_with_corpus(directory: Path, cases: list[Case], *, as_json: bool) ->
 
 def _divide_types(options: argparse.Namespace, groups: Sequence[Group]) -> tuple[list[tuple[CauseGroup, ...]], bool]:
     """Return the crashes of each type, divided by cause, and whether the user has interrupted the division."""
+    from crashhunt.analysis import divide_by_cause
     from crashhunt.base.signals import stop_requests
     from crashhunt.replays import ReplayOptions
-    from crashhunt.whatif import divide_by_cause
 
     for first in {group.first.hunt: group.first for group in groups}.values():  # before the first one runs
         check_trust(first, options.trust or None)

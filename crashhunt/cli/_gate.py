@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from crashhunt.cli._common import Commands
-    from crashhunt.estimation import GateReport
+    from crashhunt.statistics import GateReport
     from crashhunt.suites import GateProgress, RunRequest
 
 __all__ = ["add_gate"]

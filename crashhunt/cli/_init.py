@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.json_types import Plain
     from crashhunt.cli._common import Commands
-    from crashhunt.maps import MapSource, PlainTrial
+    from crashhunt.sumo.maps import MapSource, PlainTrial
 
 __all__ = ["add_init"]
 
@@ -66,7 +66,7 @@ def add_init(commands: Commands) -> None:
 
 
 def _init(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.maps import MapOptions, describe_place, make_scenario, parse_bbox
+    from crashhunt.sumo.maps import MapOptions, describe_place, make_scenario, parse_bbox
 
     asked = MapOptions(
         bbox=parse_bbox(options.bbox) if options.bbox is not None else None,
@@ -101,7 +101,7 @@ def _init(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _source(options: argparse.Namespace) -> MapSource:
-    from crashhunt.maps import MapSource, parse_shape
+    from crashhunt.sumo.maps import MapSource, parse_shape
 
     if options.grid:
         return MapSource(kind="grid", shape=parse_shape(options.grid, "--grid"))
@@ -170,7 +170,7 @@ def _run_one_trial(folder: Path, steps: int) -> PlainTrial:
     """
     from crashhunt.api import run
     from crashhunt.base.temporary import temporary_folder
-    from crashhunt.maps import PlainTrial
+    from crashhunt.sumo.maps import PlainTrial
 
     began = time.monotonic()
     with temporary_folder("try") as place:

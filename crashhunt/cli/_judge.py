@@ -110,7 +110,7 @@ def _judge(options: argparse.Namespace, _words: list[str]) -> int:
 
 def _unjudged(options: argparse.Namespace) -> list[Bundle]:
     from crashhunt.crashes import judgement_of, list_bundles, partner
-    from crashhunt.hunts import find_hunts
+    from crashhunt.results import find_hunts
     from crashhunt.trial import Outcome
 
     if options.directory.is_file():
@@ -131,10 +131,10 @@ def _unjudged(options: argparse.Namespace) -> list[Bundle]:
 def _judge_one(
     options: argparse.Namespace, bundle: Bundle, stops: list[int], trusted: bool | None, *, write: bool
 ) -> dict[str, object]:
+    from crashhunt.analysis import judge
     from crashhunt.crashes import as_stored, judgement_of, with_judgement
     from crashhunt.replays import ReplayOptions
     from crashhunt.report import Story
-    from crashhunt.whatif import judge
 
     with shown_progress(f"running {bundle.id}", as_json=options.json) as watch:
         found: Judgement = judge(

@@ -48,7 +48,7 @@ def add_logs(commands: Commands) -> None:
 
 
 def _logs(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.hunts import LogKind, LogReader, hunt_state
+    from crashhunt.results import LogKind, LogReader, hunt_state
 
     if options.errors_only and options.type not in (None, "error"):
         raise UsageError(f"--errors-only and --type {options.type} contradict each other", fix="give one of them")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from crashhunt.cli._common import Commands
-    from crashhunt.rates import Per
+    from crashhunt.statistics import Per
 
 __all__ = ["add_rate", "exit_code_of"]
 
@@ -63,10 +63,10 @@ def add_rate(commands: Commands) -> None:
 
 
 def _rate(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.estimation import measure_rates
-    from crashhunt.hunts import find_searches
     from crashhunt.plans import check_rate, rate_of
     from crashhunt.report import describe_rates, rates_page, write_rates_csv
+    from crashhunt.results import find_searches
+    from crashhunt.statistics import measure_rates
 
     per: Per | None = options.per
     bar = None

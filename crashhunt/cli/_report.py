@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from crashhunt.cli._common import Commands
     from crashhunt.crashes import Bundle
-    from crashhunt.hunts import FoundCrashes
+    from crashhunt.results import FoundCrashes
 
 __all__ = ["add_report"]
 
@@ -47,8 +47,8 @@ def add_report(commands: Commands) -> None:
 
 def _report(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.crashes import find_bundle, list_near_misses
-    from crashhunt.hunts import find_crashes, hunt_state
     from crashhunt.report import write_report
+    from crashhunt.results import find_crashes, hunt_state
 
     if options.crashes < 0:
         raise UsageError(f"--crashes is {options.crashes}", fix="give at least 0")

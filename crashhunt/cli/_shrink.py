@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
 
+    from crashhunt.analysis import Shrunk
     from crashhunt.cli._common import Commands
     from crashhunt.crashes import Bundle
-    from crashhunt.shrinking import Shrunk
 
 __all__ = ["add_shrink"]
 
@@ -71,9 +71,9 @@ def add_shrink(commands: Commands) -> None:
 
 
 def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.analysis import shrink
     from crashhunt.base.signals import stop_requests
     from crashhunt.plans import seconds_of
-    from crashhunt.shrinking import shrink
 
     if options.budget < 1:
         raise UsageError(f"--budget is {options.budget}", fix="give at least 1")

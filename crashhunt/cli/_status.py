@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from crashhunt.cli._common import Commands
-    from crashhunt.hunts import BranchSums, HuntState, ProbeSums
+    from crashhunt.results import BranchSums, HuntState, ProbeSums
 
 __all__ = ["add_status", "show_states", "states_console", "states_table"]
 
@@ -68,7 +68,7 @@ def _status(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _states(directories: list[Path]) -> list[HuntState]:
-    from crashhunt.hunts import find_searches, hunt_state
+    from crashhunt.results import find_searches, hunt_state
 
     return [hunt_state(hunt) for directory in directories for hunt in find_searches(directory)]
 

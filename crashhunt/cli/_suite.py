@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.cli._common import Commands
-    from crashhunt.hunts import HuntState
+    from crashhunt.results import HuntState
 
 __all__ = ["add_rerun", "add_suite"]
 
@@ -105,7 +105,7 @@ def add_rerun(commands: Commands) -> None:
 
 
 def _run(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.hunts import find_hunts, hunt_state
+    from crashhunt.results import find_hunts, hunt_state
     from crashhunt.suites import Suite
 
     suite = Suite.read(options.file)

@@ -47,7 +47,7 @@ def add_trials(commands: Commands) -> None:
 
 def _trials(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.base.files import whole_file
-    from crashhunt.hunts import HuntResults, write_parquet, write_text
+    from crashhunt.results import HuntResults, write_parquet, write_text
     from crashhunt.trial import Outcome, in_order
 
     outcomes = [name for name in options.outcome.split(",") if name]

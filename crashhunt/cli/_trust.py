@@ -81,7 +81,7 @@ def _trust_place(place: Path) -> list[TrustedOrigin]:
     from crashhunt.base.git import work_tree
     from crashhunt.corpus import find_cases
     from crashhunt.crashes import open_archive, trust_repository
-    from crashhunt.hunts import find_hunts
+    from crashhunt.results import find_hunts
     from crashhunt.suites import trust_hunt
 
     if place.is_file():

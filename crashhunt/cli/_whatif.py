@@ -27,8 +27,8 @@ from crashhunt.trial import Manoeuvre
 if TYPE_CHECKING:
     import argparse
 
+    from crashhunt.analysis import Counts
     from crashhunt.cli._common import Commands
-    from crashhunt.whatif import Counts
 
 __all__ = ["add_whatif"]
 
@@ -124,7 +124,7 @@ def _whatif(options: argparse.Namespace, _words: list[str]) -> int:
     except ValueError:
         raise UsageError(f"--for is {options.time!r}", fix="give a time above 0, such as 90s, 1m or 1h30m") from None
     sets, arguments = pairs(options.sets, "--set"), pairs(options.arg, "--arg")
-    from crashhunt.whatif import WhatIfOptions, interventions_of, what_if
+    from crashhunt.analysis import WhatIfOptions, interventions_of, what_if
 
     with opened_crash(options.directory, options.crash) as (bundle, archive), stop_requests() as stops:
         asked = interventions_of(

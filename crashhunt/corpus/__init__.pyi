@@ -1,4 +1,5 @@
-from ._bisect import Bisected as Bisected, bisect as bisect
+from ._bisection import Bisected as Bisected, bisect as bisect
+from ._case_runs import CaseReport as CaseReport, Got as Got, run_cases as run_cases, untrusted_case as untrusted_case
 from ._cases import (
     Added as Added,
     Case as Case,
@@ -10,10 +11,4 @@ from ._cases import (
     find_cases as find_cases,
     read_case as read_case,
     signature_today as signature_today,
-)
-from ._run import (
-    CaseReport as CaseReport,
-    Got as Got,
-    run_cases as run_cases,
-    untrusted_case as untrusted_case,
 )

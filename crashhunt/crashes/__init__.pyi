@@ -17,6 +17,22 @@ from ._bundle import (
     write_bundle as write_bundle,
     write_trial as write_trial,
 )
+from ._bundle_trust import (
+    TrustedOrigin as TrustedOrigin,
+    add_trusted as add_trusted,
+    describe_code as describe_code,
+    is_bundle_trusted as is_bundle_trusted,
+    is_fingerprint_trusted as is_fingerprint_trusted,
+    is_hunt_trusted as is_hunt_trusted,
+    is_snapshot_trusted as is_snapshot_trusted,
+    list_trusted as list_trusted,
+    refuse_side_effects as refuse_side_effects,
+    refuse_untrusted as refuse_untrusted,
+    remove_trusted as remove_trusted,
+    trust_repositories as trust_repositories,
+    trust_repository as trust_repository,
+    trust_snapshot as trust_snapshot,
+)
 from ._causes import (
     Cause as Cause,
     CauseGroup as CauseGroup,
@@ -28,7 +44,7 @@ from ._causes import (
     join_causes as join_causes,
     without_chance_lengths as without_chance_lengths,
 )
-from ._contact import ContactRecord as ContactRecord, contact_record as contact_record
+from ._contact_record import ContactRecord as ContactRecord, contact_record as contact_record
 from ._encounter import (
     DangerCourse as DangerCourse,
     Encounter as Encounter,
@@ -72,25 +88,4 @@ from ._signature import (
     signature_of as signature_of,
     signature_of_fault as signature_of_fault,
 )
-from ._trust import (
-    TrustedOrigin as TrustedOrigin,
-    add_trusted as add_trusted,
-    describe_code as describe_code,
-    is_bundle_trusted as is_bundle_trusted,
-    is_fingerprint_trusted as is_fingerprint_trusted,
-    is_hunt_trusted as is_hunt_trusted,
-    is_snapshot_trusted as is_snapshot_trusted,
-    list_trusted as list_trusted,
-    refuse_side_effects as refuse_side_effects,
-    refuse_untrusted as refuse_untrusted,
-    remove_trusted as remove_trusted,
-    trust_repositories as trust_repositories,
-    trust_repository as trust_repository,
-    trust_snapshot as trust_snapshot,
-)
-from ._types import (
-    Group as Group,
-    Groups as Groups,
-    group_crashes as group_crashes,
-    groups_of as groups_of,
-)
+from ._types import Group as Group, Groups as Groups, group_crashes as group_crashes, groups_of as groups_of

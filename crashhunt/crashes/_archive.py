@@ -22,7 +22,7 @@ from crashhunt.base.integrity import FILES, parse_object, too_large, typed
 from crashhunt.base.progress import watched
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes._bundle import ArchiveIndex, is_bundle_made_here
-from crashhunt.crashes._trust import is_made_here, signature
+from crashhunt.crashes._bundle_trust import is_made_here, signature
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
-from crashhunt.crashes._contact import SAME_WAY, contact_record
+from crashhunt.crashes._contact_record import SAME_WAY, contact_record
 from crashhunt.snapshots import Snapshot
 from crashhunt.trial import Outcome
 from crashhunt.world import STANDS_MPS, is_person
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle
-    from crashhunt.crashes._contact import ContactRecord
+    from crashhunt.crashes._contact_record import ContactRecord
     from crashhunt.recording import Recording
     from crashhunt.world import RightOfWay
 

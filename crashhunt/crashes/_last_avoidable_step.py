@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from crashhunt.crashes._contact import record_in
+from crashhunt.crashes._contact_record import record_in
 from crashhunt.crashes._encounter import Encounter, last_escape
 from crashhunt.crashes._lanes import LaneMap
 from crashhunt.recording import has_same_scenes

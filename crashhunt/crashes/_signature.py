@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
-from crashhunt.crashes._contact import contact_record
+from crashhunt.crashes._contact_record import contact_record
 from crashhunt.crashes._lanes import LaneMap
 from crashhunt.trial import UNUSABLE_VALUE, Outcome
 
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
-    from crashhunt.crashes._contact import ContactRecord
+    from crashhunt.crashes._contact_record import ContactRecord
     from crashhunt.recording import Recording
     from crashhunt.trial import Collision, Failure, TrialResult
 

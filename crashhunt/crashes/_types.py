@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import BundleError
 from crashhunt.crashes import judgement_of
-from crashhunt.crashes._contact import contact_record
+from crashhunt.crashes._contact_record import contact_record
 from crashhunt.crashes._fault import fault_of
 from crashhunt.crashes._signature import Signature, signature_of
 

@@ -24,12 +24,12 @@ from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.base.version import __version__
 from crashhunt.crashes import export_crash
 from crashhunt.dashboard._control import Jobs, stop_hunt
-from crashhunt.dashboard._crashes import CrashList
+from crashhunt.dashboard._crash_list import CrashList
 from crashhunt.dashboard._details import HuntComparer, detail_of, importance_of_points
-from crashhunt.dashboard._hunt import HuntView
+from crashhunt.dashboard._hunt_page import HuntView
 from crashhunt.dashboard._security import Guard
-from crashhunt.hunts import CodeVersions
 from crashhunt.report import argument_units, player_parts
+from crashhunt.results import CodeVersions
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.integrity import too_large
-from crashhunt.hunts import is_case, is_hunt
+from crashhunt.results import is_case, is_hunt
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

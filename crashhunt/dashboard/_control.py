@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.dashboard._hunt import HuntView
+    from crashhunt.dashboard._hunt_page import HuntView
 
 __all__ = ["COMMANDS", "Jobs", "stop_hunt"]
 

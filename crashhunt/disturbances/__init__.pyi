@@ -1,3 +1,15 @@
+from ._disturbance_rates import (
+    FORM as FORM,
+    NONE as NONE,
+    DisturbanceSampler as DisturbanceSampler,
+    disturber_of as disturber_of,
+    is_fixed as is_fixed,
+    locate_model as locate_model,
+    modules_of_models as modules_of_models,
+    parse_fixed as parse_fixed,
+    parse_rates as parse_rates,
+    word_of as word_of,
+)
 from ._foreign_models import ModelApart as ModelApart, described_model as described_model
 from ._models import (
     Choices as Choices,
@@ -24,15 +36,3 @@ from ._onsets import (
     first_forcing as first_forcing,
 )
 from ._protocol import DisturbanceModel as DisturbanceModel, Drawn as Drawn, Enumerates as Enumerates
-from ._rates import (
-    FORM as FORM,
-    NONE as NONE,
-    DisturbanceSampler as DisturbanceSampler,
-    disturber_of as disturber_of,
-    is_fixed as is_fixed,
-    locate_model as locate_model,
-    modules_of_models as modules_of_models,
-    parse_fixed as parse_fixed,
-    parse_rates as parse_rates,
-    word_of as word_of,
-)

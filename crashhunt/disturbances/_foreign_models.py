@@ -9,8 +9,8 @@ import numpy as np
 from crashhunt.base.errors import CrashhuntError, PluginError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.isolation import ServerApart
+from crashhunt.disturbances._disturbance_rates import draw_checked, locate_model
 from crashhunt.disturbances._protocol import Drawn
-from crashhunt.disturbances._rates import draw_checked, locate_model
 
 if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain

@@ -56,7 +56,7 @@ from crashhunt.trial import KINDS, SENSOR_KINDS, Disturbance, Forcing, in_turn
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.disturbances._rates import DisturbanceSampler
+    from crashhunt.disturbances._disturbance_rates import DisturbanceSampler
 
 __all__ = [
     "COPIES_PER_ROOT",

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-    from crashhunt.envs._episodes import Episodes
+    from crashhunt.envs._env_episodes import Episodes
     from crashhunt.trial import Value
 
 __all__ = ["RemoteEpisodes"]
@@ -57,7 +57,7 @@ class RemoteEpisodes:
         words: The arguments of `Episodes`, or of the class that a subclass uses; they can be pickled.
     """
 
-    served = "crashhunt.envs._episodes:Episodes"
+    served = "crashhunt.envs._env_episodes:Episodes"
     """The class whose methods the child process calls."""
 
     def __init__(self, *words: object) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_of
-from crashhunt.envs._episodes import Episodes
+from crashhunt.envs._env_episodes import Episodes
 from crashhunt.envs._process import RemoteEpisodes
 
 if TYPE_CHECKING:

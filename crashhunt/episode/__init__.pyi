@@ -8,11 +8,7 @@ from ._action_override import (
 from ._blame import has_users_code as has_users_code, internal_error as internal_error
 from ._branches import Brancher as Brancher
 from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
-from ._failures import (
-    failure_of as failure_of,
-    is_tampered as is_tampered,
-    message_of_error as message_of_error,
-)
+from ._failures import failure_of as failure_of, is_tampered as is_tampered, message_of_error as message_of_error
 from ._fast_path import FastEpisode as FastEpisode
 from ._forced_onsets import OnsetForcer as OnsetForcer
 from ._forks import FirstCopy as FirstCopy, ForkRunner as ForkRunner
@@ -31,7 +27,7 @@ from ._probes import (
     Probed as Probed,
     Prober as Prober,
 )
-from ._run import (
+from ._run_episode import (
     Parts as Parts,
     generators as generators,
     require_origin as require_origin,
@@ -41,14 +37,10 @@ from ._run import (
     set_generators as set_generators,
     stage_of as stage_of,
 )
-from ._settings import (
-    WorkerSettings as WorkerSettings,
-    answer_file as answer_file,
-    scratch_of as scratch_of,
-)
 from ._splitting import (
     COPIES_PER_LEVEL as COPIES_PER_LEVEL,
     SplitPath as SplitPath,
     Splitter as Splitter,
     run_path as run_path,
 )
+from ._worker_settings import WorkerSettings as WorkerSettings, answer_file as answer_file, scratch_of as scratch_of

@@ -24,11 +24,12 @@ __all__ = ["as_markdown", "definition", "describe_api", "describe_commands", "de
 
 _PUBLIC_MODULES = {
     "crashhunt": "",
-    "crashhunt.hunts": "HuntReport HuntResults SuiteResults",
+    "crashhunt.hunts": "HuntReport",
+    "crashhunt.results": "HuntResults SuiteResults",
     "crashhunt.crashes": "Bundle",
     "crashhunt.recording": "Recording Divergence",
     "crashhunt.replays": "ReplayReport",
-    "crashhunt.estimation": "Comparison HuntFigures",
+    "crashhunt.statistics": "Comparison HuntFigures",
     "crashhunt.snapshots": "SnapshotOptions",
     "crashhunt.trial": "Outcome TrialSpec TrialResult Collision Escape Failure",
     "crashhunt.space": "",
@@ -271,10 +272,10 @@ _SCENARIO = (
     ("[observation]", "crashhunt.scenario", "ObservationSetup"),
     ("[arguments.NAME], [agents.ID.arguments.NAME]", "crashhunt.scenario", "ArgumentSetup"),
     ("[agents.ID]", "crashhunt.scenario", "AgentSetup"),
-    ("[sumo]", "crashhunt.scenario.backends.sumo._options", "SumoSetup"),
-    ("[highway]", "crashhunt.scenario.backends.highway", "HighwaySetup"),
-    ("[gym]", "crashhunt.scenario.backends.gym", "GymSetup"),
-    ("crash, in [gym]", "crashhunt.scenario.backends.gym", "CrashRule"),
+    ("[sumo]", "crashhunt.sumo._options", "SumoSetup"),
+    ("[highway]", "crashhunt.highway._backend", "HighwaySetup"),
+    ("[gym]", "crashhunt.gym._backend", "GymSetup"),
+    ("crash, in [gym]", "crashhunt.gym._backend", "CrashRule"),
 )
 # Fields of Scenario that no file has, and the one that represents the tables below.
 _NO_KEY = re.compile(r"^- `(?:tables|\w+`: .*not part of (?:the file|it)\b).*\n(?:  .*\n)*", re.MULTILINE)

@@ -9,17 +9,18 @@ from __future__ import annotations
 import json
 from typing import Any, Literal, NotRequired, TypedDict
 
+from crashhunt.analysis import Counts
 from crashhunt.base.codec import JsonObject
 from crashhunt.base.json_types import ErrorData, Plain
 from crashhunt.base.schemas import json_schema
 from crashhunt.crashes import CrashSummary, Ending, JudgementVerdict, Reference, Verdict as FaultVerdict, Why
-from crashhunt.hunts import AuditReport, CheckFinding, HuntState, StoppedBecause
+from crashhunt.hunts import AuditReport, CheckFinding, StoppedBecause
 from crashhunt.ledger import KindData
-from crashhunt.rates import PairVerdict
 from crashhunt.replays import Code, Verdict
 from crashhunt.report import ListingEntry
+from crashhunt.results import HuntState
+from crashhunt.statistics import PairVerdict
 from crashhunt.trial import Kind, Value
-from crashhunt.whatif import Counts
 
 __all__ = ["SCHEMAS", "describe_schemas"]
 

@@ -15,10 +15,10 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.temporary import remove_at_once
 from crashhunt.crashes import list_near_misses
-from crashhunt.hunts._rates import crashed_copies, rare_watch
 from crashhunt.hunts._reports import BranchReport, ProbeReport, RareReport
-from crashhunt.hunts._state import BRANCHES, PROBES
 from crashhunt.hunts._verification import Found
+from crashhunt.results import BRANCHES, PROBES
+from crashhunt.statistics import crashed_copies, rare_watch
 from crashhunt.trial import Branches, Stress, in_turn
 
 if TYPE_CHECKING:

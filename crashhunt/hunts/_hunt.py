@@ -20,27 +20,28 @@ from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, trust_repositories, write_bundle, write_trial
 from crashhunt.episode import internal_error, scratch_of
 from crashhunt.executors import HostConditions, SharedExecutors, make_executor, read_map
-from crashhunt.hunts._code_versions import CodeVersions, count_versions, resumed_versions
-from crashhunt.hunts._crashes import prune_bundles, tally_crashes
 from crashhunt.hunts._fork_results import ForkCrashes, keep_near_misses, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._preflight import Preflight, WorkerNotices, is_hopeless, unusable_value, why_invalid
 from crashhunt.hunts._progress import HuntStatus, PhaseClock, PhaseStatus, Progress, RemainingTime
-from crashhunt.hunts._rates import bar_watch, forcings_of, rare_watch, rate_watch, refuse_training_traffic
 from crashhunt.hunts._reports import HuntReport, StoppedBecause
-from crashhunt.hunts._state import (
-    HEARTBEAT_S,
-    HuntDirectory,
-    copies_to_come,
-    draws_independently,
-    ledger_owner,
-    sums_of_branches,
-    sums_of_probes,
-)
 from crashhunt.hunts._verification import Audit, Confirmation, PendingAudits, TrialReruns, VerificationRuns, is_settled
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import core_of, disturber_apart, parallel_here, sampler_of
-from crashhunt.rates import WHY_NOT_UNTIL_RATE, make_rate
+from crashhunt.results import (
+    HEARTBEAT_S,
+    CodeVersions,
+    HuntDirectory,
+    copies_to_come,
+    count_versions,
+    draws_independently,
+    ledger_owner,
+    prune_bundles,
+    resumed_versions,
+    sums_of_branches,
+    sums_of_probes,
+    tally_crashes,
+)
 from crashhunt.snapshots import (
     Snapshot,
     SnapshotOptions,
@@ -48,6 +49,15 @@ from crashhunt.snapshots import (
     describe_unsaved,
     take_snapshot,
     with_original_paths,
+)
+from crashhunt.statistics import (
+    WHY_NOT_UNTIL_RATE,
+    bar_watch,
+    forcings_of,
+    make_rate,
+    rare_watch,
+    rate_watch,
+    refuse_training_traffic,
 )
 from crashhunt.training import held_out_traffics
 from crashhunt.trial import Outcome, TrialResult
@@ -60,9 +70,9 @@ if TYPE_CHECKING:
     from crashhunt.executors import Executor
     from crashhunt.ledger import Facts, Noted
     from crashhunt.plans import HuntSettings
-    from crashhunt.rates import BarWatch, CrashRate
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.scenario import Scenario
+    from crashhunt.statistics import BarWatch, CrashRate
 
 __all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
 

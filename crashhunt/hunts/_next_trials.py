@@ -18,9 +18,9 @@ import numpy as np
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.disturbances import FIRST_STEP
 from crashhunt.episode import WorkerSettings
-from crashhunt.hunts._state import trials_of_running
 from crashhunt.ledger import Turn
 from crashhunt.plans import with_settings
+from crashhunt.results import trials_of_running
 from crashhunt.trial import KILLED, TrialSpec
 
 if TYPE_CHECKING:
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.hunts._progress import Progress
-    from crashhunt.hunts._rates import Forcings, SplittingForcings
     from crashhunt.ledger import Ledger
     from crashhunt.plans import HuntSettings
     from crashhunt.samplers import NamedSampler
     from crashhunt.snapshots import Snapshot
+    from crashhunt.statistics import Forcings, SplittingForcings
     from crashhunt.trial import Disturbance, Forcing, TrialResult, Value
 
 

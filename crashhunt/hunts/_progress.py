@@ -18,8 +18,8 @@ from crashhunt.crashes import (
     Group,
 )
 from crashhunt.executors import HasNodes
-from crashhunt.hunts._crashes import CrashTally, Kinds
 from crashhunt.hunts._reports import kind_data
+from crashhunt.results import CrashTally, Kinds
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -27,12 +27,11 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle
     from crashhunt.executors import Executor, NodeFigures
-    from crashhunt.hunts._rates import RareWatch
     from crashhunt.hunts._reports import AuditReport, StoppedBecause
     from crashhunt.ledger import Facts, Noted, RunningRate
     from crashhunt.plans import RunSettings
-    from crashhunt.rates import BarWatch, RateWatch
     from crashhunt.recording import BlackBoxHeader
+    from crashhunt.statistics import BarWatch, RareWatch, RateWatch
     from crashhunt.trial import TrialResult
 
 

@@ -7,18 +7,18 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.codec import Serializable
-from crashhunt.hunts._crashes import CrashTally
-from crashhunt.rates import TRIALS_PER_ROOT
+from crashhunt.results import CrashTally
+from crashhunt.statistics import TRIALS_PER_ROOT
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, Group
-    from crashhunt.hunts._code_versions import VersionCounts
     from crashhunt.ledger import KindData
     from crashhunt.plans import HuntSettings
-    from crashhunt.rates import CrashRate, RareEstimate
+    from crashhunt.results import VersionCounts
+    from crashhunt.statistics import CrashRate, RareEstimate
     from crashhunt.trial import Disturbance
 
 __all__ = [

@@ -10,6 +10,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from crashhunt.analysis import find_cause
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError
 from crashhunt.base.temporary import remove_at_once, remove_scratch
@@ -24,13 +25,12 @@ from crashhunt.executors import (
     run_trials,
     snapshot_executor,
 )
-from crashhunt.hunts._crashes import Judged
 from crashhunt.hunts._next_trials import settings_again
 from crashhunt.hunts._reports import AuditReport, Difference
 from crashhunt.recording import Recording, first_divergence, read_black_box
 from crashhunt.replays import ReplayOptions, confirm
+from crashhunt.results import Judged
 from crashhunt.snapshots import Snapshot
-from crashhunt.whatif import find_cause
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.executors import Executor
     from crashhunt.hunts._progress import PhaseClock, PhaseName, Progress
-    from crashhunt.hunts._state import HuntDirectory
     from crashhunt.ledger import Facts, Ledger
     from crashhunt.plans import HuntSettings
+    from crashhunt.results import HuntDirectory
     from crashhunt.trial import TrialResult, TrialSpec
 
 

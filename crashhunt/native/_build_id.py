@@ -17,7 +17,11 @@ from typing import Final
 __all__ = ["HOW_TO_REBUILD", "build_id", "outdated_modules"]
 
 HOW_TO_REBUILD: Final = "pip install --no-deps --editable ."
-_MODULES: Final = {"_crashhunt_core": "native", "_crashhunt_link_order": "native", "_crashhunt_highway": "accelerator"}
+_MODULES: Final = {
+    "_crashhunt_core": "native",
+    "_crashhunt_link_order": "native",
+    "_crashhunt_highway": "highway/accelerator",
+}
 """Compiled module to the folder of its sources in crashhunt."""
 
 

@@ -568,7 +568,7 @@ PyObject *vehicles_look(PyObject *object, PyObject *const *given, Py_ssize_t cou
 }
 
 // in_sight(controlled: Vehicles, distance squared) -> (ids, eyes) | None
-// As Sight._in_sight of crashhunt/simulators/sumo/_range_of_sight.py: who is near one of the controlled vehicles, and where
+// As Sight._in_sight of sumo/_range_of_sight.py: who is near one of the controlled vehicles, and where
 // these are.
 PyObject *in_sight(PyObject *, PyObject *const *given, Py_ssize_t count) {
     Vehicles *controlled = count == 2 ? vehicles_of(given[0]) : nullptr;
@@ -739,7 +739,7 @@ typedef std::vector<long> Earlier;
 
 long earlier_row(const Earlier &earlier, size_t row) { return earlier.empty() ? static_cast<long>(row) : earlier[row]; }
 
-// As _moved of crashhunt/oracles/_crashes.py.
+// As _moved of oracles/_crash_oracles.py.
 Moved moved(const Scene &previous, const Scene &present, size_t row, const Earlier &earlier) {
     const long found = earlier_row(earlier, row);
     if (found < 0) {
@@ -756,7 +756,7 @@ Moved moved(const Scene &previous, const Scene &present, size_t row, const Earli
     return {dx, dy, aside};
 }
 
-// As _within_reach of crashhunt/oracles/_crashes.py, of two scenes; false where that is Python's to do.
+// As _within_reach of oracles/_crash_oracles.py, of two scenes; false where that is Python's to do.
 bool reach(const Scene &present, const Scene &previous, size_t row, double step_s, double hardest,
            std::vector<size_t> &found, const Earlier &earlier = Earlier()) {
     const std::vector<double> &reaches = present.roster->reaches;

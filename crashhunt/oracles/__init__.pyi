@@ -1,4 +1,4 @@
-from ._crashes import (
+from ._crash_oracles import (
     MAX_BRAKING_MPS2 as MAX_BRAKING_MPS2,
     OffRoad as OffRoad,
     Overlap as Overlap,

@@ -31,12 +31,12 @@ from ._values import (
     is_opaque as is_opaque,
 )
 from .records import RECORD_TYPES as RECORD_TYPES, Tag as Tag
-from .records._events import (
+from .records._event_record import (
     encode_disturbance as encode_disturbance,
     encode_events as encode_events,
     encode_notes as encode_notes,
 )
-from .records._scene import (
+from .records._scene_record import (
     encode_actors as encode_actors,
     encode_heights as encode_heights,
     encode_lanes as encode_lanes,

@@ -24,9 +24,9 @@ from crashhunt.recording._foxglove import MESSAGES, NAMESPACE, LogWriter, messag
 from crashhunt.recording._reading import Prologue
 from crashhunt.recording._recording import Compact, Recording
 from crashhunt.recording.records import RECORD_TYPES
-from crashhunt.recording.records._agents import ACTION, OBSERVATION
-from crashhunt.recording.records._events import DISTURBANCES
-from crashhunt.recording.records._scene import STEP, time_of
+from crashhunt.recording.records._agent_records import ACTION, OBSERVATION
+from crashhunt.recording.records._event_record import DISTURBANCES
+from crashhunt.recording.records._scene_record import STEP, time_of
 from crashhunt.recording.records._type import BytesForm, TextForm
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from crashhunt.recording._blackbox import digest_of, is_evidence
 from crashhunt.recording._reading import Prologue, Reading
 from crashhunt.recording._values import is_opaque
 from crashhunt.recording.records import RECORD_TYPES
-from crashhunt.recording.records._agents import OBSERVATION, PROLOGUE
-from crashhunt.recording.records._scene import (
+from crashhunt.recording.records._agent_records import OBSERVATION, PROLOGUE
+from crashhunt.recording.records._scene_record import (
     ACTORS,
     HEIGHTS,
     LANES,

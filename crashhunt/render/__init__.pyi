@@ -9,7 +9,7 @@ from ._film import (
     write_gif as write_gif,
     write_video as write_video,
 )
-from ._panels import (
+from ._panel_drawing import (
     Action as Action,
     ActionDistribution as ActionDistribution,
     Bar as Bar,
@@ -28,4 +28,4 @@ from ._panels import (
     save_panels as save_panels,
     scope as scope,
 )
-from ._scene import SceneView as SceneView
+from ._scene_from_above import SceneView as SceneView

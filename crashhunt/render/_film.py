@@ -13,8 +13,8 @@ from crashhunt.base.errors import UsageError
 from crashhunt.base.files import cannot_write, whole_file
 from crashhunt.base.progress import watched
 from crashhunt.base.temporary import temporary_beside
-from crashhunt.render._panels import BuiltinPanels, builtin_labels
-from crashhunt.render._scene import SceneView
+from crashhunt.render._panel_drawing import BuiltinPanels, builtin_labels
+from crashhunt.render._scene_from_above import SceneView
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

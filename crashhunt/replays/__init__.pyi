@@ -7,7 +7,7 @@ from ._prepare import (
     is_current_code as is_current_code,
     prepare as prepare,
 )
-from ._replay import (
+from ._replaying import (
     ReplayReport as ReplayReport,
     Verdict as Verdict,
     confirm as confirm,

@@ -1,4 +1,5 @@
-from ._compare import comparison_page as comparison_page, describe_comparison as describe_comparison
+from ._comparison_text import comparison_page as comparison_page, describe_comparison as describe_comparison
+from ._crash_text import Story as Story
 from ._findings import (
     corpus_annotations as corpus_annotations,
     corpus_summary as corpus_summary,
@@ -7,7 +8,7 @@ from ._findings import (
     findings_of as findings_of,
     write_sarif as write_sarif,
 )
-from ._gate import (
+from ._gate_report import (
     describe_gate as describe_gate,
     gate_annotations as gate_annotations,
     gate_summary as gate_summary,
@@ -33,7 +34,7 @@ from ._page import (
     values_of as values_of,
     write_report as write_report,
 )
-from ._rate import (
+from ._rate_text import (
     describe_rates as describe_rates,
     describe_running as describe_running,
     format_interval as format_interval,
@@ -41,7 +42,6 @@ from ._rate import (
     rates_page as rates_page,
     write_rates_csv as write_rates_csv,
 )
-from ._show import Story as Story
 from ._status_screen import (
     Watcher as Watcher,
     describe_phase as describe_phase,
@@ -62,7 +62,4 @@ from ._table import (
     format_table as format_table,
     steps_table as steps_table,
 )
-from ._words import (
-    describe_types_by_version as describe_types_by_version,
-    describe_versions as describe_versions,
-)
+from ._words import describe_types_by_version as describe_types_by_version, describe_versions as describe_versions

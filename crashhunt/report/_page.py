@@ -21,16 +21,16 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.progress import watched
 from crashhunt.base.version import __version__
 from crashhunt.crashes import closest_actors, signature_of
-from crashhunt.hunts import CodeVersions, TrialRow, count_versions, find_crashes
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import is_opaque, read_lanes
-from crashhunt.report._rate import describe_running
-from crashhunt.report._show import Story
+from crashhunt.report._crash_text import Story
+from crashhunt.report._rate_text import describe_running
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import argument_units
 from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import by_likelihood, describe_versions, may_be_disturbed, traffic_of
+from crashhunt.results import CodeVersions, TrialRow, count_versions, find_crashes
 from crashhunt.trial import Outcome, steps_of
 from crashhunt.world import approaches
 
@@ -42,10 +42,10 @@ if TYPE_CHECKING:
 
     from crashhunt.base.progress import Watch
     from crashhunt.crashes import Bundle, Encounter
-    from crashhunt.hunts import FoundCrashes
     from crashhunt.ledger import RunningRate
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import Recording
+    from crashhunt.results import FoundCrashes
     from crashhunt.trial import TrialResult, Value
     from crashhunt.world import Actor
 

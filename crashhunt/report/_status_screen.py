@@ -14,7 +14,7 @@ from rich.text import Text
 
 from crashhunt.base.text import one_line, out_of
 from crashhunt.recording import Phase
-from crashhunt.report._rate import describe_running
+from crashhunt.report._rate_text import describe_running
 from crashhunt.trial import Outcome, without_folder
 
 if TYPE_CHECKING:

@@ -2,11 +2,13 @@ from ._load import (
     copy_shipped_scenario as copy_shipped_scenario,
     endings as endings,
     load_scenario as load_scenario,
+    refuse as refuse,
     scenario_from_dict as scenario_from_dict,
     shipped_folder as shipped_folder,
     shipped_scenarios as shipped_scenarios,
 )
 from ._scenario import (
+    STEP_LENGTH_S as STEP_LENGTH_S,
     Accelerator as Accelerator,
     AgentSetup as AgentSetup,
     ArgumentSetup as ArgumentSetup,

@@ -23,19 +23,16 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
-import pkgutil
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypedDict, TypeVar
 
-import crashhunt.scenario.backends
 from crashhunt.base import layout
 from crashhunt.base.errors import PluginError, ScenarioError
 from crashhunt.base.integrity import digest_of_file
 from crashhunt.base.plugins import load_attribute, registered
 from crashhunt.base.text import listed
-from crashhunt.scenario.backends import DEFAULT_SIMULATOR
 from crashhunt.trial import Argument, Kind, kind_of, parse_spec
 
 if TYPE_CHECKING:
@@ -77,6 +74,9 @@ __all__ = [
 # The tables of a ``scenario.toml`` that every simulator has.
 
 DEFAULT_AGENT = "crashhunt.agents:KeepLaneWithSpeed"
+DEFAULT_SIMULATOR = "sumo"
+"""The simulator of a ``scenario.toml`` without one. It may never change: it is part of the file format, and messages to
+workers of older versions omit default values."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -565,11 +565,14 @@ class Backend:
 # Which simulators have a descriptor, and where it is.
 
 
-@cache
-def _own_backends() -> tuple[str, ...]:
-    # Crashhunt's own simulators are found by module and not by entry point: a bundle brings a crashhunt of its own
-    # along, and what is installed around it may be of a version in which they are elsewhere.
-    return tuple(sorted(module.name for module in pkgutil.iter_modules(crashhunt.scenario.backends.__path__)))
+# Crashhunt's own simulators are found by module and not by entry point: a bundle brings a crashhunt of its own along,
+# and what is installed around it may be of a version in which they are elsewhere.
+_OWN_BACKENDS = {
+    "gym": "crashhunt.gym._backend",
+    "highway": "crashhunt.highway._backend",
+    "sumo": "crashhunt.sumo._backend",
+    "toy": "crashhunt.simulators._toy_backend",
+}
 
 
 def _plugin_backends() -> Mapping[str, EntryPoint]:
@@ -578,7 +581,7 @@ def _plugin_backends() -> Mapping[str, EntryPoint]:
 
 def backend_names() -> tuple[str, ...]:
     """Return the names of simulators with a descriptor, crashhunt's own simulators first; no module is imported."""
-    return tuple(dict.fromkeys((*_own_backends(), *_plugin_backends())))
+    return tuple(dict.fromkeys((*_OWN_BACKENDS, *_plugin_backends())))
 
 
 @cache
@@ -591,8 +594,8 @@ def backend_of(name: str) -> Backend | None:
     Raises:
         PluginError: the descriptor cannot be imported, or is not a `Backend`.
     """
-    if name in _own_backends():
-        own: Backend = importlib.import_module(f"crashhunt.scenario.backends.{name}").BACKEND
+    if name in _OWN_BACKENDS:
+        own: Backend = importlib.import_module(_OWN_BACKENDS[name]).BACKEND
         return own
     point = _plugin_backends().get(name)
     if point is None:

@@ -1,4 +1,4 @@
-"""Simulators: the world that agents drive in. Nothing here imports libsumo; `crashhunt.simulators.sumo` does."""
+"""Simulators: the world that agents drive in. Nothing here imports libsumo; `crashhunt.sumo` does."""
 
 import lazy_loader
 

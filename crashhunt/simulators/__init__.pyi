@@ -4,8 +4,19 @@ from ._actions import (
     SpaceAction as SpaceAction,
     SpeedAndLaneChange as SpeedAndLaneChange,
 )
-from ._gymnasium import action_form as action_form, native as native
-from ._kinematics_observation import Kinematics as Kinematics
+from ._any_space import (
+    ObservationForm as ObservationForm,
+    action_form as action_form,
+    action_mask_of as action_mask_of,
+    as_tables as as_tables,
+    has_action_masks as has_action_masks,
+    has_nan as has_nan,
+    merge as merge,
+    native as native,
+    reseed_in_place as reseed_in_place,
+    time_limit_of as time_limit_of,
+)
+from ._kinematics_observation import Kinematics as Kinematics, Unseen as Unseen
 from ._protocol import (
     FACULTIES as FACULTIES,
     ActionForm as ActionForm,
@@ -43,3 +54,4 @@ from ._protocol import (
     SupportsScripts as SupportsScripts,
     TranslatesMotion as TranslatesMotion,
 )
+from ._standstill import Standstill as Standstill

@@ -1,4 +1,4 @@
-from ._gate import Gate as Gate, GateProgress as GateProgress, GateVersion as GateVersion
+from ._gate_runs import Gate as Gate, GateProgress as GateProgress, GateVersion as GateVersion
 from ._processes import (
     RunRequest as RunRequest,
     refuse_untrusted_hunt as refuse_untrusted_hunt,
@@ -6,4 +6,4 @@ from ._processes import (
     trust_hunt as trust_hunt,
 )
 from ._rerun import rerun as rerun
-from ._suite import Suite as Suite, SuiteEntry as SuiteEntry, default_suite as default_suite
+from ._suite_file import Suite as Suite, SuiteEntry as SuiteEntry, default_suite as default_suite

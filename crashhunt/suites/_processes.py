@@ -25,7 +25,6 @@ from crashhunt.base.signals import stop_requests
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.text import command_line
 from crashhunt.crashes import add_trusted, describe_code, is_fingerprint_trusted, is_hunt_trusted, trust_snapshot
-from crashhunt.hunts import HuntDirectory
 from crashhunt.ledger import Ledger
 from crashhunt.plans import (
     Request,
@@ -37,6 +36,7 @@ from crashhunt.plans import (
     read_settings,
     with_settings,
 )
+from crashhunt.results import HuntDirectory
 from crashhunt.snapshots import Snapshot, SnapshotOptions, latest_snapshot
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from crashhunt.base.files import is_empty_folder, sync_folder
 from crashhunt.base.temporary import new_folder
 from crashhunt.base.text import command_line
 from crashhunt.disturbances import NONE
-from crashhunt.hunts import HuntState, hunt_state
 from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings, Owners, Request, Takes, TrialOptions, fields_of, read_settings, takes_of
+from crashhunt.results import HuntState, hunt_state
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.snapshots import latest_snapshot
 from crashhunt.suites._processes import (

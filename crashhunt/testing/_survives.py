@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypedDict
 
+from crashhunt.analysis import shrink
 from crashhunt.api import run
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.temporary import temporary_folder
@@ -14,7 +15,6 @@ from crashhunt.base.text import command_line, one_of, visible
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
 from crashhunt.plans import HuntOptions, plan, request_of
-from crashhunt.shrinking import shrink
 from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
 if TYPE_CHECKING:

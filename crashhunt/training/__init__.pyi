@@ -1,5 +1,5 @@
 from ._crash_env import CrashEnv as CrashEnv, make_training_env as make_training_env
-from ._split import (
+from ._traffic_split import (
     SavedCrash as SavedCrash,
     Split as Split,
     check_test_share as check_test_share,

@@ -17,10 +17,10 @@ from crashhunt.base.text import one_of
 from crashhunt.crashes import snapshot_of
 from crashhunt.envs import RemoteEpisodes
 from crashhunt.plans import read_settings
-from crashhunt.training._episodes import CrashEpisodes
 from crashhunt.training._prioritized_replay import CrashReplay
-from crashhunt.training._split import check_test_share, is_test_traffic, split_crashes
+from crashhunt.training._traffic_split import check_test_share, is_test_traffic, split_crashes
 from crashhunt.training._trained_on import TrainedOn
+from crashhunt.training._training_episodes import CrashEpisodes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -236,7 +236,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
 class _RemoteCrashEpisodes(RemoteEpisodes):
     """Runs `CrashEpisodes` in a child process."""
 
-    served = "crashhunt.training._episodes:CrashEpisodes"
+    served = "crashhunt.training._training_episodes:CrashEpisodes"
 
     def reset_to_crash(self, index: int) -> tuple[Any, dict[str, Any], str]:
         """Begin an episode shortly before a crash."""

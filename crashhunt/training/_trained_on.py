@@ -20,7 +20,7 @@ from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import parse_object, read_bounded, typed
 from crashhunt.snapshots import Snapshot
-from crashhunt.training._split import is_test_traffic
+from crashhunt.training._traffic_split import is_test_traffic
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -16,8 +16,8 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
 
 from crashhunt.agents import NumpyPolicy
+from crashhunt.highway import HighwaySimulator
 from crashhunt.scenario import load_scenario
-from crashhunt.simulators.highway import HighwaySimulator
 
 HERE = Path(__file__).resolve().parent
 ROWS, COLUMNS = 8, np.array([0, 1, 2, 3, 4])

@@ -129,7 +129,7 @@ def child_step(scenario: str) -> dict[str, float]:
     from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
     from crashhunt.recording import BlackBox
     from crashhunt.scenario import argument_values, load_scenario
-    from crashhunt.simulators.sumo import Sight, SumoSimulator
+    from crashhunt.sumo import Sight, SumoSimulator
     from crashhunt.trial import TrialSpec
     from crashhunt.world import ApproachMeter, DangerMeter
 
@@ -245,7 +245,7 @@ def child_core(scenario: str) -> dict[str, float]:
 
     from crashhunt.episode import WorkerSettings
     from crashhunt.scenario import argument_values, load_scenario
-    from crashhunt.scenario.backends.sumo import SumoSetup
+    from crashhunt.sumo import SumoSetup
     from crashhunt.trial import TrialSpec
 
     chosen, rounds, at_once = load_scenario(scenario), 6, 8  # the kernel counts in hundredths of a second
@@ -569,7 +569,7 @@ def child_fork() -> dict[str, float]:
     from crashhunt.agents import KeepLaneWithSpeed
     from crashhunt.episode import Episode
     from crashhunt.scenario import argument_values, load_scenario
-    from crashhunt.simulators.sumo import SumoSimulator
+    from crashhunt.sumo import SumoSimulator
     from crashhunt.trial import TrialSpec
 
     def fork_alone() -> None:
@@ -614,7 +614,7 @@ def child_trial(number: str, steps: str) -> dict[str, float]:
     import libsumo
 
     from crashhunt.scenario import argument_values, load_scenario
-    from crashhunt.simulators.sumo import SumoSimulator
+    from crashhunt.sumo import SumoSimulator
 
     scenario = load_scenario("loop")
     with folder() as stage:
@@ -1025,7 +1025,7 @@ def child_accelerator(name: str, vehicles: str, rounds: str, how: str = "") -> d
     import highway_env
     from highway_env.road.road import Road
 
-    from crashhunt.accelerator import switch_off, switch_on
+    from crashhunt.highway.accelerator import switch_off, switch_on
 
     warnings.simplefilter("ignore")
     assert highway_env

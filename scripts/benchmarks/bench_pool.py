@@ -72,8 +72,8 @@ def forked_trial_s(trials: int, steps: int) -> float:
     """
     import gymnasium
 
-    importlib.import_module("crashhunt.simulators.highway")  # imports highway-env without matplotlib, as a hunt does
-    from crashhunt.accelerator import switch_on
+    importlib.import_module("crashhunt.highway")  # imports highway-env without matplotlib, as a hunt does
+    from crashhunt.highway.accelerator import switch_on
 
     reason = switch_on()
     if reason:

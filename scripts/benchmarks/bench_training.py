@@ -45,7 +45,7 @@ def child_ppo(name: str, steps: str, rounds: str) -> dict[str, float]:
     import highway_env
     from stable_baselines3 import PPO
 
-    from crashhunt.accelerator import switch_off, switch_on
+    from crashhunt.highway.accelerator import switch_off, switch_on
 
     assert highway_env
     slow: list[float] = []

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gallery import command_line
 
-from crashhunt.hunts import HuntResults, spec_of
+from crashhunt.hunts import spec_of
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, sampler_of
-from crashhunt.rates import RateTest
+from crashhunt.results import HuntResults
+from crashhunt.statistics import RateTest
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:

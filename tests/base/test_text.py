@@ -81,8 +81,8 @@ def test_the_screen_shows_what_is_there():
     from rich.console import Console
 
     from crashhunt.cli._status import show_states
-    from crashhunt.hunts import HuntState
     from crashhunt.report import Watcher
+    from crashhunt.results import HuntState
 
     shown = StringIO()
     console = Console(file=shown, force_terminal=True, color_system=None, width=200)

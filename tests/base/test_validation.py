@@ -15,11 +15,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from crashhunt.base.errors import ScenarioError, UsageError
 from crashhunt.base.validation import validate
+from crashhunt.highway._backend import HighwaySetup
 from crashhunt.plans import HuntSettings, Request, plan
 from crashhunt.scenario import Scenario, backend_of, shipped_folder
-from crashhunt.scenario.backends.highway import HighwaySetup
-from crashhunt.scenario.backends.sumo import SumoSetup
 from crashhunt.suites import SuiteEntry
+from crashhunt.sumo import SumoSetup
 
 
 def as_read(settings) -> dict:

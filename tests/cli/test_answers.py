@@ -16,7 +16,7 @@ from crashhunt import cli
 from crashhunt.cli import _corpus, _gate, _judge, _rate, _suite
 from crashhunt.corpus import CaseReport
 from crashhunt.errors import UntrustedError, UsageError
-from crashhunt.hunts import HuntState
+from crashhunt.results import HuntState
 from crashhunt.suites import GateProgress
 
 
@@ -51,8 +51,8 @@ def test_rate_is_measured_as_asked(monkeypatch, capsys, words, asked, code):
         calls.append((hunt, options))
         return [SimpleNamespace(verdict="above", to_json=lambda: {"hunt": hunt})]
 
-    monkeypatch.setattr("crashhunt.estimation.measure_rates", measure)
-    monkeypatch.setattr("crashhunt.hunts.find_searches", lambda directory: [f"{directory}/0", f"{directory}/1"])
+    monkeypatch.setattr("crashhunt.statistics.measure_rates", measure)
+    monkeypatch.setattr("crashhunt.results.find_searches", lambda directory: [f"{directory}/0", f"{directory}/1"])
     monkeypatch.setattr("crashhunt.report.describe_rates", lambda rates: f"{len(rates)} rates")
     for json_words in ([], ["--json"]):
         calls.clear()
@@ -379,9 +379,9 @@ def test_table_of_trials_goes_to_its_file_or_to_the_output(monkeypatch, capsys, 
         file.write("number\n")
         return 7
 
-    monkeypatch.setattr("crashhunt.hunts.HuntResults", lambda directory: directory)
-    monkeypatch.setattr("crashhunt.hunts.write_text", write)
-    monkeypatch.setattr("crashhunt.hunts.write_parquet", lambda hunt, out, outcomes: 8)
+    monkeypatch.setattr("crashhunt.results.HuntResults", lambda directory: directory)
+    monkeypatch.setattr("crashhunt.results.write_text", write)
+    monkeypatch.setattr("crashhunt.results.write_parquet", lambda hunt, out, outcomes: 8)
     assert run("trials", "h", "--outcome", "hang,collision", "--format", "json") == 0
     assert run("trials", "h", "--out", str(tmp_path / "t.csv")) == 0
     assert run("trials", "h", "--out", "t.parquet", "--format", "parquet") == 0

@@ -65,8 +65,8 @@ def test_compare_prints_a_text_a_table_or_json(monkeypatch, capsys, tmp_path):
     hunts = {"suite": [tmp_path / "begun", tmp_path / "later"], "hunt": [Path("hunt")]}
     asked, pages = [], []
     found = SimpleNamespace(to_json=lambda: {"hunts": 2}, write_csv=lambda file: file.write("dir\n"))
-    monkeypatch.setattr("crashhunt.hunts.find_searches", lambda directory: hunts[str(directory)])
-    monkeypatch.setattr("crashhunt.estimation.compare", lambda *words, per: asked.append((*words, per)) or found)
+    monkeypatch.setattr("crashhunt.results.find_searches", lambda directory: hunts[str(directory)])
+    monkeypatch.setattr("crashhunt.statistics.compare", lambda *words, per: asked.append((*words, per)) or found)
     monkeypatch.setattr("crashhunt.report.describe_comparison", lambda comparison: "better")
     monkeypatch.setattr("crashhunt.report.comparison_page", lambda *words: pages.append(words))
     excluded = f"{tmp_path / 'later'} has not begun, and is excluded\n"
@@ -104,17 +104,17 @@ def grouped(monkeypatch):
     def requests():
         yield asked["stops"]
 
-    monkeypatch.setattr("crashhunt.hunts.find_hunts", lambda directory: [f"{directory}/0", f"{directory}/1"])
+    monkeypatch.setattr("crashhunt.results.find_hunts", lambda directory: [f"{directory}/0", f"{directory}/1"])
     monkeypatch.setattr("crashhunt.crashes.list_bundles", lambda hunt: [f"{hunt} crash"])
-    monkeypatch.setattr("crashhunt.hunts.dropped_crashes", lambda hunts: len(hunts))
-    monkeypatch.setattr("crashhunt.hunts.crashes_by_version", lambda hunts, groups: {})
+    monkeypatch.setattr("crashhunt.results.dropped_crashes", lambda hunts: len(hunts))
+    monkeypatch.setattr("crashhunt.results.crashes_by_version", lambda hunts, groups: {})
     monkeypatch.setattr("crashhunt.crashes.group_crashes", group_crashes)
     monkeypatch.setattr("crashhunt.report.describe_groups", lambda groups, known: f"types; known: {known}")
     monkeypatch.setattr("crashhunt.report.describe_causes", lambda groups, causes: "causes")
     monkeypatch.setattr("crashhunt.crashes.join_causes", lambda groups, causes: [named("joined")])
     monkeypatch.setattr("crashhunt.crashes.count_causes", lambda joined: (5, 6))
     monkeypatch.setattr("crashhunt.base.signals.stop_requests", requests)
-    monkeypatch.setattr("crashhunt.whatif.divide_by_cause", lambda group, chosen, **more: (
+    monkeypatch.setattr("crashhunt.analysis.divide_by_cause", lambda group, chosen, **more: (
         asked["divided"].append((group.signature, chosen, more)) or (named("why"),)
     ))  # fmt: skip
     monkeypatch.setattr("crashhunt.cli._crashes.check_trust", lambda *words: asked["trust"].append(words))
@@ -407,8 +407,10 @@ def test_whatif_asks_for_the_change_that_is_named(opened, monkeypatch, capsys, s
         yield [1] if stopped else []
 
     monkeypatch.setattr("crashhunt.base.signals.stop_requests", requests)
-    monkeypatch.setattr("crashhunt.whatif.interventions_of", lambda *words, **more: asked.append((words, more)) or "x")
-    monkeypatch.setattr("crashhunt.whatif.what_if", lambda *words: asked.append(words) or counts)
+    monkeypatch.setattr(
+        "crashhunt.analysis.interventions_of", lambda *words, **more: asked.append((words, more)) or "x"
+    )
+    monkeypatch.setattr("crashhunt.analysis.what_if", lambda *words: asked.append(words) or counts)
     bundle = crash()
     opened(bundle, _whatif)
     words = ["--set", "speed=3", "--from-step", "20", "--agent", "idm", "--arg", "a=b", "--futures", "--times", "5"]
@@ -477,7 +479,7 @@ def shrunk(**more):
 )  # fmt: skip
 def test_shrink_ends_with_1_where_the_crash_does_not_reproduce(opened, monkeypatch, capsys, found, code):
     asked = []
-    monkeypatch.setattr("crashhunt.shrinking.shrink", lambda bundle, **more: asked.append((bundle, more)) or found)
+    monkeypatch.setattr("crashhunt.analysis.shrink", lambda bundle, **more: asked.append((bundle, more)) or found)
     bundle = crash()
     opened(bundle, _shrink)
     words = ["--budget", "7", "--for", "1m", "--form", "scripted", "--parallel", "2", "--json"]
@@ -737,7 +739,7 @@ def test_trust_lists_adds_and_removes_code(origins, monkeypatch, capsys, tmp_pat
     assert err == "no longer trusted: 2222  today  p2: code\n"
     for name in ("ab", "abc"):
         (tmp_path / name).mkdir()
-    monkeypatch.setattr("crashhunt.hunts.find_hunts", lambda place: [place])
+    monkeypatch.setattr("crashhunt.results.find_hunts", lambda place: [place])
     assert run("trust", tmp_path / "abc", tmp_path / "ab", tmp_path / "ab") == 0
     assert capsys.readouterr().out == "trusted: 3333  today  p3: code\ntrusted: 2222  today  p2: code\n"
     monkeypatch.setattr("crashhunt.crashes.list_trusted", list)
@@ -751,7 +753,7 @@ def test_what_has_no_code_cannot_be_trusted(origins, monkeypatch, tmp_path):
     def refuse(*_):
         raise HuntDirectoryError("no hunt", fix="x")
 
-    monkeypatch.setattr("crashhunt.hunts.find_hunts", refuse)
+    monkeypatch.setattr("crashhunt.results.find_hunts", refuse)
     with pytest.raises(BundleError, match="the folder has no code that could run; give the directory of a hunt"):
         _trust._trust_place(tmp_path)
     with pytest.raises(BundleError, match=r"'.*nowhere' does not exist; .*give a folder or a file"):
@@ -775,8 +777,8 @@ def test_logs_are_of_the_type_and_the_trial_that_are_named(monkeypatch, capsys):
         def fresh(self):
             return next(self.looks)
 
-    monkeypatch.setattr("crashhunt.hunts.LogReader", Reader)
-    monkeypatch.setattr("crashhunt.hunts.hunt_state", lambda hunt: SimpleNamespace(state=states.pop(0)))
+    monkeypatch.setattr("crashhunt.results.LogReader", Reader)
+    monkeypatch.setattr("crashhunt.results.hunt_state", lambda hunt: SimpleNamespace(state=states.pop(0)))
     monkeypatch.setattr("crashhunt.cli._logs.chosen_runs", lambda directory, runs: {run: run for run in runs or ["."]})
     monkeypatch.setattr("crashhunt.cli._logs.time", SimpleNamespace(sleep=asked.append))
     assert run("logs", "s", "--run", "town/0", "--trial", "3", "--type", "run") == 0

@@ -107,7 +107,7 @@ def test_text_goes_to_stderr_if_json_is_printed(capsys):
 
 def test_runs_of_a_suite_are_chosen_by_hunt_or_number(tmp_path, monkeypatch):
     places = [tmp_path / name for name in ("town/0", "town/1", "road/0")]
-    monkeypatch.setattr("crashhunt.hunts.find_searches", lambda directory: places)
+    monkeypatch.setattr("crashhunt.results.find_searches", lambda directory: places)
     names = ["town/0", "town/1", "road/0"]
     for runs, expected in (
         ([], names), (["town"], names[:2]), (["road/0"], names[2:]), (["road", "town/1"], names[1:]),

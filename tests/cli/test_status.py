@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from crashhunt.cli import _status
-from crashhunt.hunts import HuntState
+from crashhunt.results import HuntState
 
 PROBES = {
     "trials": 9, "not_fully_asked": 1, "least": 0.254, "trial": 4, "probes": 30, "steps": 100, "left_out": 0,

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.errors import CrashhuntError, UsageError
-from crashhunt.corpus import Bisected, _bisect
+from crashhunt.corpus import Bisected, _bisection as _bisect
 
 
 def git(folder, *words, **options):

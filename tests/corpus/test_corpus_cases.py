@@ -12,8 +12,8 @@ import pytest
 from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError, UsageError
 from crashhunt.corpus import (
     CaseReport,
+    _case_runs as _run,
     _cases,
-    _run,
     add_case,
     cases_of_type,
     compare_types,

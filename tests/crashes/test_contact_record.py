@@ -14,7 +14,7 @@ from hypothesis import given, settings, strategies as st
 from test_fault import LANES, Map, rotated
 
 from crashhunt.crashes import find_bundle
-from crashhunt.crashes._contact import ContactRecord, _distance, contact_record, record_in
+from crashhunt.crashes._contact_record import ContactRecord, _distance, contact_record, record_in
 from crashhunt.crashes._fault import fault_in
 from crashhunt.crashes._lanes import LaneMap
 from crashhunt.trial import Collision

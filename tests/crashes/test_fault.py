@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from crashhunt.crashes import Bundle
-from crashhunt.crashes._contact import ContactRecord
+from crashhunt.crashes._contact_record import ContactRecord
 from crashhunt.crashes._fault import fault_in, fault_of, safe_gap_m
 from crashhunt.crashes._lanes import LaneMap
 from crashhunt.scenario import load_scenario

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.crashes import _trust, refuse_side_effects
-from crashhunt.crashes._trust import TrustedOrigin, remove_trusted
+from crashhunt.crashes import _bundle_trust as _trust, refuse_side_effects
+from crashhunt.crashes._bundle_trust import TrustedOrigin, remove_trusted
 from crashhunt.errors import UsageError
 from crashhunt.scenario import load_scenario
 

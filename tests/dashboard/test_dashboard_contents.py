@@ -12,8 +12,8 @@ from dashboard_hunts import View
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
-from crashhunt.dashboard import _crashes, _details
-from crashhunt.dashboard._crashes import CrashList
+from crashhunt.dashboard import _crash_list as _crashes, _details
+from crashhunt.dashboard._crash_list import CrashList
 from crashhunt.recording import Phase
 from crashhunt.trial import Outcome
 

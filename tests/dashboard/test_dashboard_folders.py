@@ -13,9 +13,9 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, UsageError
-from crashhunt.dashboard import _catalog, _crashes, _hunt, _server, _serving
+from crashhunt.dashboard import _catalog, _crash_list as _crashes, _hunt_page as _hunt, _server, _serving
 from crashhunt.dashboard._catalog import Catalog, FoundHunt, is_inside, unreadable, unreadable_below
-from crashhunt.dashboard._hunt import HuntView
+from crashhunt.dashboard._hunt_page import HuntView
 from crashhunt.ledger import Ledger
 from crashhunt.training import HeldOutTraffics
 from crashhunt.trial import Outcome, TrialResult, TrialSpec

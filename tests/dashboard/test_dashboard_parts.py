@@ -12,9 +12,9 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.errors import HuntDirectoryError, UsageError
-from crashhunt.dashboard import _control, _hunt, _server
+from crashhunt.dashboard import _control, _hunt_page as _hunt, _server
 from crashhunt.dashboard._control import Jobs, stop_hunt
-from crashhunt.dashboard._hunt import HuntView, read_tail
+from crashhunt.dashboard._hunt_page import HuntView, read_tail
 from crashhunt.dashboard._server import Address
 
 

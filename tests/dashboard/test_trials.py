@@ -14,13 +14,13 @@ from dashboard_hunts import hunted
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.crashes import list_near_misses, most_dangerous
-from crashhunt.dashboard import _trials
+from crashhunt.dashboard import _trial_counts as _trials
 from crashhunt.dashboard._catalog import Catalog
-from crashhunt.dashboard._crashes import CrashList
-from crashhunt.dashboard._hunt import HuntView
-from crashhunt.dashboard._trials import Sample, TrialCounts
-from crashhunt.estimation import counts_suffice, measure_rates, rate_of_counts
+from crashhunt.dashboard._crash_list import CrashList
+from crashhunt.dashboard._hunt_page import HuntView
+from crashhunt.dashboard._trial_counts import Sample, TrialCounts
 from crashhunt.ledger import Ledger
+from crashhunt.statistics import counts_suffice, measure_rates, rate_of_counts
 from crashhunt.training import HeldOutTraffics, TrainedOn
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 

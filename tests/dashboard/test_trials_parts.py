@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.dashboard import _trials
-from crashhunt.dashboard._trials import Sample, TrialCounts, _is_drawn, _point, _rounded
-from crashhunt.hunts import TrialRow
+from crashhunt.dashboard import _trial_counts as _trials
+from crashhunt.dashboard._trial_counts import Sample, TrialCounts, _is_drawn, _point, _rounded
+from crashhunt.results import TrialRow
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 CRASH_ON = (Outcome.COLLISION,)

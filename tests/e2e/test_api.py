@@ -14,10 +14,10 @@ from conftest import keeps_going
 
 import crashhunt
 from crashhunt.errors import CrashhuntError, HuntDirectoryError, UsageError
-from crashhunt.hunts import HuntResults, IncompleteHuntWarning, SuiteResults
+from crashhunt.results import HuntResults, IncompleteHuntWarning, SuiteResults
 
 if TYPE_CHECKING:
-    from crashhunt.hunts import HuntState
+    from crashhunt.results import HuntState
 
 SCRIPT = """
 import crashhunt
@@ -46,7 +46,7 @@ def hunt(toy, made_once, monkeypatch):
     return made_once(keeps_going, toy)
 
 
-@pytest.mark.nightly  # by day, hunts/test_results.py, and test_check.py replays with changes
+@pytest.mark.nightly  # by day, results/test_results.py, and test_check.py replays with changes
 def test_results_are_typed_objects_and_arrays(hunt):
     found = crashhunt.load("h")
     assert isinstance(found, HuntResults)

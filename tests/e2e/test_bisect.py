@@ -9,7 +9,7 @@ from repositories import git
 from test_corpus import BROKEN, DRIVER, MENDED
 
 from crashhunt.base.errors import UsageError
-from crashhunt.corpus import _bisect
+from crashhunt.corpus import _bisection as _bisect
 
 
 @pytest.fixture

@@ -284,7 +284,7 @@ def test_check_states_what_is_lost_and_saves_the_rest(hunt, crash, toy):
     assert second.name
 
 
-@pytest.mark.nightly  # by day, hunts/test_check_parts.py and hunts/test_results.py
+@pytest.mark.nightly  # by day, hunts/test_check_parts.py and results/test_results.py
 def test_check_finds_what_does_not_belong_together(hunt, crash, toy):
     shutil.rmtree(crash)
     code, out, _ = command("check", "h")

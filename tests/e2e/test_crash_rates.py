@@ -83,7 +83,7 @@ def test_bar_decides_the_exit_code(hunt):
     assert rates(hunt, "h", "--bar", f"{close['estimate']}/trial", expect=3)[0]["verdict"] == "undecided"
 
 
-@pytest.mark.nightly  # by day, estimation/test_rates_by_part.py
+@pytest.mark.nightly  # by day, statistics/test_rates_by_part.py
 def test_hunt_that_stops_at_its_first_crash_has_an_interval_and_no_estimate(toy):
     toy.crashhunt("run", "h", "1", "40", *HUNT)
     (rate,) = rates(toy, "h", "--per", "trial")
@@ -119,7 +119,7 @@ def test_bad_input_is_one_line(hunt):
     assert "pipe: is a device or a pipe" in toy.crashhunt("rate", "h", "--html", "pipe", expect=2).err
 
 
-@pytest.mark.nightly  # by day, estimation/test_rates_by_part.py
+@pytest.mark.nightly  # by day, statistics/test_rates_by_part.py
 def test_sampler_that_does_not_draw_independently_has_no_rate(toy):
     toy.crashhunt("run", "h", "1", "2", *HUNT, "--keep-going", "--keep", "1", "--sampler", "grid")
     (rate,) = rates(toy, "h", "--per", "trial")
@@ -150,7 +150,7 @@ def until(toy, folder, workers, trials, rate, *words, expect):
     return toy.crashhunt("run", folder, workers, trials, *HUNT, *options, expect=expect).json
 
 
-@pytest.mark.nightly  # by day, hunts/test_hunt_loop.py and estimation/test_rates_by_part.py
+@pytest.mark.nightly  # by day, hunts/test_hunt_loop.py and statistics/test_rates_by_part.py
 def test_hunt_ends_once_the_rate_is_certainly_below_or_above(toy):
     calm = ("--arg", "speed=2", "--set", "gap_m=40")
     done = toy.crashhunt("run", "calm", "2", "0", "20", "--scenario", "toy", *calm, "--until-rate", "0.3/trial")

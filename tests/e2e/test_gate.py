@@ -90,7 +90,7 @@ def test_worse_agent_fails_the_gate_and_the_hunts_stay_for_compare(drivers):
     assert "--set" in refused.err  # given twice
 
 
-@pytest.mark.nightly  # by day, rates/test_paired_test.py
+@pytest.mark.nightly  # by day, statistics/test_paired_test.py
 def test_agent_that_does_not_start_in_some_trials_is_worse(drivers):
     done = drivers.crashhunt("gate", CALM, "drivers:Shy", *TOY, *SEED, "--keep", "kept", "--json", expect=1)
     found = done.json
@@ -110,7 +110,7 @@ def test_better_agent_passes_the_gate(drivers):
     assert (found["verdict"], found["only_base"], found["only_head"], found["dir"]) == ("better", 8, 0, None)
 
 
-@pytest.mark.nightly  # by day, the verdict within a margin is tested in tests/rates/test_paired_test.py
+@pytest.mark.nightly  # by day, the verdict within a margin is tested in tests/statistics/test_paired_test.py
 def test_equal_agents_pass_the_gate_once_the_difference_is_within_the_margin(drivers):
     found = gate(drivers, CALM, TWIN, "--margin", "40%", *SEED, "--keep", "kept", "--most", "200", expect=0)
     assert (found["verdict"], found["margin"]) == ("no_difference", 0.4)

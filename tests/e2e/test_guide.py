@@ -131,7 +131,7 @@ def test_the_python_reference_has_what_users_import():
     for name in ("crashhunt", "crashhunt.agents", "crashhunt.errors", "crashhunt.testing"):
         offered = [public for public in importlib.import_module(name).__all__ if not public.startswith("_")]
         assert {public for module, public in described if module == name} == set(offered)
-    assert ("crashhunt.hunts", "HuntResults") in described
+    assert ("crashhunt.results", "HuntResults") in described
     assert "run(\n    directory: Path | str," in text
     assert "    snapshot_limit_mb: float = 500.0,\n" in text
     assert "'process_died', 'hang')" in text

@@ -233,7 +233,7 @@ def test_a_finished_hunt_states_again_what_it_found(toy):
     assert toy.crashhunt(*words, "--fail-on-crash", expect=1).json["crashes"] == first["crashes"]
 
 
-@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py and hunts/test_tally.py
+@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py and results/test_tally.py
 def test_keep_going_collects_all_crashes(toy):
     words = ("run", "h", "2", "5", "60", "--agent", "faulty:Raises", "--scenario", "toy", "--keep-going", "--json")
     report = toy.crashhunt(*words).json

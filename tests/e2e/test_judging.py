@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 
+from crashhunt.analysis import judge
+from crashhunt.analysis._avoidability import AvoidanceSearch
+from crashhunt.analysis._cause_runs import _Search
 from crashhunt.crashes import INTERRUPTED, find_bundle, judgement_of, with_judgement
 from crashhunt.errors import UsageError
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Outcome
-from crashhunt.whatif import judge
-from crashhunt.whatif._avoidability import AvoidanceSearch
-from crashhunt.whatif._causes import _Search
 
 HUNT = ("--scenario", "toy", "--arg", "speed=14", "--seed", "1")
 

@@ -27,12 +27,13 @@ from test_corpus import DRIVER, MENDED
 
 from crashhunt.base.git import run_to_end
 from crashhunt.base.temporary import OwnerProcess, owner_in, remove_leftovers, remove_tree, start_time, this_process
-from crashhunt.corpus import _bisect
+from crashhunt.corpus import _bisection as _bisect
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import Hunt, check, hunt_state, salvage
+from crashhunt.hunts import Hunt, check, salvage
 from crashhunt.ledger import Ledger
 from crashhunt.plans import Request, plan
+from crashhunt.results import hunt_state
 from crashhunt.suites import _processes, _rerun
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="owners are known by /proc")

@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 
-from crashhunt.hunts import hunt_state
+from crashhunt.results import hunt_state
 
 AGENT = """
 import os

@@ -16,7 +16,7 @@ import pytest
 from conftest import CRASHHUNT, keeps_going
 
 from crashhunt.ledger import Ledger
-from crashhunt.rates import RateTest
+from crashhunt.statistics import RateTest
 
 KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
 
@@ -272,7 +272,7 @@ def rate_of_none(trials):
     return test.interval().high
 
 
-@pytest.mark.nightly  # by day, estimation/test_comparison.py and test_gate.py
+@pytest.mark.nightly  # by day, statistics/test_comparison.py and test_gate.py
 def test_which_of_two_agents_crashes_less(toy):
     for name, speed in (("fast", "14"), ("slow", "4")):
         words = (*KEEP, "--keep", "1", "--arg", f"speed={speed}", "--set", "gap_m=20:30")
@@ -303,7 +303,7 @@ def test_which_of_two_agents_crashes_less(toy):
     assert len(lines) == 2
 
 
-@pytest.mark.nightly  # by day, estimation/test_comparison.py
+@pytest.mark.nightly  # by day, statistics/test_comparison.py
 def test_an_interval_only_where_trials_are_independent(toy):
     toy.crashhunt("run", "first", "1", "40", "99", "--scenario", "toy", "--seed", "4", "--arg", "speed=14")
     words = ("--scenario", "toy", "--seed", "4", "--sampler", "grid", "--arg", "speed=4:14", "--points", "5")

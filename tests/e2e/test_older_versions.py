@@ -27,14 +27,6 @@ hunts = pytest.mark.parametrize("place", HUNTS, ids=[path.name for path in HUNTS
 
 
 @bundles
-def test_its_crash_is_replayed_by_the_crashhunt_inside(shell, bundle):
-    report = shell.crashhunt("replay", bundle, "--trust", "--json", expect=0 if SAME_TRAFFIC else None).json
-    assert report["verdict"] == "reproduced" if SAME_TRAFFIC else report["verdict"] in ("reproduced", "not_comparable")
-    if SAME_TRAFFIC:
-        assert report["digest_replayed"] == report["digest_recorded"] != ""
-
-
-@bundles
 def test_it_is_reported_and_driven_from_its_log_without_running_its_code(shell, bundle):
     assert "drove into left.8 at step 40" in shell.crashhunt("show", bundle).out
     shell.crashhunt("report", bundle, "--output", "page.html")

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from crashhunt.analysis import Overrule, WhatIfOptions, judge, what_if
 from crashhunt.crashes import find_bundle, judgement_of, list_bundles, with_judgement
 from crashhunt.replays import ReplayOptions
-from crashhunt.whatif import Overrule, WhatIfOptions, judge, what_if
 
 OMITTING = Path(__file__).with_name("omitting.py")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from crashhunt.recording import read_log
 
-NET = Path(__file__).parents[1] / "simulators" / "signal.net.xml"
+NET = Path(__file__).parents[1] / "on_sumo" / "signal.net.xml"
 SCENARIO = """
 title = "A crossing with a signal, at which the vehicle arrives when it is red"
 schema = 1

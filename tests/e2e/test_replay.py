@@ -13,11 +13,11 @@ import pytest
 from conftest import add_toy, rewritten
 
 from crashhunt.base.version import __version__
-from crashhunt.corpus._run import _begin
+from crashhunt.corpus._case_runs import _begin
 from crashhunt.crashes import find_bundle
 from crashhunt.replays import ReplayOptions, prepare
-from crashhunt.replays._replay import judged
-from crashhunt.scenario.backends.sumo import SumoSetup
+from crashhunt.replays._replaying import judged
+from crashhunt.sumo import SumoSetup
 from crashhunt.trial import Outcome
 
 AGENT = '''
@@ -307,7 +307,7 @@ def test_a_case_keeps_the_order_of_links_that_it_was_recorded_with(crash_on_sumo
     asked = []
     submitted = SimpleNamespace(submit=lambda _: None, close=lambda: None)
     monkeypatch.setattr(
-        "crashhunt.corpus._run.FreshProcessExecutor", lambda settings: asked.append(settings) or submitted
+        "crashhunt.corpus._case_runs.FreshProcessExecutor", lambda settings: asked.append(settings) or submitted
     )
     monkeypatch.setattr("crashhunt.native._link_order._load_library", lambda: None)
     missing = "the order of SUMO's links was fixed and is not fixed: the library is not built, which may be why"
@@ -338,7 +338,7 @@ def test_a_fixed_order_of_links_that_is_missing_is_the_first_suspect(crash_on_su
 def test_a_snapshot_of_a_crashhunt_that_runs_trials_in_another_way_states_so(crash):
     (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
     code = snapshot / "code" / "crashhunt"
-    edit(code / "episode" / "_settings.py", "_SCHEMA = 1", "_SCHEMA = 99")
+    edit(code / "episode" / "_worker_settings.py", "_SCHEMA = 1", "_SCHEMA = 99")
     edit(code / "base" / "version.py", f'__version__ = "{__version__}"', '__version__ = "7.8.9"')
     for words in ((), ("--until", "5")):
         refused = crash.crashhunt("replay", "h", "--force", "--trust", *words, expect=2)

@@ -117,7 +117,7 @@ agent = "shaky:Swing"
 """
 
 
-@pytest.mark.nightly  # by day, an environment of ones own, and simulators/test_gym.py has the words
+@pytest.mark.nightly  # by day, an environment of ones own, and on_gym/test_gym.py has the words
 def test_a_crash_of_a_gymnasium_environment_without_a_scene(shell):
     (shell.folder / "scenario.toml").write_text(POLE)
     (crash,) = shell.crashhunt("run", "h", "2", "20", "400", "--scenario", ".", "--seed", "1", "--json").json["crashes"]
@@ -167,7 +167,7 @@ def test_a_mistake_in_a_highway_scenario_is_one_line(shell, table, says):
     assert "snapshots" not in done.err  # the file to mend is the one that was given
 
 
-@pytest.mark.nightly  # by day, simulators/test_accelerator.py compares every bit, and test_golden.py the digests
+@pytest.mark.nightly  # by day, test_accelerator.py compares every bit, and test_golden.py the digests
 def test_the_accelerator_changes_nothing_but_the_time(shell):
     words = ("2", "2", "30", "--scenario", "highway", "--seed", "1", "--keep-going")
     shell.crashhunt("run", "fast", *words)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from crashhunt.analysis import shrink
 from crashhunt.crashes import find_bundle, list_bundles, read_bundle, signature_of, write_bundle
 from crashhunt.errors import BundleError, UsageError
-from crashhunt.shrinking import shrink
 
 
 def hunted(shell):
@@ -39,7 +39,7 @@ def test_a_crash_becomes_smaller_and_replays(shell):
     assert (replayed["verdict"], replayed["steps_replayed"]) == ("reproduced", told["steps_after"])
 
 
-@pytest.mark.nightly  # by day, shrinking/test_shrink_bundle.py
+@pytest.mark.nightly  # by day, analysis/test_shrink_bundle.py
 def test_arguments_become_plain_and_the_rest_stays(hunt):
     was = find_bundle(hunt.folder / "h")
     told = hunt.crashhunt("shrink", "h", "--json").json
@@ -67,7 +67,7 @@ def test_arguments_become_plain_and_the_rest_stays(hunt):
     assert hunt.crashhunt("corpus", "run", "kept", "--json").json["cases"][0]["got"] == "still"
 
 
-@pytest.mark.nightly  # by day, shrinking/test_shrink_bundle.py resumes
+@pytest.mark.nightly  # by day, analysis/test_shrink_bundle.py resumes
 def test_a_budget_that_is_too_small_leaves_the_best_and_is_gone_on_from(hunt):
     bundle = find_bundle(hunt.folder / "h")
     part = shrink(bundle, budget=2, parallel=1)
@@ -83,10 +83,10 @@ def test_a_budget_that_is_too_small_leaves_the_best_and_is_gone_on_from(hunt):
     assert not list(bundle.path.parent.glob(".*"))
 
 
-@pytest.mark.nightly  # by day, shrinking/test_shrink_bundle.py
+@pytest.mark.nightly  # by day, analysis/test_shrink_bundle.py
 def test_a_crash_that_does_not_come_again_is_reported(hunt, monkeypatch):
     bundle = find_bundle(hunt.folder / "h")
-    monkeypatch.setattr("crashhunt.shrinking._runs.signature_of", lambda _: None)
+    monkeypatch.setattr("crashhunt.analysis._shrink_runs.signature_of", lambda _: None)
     found = shrink(bundle, parallel=1)
     assert (found.verdict, found.small) == ("not_reproduced", None)
     assert "did not come again" in found.why
@@ -110,19 +110,19 @@ def test_a_full_disk_is_reported_and_what_came_of_the_trials_is_remembered(hunt,
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patched:
-        patched.setattr("crashhunt.shrinking._shrink.write_bundle", full)
+        patched.setattr("crashhunt.analysis._minimization.write_bundle", full)
         with pytest.raises(BundleError, match=r"small' cannot be written: No space left") as raised:
             shrink(bundle, parallel=1)
     assert "run the same command again" in raised.value.fix
     (memory,) = folder.glob(".*")  # and no part of a bundle
     assert memory.stat().st_size > 0
     with monkeypatch.context() as patched:  # only after it has been written as a whole
-        patched.setattr("crashhunt.shrinking._shrink.confirm", full_later)
+        patched.setattr("crashhunt.analysis._minimization.confirm", full_later)
         with pytest.raises(BundleError, match=r"small' cannot be written: No space left"):
             shrink(bundle, parallel=1)
     assert not list(folder.glob("*.small"))
     run_again = []
-    monkeypatch.setattr("crashhunt.shrinking._runs.Runs._remember", lambda _, spec, ran: run_again.append(spec))
+    monkeypatch.setattr("crashhunt.analysis._shrink_runs.Runs._remember", lambda _, spec, ran: run_again.append(spec))
     found = shrink(bundle, parallel=1)
     assert (found.verdict, found.ended, run_again) == ("shrunk", "done", [])
     assert not list(folder.glob(".*"))

@@ -113,7 +113,7 @@ def test_what_is_not_known_to_be_harmless_asks_for_trust(crash, tmp_path, attack
     assert victim.read_text() == "mine"
 
 
-@pytest.mark.nightly  # by day, crashes/test_trust.py, and scenario/test_sumo_files.py discards output
+@pytest.mark.nightly  # by day, crashes/test_trust.py, and on_sumo/test_sumo_files.py discards output
 def test_detectors_are_no_reason_to_distrust_and_write_nowhere(crash, tmp_path):
     victim = tmp_path / "victim"
     victim.write_text("mine")
@@ -124,7 +124,7 @@ def test_detectors_are_no_reason_to_distrust_and_write_nowhere(crash, tmp_path):
 
 
 DOORS_OPEN = """
-from crashhunt.scenario.backends.sumo import _files as files
+from crashhunt.sumo import _files as files
 files.is_output = files.is_shown = lambda name: False
 files.rewritten = lambda content, *_: content
 files.FIXED_OPTIONS.pop("device.ssm.file", None)
@@ -207,7 +207,7 @@ def test_gymnasium_may_import_nothing_either(tmp_path):
 
 
 def test_a_compressed_file_without_end_is_refused(tmp_path, monkeypatch):
-    from crashhunt.scenario.backends.sumo import _files as _sumo_xml
+    from crashhunt.sumo import _files as _sumo_xml
 
     monkeypatch.setattr(_sumo_xml, "_MAX_BYTES", 1000)
     (tmp_path / "a.xml.gz").write_bytes(gzip.compress(bytes(10_000)))

@@ -183,7 +183,7 @@ def test_a_damaged_plan_leaves_the_others_untouched(toy):
     assert "no request.json" in toy.crashhunt("logs", "out", "--errors-only").out
 
 
-@pytest.mark.nightly  # by day, hunts/test_directory.py has several claim a directory
+@pytest.mark.nightly  # by day, results/test_directory.py has several claim a directory
 @pytest.mark.long
 def test_two_at_once_do_not_disturb_each_other(toy):
     written(toy, SLOW.replace("80", "10").replace('[[hunts]]\nid = "c"\n', ""))

@@ -12,13 +12,13 @@ import pytest
 from conftest import mostly_nightly
 
 import crashhunt
+from crashhunt.analysis import Reseed, WhatIfOptions, _whatif_runs as _engine, what_if
+from crashhunt.analysis._reruns import Reruns
 from crashhunt.base.errors import UsageError
 from crashhunt.crashes import find_bundle
 from crashhunt.recording import first_divergence
 from crashhunt.replays import ReplayOptions, prepare, up_to
 from crashhunt.trial import KILLED, Failure, Outcome, Reseeding
-from crashhunt.whatif import Reseed, WhatIfOptions, _engine, what_if
-from crashhunt.whatif._reruns import Reruns
 
 SPEED = ("--agent", "crashhunt.agents:KeepLaneWithSpeed", "--arg")
 
@@ -247,7 +247,7 @@ class Tampered(Reruns):
 OTHER: list = []
 
 
-@pytest.mark.nightly  # by day, whatif/test_what_is_counted.py
+@pytest.mark.nightly  # by day, analysis/test_what_is_counted.py
 def test_runs_that_are_killed_or_differ_before_the_step_do_not_count(crash, monkeypatch):
     crash.crashhunt("run", "other", "1", "20", "300", "--scenario", "toy", "--arg", "speed=13", "--seed", "7")
     OTHER[:] = [crash.folder / "other"]
@@ -263,7 +263,7 @@ def test_runs_that_are_killed_or_differ_before_the_step_do_not_count(crash, monk
     assert sum(found.excluded.values()) == 3
 
 
-@pytest.mark.nightly  # by day, whatif/test_reruns.py
+@pytest.mark.nightly  # by day, analysis/test_reruns.py
 @pytest.mark.parametrize("name", ["crashhunt-0.1.0", "crashhunt-0.1.0-packages"])
 def test_crash_of_an_earlier_version_takes_changes_and_names_what_needs_todays_code(toy, name):
     bundle = str(Path(__file__).with_name("bundles") / f"{name}.zip")

@@ -19,8 +19,8 @@ import pytest
 
 from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.base.forks import CannotForkError
-from crashhunt.envs import SumoEnv, _episodes, _process, _sumo_env
-from crashhunt.envs._episodes import Episodes, _Trail
+from crashhunt.envs import SumoEnv, _env_episodes as _episodes, _process, _sumo_env
+from crashhunt.envs._env_episodes import Episodes, _Trail
 from crashhunt.envs._process import RemoteEpisodes
 from crashhunt.errors import ArgumentError, SimulatorError, UsageError
 from crashhunt.trial import Argument, Outcome
@@ -311,7 +311,7 @@ def test_process_is_started_apart_from_the_users_terminal_and_with_its_modules(m
     assert environment["PYTHONPATH"] == f"/one{os.pathsep}/two"
     assert (environment["OMP_NUM_THREADS"], environment["MINE"]) == ("1", "yes")
     assert there != os.fstat(made._pipe.fileno()).st_ino
-    assert ends == [("made", "crashhunt.envs._episodes:Episodes", "toy", "a")]
+    assert ends == [("made", "crashhunt.envs._env_episodes:Episodes", "toy", "a")]
     assert (made.observation_space, made.action_space, made.step_length_s, made.agent) == (1, 2, 3.0, "ego")
     assert (made.pid, made._name) == (55, "the environment")
     process, pipe = made._process, made._pipe

@@ -14,9 +14,9 @@ import pytest
 from crashhunt.episode import Episode, _failures, run_episode
 from crashhunt.episode._failures import Attribution, attribute_error, record_originals
 from crashhunt.errors import RecorderError
+from crashhunt.gym import GymSimulator
 from crashhunt.recording import BlackBox
 from crashhunt.scenario import AgentSetup, Scenario, scenario_from_dict
-from crashhunt.simulators.gym import GymSimulator
 from crashhunt.simulators.toy import ToySimulator
 from crashhunt.trial import TrialSpec
 

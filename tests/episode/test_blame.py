@@ -18,12 +18,12 @@ from crashhunt.episode import Episode, Nearness, Observer, Parts, Recorder, Work
 from crashhunt.episode._blame import guarded_check, guarded_step
 from crashhunt.episode._fast_path import FastPath
 from crashhunt.errors import InternalError, RecorderError, ScenarioError, UnusableValueError
+from crashhunt.gym import GymSimulator
 from crashhunt.oracles import ReportedCollision
 from crashhunt.recording import BlackBox
 from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario, scenario_from_dict
-from crashhunt.simulators.gym import GymSimulator
-from crashhunt.simulators.sumo import SumoSimulator
 from crashhunt.simulators.toy import ToySimulator
+from crashhunt.sumo import SumoSimulator
 from crashhunt.trial import CRASHES, UNUSABLE_VALUE, TrialSpec
 
 # Modules of a user's: an environment, an agent, an oracle, a simulator. `fails` says where each of them goes wrong.
@@ -155,7 +155,7 @@ class Agent:
         if fails == "outside":
             return {"word": "go", "turn": np.float32(7)}
         if fails == "look":  # a function of crashhunt's is replaced by one of the agent's
-            from crashhunt.simulators.gym import GymSimulator
+            from crashhunt.gym import GymSimulator
             GymSimulator._look = lambda *_: fail("look")
         return {"word": "go", "turn": np.array(0.5, np.float32)}
 
@@ -417,10 +417,10 @@ def broken_function():
 
 OURS = {
     "reset": (GymSimulator, "_look"),
-    "space conversion": ("crashhunt.simulators._gymnasium.ObservationForm", "encode"),
-    "observe": ("crashhunt.simulators._gymnasium.ObservationForm", "restore"),
-    "action conversion": ("crashhunt.simulators._gymnasium._Values", "encode"),
-    "native action": ("crashhunt.simulators.gym", "native"),
+    "space conversion": ("crashhunt.simulators._any_space.ObservationForm", "encode"),
+    "observe": ("crashhunt.simulators._any_space.ObservationForm", "restore"),
+    "action conversion": ("crashhunt.simulators._any_space._Values", "encode"),
+    "native action": ("crashhunt.gym._simulator", "native"),
     "agent's arguments": (Parts, "_factory"),
     "step": (GymSimulator, "_notice"),
     "info": (GymSimulator, "_record_danger"),
@@ -445,7 +445,7 @@ def test_failure_of_crashhunt_itself_is_no_trials_outcome(modules, tmp_path, mon
         )
     monkeypatch.setattr(owner, name, broken_function())
     if place == "step":  # is called for an observation outside the space only
-        monkeypatch.setattr("crashhunt.simulators._gymnasium.ObservationForm.contains", lambda *_: False)
+        monkeypatch.setattr("crashhunt.simulators._any_space.ObservationForm.contains", lambda *_: False)
     with pytest.raises(InternalError) as caught:
         run(tmp_path, simulator)
     fault = caught.value
@@ -564,9 +564,9 @@ def test_hunt_names_the_party_that_failed(shell, environment, agent, outcome, pa
 
 
 FAULT = f"""
-import crashhunt.simulators.gym as broken_module
+import crashhunt.gym._simulator as broken_module
 names = {{"__name__": "crashhunt.broken"}}
-exec(compile({BROKEN!r}, broken_module.__file__.replace("gym.py", "broken.py"), "exec"), names)
+exec(compile({BROKEN!r}, broken_module.__file__.replace("_simulator.py", "broken.py"), "exec"), names)
 broken_module.native = names["broken"]
 """  # before crashhunt notes what its functions are, so that it is as if crashhunt came like this
 

@@ -10,8 +10,7 @@ import pytest
 
 from crashhunt.episode import Nearness, Observer, Recorder, ready_recorder
 from crashhunt.episode._observers import _type_of
-from crashhunt.recording import Phase
-from crashhunt.recording.records import Tag
+from crashhunt.recording import Phase, Tag
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Actor, Contact, Event, Roster, Scene

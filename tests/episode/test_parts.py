@@ -13,7 +13,7 @@ import pytest
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.plugins import CurrentFolder, locate
-from crashhunt.episode import Parts, WorkerSettings, _run, require_origin, seal
+from crashhunt.episode import Parts, WorkerSettings, _run_episode as _run, require_origin, seal
 from crashhunt.scenario import load_scenario
 
 AGENT = """

@@ -17,8 +17,8 @@ from crashhunt.errors import CrashhuntError, HuntDirectoryError, ScenarioError
 from crashhunt.hunts import _hunt as hunt_module, _next_trials
 from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace
-from crashhunt.hunts._state import ledger_owner
 from crashhunt.ledger import Ledger
+from crashhunt.results._state import ledger_owner
 from crashhunt.trial import UNUSABLE_VALUE, Branches, Failure, Outcome, TrialResult, TrialSpec
 
 TOY = """

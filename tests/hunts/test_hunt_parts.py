@@ -18,16 +18,17 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UntrustedError
 from crashhunt.executors import PoolExecutor
-from crashhunt.hunts import HuntReport, _hunt, _preflight, _results, _state, _verification
+from crashhunt.hunts import HuntReport, _hunt, _preflight, _verification
 from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._progress import PhaseClock
 from crashhunt.hunts._reports import BranchReport, Difference, ProbeReport, RareReport, kind_data
-from crashhunt.hunts._state import HuntDirectory, LogReader
 from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReruns, is_settled
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
-from crashhunt.rates import TRIALS_PER_ROOT, RareEstimate
-from crashhunt.rates._rare import Estimated
+from crashhunt.results import _hunt_results as _results, _state
+from crashhunt.results._state import HuntDirectory, LogReader
+from crashhunt.statistics import TRIALS_PER_ROOT, RareEstimate
+from crashhunt.statistics._rare import Estimated
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 SETTINGS = HuntSettings(

@@ -23,11 +23,11 @@ from crashhunt.crashes import (
     count_causes,
     join_causes,
 )
-from crashhunt.hunts import _crashes
-from crashhunt.hunts._crashes import Judged, Kinds, dropped_crashes, find_crashes, prune_bundles
 from crashhunt.hunts._reports import kind_data
 from crashhunt.ledger import Ledger
 from crashhunt.plans import RunSettings
+from crashhunt.results import _found_crashes as _crashes
+from crashhunt.results._found_crashes import Judged, Kinds, dropped_crashes, find_crashes, prune_bundles
 from crashhunt.trial import Collision, Failure, Outcome, TrialResult, TrialSpec
 
 

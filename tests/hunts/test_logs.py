@@ -1,7 +1,7 @@
 from __future__ import annotations
 
-from crashhunt.hunts import LogReader
 from crashhunt.ledger import Ledger
+from crashhunt.results import LogReader
 
 
 def test_only_what_is_new_is_read_however_long_a_log_is(tmp_path):

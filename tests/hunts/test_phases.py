@@ -9,16 +9,20 @@ import signal
 import time
 from contextlib import closing
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import pytest
 from conftest import copy_files, keeps_going
 
-from crashhunt.estimation import compare
-from crashhunt.hunts import PhaseStatus, hunt_state
 from crashhunt.hunts._progress import PhaseClock, RemainingTime
-from crashhunt.hunts._state import ledger_owner
 from crashhunt.ledger import Ledger
 from crashhunt.report import describe_phase, format_pace
+from crashhunt.results import hunt_state
+from crashhunt.results._state import ledger_owner
+from crashhunt.statistics import compare
+
+if TYPE_CHECKING:
+    from crashhunt.hunts import PhaseStatus
 
 SLOW = """
 import time

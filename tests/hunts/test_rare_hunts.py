@@ -13,11 +13,17 @@ import crashhunt
 from crashhunt.cli import _spell_out
 from crashhunt.disturbances import DisturbanceSampler, brake
 from crashhunt.errors import UsageError
-from crashhunt.hunts import _rates as rare_module, hunt_state
-from crashhunt.hunts._rates import Forcings, RareWatch, SplittingWatch
 from crashhunt.hunts._reports import RareReport
 from crashhunt.ledger import Ledger
-from crashhunt.rates import BLOCK, TRIALS_PER_ROOT, _splitting as splitting, is_root
+from crashhunt.results import hunt_state
+from crashhunt.statistics import (
+    BLOCK,
+    TRIALS_PER_ROOT,
+    _rate_of_running_hunt as rare_module,
+    _splitting as splitting,
+    is_root,
+)
+from crashhunt.statistics._rate_of_running_hunt import Forcings, RareWatch, SplittingWatch
 from crashhunt.trial import (
     CRASHES,
     KILLED,

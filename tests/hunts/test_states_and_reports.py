@@ -20,25 +20,16 @@ import crashhunt
 from crashhunt.base import layout
 from crashhunt.episode import WorkerSettings
 from crashhunt.errors import CrashhuntError, HuntDirectoryError
-from crashhunt.hunts import (
-    HuntStatus,
-    _hunt as hunt_module,
-    check,
-    find_hunts,
-    find_searches,
-    hunt_state,
-    is_hunt,
-    load,
-    salvage,
-)
+from crashhunt.hunts import HuntStatus, _hunt as hunt_module, check, salvage
 from crashhunt.hunts._next_trials import Unanswered, find_unanswered
 from crashhunt.hunts._progress import Progress
-from crashhunt.hunts._state import draws_independently, ledger_owner, sums_of_branches, sums_of_probes
 from crashhunt.hunts._verification import Audit
 from crashhunt.ledger import Ledger
 from crashhunt.plans import RunSettings
-from crashhunt.rates import CountingRule, RateWatch
+from crashhunt.results import find_hunts, find_searches, hunt_state, is_hunt, load
+from crashhunt.results._state import draws_independently, ledger_owner, sums_of_branches, sums_of_probes
 from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.statistics import CountingRule, RateWatch
 from crashhunt.trial import KILLED, Branches, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -471,7 +462,7 @@ def test_salvage_refuses_a_directory_that_has_something_and_names_what_cannot_be
     def fail(*_):
         raise shutil.Error([("source", "copy", "[Errno 5] Input/output error")])
 
-    monkeypatch.setattr("crashhunt.hunts._check.shutil.copytree", fail)
+    monkeypatch.setattr("crashhunt.hunts._disk_check.shutil.copytree", fail)
     with pytest.raises(HuntDirectoryError, match=r"cannot be written: \[Errno 5\] Input/output error"):
         salvage(checked, tmp_path / "s")
     assert not (tmp_path / "s").exists()

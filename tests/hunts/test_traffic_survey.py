@@ -120,7 +120,7 @@ def test_the_demand_is_simulated_at_both_ends_of_its_range(town, monkeypatch):
     [
         pytest.param(
             f'<vType id="train" vClass="rail_urban"/>{WAY}<vehicle id="a" type="train" route="way" depart="5"/>', 2,
-            "only rail vehicles enter", marks=pytest.mark.nightly,  # by day, scenario/test_sumo_survey.py
+            "only rail vehicles enter", marks=pytest.mark.nightly,  # by day, on_sumo/test_sumo_survey.py
         ),
         ('<flow id="f" begin="10" end="20" probability="0.00001" from="south" to="east"/>', 3,
          "no vehicle enters in 25 s of simulation (50 steps from 0 s)"),

@@ -15,9 +15,10 @@ import crashhunt
 from crashhunt.base.errors import InternalError
 from crashhunt.crashes import list_bundles, list_near_misses
 from crashhunt.errors import HuntDirectoryError, UsageError
-from crashhunt.estimation import measure_rates
-from crashhunt.hunts import check, hunt_state
+from crashhunt.hunts import check
 from crashhunt.ledger import Ledger
+from crashhunt.results import hunt_state
+from crashhunt.statistics import measure_rates
 
 TOY = """
 title = "A toy"

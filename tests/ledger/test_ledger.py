@@ -12,10 +12,10 @@ from conftest import examples
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import TrialRow
 from crashhunt.hunts._next_trials import find_unanswered
-from crashhunt.hunts._state import sums_of_branches, sums_of_probes
 from crashhunt.ledger import Ledger, has_begun
+from crashhunt.results import TrialRow
+from crashhunt.results._state import sums_of_branches, sums_of_probes
 from crashhunt.trial import KILLED, Branches, Failure, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 

@@ -15,11 +15,11 @@ from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.episode import run_episode
 from crashhunt.native import _core, core_for, why_not
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
-from crashhunt.oracles._crashes import _within_reach
+from crashhunt.oracles._crash_oracles import _within_reach
 from crashhunt.recording import BlackBox
 from crashhunt.scenario import ObservationSetup, argument_values, load_scenario
-from crashhunt.scenario.backends.sumo import SumoSetup
 from crashhunt.simulators import Kinematics
+from crashhunt.sumo import SumoSetup
 from crashhunt.trial import CRASHES, TrialSpec
 from crashhunt.world import Actor, ApproachMeter, DangerMeter, Roster, Scene, approaches, joined_frame
 from crashhunt.world._danger import _Way
@@ -541,7 +541,7 @@ LIES = {
 
 @pytest.fixture
 def run(tmp_path):
-    from crashhunt.simulators.sumo import SumoSimulator
+    from crashhunt.sumo import SumoSimulator
 
     def trial(scenario, *, native, steps=60, lie=None, speed=15.0, seed=5):
         chosen = load_scenario(scenario)

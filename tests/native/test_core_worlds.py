@@ -13,12 +13,12 @@ from crashhunt.episode import run_episode
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox
 from crashhunt.scenario import load_scenario
-from crashhunt.scenario.backends.sumo import SumoSetup
+from crashhunt.sumo import SumoSetup
 from crashhunt.trial import TrialSpec
 
 core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
 
-NETS = Path(__file__).parents[1] / "simulators" / "nets"
+NETS = Path(__file__).parents[1] / "on_sumo" / "nets"
 WALKERS = (
     '<vType id="wide" width="2.8"/><vType id="ghost" vClass="pedestrian" maxSpeed="0.01"/>'
     '<vehicle id="ego" type="wide" depart="0" departPos="10" departSpeed="10"><route edges="wc ce"/></vehicle>'
@@ -95,7 +95,7 @@ WORLDS = {
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_a_trial_in_another_world_is_the_same_bit_by_bit(tmp_path, world):
-    from crashhunt.simulators.sumo import SumoSimulator
+    from crashhunt.sumo import SumoSimulator
 
     net, traffic, step_s, steps = WORLDS[world]
     shutil.copy(NETS / f"{net}.net.xml", tmp_path)

@@ -10,7 +10,7 @@ import pytest
 
 from crashhunt.native import _generators, reseed_generators, why_no_reseeding
 from crashhunt.scenario import argument_values, load_scenario
-from crashhunt.simulators.sumo import SumoSimulator
+from crashhunt.sumo import SumoSimulator
 
 BYTES = _generators._GENERATOR_BYTES
 

@@ -19,10 +19,10 @@ from crashhunt.native import LinkOrder, _link_order, link_order, why_no_link_ord
 from crashhunt.plans import RunSettings, load_order_change, load_order_of, with_recorded_load_order
 from crashhunt.plans._plan import _with_notes
 from crashhunt.scenario import load_scenario
-from crashhunt.scenario.backends.sumo import SumoSetup
+from crashhunt.sumo import SumoSetup
 
 ROOT = Path(__file__).parents[2]
-NETS = ROOT / "tests" / "simulators" / "nets"
+NETS = ROOT / "tests" / "on_sumo" / "nets"
 LIBRARY = importlib.util.find_spec("_crashhunt_link_order")
 COMPILER = shutil.which("c++") or shutil.which("g++")
 needs_library = pytest.mark.skipif(LIBRARY is None, reason="the library is not built")
@@ -221,7 +221,7 @@ def sumo_scenario(folder: Path, **table: object):
 
 
 def simulator(folder: Path, **table: object):
-    from crashhunt.simulators.sumo import SumoSimulator
+    from crashhunt.sumo import SumoSimulator
 
     stage = folder / "stage"
     stage.mkdir()

@@ -24,7 +24,7 @@ from crashhunt.trial import CRASHES, Outcome, TrialSpec
 
 core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
 
-NET = Path(__file__).parents[1] / "simulators" / "signal.net.xml"
+NET = Path(__file__).parents[1] / "on_sumo" / "signal.net.xml"
 # Somebody follows the agent, somebody comes and somebody goes in its sight, and somebody else out of it.
 TRAFFIC = (
     '<vType id="car" sigma="0"/>'
@@ -39,7 +39,7 @@ class Street:
     """A small scenario, whose episodes run with the core's own steps or without."""
 
     def __init__(self, folder, agent=""):
-        from crashhunt.simulators.sumo import SumoSimulator
+        from crashhunt.sumo import SumoSimulator
 
         shutil.copy(NET, folder)
         (folder / "r.rou.xml").write_text(f"<routes>{TRAFFIC}</routes>")

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from crashhunt.recording._foxglove import MESSAGES, to_ns
-from crashhunt.recording.records._agents import message_of
+from crashhunt.recording.records._agent_records import message_of
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from crashhunt.panels import Action, Curve
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.render import FilmOptions, Shot, frames
 from crashhunt.render._film import _steps, shown_steps
-from crashhunt.render._panels import BuiltinPanels, save_panels
-from crashhunt.render._scene import SceneView
+from crashhunt.render._panel_drawing import BuiltinPanels, save_panels
+from crashhunt.render._scene_from_above import SceneView
 from crashhunt.world import PERSON, Actor, Roster, Scene
 
 EGO, CRASH, AGENT, OTHER, MARK = (224, 138, 0), (198, 40, 40), (46, 158, 91), (125, 139, 156), (170, 180, 192)

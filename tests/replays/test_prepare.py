@@ -10,7 +10,7 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.errors import UntrustedError, UsageError
 from crashhunt.plans import AgentSettings, HuntSettings, RunSettings
-from crashhunt.replays import Look, ReplayOptions, ReplayReport, _debugger, _prepare, _replay, prepare
+from crashhunt.replays import Look, ReplayOptions, ReplayReport, _debugger, _prepare, _replaying as _replay, prepare
 from crashhunt.replays._edits import Edits
 from crashhunt.replays._prepare import _in_scenario, is_current_code
 from crashhunt.scenario import argument_values, load_scenario

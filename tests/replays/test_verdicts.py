@@ -10,7 +10,7 @@ import pytest
 
 from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError, UsageError
 from crashhunt.recording import AgentChannel, Divergence, Prologue, Tag
-from crashhunt.replays import Look, ReplayOptions, ReplayReport, _debugger, _replay
+from crashhunt.replays import Look, ReplayOptions, ReplayReport, _debugger, _replaying as _replay
 from crashhunt.trial import KILLED, Collision, Failure, Outcome, TrialResult, TrialSpec
 
 EGO = AgentChannel("ego", "float32", (8, 7), "float64", (2,))

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from crashhunt.report._compare import _argument_plot, _outcomes, _rates, describe_comparison
+from crashhunt.report._comparison_text import _argument_plot, _outcomes, _rates, describe_comparison
 
 COLORS = {"a": "#a00", "b": "#0b0"}
 

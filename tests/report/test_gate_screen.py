@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from crashhunt.estimation import GateReport, ScenarioCounts
-from crashhunt.rates import Interval, SideCounts
 from crashhunt.report import describe_gate, gate_summary
-from crashhunt.report._gate import _rate
+from crashhunt.report._gate_report import _rate
+from crashhunt.statistics import GateReport, Interval, ScenarioCounts, SideCounts
 
 
 def test_lines_of_a_verdict_fit_a_terminal_of_80_columns():

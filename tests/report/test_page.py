@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from crashhunt.crashes import list_bundles
-from crashhunt.hunts import HuntResults, hunt_state
 from crashhunt.report import describe_running
+from crashhunt.results import HuntResults, hunt_state
 
 selenium = pytest.importorskip("selenium")
 from selenium import webdriver  # noqa: E402

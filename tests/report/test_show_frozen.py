@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from crashhunt.analysis import step_before
 from crashhunt.crashes import find_bundle, open_archive
+from crashhunt.report._crash_text import Story, _steps_around, _thinned
 from crashhunt.report._page import _crash
-from crashhunt.report._show import Story, _steps_around, _thinned
-from crashhunt.whatif import step_before
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages"
 TABLE = """\

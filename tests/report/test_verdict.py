@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from crashhunt.crashes import Attempt, Judgement, LaneMap, Omission, Reference, ReferenceRun
-from crashhunt.crashes._contact import record_in
-from crashhunt.report._show import _cells
+from crashhunt.crashes._contact_record import record_in
+from crashhunt.report._crash_text import _cells
 from crashhunt.report._verdict import describe_contact, verdict_of
 from crashhunt.trial import Collision, Escape
 from crashhunt.world import Actor, Roster, Scene

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from crashhunt.crashes import Attempt, Factor, Judgement, LeftOut, Why
-from crashhunt.report._rate import format_rate
+from crashhunt.report._rate_text import format_rate
 from crashhunt.report._words import about_judgement, about_why
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from crashhunt.errors import PluginError, ScenarioError
+from crashhunt.gym._backend import GymSetup
+from crashhunt.highway._backend import HighwaySetup
 from crashhunt.scenario import (
     AgentSetup,
     Backend,
@@ -19,9 +21,7 @@ from crashhunt.scenario import (
     scenario_from_dict,
     shipped_folder,
 )
-from crashhunt.scenario.backends.gym import GymSetup
-from crashhunt.scenario.backends.highway import HighwaySetup
-from crashhunt.scenario.backends.sumo import SumoSetup
+from crashhunt.sumo import SumoSetup
 from crashhunt.testing import BackendContract
 
 

@@ -22,7 +22,7 @@ from crashhunt.scenario import (
     shipped_scenarios,
 )
 from crashhunt.scenario._load import check
-from crashhunt.scenario.backends.sumo import SumoSetup
+from crashhunt.sumo import SumoSetup
 
 LOOP = shipped_folder() / "loop"
 

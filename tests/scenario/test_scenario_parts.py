@@ -13,6 +13,8 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.errors import HuntDirectoryError, ScenarioError
+from crashhunt.gym._backend import BACKEND as GYM, CrashRule, GymSetup
+from crashhunt.highway._backend import BACKEND as HIGHWAY, HighwaySetup
 from crashhunt.scenario import (
     AgentSetup,
     ArgumentSetup,
@@ -30,19 +32,10 @@ from crashhunt.scenario import (
 )
 from crashhunt.scenario._load import check, copy_shipped_scenario, scenario_from_dict
 from crashhunt.scenario._scenario import STEP_LENGTH_S, digest_of_described, with_action
-from crashhunt.scenario.backends.gym import BACKEND as GYM, CrashRule, GymSetup
-from crashhunt.scenario.backends.highway import BACKEND as HIGHWAY, HighwaySetup
-from crashhunt.scenario.backends.sumo import BACKEND as SUMO, StagedFiles, SumoSetup, _ego
-from crashhunt.scenario.backends.sumo._files import (
-    filled_in,
-    movable,
-    nested_files,
-    read_xml,
-    references,
-    written_by,
-)
-from crashhunt.scenario.backends.sumo._options import HARMLESS
-from crashhunt.scenario.backends.sumo._side_effects import _check_text, _SideEffectError
+from crashhunt.sumo import BACKEND as SUMO, StagedFiles, SumoSetup, _ego
+from crashhunt.sumo._files import filled_in, movable, nested_files, read_xml, references, written_by
+from crashhunt.sumo._options import HARMLESS
+from crashhunt.sumo._side_effects import _check_text, _SideEffectError
 
 ROUTES = (
     '<routes><route id="way" edges="south east north west"/>'

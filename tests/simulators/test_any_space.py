@@ -18,6 +18,8 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from crashhunt.episode import run_episode
 from crashhunt.errors import ActionError
+from crashhunt.gym import GymSimulator
+from crashhunt.gym._backend import CrashRule, GymSetup
 from crashhunt.recording import (
     BlackBox,
     OpaqueValue,
@@ -32,10 +34,8 @@ from crashhunt.recording import (
     write_log,
 )
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.scenario.backends.gym import CrashRule, GymSetup
 from crashhunt.simulators import action_form, native
-from crashhunt.simulators._gymnasium import FlatAction, ObservationForm
-from crashhunt.simulators.gym import GymSimulator
+from crashhunt.simulators._any_space import FlatAction, ObservationForm
 from crashhunt.testing import SimulatorContract
 from crashhunt.trial import TrialSpec
 

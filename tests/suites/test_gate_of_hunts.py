@@ -12,7 +12,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings, Request, RunSettings, write_settings
-from crashhunt.suites import Gate, GateVersion, RunRequest, _gate
+from crashhunt.suites import Gate, GateVersion, RunRequest, _gate_runs as _gate
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
 SEED = 4

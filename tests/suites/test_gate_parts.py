@@ -14,11 +14,10 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, NoValidTrialError, UsageError
-from crashhunt.estimation import ScenarioCounts
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, RunSettings, write_settings
-from crashhunt.rates import SideCounts
-from crashhunt.suites import Gate, GateVersion, RunRequest, _gate
+from crashhunt.statistics import ScenarioCounts, SideCounts
+from crashhunt.suites import Gate, GateVersion, RunRequest, _gate_runs as _gate
 from crashhunt.suites._processes import REQUEST, write_request
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 

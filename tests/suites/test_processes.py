@@ -14,9 +14,9 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
-from crashhunt.hunts import hunt_state
 from crashhunt.ledger import Ledger
 from crashhunt.plans import Request, RunSettings, SnapshotChoices, plan
+from crashhunt.results import hunt_state
 from crashhunt.suites import RunRequest, Suite, SuiteEntry, _processes, _rerun, rerun, run_all
 from crashhunt.suites._processes import REQUEST, check_machine, set_aside, write_request
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 
 from crashhunt.base import layout
-from crashhunt.hunts import HuntState
 from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings, RunSettings, write_settings
+from crashhunt.results import HuntState
 from crashhunt.suites._rerun import _replace_invalid
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 

@@ -15,10 +15,10 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, HuntDirectoryError, UntrustedError, UsageError
-from crashhunt.hunts import hunt_state
 from crashhunt.plans import AgentSettings, HuntSettings, Request, RunSettings, read_settings, write_settings
+from crashhunt.results import hunt_state
 from crashhunt.scenario import shipped_scenarios
-from crashhunt.suites import RunRequest, Suite, SuiteEntry, _processes, _rerun, _suite, rerun
+from crashhunt.suites import RunRequest, Suite, SuiteEntry, _processes, _rerun, _suite_file as _suite, rerun
 from crashhunt.suites._processes import REQUEST, refuse_untrusted_hunt, slots_of, trust_hunt, write_request
 
 ASKED = RunRequest(

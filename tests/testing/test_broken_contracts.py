@@ -26,13 +26,13 @@ from crashhunt.testing import (
     OracleContract,
     SamplerContract,
     SimulatorContract,
-    _last_avoidable_step,
+    _last_avoidable_step_check as _last_avoidable_step,
     check_escape,
     drive,
 )
-from crashhunt.testing._disturbances import DisturbanceContract
-from crashhunt.testing._last_avoidable_step import EscapeCheck, RecordedThenBrakes
-from crashhunt.testing._oracles import _LANES
+from crashhunt.testing._disturbance_contract import DisturbanceContract
+from crashhunt.testing._last_avoidable_step_check import EscapeCheck, RecordedThenBrakes
+from crashhunt.testing._oracle_contract import _LANES
 from crashhunt.world import Event
 
 
@@ -590,7 +590,7 @@ def test_verdict_on_an_escape_needs_both_runs(found, verdict):
 
 def test_driver_repeats_the_log_and_brakes_after_its_step(monkeypatch):
     log = SimpleNamespace(actions=lambda agent: [f"{agent} {n}" for n in range(4)])
-    monkeypatch.setattr("crashhunt.testing._last_avoidable_step.read_log", lambda path: log)
+    monkeypatch.setattr("crashhunt.testing._last_avoidable_step_check.read_log", lambda path: log)
     found = []
     for after in (2, 9):
         agent = RecordedThenBrakes("log.mcap", "ego", after, None)
@@ -607,7 +607,7 @@ def test_driver_repeats_the_log_and_brakes_after_its_step(monkeypatch):
 
 def test_overruled_driver_may_act_after_the_end_of_its_log(monkeypatch):
     log = SimpleNamespace(actions=lambda agent: ["first"])
-    monkeypatch.setattr("crashhunt.testing._last_avoidable_step.read_log", lambda path: log)
+    monkeypatch.setattr("crashhunt.testing._last_avoidable_step_check.read_log", lambda path: log)
     agent = RecordedThenBrakes("log.mcap", "ego", _last_avoidable_step._NEVER, None)
     assert [agent.act(None) for _ in range(3)] == ["first"] * 3
     assert agent._after > 10**6
@@ -693,7 +693,7 @@ def test_last_avoidable_step_is_checked_by_braking_after_it_and_later(escapes, b
         assert run.spec.arguments["second"] == {"log": "b", "after": _last_avoidable_step._NEVER}
         assert run.spec.max_steps == 30 + round(_last_avoidable_step._AFTERWARDS_S / 0.25)
         assert run.spec.seed == 5
-        name = "crashhunt.testing._last_avoidable_step:RecordedThenBrakes"
+        name = "crashhunt.testing._last_avoidable_step_check:RecordedThenBrakes"
         assert run.worker.scenario == ("with", {"ego": name, "second": name})
         assert run.closed == 1
         assert not run.worker.scratch.exists()

@@ -49,7 +49,7 @@ SUMO = """
 import sys, tempfile, pytest
 from pathlib import Path
 from crashhunt.scenario import load_scenario, with_action
-from crashhunt.simulators.sumo import SumoSimulator
+from crashhunt.sumo import SumoSimulator
 from crashhunt.testing import SimulatorContract
 
 @pytest.mark.parametrize(("name", "form"), CASES)

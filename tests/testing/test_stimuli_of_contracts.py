@@ -31,7 +31,7 @@ from crashhunt.testing import (
     OracleContract,
     SamplerContract,
     SimulatorContract,
-    _samplers,
+    _sampler_contract as _samplers,
     drive,
 )
 from crashhunt.trial import CELLS, Collision, Outcome, TrialResult
@@ -530,7 +530,7 @@ ONCE, COSTS, CANCELLED, STATES, REPORTED, BOX = (
 @pytest.fixture
 def boxes(monkeypatch):
     """Replace black boxes: each has the steps of its trial."""
-    from crashhunt.testing import _executors
+    from crashhunt.testing import _executor_contract as _executors
 
     read = []
     monkeypatch.setattr(_executors, "read_black_box", lambda path: read.append(path) or path)

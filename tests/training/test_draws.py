@@ -12,8 +12,8 @@ import pytest
 
 from crashhunt.errors import HuntDirectoryError, SimulatorError, UsageError
 from crashhunt.training import CrashEnv, TrainedOn, _crash_env, is_test_traffic, read_trained_on
-from crashhunt.training._episodes import _seeded
 from crashhunt.training._prioritized_replay import CrashReplay
+from crashhunt.training._training_episodes import _seeded
 
 
 def test_probabilities_are_those_of_prioritized_level_replay():

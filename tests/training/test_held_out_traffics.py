@@ -17,11 +17,20 @@ from hypothesis import given, strategies as st
 import crashhunt
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError, UsageError
-from crashhunt.estimation import GateReport, PairedHunts, measure_rates
-from crashhunt.hunts import hunt_state
 from crashhunt.ledger import Ledger
-from crashhunt.rates import CountingRule, PairWatch, RateCounter, TrialFacts, UnitSequence, make_rate
 from crashhunt.report import comparison_page, describe_comparison, describe_gate, describe_running, gate_summary
+from crashhunt.results import hunt_state
+from crashhunt.statistics import (
+    CountingRule,
+    GateReport,
+    PairedHunts,
+    PairWatch,
+    RateCounter,
+    TrialFacts,
+    UnitSequence,
+    make_rate,
+    measure_rates,
+)
 from crashhunt.training import (
     CrashEnv,
     HeldOutTraffics,

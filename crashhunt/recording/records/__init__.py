@@ -9,9 +9,9 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
-from crashhunt.recording.records._agents import ACTION, OBSERVATION, PROLOGUE
-from crashhunt.recording.records._events import DISTURBANCES, EVENTS, NOTES
-from crashhunt.recording.records._scene import ACTORS, HEIGHTS, LANES, ROSTER, SPINES, STEP
+from crashhunt.recording.records._agent_records import ACTION, OBSERVATION, PROLOGUE
+from crashhunt.recording.records._event_record import DISTURBANCES, EVENTS, NOTES
+from crashhunt.recording.records._scene_record import ACTORS, HEIGHTS, LANES, ROSTER, SPINES, STEP
 
 if TYPE_CHECKING:
     from crashhunt.recording.records._type import RecordType

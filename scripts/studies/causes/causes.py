@@ -39,11 +39,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.analysis import Reruns, divide_by_cause
 from crashhunt.base import layout
 from crashhunt.crashes import group_crashes, join_causes, list_bundles
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Handover, Outcome
-from crashhunt.whatif import Reruns, divide_by_cause
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

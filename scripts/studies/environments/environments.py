@@ -169,9 +169,9 @@ def ask(command: list[str], folder: Path) -> object:
 
 def print_spaces(scenario: str) -> None:
     """Print how the spaces of an environment are recorded."""
+    from crashhunt.gym import GymSimulator
     from crashhunt.scenario import load_scenario
-    from crashhunt.simulators._gymnasium import FlatAction, OpaqueAction
-    from crashhunt.simulators.gym import GymSimulator
+    from crashhunt.simulators._any_space import FlatAction, OpaqueAction
 
     simulator = GymSimulator(load_scenario(scenario), Path())
     form, action = simulator._form, simulator.actions["me"]

@@ -27,11 +27,11 @@ from typing import TYPE_CHECKING, Any
 
 from towns import TOWNS, make_town
 
+from crashhunt.analysis._cause_runs import _Search
+from crashhunt.analysis._reruns import Reruns
 from crashhunt.crashes import ending_of, fault_of, list_bundles, overruled_trial
 from crashhunt.replays import ReplayOptions, Rerun, prepare
 from crashhunt.trial import KINDS, Disturbance, Outcome
-from crashhunt.whatif._causes import _Search
-from crashhunt.whatif._reruns import Reruns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crashhunt.rates import PairTest, PairWatch
+from crashhunt.statistics import PairTest, PairWatch
 
 
 class Chances(NamedTuple):

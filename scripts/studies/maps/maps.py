@@ -16,10 +16,10 @@ from collections import Counter
 from pathlib import Path
 
 from crashhunt.errors import CrashhuntError
-from crashhunt.maps import MapSource, check_source
-from crashhunt.maps._convert import ConvertOptions, convert
-from crashhunt.maps._source import kind_of_file
-from crashhunt.maps._tools import find_tools
+from crashhunt.sumo.maps import MapSource, check_source
+from crashhunt.sumo.maps._convert import ConvertOptions, convert
+from crashhunt.sumo.maps._source import kind_of_file
+from crashhunt.sumo.maps._tools import find_tools
 
 PROGRAM = Path(sys.executable).with_name("crashhunt")
 OPTIONS = {".xodr": "--opendrive", ".osm": "--osm", ".pbf": "--osm", ".xml": "--net", ".gz": "--osm"}

@@ -17,7 +17,7 @@ import numpy as np
 from crashhunt.disturbances import COPIES_PER_ROOT, FIRST_STEP, cell_of
 from crashhunt.trial import Disturbance, Forced, ForcedCopy, Forcing, Outcome, TrialResult, TrialSpec
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "tests" / "rates"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "tests" / "statistics"))
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import beta
 
 from crashhunt.disturbances import first_forcing
-from crashhunt.rates import (
+from crashhunt.statistics import (
     BLOCK,
     TRIALS_PER_ROOT,
     BarWatch,
@@ -37,7 +37,7 @@ from crashhunt.trial import CRASHES, Forced
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "tests" / "rates"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "tests" / "statistics"))
 
 ALPHA = 0.05
 BETS = Bets()

@@ -37,8 +37,8 @@ from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.base.plugins import locate
 from crashhunt.episode import COPIES_PER_LEVEL, Episode, seed_everything
 from crashhunt.oracles import Overlap, ReportedCollision
-from crashhunt.rates import RareCounter, RateTest, Root, choose_levels, why_unfit
 from crashhunt.scenario import argument_values, load_scenario, with_action
+from crashhunt.statistics import RareCounter, RateTest, Root, choose_levels, why_unfit
 from crashhunt.trial import CRASHES, TrialSpec
 from crashhunt.world import closing_rate
 

@@ -1,0 +1,284 @@
+"""Minimization of a crash, from the original crash to the bundle of the minimized crash."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
+
+from crashhunt.analysis._shrink_runs import Runs, is_same
+from crashhunt.analysis._shrink_stages import Ended, Form, Minimizer
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
+from crashhunt.base.files import put_in_place, sync_folder
+from crashhunt.base.temporary import temporary_beside, temporary_folder
+from crashhunt.crashes import is_bundle_made_here, signature_of, write_bundle
+from crashhunt.episode import scratch_of
+from crashhunt.executors import read_map, run_alone
+from crashhunt.plans import takes_of
+from crashhunt.replays import ReplayOptions, confirm, prepare
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.base.progress import Watch
+    from crashhunt.crashes import Bundle, Signature
+    from crashhunt.replays import Rerun
+    from crashhunt.trial import TrialSpec, Value
+
+__all__ = ["Shrunk", "shrink", "shrunk_name"]
+
+Verdict = Literal["shrunk", "unchanged", "not_reproduced"]
+_MAX_CONFIRMATIONS = 3  # of what is left of a flaky crash
+_DISK_FIX = "free some space and run the same command again, which reuses the results of finished trials"
+
+
+@dataclass(frozen=True, slots=True)
+class Shrunk:
+    """The result of a minimization.
+
+    Args:
+        bundle: bundle of the original crash.
+        verdict: whether the crash was minimized, cannot be minimized, or did not reproduce.
+        ended: how the minimization ended.
+        small: the minimized crash; None if nothing was removed.
+        why: the reason for the end, as text.
+        actors: number of actors in the scenes before and after the minimization, including agents.
+        agents: number of agents in the scenes.
+        trials: number of runs.
+        steps: total number of simulated steps in these runs.
+        removed: the removed actors and disturbances.
+        changed: arguments with a new value: old and new value by name.
+        steps_cut: number of steps that were removed from the beginning.
+        notes: notes on possible causes of different results, as text.
+    """
+
+    bundle: Bundle
+    verdict: Verdict
+    ended: Ended
+    small: Bundle | None = None
+    why: str = ""
+    actors: tuple[int, int] = (0, 0)
+    agents: int = 0
+    trials: int = 0
+    steps: int = 0
+    removed: tuple[str, ...] = ()
+    changed: Mapping[str, tuple[Value | None, Value | None]] = field(default_factory=dict)
+    steps_cut: int = 0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def others(self) -> tuple[int, int]:
+        """The number of actors other than the agents, before and after the minimization."""
+        before, after = self.actors
+        return before - self.agents, after - self.agents
+
+    @property
+    def scripted(self) -> tuple[str, ...] | None:
+        """The actors that follow recorded paths; None if the other actors drive themselves."""
+        script = self.small.result.spec.script if self.small is not None else None
+        return None if script is None else script.names
+
+    def to_json(self) -> JsonObject:
+        """Return the result in the form that ``shrink --json`` prints."""
+        after = self.small or self.bundle
+        return {
+            "crash": self.bundle.id,
+            "path": str(self.small.path) if self.small else None,
+            "verdict": self.verdict,
+            "ended": self.ended,
+            "why": self.why,
+            "signature_kept": self.verdict != "not_reproduced",
+            "confirmed": after.confirmed,
+            "actors_before": self.actors[0],
+            "actors_after": self.actors[1],
+            "steps_before": self.bundle.result.steps,
+            "steps_after": after.result.steps,
+            "trials_run": self.trials,
+            "steps_run": self.steps,
+            "removed": list(self.removed),
+            "changed": {name: list(values) for name, values in self.changed.items()},
+            "scripted": None if self.scripted is None else list(self.scripted),
+            "steps_cut": self.steps_cut,
+            "notes": list(self.notes),
+        }
+
+
+def shrunk_name(crash: str) -> str:
+    """Return the name of the minimized bundle of a crash."""
+    return f"{crash}{layout.SMALL}"
+
+
+def shrink(
+    bundle: Bundle,
+    *,
+    budget: int = 500,
+    time_s: float | None = None,
+    form: Form = "either",
+    parallel: int = 0,
+    watch: Watch | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+    trusted: bool | None = None,
+) -> Shrunk:
+    """Minimize a crash while its crash type stays the same, and write the minimized crash as a bundle next to it.
+
+    The search removes other actors and disturbances, and simplifies arguments: towards their defaults, or rounder. If
+    the crash needs more than a few other actors, these follow their recorded paths. In that form, any path and the
+    beginning can be removed. The result depends only on the crash and the budget, unless the time runs out. An
+    interrupted search keeps the best result, and the same call resumes the search.
+
+    Args:
+        bundle: the crash to minimize.
+        budget: maximum number of trials.
+        time_s: wall-time limit, in s; the two runs that confirm the result take additional time.
+        form: how the other actors move: by themselves (``traffic``), along recorded paths (``scripted``), or depending
+            on the number of remaining actors (``either``).
+        parallel: number of runs at a time; 0 for one per core.
+        watch: function called with the number of finished runs and the maximum number.
+        stopped: function that returns whether to stop; called repeatedly.
+        trusted: whether the code of the crash may run; None to determine it.
+
+    Raises:
+        BundleError: the crash is damaged.
+        UntrustedError: the code of the crash is neither made here nor trusted.
+        CrashhuntError: no trial can be run, or the bundle cannot be written.
+    """
+    if bundle.id.endswith(layout.SMALL):
+        fix = f"give --crash {bundle.id.removesuffix(layout.SMALL)} to minimize the original crash again"
+        raise UsageError(f"{bundle.id!r} is already minimized", fix=fix)
+    if bundle.result.outcome in (Outcome.SURVIVED, Outcome.FINISHED):
+        raise UsageError(f"{bundle.id!r} is a near miss, not a crash", fix="give a crash")
+    if budget < 1:
+        raise UsageError(f"the budget is {budget}", fix="give at least 1 trial")
+    if time_s is not None and not time_s > 0:
+        raise UsageError(f"the time limit is {time_s} s", fix="give more than 0")
+    rerun = prepare(bundle, ReplayOptions(trusted=trusted))
+    signature = signature_of(bundle)
+    memory = bundle.path.with_name(f".{shrunk_name(bundle.id)}.jsonl")
+    with temporary_folder("shrink") as scratch:
+        runs = Runs(
+            rerun, signature, scratch, memory,
+            parallel=parallel or len(os.sched_getaffinity(0)), budget=budget, time_s=time_s,
+            stopped=stopped, watch=watch,
+        )  # fmt: skip
+        try:
+            search = Minimizer(rerun, runs, form, _constructor_defaults(rerun))
+            ended, why = search.run(stopped)
+        finally:
+            runs.close()
+    small = None
+    if search.reproduced and search.best != rerun.spec:
+        try:
+            small = _write_smallest(rerun, search, signature)
+        except OSError as error:
+            message = f"{shrunk_name(bundle.id)!r} cannot be written: {error.strerror or error}"
+            raise BundleError(message, fix=_DISK_FIX, where=str(bundle.path.parent)) from None
+        if small is None:
+            why = "what was left did not do the same in a fresh process"
+    if not search.reproduced:
+        verdict: Verdict = "not_reproduced" if ended == "done" else "unchanged"
+        return Shrunk(
+            bundle=bundle,
+            verdict=verdict,
+            ended=ended,
+            small=None,
+            why=why,
+            actors=search.actors(None),
+            agents=search.agents,
+            trials=runs.count,
+            steps=runs.steps,
+            notes=(*rerun.warnings, *search.notes),
+        )
+    if small is None:
+        return Shrunk(
+            bundle=bundle,
+            verdict="unchanged",
+            ended=ended,
+            small=None,
+            why=why,
+            actors=search.actors(None),
+            agents=search.agents,
+            trials=runs.count,
+            steps=runs.steps,
+            notes=(*rerun.warnings, *search.notes),
+        )
+    if ended == "done":
+        memory.unlink(missing_ok=True)
+    return Shrunk(
+        bundle=bundle,
+        verdict="shrunk",
+        ended=ended,
+        small=small,
+        why=why,
+        actors=search.actors(small.recording()),
+        agents=search.agents,
+        trials=runs.count,
+        steps=runs.steps,
+        removed=search.removed(),
+        changed=search.changed(),
+        steps_cut=search.steps_cut,
+        notes=(*rerun.warnings, *search.notes),
+    )
+
+
+def _constructor_defaults(rerun: Rerun) -> dict[tuple[str, str], Value]:
+    """Return the default arguments of the agents' constructors, by agent and name, if they are plain values."""
+    found: dict[tuple[str, str], Value] = {}
+    for agent, setup in rerun.worker.scenario.agents.items():
+        defaults = takes_of(setup.agent, rerun.worker.code).defaults
+        found |= {(agent, name): default for name, default in defaults.items()}
+    return found
+
+
+def _write_smallest(rerun: Rerun, search: Minimizer, signature: Signature) -> Bundle | None:
+    """Run the smallest candidate in a new process, and write its bundle, which another process then confirms.
+
+    If a candidate does not reproduce, the next larger candidate is run. The result is None if no candidate reproduces.
+    Until the confirmation has ended, the bundle has a temporary name: the bundle of an earlier minimization stays.
+    """
+    bundle = rerun.bundle
+    final = bundle.hunt / layout.CRASHES / shrunk_name(bundle.id)
+    tries = _MAX_CONFIRMATIONS if bundle.confirmed is False else 1
+    for spec in (spec for spec in reversed(search.smaller) for _ in range(tries)):
+        search.best = spec
+        with temporary_beside(final) as building:
+            small = _run_fresh(rerun, search.best, building.name)
+            if is_same(signature_of(small), signature, spec):
+                shrunk: dict[str, object] = {
+                    "of": bundle.id, "removed": list(search.removed()), "changed": _plain(search),
+                }  # fmt: skip
+                if search.steps_cut:
+                    shrunk["steps_cut"] = search.steps_cut
+                return _confirm_smallest(replace(small, added={**small.added, "shrunk": shrunk}), final)
+    return None
+
+
+def _confirm_smallest(small: Bundle, final: Path) -> Bundle:
+    """Confirm the minimized crash, then move its bundle to its final path."""
+    confirmed = confirm(small, trusted=True) or small  # it runs what the whole crash was trusted to run
+    placed = replace(confirmed, path=final)
+    placed.write(into=small.path)
+    put_in_place(small.path, final)
+    sync_folder(final.parent)
+    return placed
+
+
+def _run_fresh(rerun: Rerun, spec: TrialSpec, name: str) -> Bundle:
+    bundle = rerun.bundle
+    with temporary_folder("shrink") as scratch:
+        result = run_alone(replace(rerun.worker, scratch=scratch), spec)
+        assert result is not None  # it is never stopped
+        if result.was_killed_from_outside:
+            raise CrashhuntError(f"a trial was {result.summary}", fix="run the same command again", where=bundle.id)
+        trial = scratch_of(scratch, spec.number)
+        return write_bundle(
+            bundle.hunt, result, trial, hunt_seed=bundle.hunt_seed, snapshot=bundle.snapshot,
+            lanes=read_map(scratch, trial), name=name, authenticate=is_bundle_made_here(bundle),
+        )  # fmt: skip
+
+
+def _plain(search: Minimizer) -> dict[str, list[Value | None]]:
+    return {name: list(values) for name, values in search.changed().items()}

@@ -1,0 +1,12 @@
+from ._frames import TrafficFrame as TrafficFrame
+from ._kernel import Poses as Poses, kernel as kernel
+from ._lane_network import Network as Network
+from ._substep_loop import Onlooker as Onlooker, SkippedObservation as SkippedObservation
+from ._switch import (
+    Acceleration as Acceleration,
+    accelerate as accelerate,
+    switch_off as switch_off,
+    switch_on as switch_on,
+    why_not as why_not,
+)
+from ._versions import kind_of as kind_of, reason_against as reason_against

@@ -1,0 +1,383 @@
+"""Switches the accelerator of highway-env on and off: bit-identical results in a fraction of the time.
+
+The accelerator replaces methods of highway-env's roads, environments and observations, in this process only. For
+everything that it does not know, such as a class that overrides one of these methods, highway-env's own code runs.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Self
+
+from highway_env.envs.common import observation as highway_env_observation
+from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.envs.common.observation import (
+    ExitObservation,
+    KinematicObservation,
+    KinematicsGoalObservation,
+    OccupancyGridObservation,
+)
+from highway_env.envs.highway_env import HighwayEnv
+from highway_env.road.regulation import RegulatedRoad
+from highway_env.road.road import Road
+
+from crashhunt.highway.accelerator._agent_steps import rewards
+from crashhunt.highway.accelerator._observe import (
+    close_objects,
+    fill_lanes,
+    fill_times,
+    observe,
+    observe_exit,
+    observe_goal,
+    observe_grid,
+    observe_in_kernel,
+)
+from crashhunt.highway.accelerator._roads import (
+    forget,
+    frame_of,
+    is_intact,
+    look,
+    methods_of,
+    network_of,
+    take,
+    take_for_observation,
+    watches,
+)
+from crashhunt.highway.accelerator._rules import collide_one_by_one, enforce, finish
+from crashhunt.highway.accelerator._substep_loop import can_run_alone, run_step, simulate
+from crashhunt.highway.accelerator._versions import Watch, is_genuine, kind_of, left_alone, originals, reason_against
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import ModuleType, TracebackType
+
+    from highway_env.road.lane import LaneIndex
+    from highway_env.vehicle.controller import MDPVehicle
+    from highway_env.vehicle.kinematics import Vehicle
+
+
+__all__ = ["Acceleration", "accelerate", "is_on", "left_alone", "switch_off", "switch_on", "why_not"]
+
+
+def switch_on() -> str:
+    """Accelerate highway-env in this process.
+
+    Returns:
+        The reason why highway-env cannot be accelerated; empty if it is accelerated.
+    """
+    if watches:
+        return why_not()
+    _restore()  # a user's module may have put back one of our methods after the accelerator was switched off
+    reason = reason_against()
+    if not reason:
+        alone = can_run_alone()
+        for owner, name, faster in _REPLACEMENTS:
+            current = getattr(owner, name)
+            if alone if owner is AbstractEnv else is_genuine(_qualified(owner, name), current):
+                originals[_name(owner, name)] = current
+                setattr(owner, name, faster)
+        # highway-env calls a replacement of one of our methods, so watching them is unnecessary. The exception is
+        # `neighbour_vehicles`, which accelerated decisions bypass.
+        ours = {_name(owner, name) for owner, name, _ in _REPLACEMENTS}
+        watches["roads"] = Watch.of_roads(ours - {"Road.neighbour_vehicles"})
+        watches["observations"] = Watch.of_observations(ours)
+    return reason
+
+
+def switch_off() -> None:
+    """Restore highway-env's methods; a method that other code has replaced in the meantime is not restored."""
+    forget()
+    _restore()
+
+
+def _restore() -> None:
+    for owner, name, faster in _REPLACEMENTS:
+        if vars(owner).get(name) is faster:
+            setattr(owner, name, originals[_name(owner, name)])
+
+
+def _qualified(owner: type | ModuleType, name: str) -> str:
+    return f"{owner.__qualname__}.{name}" if isinstance(owner, type) else name
+
+
+def _name(owner: type | ModuleType, name: str) -> str:
+    return f"{owner.__qualname__ if isinstance(owner, type) else owner.__name__}.{name}"
+
+
+def is_on() -> bool:
+    """Return whether the accelerator is switched on."""
+    return bool(watches)
+
+
+def why_not() -> str:
+    """Return why the accelerator currently has no effect; empty if it has an effect or is switched off."""
+    return next((watch.reason for watch in [*watches.values()] if watch.reason), "")
+
+
+def _act(self: Road) -> None:
+    if len(self.vehicles) < 2:
+        for vehicle in self.vehicles:
+            vehicle.act()
+        return
+    state = take(self) or look(self)
+    if state is None or not state.roster.decides:
+        originals["Road.act"](self)
+        return
+    state.traffic.act()
+    state.owner.keep(state)
+
+
+def _step(self: Road, dt: float) -> None:
+    if len(self.vehicles) + len(self.objects) < 2 and not any(map(_slides, self.vehicles)):
+        # This is cheaper than the original, which loops over pairs, and than the kernel.
+        for vehicle in self.vehicles:
+            vehicle.step(dt)
+        if len(self.vehicles) + len(self.objects) > 1:
+            collide_one_by_one(self, dt)
+        return
+    state = take(self) or look(self)
+    if state is None or not state.roster.moves or type(dt) is not float:
+        _step_one_by_one(self, dt)
+    elif state.traffic.step(dt):
+        state.owner.keep(state)
+    else:
+        finish(self, dt)
+
+
+def _slides(vehicle: Vehicle) -> bool:
+    """Return whether the kernel computes the dynamic bicycle model of a vehicle, which is slow in highway-env."""
+    kind = kind_of(type(vehicle))
+    return kind.slides and kind.moves
+
+
+def _step_one_by_one(road: Road, dt: float) -> None:
+    """Compute the result of `Road.step`; the kernel checks pairs if it knows the vehicles afterwards."""
+    for vehicle in road.vehicles:
+        vehicle.step(dt)
+    state = look(road) if type(dt) is float else None
+    if state is not None:
+        state.traffic.collide(dt)
+    else:
+        collide_one_by_one(road, dt)
+
+
+def _simulate(self: AbstractEnv, action: object = None) -> None:
+    if self.road is None or len(self.road.vehicles) < 2:
+        originals["AbstractEnv._simulate"](self, action)
+    else:
+        simulate(self, action, _ROAD_REPLACEMENTS, _observe)
+
+
+def _step_env(self: AbstractEnv, action: object) -> object:
+    return run_step(self, action, _simulate)
+
+
+def _rewards(self: HighwayEnv, action: object) -> dict[str, float]:
+    del action  # highway-env's rewards do not depend on it
+    return rewards(self)
+
+
+def _neighbour_vehicles(self: Road, vehicle: Vehicle, lane_index: LaneIndex | None = None) -> object:
+    frame = frame_of(self)
+    row = frame.row.get(id(vehicle)) if frame is not None else None
+    key = lane_index or vehicle.lane_index
+    if frame is not None and row is not None and key:
+        found = frame.neighbours(vehicle, row, key)
+        if found is not None:
+            return found
+    return originals["Road.neighbour_vehicles"](self, vehicle, lane_index)
+
+
+def _close_objects_to(
+    self: Road,
+    vehicle: Vehicle,
+    distance: float,
+    count: int | None = None,
+    see_behind: bool = True,
+    sort: bool = True,
+    vehicles_only: bool = False,
+) -> object:
+    frame = frame_of(self)
+    if frame is not None:
+        found = close_objects(
+            frame, vehicle, distance, count, see_behind=see_behind, sort=sort, vehicles_only=vehicles_only
+        )
+        if found is not None:
+            return found
+    return originals["Road.close_objects_to"](self, vehicle, distance, count, see_behind, sort, vehicles_only)
+
+
+def _enforce_road_rules(self: RegulatedRoad) -> None:
+    kept = take(self)
+    state = kept or look(self)
+    if state is None or not state.roster.predicts or not enforce(self, state.traffic):
+        originals["RegulatedRoad.enforce_road_rules"](self)
+    elif kept is not None and kept.traffic.read():
+        kept.owner.keep(kept)
+
+
+def _observe(self: KinematicObservation) -> object:
+    road = self.env.road
+    kept = take_for_observation(road)
+    if _is_plain(self, KinematicObservation) and _searches(road):
+        state = kept or look(road)
+        found = observe_in_kernel(self, state) if state is not None else None
+        if found is None:
+            found = observe(self, frame_of(road))
+        if found is not None:
+            return found
+    return originals["KinematicObservation.observe"](self)
+
+
+def _searches(road: Road) -> bool:
+    """Return whether highway-env searches a road for close objects; a user's search must run exactly once."""
+    kind = type(road)
+    return kind.close_objects_to is _close_objects_to and kind.close_vehicles_to is _CLOSE_VEHICLES_TO
+
+
+def _observe_exit(self: ExitObservation) -> object:
+    if _is_plain(self, ExitObservation) and _searches(self.env.road):
+        found = observe_exit(self, frame_of(self.env.road))
+        if found is not None:
+            return found
+    return originals["ExitObservation.observe"](self)
+
+
+def _observe_goal(self: KinematicsGoalObservation) -> object:
+    found = observe_goal(self) if _is_plain(self, KinematicsGoalObservation) else None
+    return found if found is not None else originals["KinematicsGoalObservation.observe"](self)
+
+
+def _observe_grid(self: OccupancyGridObservation) -> object:
+    if _is_plain(self, OccupancyGridObservation):
+        found = observe_grid(self, frame_of(self.env.road))
+        if found is not None:
+            return found
+    return originals["OccupancyGridObservation.observe"](self)
+
+
+def _fill_road_layer_by_lanes(
+    self: OccupancyGridObservation, layer_index: int, lane_perception_distance: float = 100
+) -> None:
+    network = network_of(self.env.road) if _is_plain(self, OccupancyGridObservation) else None
+    if network is None or not fill_lanes(self, network, layer_index, lane_perception_distance):
+        originals["OccupancyGridObservation.fill_road_layer_by_lanes"](self, layer_index, lane_perception_distance)
+
+
+def _compute_ttc_grid(
+    env: AbstractEnv, time_quantization: float, horizon: float, vehicle: MDPVehicle | None = None
+) -> object:
+    is_usual = is_intact("observations") and isinstance(env.road, Road)
+    state = look(env.road) if is_usual else None
+    if state is not None:
+        observer = vehicle if vehicle is not None else env.vehicle
+        found = fill_times(env, state, observer, time_quantization, horizon)
+        if found is not None:
+            return found
+    original = originals[_name(highway_env_observation, "compute_ttc_grid")]
+    return original(env, time_quantization, horizon, vehicle)
+
+
+def _is_plain(observation: KinematicObservation | OccupancyGridObservation, kind: Any) -> bool:
+    """Return whether an observation has a known class, observes a road, and has no replaced method."""
+    return bool(
+        type(observation) is kind
+        and is_intact("observations")
+        and isinstance(observation.env.road, Road)
+        and _OBSERVATION_METHODS[kind].isdisjoint(vars(observation))
+    )
+
+
+_CLOSE_VEHICLES_TO = Road.close_vehicles_to
+_OBSERVATIONS = (KinematicObservation, ExitObservation, KinematicsGoalObservation, OccupancyGridObservation)
+_OBSERVATION_METHODS = {kind: methods_of(kind) for kind in _OBSERVATIONS}
+_REPLACEMENTS: tuple[tuple[type | ModuleType, str, Callable[..., object]], ...] = (
+    (Road, "act", _act),
+    (Road, "step", _step),
+    (Road, "neighbour_vehicles", _neighbour_vehicles),
+    (Road, "close_objects_to", _close_objects_to),
+    (RegulatedRoad, "enforce_road_rules", _enforce_road_rules),
+    (AbstractEnv, "_simulate", _simulate),
+    (AbstractEnv, "step", _step_env),
+    (HighwayEnv, "_rewards", _rewards),
+    (KinematicObservation, "observe", _observe),
+    (ExitObservation, "observe", _observe_exit),
+    (KinematicsGoalObservation, "observe", _observe_goal),
+    (OccupancyGridObservation, "observe", _observe_grid),
+    (OccupancyGridObservation, "fill_road_layer_by_lanes", _fill_road_layer_by_lanes),
+    (highway_env_observation, "compute_ttc_grid", _compute_ttc_grid),
+)
+_ROAD_REPLACEMENTS = [replaced for replaced in _REPLACEMENTS if replaced[0] in (Road, RegulatedRoad)]
+
+
+# ``crashhunt.accelerate()`` accelerates highway-env in the user's process, such as a training of a policy.
+
+
+class Acceleration:
+    """The current state of the acceleration: true if highway-env is accelerated.
+
+    As a context manager, it switches the accelerator off at the end of the block, unless it was on before.
+    """
+
+    def __init__(self, reason: str, *, before: bool) -> None:
+        self._reason = reason
+        self._before = before
+
+    @property
+    def reason(self) -> str:
+        """Why highway-env is not accelerated, such as a missing kernel; empty if it is accelerated."""
+        if self._reason:
+            return self._reason
+        return why_not() if is_on() else "it has been undone"
+
+    @property
+    def left_alone(self) -> dict[str, tuple[str, ...]]:
+        """Classes of vehicles that are not or only partly accelerated, each with the members that it overrides."""
+        return {name: tuple(own) for name, own in left_alone.items()}
+
+    def undo(self) -> None:
+        """Switch the accelerator off."""
+        switch_off()
+
+    def __bool__(self) -> bool:
+        return not self.reason
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if not self._before:
+            self.undo()
+
+    def __repr__(self) -> str:
+        if self.reason:
+            return f"<highway-env is not accelerated: {self.reason}>"
+        own = "; ".join(f"{name} has its own {', '.join(names)}" for name, names in self.left_alone.items())
+        return f"<highway-env is accelerated{f', but {own}' if own else ''}>"
+
+
+def accelerate() -> Acceleration:
+    """Accelerate highway-env in this process: bit-identical results in a fraction of the time.
+
+    Hunts call this function automatically. Call it in your own process, for example for training. In every
+    step, the accelerator checks for cases that it does not know. highway-env's own code runs in these cases:
+
+    - another version of highway-env
+    - an installation of crashhunt without the compiled kernel, which needs a C++ compiler
+    - your classes that override an accelerated method
+    - functions and methods that other code has replaced, on a class, a module or an object
+
+    Returns:
+        The state of the acceleration. The truth value of this object is whether highway-env is accelerated. ``reason``
+        is the reason if not. ``left_alone`` lists classes that are not accelerated. ``undo()``, or the end of a
+        ``with`` block, switches the accelerator off.
+
+    Example:
+        >>> import crashhunt
+        >>> with crashhunt.accelerate() as faster:
+        ...     print(faster)
+        <highway-env is accelerated>
+    """
+    before = is_on()
+    return Acceleration(switch_on(), before=before)

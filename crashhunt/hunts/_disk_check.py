@@ -1,0 +1,541 @@
+"""Checks that the files of hunts, suites, crashes and exported crashes are complete and unchanged."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, cast
+
+from crashhunt.base import layout
+from crashhunt.base.codec import JsonObject, Serializable
+from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError, remedy
+from crashhunt.base.files import cannot_write, is_empty_folder, sync_folder, sync_tree
+from crashhunt.base.resources import error_of_next_files, limit_behind
+from crashhunt.base.temporary import has_ended, new_folder, owner_in
+from crashhunt.crashes import Bundle, read_bundle, read_params
+from crashhunt.ledger import Ledger, has_begun
+from crashhunt.plans import HuntSettings, read_settings, write_settings
+from crashhunt.results import find_hunts, hunt_state, is_hunt
+from crashhunt.snapshots import Snapshot
+from crashhunt.trial import TrialResult
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from crashhunt.ledger import Noted, Row
+
+
+__all__ = ["CheckFinding", "Checked", "check", "intact_snapshots", "salvage"]
+
+
+_MAX_SHOWN = 5
+_MAX_OPEN_FILES = 4  # at a time: a folder, and the ledger with its write-ahead log and shared memory
+
+
+@dataclass(frozen=True, slots=True)
+class CheckFinding(Serializable):
+    """A problem that the check has found.
+
+    Args:
+        where: path of the file or folder.
+        what: description of the problem.
+        lost: the data that are lost, as text; empty if nothing is lost.
+        fix: how to recover the remaining data.
+        damaged: whether the problem is damage; otherwise it is harmless.
+    """
+
+    where: str
+    what: str
+    lost: str = ""
+    fix: str = ""
+    damaged: bool = True
+
+
+@dataclass(slots=True)
+class Checked:
+    """The result of the check of a hunt, a crash or an exported crash.
+
+    Args:
+        dir: path of the hunt or crash.
+        kind: either ``hunt``, ``crash`` or ``file``.
+        protected: whether every trial has a digest; the ledgers of early versions have none.
+        trials: the numbers of the trials whose rows are unchanged since they were written.
+        damaged_trials: reason for each damaged trial.
+        crashes: the names of the bundles that are unchanged since they were written.
+        near_misses: the names of the bundles of near misses among them, and of a hunt.
+        damaged_crashes: reason for each damaged crash.
+        findings: the problems that were found.
+        dropped: the trials whose bundles were deleted, because shorter crashes of their type were kept.
+    """
+
+    dir: Path
+    kind: str = "hunt"
+    protected: bool = True
+    trials: set[int] = field(default_factory=set)
+    damaged_trials: set[int] = field(default_factory=set)
+    crashes: list[str] = field(default_factory=list)
+    near_misses: list[str] = field(default_factory=list)
+    damaged_crashes: list[str] = field(default_factory=list)
+    findings: list[CheckFinding] = field(default_factory=list)
+    dropped: set[int] = field(default_factory=set)
+
+    @property
+    def minimized(self) -> int:
+        """The number of minimized crashes, which lie next to their original crashes."""
+        return sum(name.endswith(layout.SMALL) for name in self.crashes) if self.kind == "hunt" else 0
+
+    @property
+    def crash_count(self) -> int:
+        """The number of unchanged crashes, without minimized crashes and near misses."""
+        return len(set(self.crashes) - set(self.near_misses)) - self.minimized
+
+    @property
+    def fine(self) -> bool:
+        """Whether no data are damaged."""
+        return not any(finding.damaged for finding in self.findings)
+
+    def to_json(self) -> JsonObject:
+        """Return the result for one hunt in the form that ``check --json`` prints."""
+        return {
+            "dir": str(self.dir),
+            "kind": self.kind,
+            "fine": self.fine,
+            "protected": self.protected,
+            "trials": len(self.trials),
+            "damaged_trials": sorted(self.damaged_trials),
+            "crashes": self.crashes,
+            "damaged_crashes": self.damaged_crashes,
+            "findings": [finding.to_json() for finding in self.findings],
+        }
+
+
+def check(directory: Path) -> list[Checked]:
+    """Check a hunt, the hunts of a suite, a crash, or an exported file.
+
+    Raises:
+        HuntDirectoryError: the directory or file is none of these.
+        CrashhuntError: the limit on open files is too low. A file that cannot be opened would count as damaged.
+    """
+    if no_file := error_of_next_files(_MAX_OPEN_FILES):
+        fix = limit_behind(no_file) or remedy(no_file)
+        raise CrashhuntError(f"the check cannot open files: {no_file.strerror}", fix=fix, where=str(directory))
+    if directory.is_file():
+        return [_check_file(directory)]
+    if (directory / layout.CRASH).exists():
+        found = Checked(directory, "crash")
+        bundle = _check_bundle(found, directory)
+        if bundle is not None:
+            _check_snapshot(found, bundle.hunt / layout.SNAPSHOTS / bundle.snapshot, bundle.id)
+        return [found]
+    return [_check_hunt(hunt) for hunt in find_hunts(directory)]
+
+
+def intact_snapshots(hunt: Path) -> Iterator[Snapshot]:
+    """Yield the snapshots of a hunt that are unchanged since they were written."""
+    for path in sorted((hunt / layout.SNAPSHOTS).glob(layout.SHOWN)):
+        with suppress(CrashhuntError):
+            snapshot = Snapshot(path)
+            if not _snapshot_faults(snapshot):
+                yield snapshot
+
+
+def _check_file(path: Path) -> Checked:
+    from crashhunt.crashes import open_archive
+
+    found = Checked(path, "file")
+    try:
+        with open_archive(path) as archive:
+            inside = Checked(archive.directory)
+            _check_settings(inside, archive.directory)
+            _check_parts(inside, archive.directory)
+            found.crashes, found.damaged_crashes = inside.crashes, inside.damaged_crashes
+            found.findings += inside.findings
+            if not inside.crashes and not inside.damaged_crashes:
+                found.findings.append(
+                    CheckFinding(
+                        where=str(path), what="there is no crash in it", lost="the crash", fix="export it again"
+                    )
+                )
+    except BundleError as error:
+        found.findings.append(CheckFinding(where=str(path), what=error.message, lost="the crash", fix=error.fix))
+    return found
+
+
+def _check_hunt(hunt: Path) -> Checked:
+    found = Checked(hunt)
+    settings = _check_settings(found, hunt) if (hunt / layout.HUNT).exists() or has_begun(_ledger(hunt)) else None
+    rows = _check_ledger(found, hunt, settings)
+    bundles = _check_parts(found, hunt)
+    if rows is not None:
+        _compare(found, rows, bundles, settings)
+    _find_leftovers(found, hunt)
+    return found
+
+
+def _check_settings(found: Checked, hunt: Path) -> HuntSettings | None:
+    try:
+        return read_settings(hunt / layout.HUNT)
+    except HuntDirectoryError as error:
+        lost = "what the hunt was asked"
+        fix = "copy the hunt.toml of a snapshot there"
+        found.findings.append(CheckFinding(where=str(hunt / layout.HUNT), what=error.message, lost=lost, fix=fix))
+    for snapshot in intact_snapshots(hunt):
+        with suppress(CrashhuntError):
+            return snapshot.settings()
+    return None
+
+
+def _ledger(hunt: Path) -> Path:
+    return hunt / layout.LEDGER
+
+
+def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> dict[int, TrialResult] | None:
+    """Check the rows of the ledger; return its crashes, or an empty result if the ledger cannot be read."""
+    path = _ledger(hunt)
+    if not has_begun(path):
+        if (hunt / layout.CRASHES).is_dir() and not (hunt / layout.CASE).is_file():
+            found.findings.append(
+                CheckFinding(where=str(path), what="is missing", lost="all trials but the crashes", fix=_RESUME_FIX)
+            )
+        return None
+    try:
+        with closing(Ledger(path)) as ledger:
+            found.protected = ledger.protected
+            if not ledger.protected:
+                note = "an earlier crashhunt wrote it, and its rows have no digests: not every change would be seen"
+                found.findings.append(CheckFinding(str(path), note, damaged=False))
+            elif not ledger.sealed and hunt_state(hunt).state != "running":
+                note = "its writer was killed; a missing trial would not be detected"
+                found.findings.append(CheckFinding(str(path), note, damaged=False))
+            try:
+                _read_everything(ledger)
+                found.trials = ledger.finished()
+                dropped = ledger.facts().get("dropped") or {}
+                found.dropped = {number for numbers in dropped.values() for number in numbers}
+            except HuntDirectoryError as error:
+                _count_rows(found, ledger, settings, error)
+            crashes = {}
+            for number, row in ledger.intact_rows(sorted(found.trials)):
+                if row is not None and settings is not None and row[2] in settings.crash_on:
+                    crashes[number] = row[10]
+            return {number: TrialResult.from_json(json.loads(text)) for number, text in crashes.items()}
+    except HuntDirectoryError as error:
+        found.findings.append(
+            CheckFinding(where=str(path), what=error.message, lost="all trials but the crashes", fix=_RESUME_FIX)
+        )
+        return None
+
+
+_RESUME_FIX = "crashhunt check --salvage TO copies the intact part, and the same hunt resumes there"
+
+
+def _read_everything(ledger: Ledger) -> None:
+    for rows in (ledger.results(), ledger.table(), ledger.turns()):
+        for _ in rows:
+            pass
+    for read in (ledger.facts, ledger.events, ledger.replaced, ledger.outcomes, ledger.steps_total):
+        read()
+    ledger.check_pages()
+
+
+def _count_rows(found: Checked, ledger: Ledger, settings: HuntSettings | None, error: HuntDirectoryError) -> None:
+    most = settings.trials if settings is not None else 0
+    with suppress(HuntDirectoryError):
+        most = max(most, 1 + max(ledger.finished(), default=-1))
+    for number, row in ledger.intact_rows(range(most)):
+        (found.trials if row is not None else found.damaged_trials).add(number)
+    shown = ", ".join(str(number) for number in sorted(found.damaged_trials)[:_MAX_SHOWN])
+    more = len(found.damaged_trials) - _MAX_SHOWN
+    lost = f"trials {shown}{f' and {more} more' if more > 0 else ''}" if shown else ""
+    found.findings.append(
+        CheckFinding(
+            where=error.where, what=error.message.removeprefix("the ledger is damaged: "), lost=lost, fix=_RESUME_FIX
+        )
+    )
+
+
+def _check_parts(found: Checked, hunt: Path) -> dict[str, Bundle]:
+    """Check bundles, snapshots and kept trials; return the intact bundles."""
+    bundles = {}
+    for folder in sorted((hunt / layout.CRASHES).glob(layout.SHOWN)):
+        bundle = _check_bundle(found, folder)
+        if bundle is not None:
+            bundles[folder.name] = bundle
+    other = _check_other_bundles(found, hunt)
+    needed = {bundle.snapshot: bundle.id for bundle in (*other, *reversed(bundles.values()))}
+    there = {path.name for path in (hunt / layout.SNAPSHOTS).glob(layout.SHOWN)}
+    for name in sorted(there | needed.keys()):
+        _check_snapshot(found, hunt / layout.SNAPSHOTS / name, needed.get(name, ""))
+    for folder in sorted((hunt / layout.TRIALS).glob(layout.SHOWN)):
+        for fault in read_params(folder):
+            found.findings.append(CheckFinding(str(folder), fault, "what the trial printed"))
+    return bundles
+
+
+def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
+    try:
+        bundle = read_bundle(folder)
+        faults = bundle.faults()
+        bundle.recording()
+    except CrashhuntError as error:
+        found.findings.append(
+            CheckFinding(
+                where=error.where or str(folder), what=error.message, lost=f"the crash {folder.name}", fix=_RERUN_FIX
+            )
+        )
+        found.damaged_crashes.append(folder.name)
+        return None
+    if not bundle.files:
+        note = "an earlier crashhunt wrote it, without digests: not every change would be seen"
+        found.findings.append(CheckFinding(str(folder / layout.CRASH), note, damaged=False))
+    for fault in faults:
+        added = fault.endswith("was not there")
+        found.findings.append(CheckFinding(str(folder), fault, "" if added else "that file", damaged=not added))
+    if any(not fault.endswith("was not there") for fault in faults):
+        found.damaged_crashes.append(folder.name)
+    else:
+        found.crashes.append(folder.name)
+        found.near_misses += [folder.name] if bundle.is_near_miss else []
+    return bundle
+
+
+def _check_other_bundles(found: Checked, hunt: Path) -> list[Bundle]:
+    """Return the intact bundles of near misses, probes and branches; damaged ones can be made again from the ledger."""
+    whole = []
+    options = {layout.NEAR_MISSES: "--near-misses", layout.PROBES: "--probe", layout.BRANCHES: "--branch"}
+    for place, option in options.items():
+        for folder in sorted((hunt / place).glob(layout.SHOWN)):
+            one = Checked(folder, "crash")
+            bundle = _check_bundle(one, folder)
+            if bundle is not None:
+                whole.append(bundle)
+                found.near_misses += one.near_misses
+            fix = f"remove it: the same hunt with {option} makes it again"
+            lost = f"the near miss {folder.name}" if place == layout.NEAR_MISSES else f"{place}/{folder.name}"
+            for finding in one.findings:
+                found.findings.append(replace(finding, lost=lost, fix=fix) if finding.damaged else finding)
+    return whole
+
+
+_RERUN_FIX = "crashhunt check --salvage TO leaves it out, and the same hunt runs its trial again there"
+
+
+def _snapshot_faults(snapshot: Snapshot) -> list[str]:
+    faults = snapshot.faults()
+    if not faults:
+        snapshot.environment()
+        snapshot.settings()
+        snapshot.scenario()
+    return faults
+
+
+def _check_snapshot(found: Checked, path: Path, crash: str) -> None:
+    lost = f"replays of {crash} and others by the code that ran" if crash else "the code that ran"
+    fix = "get a copy of it from elsewhere; replay --from-log and --code current may do without"
+    if not path.is_dir():
+        found.findings.append(
+            CheckFinding(where=str(path), what="is missing", lost=lost, fix="get a copy of it from elsewhere")
+        )
+        return
+    snapshot = Snapshot(path)
+    try:
+        faults = _snapshot_faults(snapshot)
+        for name in snapshot.additions():
+            note = f"{name} was added; it is no module, so it never runs"
+            found.findings.append(CheckFinding(str(path), note, damaged=False))
+    except CrashhuntError as error:
+        faults = [error.message]
+    for fault in faults[:_MAX_SHOWN]:
+        found.findings.append(CheckFinding(where=str(path), what=fault, lost=lost, fix=fix))
+    if len(faults) > _MAX_SHOWN:
+        found.findings.append(
+            CheckFinding(where=str(path), what=f"and {len(faults) - _MAX_SHOWN} more of its files", lost=lost, fix=fix)
+        )
+
+
+def _compare(
+    found: Checked, rows: dict[int, TrialResult], bundles: dict[str, Bundle], settings: HuntSettings | None
+) -> None:
+    """Compare the crashes in the ledger with the bundles."""
+    # One that was made smaller is another trial, of which the ledger knows nothing.
+    own = (bundle for name, bundle in bundles.items() if not name.endswith(layout.SMALL))
+    by_trial = {bundle.result.spec.number: bundle for bundle in own}
+    damaged = {int(name.partition("-")[0]) for name in found.damaged_crashes if name.partition("-")[0].isdecimal()}
+    for number, bundle in by_trial.items():
+        where = str(bundle.path)
+        if settings is not None and bundle.hunt_seed != settings.seed:
+            what = f"it is of a hunt with seed {bundle.hunt_seed}, and this one has {settings.seed}"
+            found.findings.append(CheckFinding(where=where, what=what, lost="", fix="put it back to where it is from"))
+        elif number not in rows:
+            if number not in found.damaged_trials:
+                what = "the ledger has no crash of its trial"
+                found.findings.append(
+                    CheckFinding(
+                        where=where, what=what, lost="", fix="run the same command again: the hunt resumes with it"
+                    )
+                )
+        elif rows[number].digest != bundle.result.digest or rows[number].outcome is not bundle.result.outcome:
+            found.findings.append(
+                CheckFinding(
+                    where=where, what="the ledger says something else about its trial", lost="", fix=_RERUN_FIX
+                )
+            )
+    for number in sorted(rows.keys() - by_trial.keys() - damaged - found.dropped):
+        if hunt_state(found.dir).state != "running":
+            what = f"trial {number} crashed, and its bundle is missing"
+            found.findings.append(
+                CheckFinding(
+                    where=str(found.dir / layout.CRASHES), what=what, lost="its log and evidence", fix=_RERUN_FIX
+                )
+            )
+
+
+def _find_leftovers(found: Checked, hunt: Path) -> None:
+    if not is_hunt(hunt) or hunt_state(hunt).state == "running":
+        return
+    places = (
+        hunt.glob(".*.*"),
+        (hunt / layout.CRASHES).glob(".*"),
+        *((hunt / place).glob(".*") for place in layout.BESIDE),
+        (hunt / layout.SNAPSHOTS).glob(".*"),
+        hunt.glob(f"{layout.SCRATCH}*"),
+    )
+    for path in sorted({path for place in places for path in place}):
+        owner = owner_in(path.name)
+        if owner is not None and not has_ended(owner) and not path.name.startswith(layout.SCRATCH):
+            continue  # shrink may be writing it, here or on another host
+        remembers = path.name.endswith(f"{layout.SMALL}.jsonl")
+        why = "shrink resumes from it" if remembers else "its writer was killed"
+        what = f"{why}; it may be removed"
+        found.findings.append(CheckFinding(str(path), what, damaged=False))
+
+
+# What can be saved of a hunt that is damaged, in a directory of its own.
+
+
+def salvage(found: Checked, to: Path) -> dict[str, int]:
+    """Copy the intact part of a hunt, so that the copy can resume; return the number of trials and of crashes.
+
+    A crash with a damaged bundle is skipped together with its row, so its trial runs again.
+
+    Args:
+        found: result of the check of the hunt.
+        to: path of a new or empty directory. The copy is moved to this path when it is complete. If the directory
+            already contains exactly the copied data, because an earlier call was killed at its end, the call does
+            nothing.
+
+    Raises:
+        HuntDirectoryError: the directory has other contents or cannot be written, or the settings of the hunt are lost.
+    """
+    if found.kind != "hunt":
+        raise HuntDirectoryError(
+            f"{str(found.dir)!r} has no part of a hunt that can be recovered", fix="give the directory of a hunt"
+        )
+    settings = _settings(found.dir)
+    try:
+        if to.exists() and not is_empty_folder(to):
+            if not _is_same(found, settings, to):
+                raise HuntDirectoryError("the directory exists already", fix="give a new directory", where=str(to))
+            return {"trials": len(_copied_trials(found, settings)), "crashes": found.crash_count}
+        with new_folder(to) as building:
+            trials = _copy(found, settings, building, to)
+        sync_folder(to.absolute().parent, to)
+    except (OSError, shutil.Error) as error:
+        wrong = error if not isinstance(error, shutil.Error) else OSError(0, str(error.args[0][0][2]))
+        raise cannot_write(to, wrong) from error
+    return {"trials": trials, "crashes": found.crash_count}
+
+
+def _copy(found: Checked, settings: HuntSettings, building: Path, to: Path) -> int:
+    """Copy all files into a temporary folder, which is moved later; return the number of trials in it."""
+    for snapshot in intact_snapshots(found.dir):
+        shutil.copytree(snapshot.path, building / layout.SNAPSHOTS / snapshot.digest)
+    for name in found.crashes:
+        shutil.copytree(found.dir / layout.CRASHES / name, building / layout.CRASHES / name)
+    for name in (layout.TRIALS, layout.REQUEST):
+        source = found.dir / name
+        if source.is_dir():
+            shutil.copytree(source, building / name)
+        elif source.is_file():
+            shutil.copy(source, building / name)
+    trials = _copy_rows(found, settings, building)
+    sync_tree(building)
+    command = ["crashhunt", "check", str(found.dir), "--salvage", str(to)]
+    write_settings(building / layout.HUNT, settings, command, like=found.dir / layout.HUNT)
+    return trials
+
+
+def _is_same(found: Checked, settings: HuntSettings, to: Path) -> bool:
+    """Return whether a directory already contains the data to copy, and no hunt has resumed in it."""
+    with suppress(HuntDirectoryError), closing(Ledger(to / layout.LEDGER)) as ledger:
+        facts = ledger.facts()
+        return (
+            (to / layout.HUNT).is_file()
+            and (facts.get("state"), facts.get("detail")) == ("interrupted", _detail(found))
+            and ledger.finished() == _copied_trials(found, settings)
+            and {path.name for path in (to / layout.CRASHES).glob(layout.SHOWN)} == set(found.crashes)
+        )
+    return False
+
+
+def _detail(found: Checked) -> str:
+    return f"what was whole of {found.dir}"
+
+
+def _settings(hunt: Path) -> HuntSettings:
+    try:
+        return read_settings(hunt / layout.HUNT)
+    except HuntDirectoryError:
+        for snapshot in intact_snapshots(hunt):
+            return snapshot.settings()
+        raise
+
+
+def _copy_rows(found: Checked, settings: HuntSettings, to: Path) -> int:
+    """Copy the intact rows of trials, except those of crashes whose bundle is missing or damaged."""
+    with closing(Ledger(to / layout.LEDGER, writable=True)) as ledger:
+        count = 0
+        source = found.dir / layout.LEDGER
+        kept: Noted = {}
+        if found.trials and has_begun(source):
+            with closing(Ledger(source)) as old:
+                try:
+                    names = _KEPT_FACTS | _DROPPED_FACTS if found.dropped else _KEPT_FACTS
+                    kept = cast("Noted", {name: fact for name, fact in old.facts().items() if name in names})
+                except HuntDirectoryError:
+                    kept = {"replanned": True}  # it is not known, and True forbids a p-value
+                ledger.propose(old.intact_turns())
+                for _, row in _copied_rows(found, settings, old):
+                    ledger.copy(row)
+                    count += 1
+        ledger.note(**kept)
+        ledger.enter("interrupted", _detail(found), planned=settings.trials, hunt_seed=settings.seed)
+    return count
+
+
+# How the copied trials were drawn, which their rows do not show. Without its sampler's version, a hunt cannot resume.
+_KEPT_FACTS = frozenset((
+    "code_versions", "crash_on", "disturb", "independent", "lag", "lag_grows", "origins", "plain_origin", "replanned",
+    "sampler_version", "under_way",
+))  # fmt: skip
+_DROPPED_FACTS = frozenset(("dropped", "dropped_at_fault", "dropped_judged"))  # about crashes without a bundle
+
+
+def _copied_rows(found: Checked, settings: HuntSettings, ledger: Ledger) -> Iterator[tuple[int, Row]]:
+    """Yield the number and the row of each trial that is copied."""
+    bundles = {int(name.partition("-")[0]) for name in found.crashes if name.partition("-")[0].isdecimal()}
+    for number, row in ledger.intact_rows(sorted(found.trials)):
+        if row is not None and (row[2] not in settings.crash_on or number in bundles or number in found.dropped):
+            yield number, row
+
+
+def _copied_trials(found: Checked, settings: HuntSettings) -> set[int]:
+    """Return the numbers of the trials that are copied."""
+    source = found.dir / layout.LEDGER
+    if not found.trials or not has_begun(source):
+        return set()
+    with closing(Ledger(source)) as ledger:
+        return {number for number, _ in _copied_rows(found, settings, ledger)}

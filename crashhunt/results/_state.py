@@ -1,0 +1,778 @@
+"""The state of a hunt, which any process can read from its directory at any time."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import math
+import os
+import shutil
+import socket
+import time
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
+
+from crashhunt.base import layout
+from crashhunt.base.codec import OMIT_DEFAULT, Serializable, written_if
+from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError
+from crashhunt.base.files import whole_file
+from crashhunt.base.integrity import changed_file
+from crashhunt.base.temporary import remove_ended, remove_scratch, temporary_beside, this_process
+from crashhunt.base.text import command_line, near_path
+from crashhunt.crashes import crash_folders, files_of
+from crashhunt.ledger import KindData, Ledger, RunningRate, damaged, has_begun
+from crashhunt.plans import HuntSettings, read_settings, write_settings
+from crashhunt.results._code_versions import count_versions
+from crashhunt.results._found_crashes import outcomes_of_crashes, tally_crashes
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from crashhunt.base.integrity import FileEntry
+    from crashhunt.ledger import Facts, HuntOwner
+
+
+__all__ = [
+    "BRANCHES",
+    "HEARTBEAT_S",
+    "PROBES",
+    "BranchSums",
+    "HuntDirectory",
+    "HuntState",
+    "LogKind",
+    "LogReader",
+    "ProbeSums",
+    "State",
+    "copies_to_come",
+    "draws_independently",
+    "find_hunts",
+    "find_searches",
+    "hunt_state",
+    "is_case",
+    "is_hunt",
+    "ledger_owner",
+    "state_of_facts",
+    "sums_of_branches",
+    "sums_of_probes",
+    "trials_of_running",
+]
+
+
+# What has come of the copies of a hunt's trials so far, as its ledger sums it up.
+
+PROBES, BRANCHES, RARE = "probes", "branches", "rare"
+
+
+class ProbeSums(TypedDict):
+    """The results of the robustness probes of a hunt in ``status --json``.
+
+    Args:
+        trials: number of trials in which all probes have a result.
+        not_fully_asked: number of further trials in which a probe has no result.
+        least: the smallest robustness margin of the trials in which all probes have a result; None if there is no such
+            trial.
+        trial: the number of the trial with the smallest margin; None if there is no such trial.
+        probes: number of probes.
+        steps: number of simulated steps of the forks.
+        left_out: number of probes that were skipped because the forks had used up their steps.
+        crashed_trials: number of trials without a crash in which a probe crashed.
+        run_again: number of the mildest crashing disturbances that were run from the start; None before these runs.
+        confirmed: number of these runs that crashed.
+    """
+
+    trials: int
+    not_fully_asked: int
+    least: float | None
+    trial: int | None
+    probes: int
+    steps: int
+    left_out: int
+    crashed_trials: int
+    run_again: int | None
+    confirmed: int | None
+
+
+class BranchSums(TypedDict):
+    """The results of the branches of a hunt in ``status --json``, with fields as in `ProbeSums`.
+
+    Args:
+        trials: number of trials in which branches were possible.
+        moments: number of steps after which forks continued.
+        branches: number of branches.
+        steps: number of simulated steps of the forks.
+        left_out: number of branches that were skipped because the forks had used up their steps.
+        crashed: number of branches that crashed.
+        crashed_trials: number of trials with a crashed branch.
+        not_fully_asked: number of trials in which a branch has no result.
+        run_again: number of the likeliest crashed branches that were run from the start; None before these runs.
+        confirmed: number of these runs that crashed.
+    """
+
+    trials: int
+    moments: int
+    branches: int
+    steps: int
+    left_out: int
+    crashed: int
+    crashed_trials: int
+    not_fully_asked: int
+    run_again: int | None
+    confirmed: int | None
+
+
+def copies_to_come(settings: HuntSettings) -> list[str] | None:
+    """Return the kinds of forks that a hunt's trials have: probes, branches or both; None for neither."""
+    every = ((PROBES, settings.probe), (BRANCHES, settings.branch), (RARE, settings.rare))
+    return [name for name, wanted in every if wanted] or None
+
+
+def sums_of_probes(ledger: Ledger, facts: Facts) -> ProbeSums | None:
+    """Return the present results of the probes of a hunt; None if it has no probes."""
+    if PROBES not in (facts.get("copies") or ()):
+        return None
+    (row,) = ledger.summed(
+        # Of a query with one min(), SQLite takes what stands bare from the row that has it.
+        "count(margin), min(margin), number, total(probes), total(steps), total(left_out), total(crashed), "
+        "count(probes)",
+        "SELECT number, {stress.margin} AS margin, {stress.probes} AS probes, {stress.steps} AS steps, "
+        "{stress.left_out} AS left_out, {stress.disturbance} IS NOT NULL AS crashed",
+    )
+    trials, least, trial, probes, steps, left_out, crashed, asked = row
+    again, confirmed = _verified_counts(facts, PROBES)
+    return {
+        "trials": trials, "not_fully_asked": asked - trials, "least": least, "trial": trial if trials else None,
+        "probes": int(probes), "steps": int(steps), "left_out": int(left_out), "crashed_trials": int(crashed),
+        "run_again": again, "confirmed": confirmed,
+    }  # fmt: skip
+
+
+def sums_of_branches(ledger: Ledger, facts: Facts) -> BranchSums | None:
+    """Return the present results of the branches of a hunt; None if it has no branches."""
+    if BRANCHES not in (facts.get("copies") or ()):
+        return None
+    (row,) = ledger.summed(
+        "count(asked), total(moments), total(asked), total(steps), total(left_out), total(crashed), total(crashed > "
+        "0), total(unanswered > 0)",
+        "SELECT {branches.moments} AS moments, {branches.asked} AS asked, {branches.steps} AS steps, "
+        "{branches.left_out} AS left_out, {branches.unanswered} AS unanswered, json_array_length(data, "
+        "'$.branches.crashes') AS crashed",
+    )
+    trials, moments, branches, steps, left_out, crashed, crashed_trials, not_fully_asked = map(int, row)
+    again, confirmed = _verified_counts(facts, BRANCHES)
+    return {
+        "trials": trials, "moments": moments, "branches": branches, "steps": steps, "left_out": left_out,
+        "crashed": crashed, "crashed_trials": crashed_trials, "not_fully_asked": not_fully_asked,
+        "run_again": again, "confirmed": confirmed,
+    }  # fmt: skip
+
+
+def _verified_counts(facts: Facts, name: str) -> tuple[int | None, int | None]:
+    """Return the number of fork crashes that were run from the start, and how many of these runs crashed."""
+    found = None if facts.get("state") == "running" else (facts.get("confirmed") or {}).get(name)  # of an earlier run
+    return (found[0], found[1]) if found else (None, None)
+
+
+State = Literal["queued", "running", "finished", "crashed", "error", "interrupted", "killed"]
+
+_HUNT_FILES = (layout.LEDGER, layout.REQUEST, layout.HUNT)  # of a hunt, or of one that is planned
+_MAX_DEPTH = 2  # of hunts below the directory of a suite
+HEARTBEAT_S = 1.0  # every so often a hunt says in its ledger that it is alive
+_HEARTBEAT_DELAY_S = 20.0  # how much later than its last heartbeat a running hunt may be
+_SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
+_STATE_BY_REASON: dict[str, State] = {
+    "crash": "crashed", "distinct": "crashed", "all_trials": "finished", "no_valid_trial": "error",
+    "rate": "finished", "interrupted": "interrupted", "time": "finished", "precise": "finished", "refused": "finished",
+    "error": "error", "queued": "queued",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class HuntState(Serializable):
+    """The state of a hunt.
+
+    Args:
+        dir: directory of the hunt.
+        state: the state of the hunt: ``queued``, ``running``, ``finished`` (no crash), ``crashed`` (a crash was found),
+            ``error``, ``interrupted`` or ``killed`` (its process ended without recording a reason).
+        detail: the reason of an error.
+        trials_planned: number of planned trials; 0 if only the time is limited.
+        trials_run: number of finished trials.
+        outcomes: number of trials with each outcome.
+        crashes: number of crashes, with or without a bundle.
+        crashes_saved: number of crashes with a bundle, if ``--keep`` has deleted some bundles; else None.
+        errors: number of trials that could not be set up, or ended in a software fault.
+        rate_per_s: trials per second in the last run of the hunt.
+        seconds_left: expected time to the last trial, to the time limit, or to the end of the phase, in s; None if
+            unknown.
+        owner_alive: whether the process of the hunt is running.
+        damaged: whether the ledger of the hunt cannot be read, so that the counts are meaningless.
+        phase: phase of the hunt after its last trial: fields of `PhaseStatus` without the time; None before these
+            phases, and if the hunt is not running.
+        disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
+        probes: present results of the probes; None if the hunt has no probes.
+        branches: present results of the branches; None if the hunt has no branches.
+        rate: the crash rate at the hunt's last heartbeat, with the fields of `RunningRate`; None if it is unknown.
+        core: whether the simulator's compiled core is used; None if the simulator has none.
+        notices: what trials test otherwise than the user's files say, such as demand that the simulator omits;
+            None if there is nothing.
+        nodes: the machines of the hunt's last run, with the fields of `NodeFigures`; None if it used only this machine.
+        kinds: crash types, the most frequent first, with the fields of `KindData`; None if the hunt ends at its first
+            crash.
+        newest_kind_s: time from the last new crash type until now, or until the last trial ended, in s; None if it is
+            unknown.
+        types_by_cause: number of crash types by cause; None without ``--by-cause``.
+        code_versions: the trials of each version of the code, with the fields of `VersionCounts`; None if all trials
+            ran with the same code. Crash types and rate are those of the newest version.
+    """
+
+    dir: str
+    state: State
+    detail: str = ""
+    trials_planned: int = 0
+    trials_run: int = 0
+    outcomes: dict[str, int] = field(default_factory=dict)
+    crashes: int = 0
+    errors: int = 0
+    rate_per_s: float = 0.0
+    seconds_left: float | None = None
+    owner_alive: bool = False
+    damaged: bool = False
+    crashes_saved: int | None = field(default=None, metadata=OMIT_DEFAULT)
+    phase: dict[str, Any] | None = field(default=None, metadata=OMIT_DEFAULT)
+    disturbed: int | None = field(default=None, metadata=OMIT_DEFAULT)
+    core: str | None = field(default=None, metadata=OMIT_DEFAULT)
+    notices: list[str] | None = field(default=None, metadata=OMIT_DEFAULT)
+    nodes: list[dict[str, Any]] | None = field(default=None, metadata=OMIT_DEFAULT)
+    kinds: list[KindData] | None = field(default=None, metadata=OMIT_DEFAULT)
+    newest_kind_s: float | None = field(default=None, metadata=written_if(lambda state: state.kinds is not None))
+    types_by_cause: int | None = field(default=None, metadata=OMIT_DEFAULT)
+    probes: ProbeSums | None = field(default=None, metadata=OMIT_DEFAULT)
+    branches: BranchSums | None = field(default=None, metadata=OMIT_DEFAULT)
+    rate: RunningRate | None = field(default=None, metadata=OMIT_DEFAULT)
+    code_versions: list[dict[str, Any]] | None = field(default=None, metadata=OMIT_DEFAULT)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the hunt ended without completing its work."""
+        return self.state in ("error", "interrupted", "killed")
+
+
+def is_hunt(directory: Path) -> bool:
+    """Return whether a directory contains a hunt or a planned hunt."""
+    return any((directory / name).exists() for name in _HUNT_FILES)
+
+
+def _explain_missing(directory: Path, what: str) -> HuntDirectoryError:
+    is_file = directory.exists()
+    near = "" if is_file else near_path(directory)
+    wrong = "is a file" if is_file else "does not exist"
+    return HuntDirectoryError(f"{str(directory)!r} {wrong}", fix=f"{near}give the directory of {what}")
+
+
+def find_hunts(directory: Path) -> list[Path]:
+    """Return the directories of hunts: the given directory itself, or those below it.
+
+    Raises:
+        HuntDirectoryError: the directory contains no hunt.
+    """
+    if not directory.is_dir():
+        raise _explain_missing(directory, "a hunt or a suite")
+    if is_hunt(directory):
+        return [directory]
+    found: set[Path] = set()
+    for depth in range(1, _MAX_DEPTH + 1):
+        for name in _HUNT_FILES:
+            for sign in directory.glob(f"{'*/' * depth}{name}"):
+                parts = sign.relative_to(directory).parts
+                if not any(part.startswith(".") or layout.REPLACED in part for part in parts):
+                    found.add(sign.parent)
+    if not found:
+        raise HuntDirectoryError(
+            f"there is no hunt in {str(directory)!r}", fix="give a directory that crashhunt run or suite run made"
+        )
+    return sorted(found, key=_ordered_states)
+
+
+def is_case(directory: Path) -> bool:
+    """Return whether a directory is a case of a corpus, which has the layout of a hunt without a ledger."""
+    return (Path(directory) / layout.CASE).exists()
+
+
+def find_searches(directory: Path) -> list[Path]:
+    """Return the directories of hunts as `find_hunts` does, without the cases of a corpus.
+
+    Raises:
+        HuntDirectoryError: the directory contains no hunt.
+    """
+    found = find_hunts(directory)
+    hunts = [hunt for hunt in found if not is_case(hunt)]
+    if not hunts:
+        raise HuntDirectoryError(
+            f"{str(directory)!r} has cases of a corpus, but no hunt",
+            fix=f"run {command_line('crashhunt', 'corpus', 'list', directory)}, or give the directory of a hunt",
+        )
+    return hunts
+
+
+def hunt_state(directory: Path) -> HuntState:
+    """Return the state of a hunt, read from its directory.
+
+    Raises:
+        HuntDirectoryError: the directory contains no hunt.
+    """
+    if not has_begun(directory / layout.LEDGER) and is_hunt(directory):
+        if any((directory / layout.SNAPSHOTS).glob(layout.SHOWN)):  # which comes after the ledger
+            gone = damaged(directory / layout.LEDGER, "it is missing, or empty")
+            return HuntState(str(directory), "error", str(gone), damaged=True)
+        return HuntState(str(directory), "queued", trials_planned=_planned(directory / layout.REQUEST))
+    if not directory.is_dir():
+        raise _explain_missing(directory, "a hunt")
+    try:
+        with closing(Ledger(directory / layout.LEDGER)) as ledger:
+            facts, outcomes, last = ledger.facts(), ledger.outcomes(), ledger.last_ended_at()
+            found = _with_crashes(state_of_facts(directory, facts, outcomes, last), ledger, facts)
+            return replace(found, probes=sums_of_probes(ledger, facts), branches=sums_of_branches(ledger, facts))
+    except HuntDirectoryError as error:
+        if not (directory / layout.LEDGER).exists():
+            raise
+        # One that cannot be read hides no other.
+        return HuntState(str(directory), "error", str(error), damaged=True)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:  # facts of an early ledger
+        wrong = damaged(directory / layout.LEDGER, f"a fact cannot be read: {type(error).__name__}: {error}")
+        return HuntState(str(directory), "error", str(wrong), damaged=True)
+
+
+def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last: float | None) -> HuntState:
+    """Return the state of a hunt from the facts in its ledger, without its crashes and the results of forks.
+
+    Args:
+        directory: directory of the hunt.
+        facts: facts from the hunt's ledger.
+        outcomes: number of trials with each outcome.
+        last: time at which the last trial ended, in s since the epoch; None if no trial has ended.
+    """
+    said = facts.get("state", "queued")
+    owner = facts.get("owner")
+    alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))
+    state: State = ("running" if alive else "killed") if said == "running" else _STATE_BY_REASON.get(said, "error")
+    run = sum(outcomes.values())
+    planned = int(facts.get("planned", 0))
+    here = run - int(facts.get("done_before", 0))
+    # The clocks of a hunt stand still after its last trial.
+    until = time.time() if state == "running" and not facts.get("phase") else last
+    lasted, newest = _duration_s(facts, until), facts.get("newest_kind")
+    rate = here / lasted if lasted > 0 and here > 0 else 0.0
+    return HuntState(
+        dir=str(directory),
+        state=state,
+        detail=str(facts.get("detail") or ("its process is gone" if state == "killed" else "")),
+        trials_planned=planned,
+        trials_run=run,
+        outcomes=outcomes,
+        errors=sum(n for name, n in outcomes.items() if name == Outcome.INVALID or Outcome(name).is_software_fault),
+        rate_per_s=rate,
+        seconds_left=_seconds_left(facts, max(0, planned - run), rate) if state == "running" else None,
+        phase=_phase(facts) if state == "running" else None,
+        owner_alive=alive,
+        core=facts.get("core"),
+        notices=facts.get("notices"),
+        nodes=facts.get("nodes"),
+        kinds=facts.get("kinds"),
+        types_by_cause=facts.get("types_by_cause"),
+        rate=facts.get("running_rate"),
+        newest_kind_s=None if newest is None or until is None else max(0.0, until - newest),
+    )
+
+
+def _duration_s(facts: Facts, until: float | None) -> float:
+    """Return how long the last run of a hunt lasted up to a time, in s; 0 if that is unknown.
+
+    If the system's clock was set or the machine was suspended, the hunt's own measurement counts.
+
+    Args:
+        facts: facts from the hunt's ledger.
+        until: the time, in s since the epoch; None if no trial has ended.
+    """
+    began, measured = facts.get("began"), facts.get("elapsed_s")
+    if began is None or until is None:  # such as in a copy that `check --salvage` has made
+        return 0.0
+    by_clock = until - began
+    if measured is not None and not 0.0 <= by_clock <= measured + _HEARTBEAT_DELAY_S:
+        return measured
+    return by_clock
+
+
+def _phase(facts: Facts) -> dict[str, Any] | None:
+    """Return the phase of a running hunt after its last trial."""
+    phase = facts.get("phase")
+    return {name: phase[name] for name in ("name", "done", "total")} if phase else None
+
+
+def _seconds_left(facts: Facts, trials: int, rate: float) -> float | None:
+    """Return the time until the last trial or the time limit; after that, the time until the end of the phase."""
+    if phase := facts.get("phase"):
+        left: float | None = phase["seconds_left"]
+        return None if left is None else max(0.0, left - (time.time() - facts.get("heartbeat", time.time())))
+    if (ends_at := facts.get("ends_at")) is not None:
+        return max(0.0, ends_at - time.time())
+    until = facts.get("until")
+    by_clock = math.inf if until is None else max(0.0, until - time.time())
+    by_count = trials / rate if rate > 0 and facts.get("planned") else math.inf
+    left = min(by_clock, by_count)
+    return left if left < math.inf else None
+
+
+def _with_crashes(state: HuntState, ledger: Ledger, facts: Facts) -> HuntState:
+    """Return the state with the counts of crashes over all trials."""
+    directory = Path(state.dir)
+    saved, disturbs = len(crash_folders(directory)), bool(facts.get("disturb"))
+    outcomes = outcomes_of_crashes(directory, facts)
+    tally = None if outcomes is None else tally_crashes(ledger, outcomes, disturbed=disturbs)
+    dropped = sum(len(numbers) for numbers in (facts.get("dropped") or {}).values())
+    # A bundle is written before its row.
+    found = max(saved + dropped, 0 if tally is None else tally.found)
+    return replace(
+        state,
+        state="crashed" if state.state == "finished" and found else state.state,
+        crashes=found,
+        crashes_saved=saved if saved < found else None,
+        disturbed=tally.disturbed if tally is not None and disturbs else None,
+        code_versions=[asdict(one) for one in count_versions(ledger, facts, outcomes or ())] or None,
+    )
+
+
+def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
+    """Return whether every trial of a hunt was drawn independently of the others, as recorded by the hunt.
+
+    Trials in the same traffic are not independent.
+
+    Args:
+        facts: facts from the hunt's ledger.
+        settings: settings of the hunt. In early ledgers without this fact, only the sampler `random` counts as
+            independent.
+    """
+    return bool(facts.get("independent", settings.sampler == "random")) and not settings.seeds
+
+
+def ledger_owner() -> HuntOwner:
+    """Return a description that identifies this process, so that others can check whether it is still running."""
+    return {"host": socket.gethostname(), "pid": os.getpid(), "started": _started(os.getpid())}
+
+
+def trials_of_running(directory: Path) -> int | None:
+    """Return the number of finished trials of a hunt; None if the hunt is not running."""
+    if not has_begun(directory / layout.LEDGER):
+        return None
+    try:
+        with closing(Ledger(directory / layout.LEDGER)) as ledger:
+            facts = ledger.facts()
+            owner = facts.get("owner")
+            alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))
+            return sum(ledger.outcomes().values()) if alive and facts.get("state") == "running" else None
+    except HuntDirectoryError:
+        return None
+
+
+def _planned(request: Path) -> int:
+    try:
+        return int(json.loads(request.read_text(encoding="utf-8"))["request"]["trials"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0
+
+
+def _is_alive(owner: HuntOwner, heartbeat: float) -> bool:
+    if owner["host"] != socket.gethostname():
+        return time.time() - heartbeat < _SILENCE_S
+    return bool(_started(owner["pid"]) == owner["started"])  # a process id is given to another one some day
+
+
+def _started(pid: int) -> int:
+    """Return when a process started, in clock ticks since boot; 0 if it does not exist, -1 if unknown."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+    except OSError:
+        if Path("/proc/self/stat").exists():
+            return 0
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return 0
+        except PermissionError:
+            pass
+        return -1
+    return 0 if stat[0] == "Z" else int(stat[19])
+
+
+def _ordered_states(path: Path) -> tuple[tuple[int, int, str], ...]:
+    """Return the sort key of folders of runs, which sorts by number: 2 before 10."""
+    return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in path.parts)
+
+
+# The directory of a hunt: its owner, and the lock against a second hunt in it.
+
+_DIFFERENCES_SHOWN = 4
+# What a hunt writes, `hunt.toml` last: without it the folder is not a hunt's.
+_OWN_FILES = (
+    "snapshots",
+    "crashes",
+    *layout.BESIDE,
+    "trials",
+    layout.LEDGER,
+    "ledger.sqlite-wal",
+    "ledger.sqlite-shm",
+    layout.HUNT,
+)
+_PERMITTED_FILES = (".lock", layout.SCRATCH, ".hunt.")  # what may be there before: of a hunt that could not begin
+
+
+class HuntDirectory:
+    """The directory of a hunt, with its lock and scratch folder.
+
+    Args:
+        path: path of the directory; the directory itself is created if it does not exist.
+
+    Attributes:
+        has_begun: whether the hunt has begun. Before that, an error deletes a directory that was created for the hunt,
+            and restores the settings of a hunt that was to resume.
+        settings_before: settings of a hunt that was to resume; None before `claim`, and for a new hunt.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._absolute = path.absolute()  # now, because the current folder may be deleted while the hunt runs
+        self.has_begun = False
+        self.settings_before: HuntSettings | None = None
+        self._file_before: bytes | None = None
+
+    @property
+    def scratch(self) -> Path:
+        """The folder into which running trials write.
+
+        A resumed hunt has another folder, because processes of a killed hunt may still write for a moment.
+        """
+        return self._absolute / f"{layout.SCRATCH}-{this_process().token}"
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Lock the directory against other hunts; the lock ends with this process.
+
+        Raises:
+            HuntDirectoryError: the directory is in use, belongs to something else, or cannot be written.
+        """
+        try:
+            is_new = self._make()
+            if not (self.path / ".lock").exists():  # leave no file in a foreign folder
+                self._refuse_foreign()
+            lock = (self.path / ".lock").open("a+")
+        except OSError as error:
+            raise self._unusable(error) from error
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                lock.seek(0)
+                raise BusyError(
+                    f"another hunt is running in this directory (process {lock.read().strip() or '?'})",
+                    fix="wait for it, stop it, or choose another directory",
+                    where=str(self.path),
+                ) from None
+            self._refuse_foreign()
+            lock.truncate(0)
+            lock.write(str(os.getpid()))
+            lock.flush()
+            try:
+                with temporary_beside(self.path / layout.LEDGER, name=self.scratch.name):
+                    yield
+            except BaseException:
+                if is_new and not self.has_begun:
+                    self._remove_own(".lock")
+                    with suppress(OSError):
+                        self.path.rmdir()
+                elif self._file_before is not None and not self.has_begun:
+                    with suppress(CrashhuntError, OSError), whole_file(self.path / layout.HUNT) as temporary:
+                        temporary.write_bytes(self._file_before)
+                raise
+
+    def _make(self) -> bool:
+        """Create the directory; return whether it is new."""
+        try:
+            self.path.mkdir()
+        except FileExistsError:
+            self.path.mkdir(exist_ok=True)  # raises for a file
+            return False
+        return True
+
+    def _remove_own(self, *more: str) -> None:
+        for name in (*_OWN_FILES, *more):
+            if (self.path / name).is_dir():
+                shutil.rmtree(self.path / name, ignore_errors=True)
+                with suppress(OSError):
+                    (self.path / name).rmdir()  # because rmtree opens the folder, which ``ulimit -n`` may refuse
+            else:
+                (self.path / name).unlink(missing_ok=True)
+
+    def claim(self, settings: HuntSettings, command: list[str], *, overwrite: bool, seed_given: bool) -> HuntSettings:
+        """Claim the directory for this hunt, or check that it already has this hunt; return the valid settings.
+
+        A hunt without the result of a trial is replaced.
+
+        Args:
+            settings: settings of the hunt.
+            command: the command line, which is written to ``hunt.toml`` as a comment.
+            overwrite: whether a new hunt replaces an existing one.
+            seed_given: whether the user chose the seed; if not, a resumed hunt keeps its own seed.
+
+        Raises:
+            HuntDirectoryError: the existing hunt has other trials, or the directory cannot be written.
+        """
+        if overwrite:
+            self._remove_own()
+        file = self.path / layout.HUNT
+        if file.exists():
+            before = read_settings(file)
+            resumed = settings if seed_given else replace(settings, seed=before.seed)
+            # The snapshots show which files of the scenario differ, if there are trials.
+            differences = before.differences(replace(resumed, scenario_digest=before.scenario_digest))
+            if not differences:
+                settings, self.settings_before = resumed, before
+            elif not self._has_results():  # the hunt ended before its first trial, often by a mistake in the scenario
+                self._remove_own()
+            else:
+                more = len(differences) - _DIFFERENCES_SHOWN
+                shown = "; ".join(differences[:_DIFFERENCES_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+                raise HuntDirectoryError(
+                    f"the directory contains another hunt: {shown}",
+                    fix="give the same settings to resume it, another directory, or --overwrite to begin again",
+                    where=str(self.path),
+                )
+        for left in self.path.glob(f"{layout.SCRATCH}*"):  # with the lock of the hunt, no other hunt uses it
+            remove_scratch(left)
+        for folder in (self.path, *(self.path / name for name in (layout.CRASHES, *layout.BESIDE))):
+            remove_ended(folder)
+        try:
+            self._file_before = file.read_bytes() if file.exists() else None
+            self.scratch.mkdir()
+            write_settings(file, settings, command)
+        except OSError as error:
+            raise self._unusable(error) from error
+        return settings
+
+    def _has_results(self) -> bool:
+        """Return whether the hunt in the directory has the result of a trial; a damaged ledger counts as results."""
+        folders = (layout.CRASHES, layout.TRIALS, *layout.BESIDE)
+        if any(path for folder in folders for path in (self.path / folder).glob(layout.SHOWN)):
+            return True
+        if not has_begun(self.path / layout.LEDGER):
+            return any((self.path / layout.SNAPSHOTS).glob(layout.SHOWN))  # which is taken after the ledger exists
+        try:
+            with closing(Ledger(self.path / layout.LEDGER)) as ledger:
+                return bool(ledger.outcomes())
+        except HuntDirectoryError:
+            return True
+
+    def _refuse_foreign(self) -> None:
+        try:
+            foreign = sorted(path.name for path in self.path.iterdir() if not path.name.startswith(_PERMITTED_FILES))
+        except OSError as error:
+            raise self._unusable(error) from error
+        if foreign and not is_hunt(self.path):
+            raise HuntDirectoryError(
+                f"the folder is not empty and not a hunt: it has {foreign[0]!r}",
+                fix="give an empty or a new folder",
+                where=str(self.path),
+            )
+
+    def _unusable(self, error: OSError) -> HuntDirectoryError:
+        if isinstance(error, FileExistsError):
+            return HuntDirectoryError(f"{str(self.path)!r} is a file", fix="give a new or an empty folder")
+        return HuntDirectoryError(
+            f"the directory cannot be used: {error.strerror}",
+            fix="choose one below a folder that exists and is writable",
+            where=str(error.filename or self.path),
+        )
+
+
+# ``crashhunt logs``: finds and reads what hunts and trials have printed, wherever it was kept.
+
+LogKind = Literal["run", "error", "state"]
+
+_MAX_LOG_BYTES = 1_000_000  # bytes of one file, from its end
+
+
+class LogReader:
+    """Reads the new lines of the logs of a hunt and its trials.
+
+    Args:
+        hunt: directory of the hunt.
+        kinds: the kinds of logs to read: ``run``, ``error`` and ``state``.
+        trial: number of the only trial whose logs are read; None for all.
+    """
+
+    def __init__(self, hunt: Path, kinds: tuple[LogKind, ...], *, trial: int | None = None) -> None:
+        self._hunt = hunt
+        self._kinds = kinds
+        self._trial = trial
+        self._read: dict[Path, int] = {}
+        self._files: dict[Path, dict[str, FileEntry]] = {}
+        self._told = 0
+
+    def fresh(self) -> Iterator[tuple[str, str]]:
+        """Yield the title and the text of lines that are new since the previous call."""
+        if self._trial is None:
+            if "state" in self._kinds:
+                yield from self._states()
+            yield from self._texts(self._hunt, "")
+        places = (layout.CRASHES, *layout.BESIDE, layout.TRIALS)
+        folders = [folder for place in places for folder in (self._hunt / place).glob(layout.SHOWN)]
+        for folder in sorted(folders, key=lambda folder: folder.name):
+            number = folder.name.partition("-")[0]
+            if number.isdecimal() and self._trial in (None, int(number)):
+                yield from self._texts(folder, f"trial {int(number)}, ")
+
+    def _states(self) -> Iterator[tuple[str, str]]:
+        if not has_begun(self._hunt / layout.LEDGER):
+            if is_hunt(self._hunt) and (state := hunt_state(self._hunt)).damaged:
+                raise HuntDirectoryError(state.detail)
+            return
+        with closing(Ledger(self._hunt / layout.LEDGER)) as ledger:
+            events = ledger.events()[self._told :]
+        self._told += len(events)
+        lines = [
+            f"{time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at))}  {state}{f'  {why}' if why else ''}"
+            for at, state, why in events
+        ]
+        if lines:
+            yield "state", "\n".join(lines)
+
+    def _texts(self, folder: Path, title: str) -> Iterator[tuple[str, str]]:
+        for kind in ("run", "error"):
+            path = folder / f"{kind}.log"
+            if kind not in self._kinds:
+                continue
+            try:
+                with path.open("rb") as file:
+                    size = file.seek(0, os.SEEK_END)
+                    begin = self._read.get(path, max(0, size - _MAX_LOG_BYTES))
+                    if size <= begin:
+                        continue
+                    file.seek(begin)
+                    text = file.read(size - begin).decode("utf-8", "replace")
+            except OSError:
+                continue
+            self._read[path] = size
+            if text.strip():
+                changed = "" if self._as_written(path) else ", which has changed since it was written"
+                yield f"{title}{kind}{changed}", text
+
+    def _as_written(self, path: Path) -> bool:
+        """Return whether a file still has the digest that its crash recorded.
+
+        Files of hunts and of early crashes have no recorded digest.
+        """
+        if path.parent not in self._files:
+            self._files[path.parent] = files_of(path.parent)
+        entry = self._files[path.parent].get(path.name)
+        return entry is None or not changed_file(path, entry)

@@ -1,0 +1,5 @@
+"""Crash rates: the trials that count, every interval and every test."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

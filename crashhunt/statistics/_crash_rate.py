@@ -1,0 +1,203 @@
+"""A rate as commands report it: an estimate if available, a certain interval, and reasons for missing numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import UsageError
+from crashhunt.statistics._units import MAX_INVALID_SHARE
+
+if TYPE_CHECKING:
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.statistics._anytime_interval import Interval
+    from crashhunt.statistics._units import Per, RateCounter, UnitSequence
+
+__all__ = ["CrashRate", "RatePart", "check_confidence", "make_rate"]
+
+_S_PER_HOUR, _M_PER_KM = 3600.0, 1000.0
+_MIN_CONFIDENCE, _MAX_CONFIDENCE = 50.0, 99.9999  # percent; above that, six digits would show 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RatePart:
+    """The rate of a part of the crashes, or in a part of the trials.
+
+    Args:
+        by: the property that divides the parts: ``kind``, ``fault``, ``disturbance`` or an argument.
+        name: name of the part, such as a crash type or a range of the argument.
+        trials: number of valid trials in the part.
+        crashes: number of crashes in the part.
+        estimate: crashes divided by exposure; None if the number of trials was not fixed in advance.
+        certain: interval that is valid at any time, at the confidence of all parts together; None if there is none.
+    """
+
+    by: str
+    name: str
+    trials: int
+    crashes: int
+    estimate: float | None
+    certain: Interval | None
+
+    def to_json(self) -> JsonObject:
+        """Return the part as JSON-compatible data."""
+        return {
+            "by": self.by, "name": self.name, "trials": self.trials, "crashes": self.crashes,
+            "estimate": self.estimate, "certain": _plain(self.certain),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CrashRate:
+    """The crash rate of the agents of a hunt.
+
+    Args:
+        dir: directory of the hunt.
+        per: the unit of exposure to which the rate refers, such as a trial or a kilometre.
+        confidence: confidence, in percent, of the certain interval, which is valid after any number of trials.
+        method: either ``plain`` for counted trials, or ``rare`` for forks with forced disturbances.
+        units: number of independent units that count: trials or traffic seeds.
+        crashes: number of crashes in the units that ``units`` counts.
+        trials: number of valid trials in the units that ``units`` counts.
+        driven_s: time that the agents drove in the counted trials, in s.
+        driven_m: distance that the agents drove in the counted trials, in m.
+        estimate: crashes divided by exposure; None if the number of trials was not fixed in advance.
+        certain: interval that is valid whenever the user looks at it; None if there is none.
+        why_not: reason why the interval or the estimate is missing; empty if both are given.
+        excluded: number of trials that do not count, by reason.
+        parts: parts of the rate, by disturbance and by the property that the user chose.
+        steps: number of simulated steps of the trials.
+        bar: threshold with which the rate is compared; None for no threshold.
+        verdict: either ``below``, ``above`` or ``undecided``; empty if there is no threshold.
+        why_undecided: reason why more trials cannot decide the comparison; empty if they can, or if it is decided.
+    """
+
+    dir: str
+    per: Per
+    confidence: float
+    method: str = "plain"
+    units: int
+    crashes: int
+    trials: int
+    driven_s: float
+    driven_m: float
+    estimate: float | None
+    certain: Interval | None
+    why_not: str
+    excluded: dict[str, int]
+    parts: tuple[RatePart, ...] = ()
+    steps: int = 0
+    bar: float | None = None
+    verdict: str = ""
+    why_undecided: str = ""
+
+    def to_json(self) -> JsonObject:
+        """Return an entry of the output of ``rate --json``; values that are not finite numbers are null."""
+        found: JsonObject = {
+            "dir": self.dir,
+            "per": self.per,
+            "confidence": self.confidence,
+            "method": self.method,
+            "units": self.units,
+            "crashes": self.crashes,
+            "exposure": {
+                "trials": self.trials,
+                "hours": self.driven_s / _S_PER_HOUR,
+                "km": self.driven_m / _M_PER_KM,
+            },
+            "estimate": self.estimate,
+            "certain": _plain(self.certain),
+            "estimated": None,
+            "why_not": self.why_not,
+            "left_out": self.excluded,
+            "parts": [part.to_json() for part in self.parts],
+            "steps": self.steps,
+            "plain_equivalent_steps": self.steps,
+        }
+        if self.bar is not None:
+            found |= {"bar": self.bar, "verdict": self.verdict}
+        return found
+
+
+def check_confidence(percent: float) -> None:
+    """Refuse a confidence, in percent, that is out of range for intervals and verdicts.
+
+    Raises:
+        UsageError: the confidence is out of range.
+    """
+    if not _MIN_CONFIDENCE <= percent <= _MAX_CONFIDENCE:
+        fix = f"give percent from {_MIN_CONFIDENCE:g} to {_MAX_CONFIDENCE:g}, such as 95"
+        raise UsageError(f"--confidence is {percent:.12g}", fix=fix)
+
+
+def make_rate(
+    directory: str,
+    per: Per,
+    counter: RateCounter,
+    sequence: UnitSequence,
+    *,
+    confidence: float = 95.0,
+    why_no_interval: str = "",
+    why_no_estimate: str = "",
+    parts: tuple[RatePart, ...] = (),
+    bar: float | None = None,
+) -> CrashRate:
+    """Return the crash rate from counted units.
+
+    Args:
+        directory: directory of the hunt.
+        per: the unit of exposure to which the rate refers.
+        counter: counter of all units.
+        sequence: sequence that yielded the units.
+        confidence: confidence of the interval, in percent.
+        why_no_interval: reason why no interval is possible, such as a learning sampler; empty if an interval is
+            possible.
+        why_no_estimate: reason why no estimate is possible; empty if an estimate is possible.
+        parts: parts of the rate.
+        bar: threshold with which the rate is compared.
+    """
+    why_not = why_no_interval or counter.why_not
+    if not why_not and not counter.units:
+        why_not = sequence.why_empty
+    if not why_not and not counter.is_measured:
+        why_not = "no trial has a driven distance and time"
+    if not why_not and sequence.invalid_share > MAX_INVALID_SHARE:
+        many = f"{sequence.invalid} of {sequence.invalid + sequence.valid} trials are invalid"
+        why_not = f"{many}, more than {MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
+    alpha = 1 - confidence / 100
+    certain = None if why_not else counter.interval(alpha)
+    verdict = "" if bar is None else "undecided"
+    if bar is not None and certain is not None and counter.test is not None:
+        verdict = counter.test.verdict(bar, alpha)
+    excluded = {
+        "trained_on": sequence.trained_on,
+        "invalid": sequence.invalid,
+        "not_random": sequence.not_random,
+        "after_unfinished": sequence.excluded,
+        "other_code": sequence.other_code,
+    }
+    return CrashRate(
+        dir=directory,
+        per=per,
+        confidence=confidence,
+        units=counter.units,
+        crashes=counter.crashes,
+        trials=counter.trials,
+        driven_s=counter.driven_s,
+        driven_m=counter.driven_m,
+        estimate=None if why_not or why_no_estimate else counter.observed,
+        certain=certain,
+        why_not=why_not or why_no_estimate,
+        excluded={name: count for name, count in excluded.items() if count},
+        parts=() if why_not else parts,
+        steps=counter.steps,
+        bar=bar,
+        verdict=verdict,
+    )
+
+
+def _plain(interval: Interval | None) -> JsonObject | None:
+    if interval is None:
+        return None
+    return {"low": interval.low, "high": interval.high if math.isfinite(interval.high) else None}

@@ -1,0 +1,409 @@
+"""Test and interval, valid at any time, for the question whether one of two agents crashes more often in equal traffic.
+
+A pair is one trial of each agent with the same number, seed and traffic. Pairs count in the order of their numbers, up
+to the first number whose trials have not both ended. A crash ends a trial early, so the finished pairs are not a fair
+sample, but the first k pairs are. With `--seeds`, a pair consists of all trials of a traffic seed.
+
+The difference Z of a pair is the failures of the second agent minus those of the first, divided by the number of
+trials. A trial fails if it crashes, or if the agent's own code prevents its start. Two sums bet on each difference d:
+
+    below(d) = sum_j w_j prod_i (1 - s_j (Z_i - d) / (1 - d))
+
+    above(d) = sum_j w_j prod_i (1 + s_j (Z_i - d) / (1 + d))
+
+The first sum bets that E[Z] is less than d, and the second that it is greater. Component j bets a share s_j of the
+maximum stake. The evidence E(d) against d is the mean of both sums.
+The interval consists of the differences with less evidence against them than 1 / alpha. The verdict follows from the
+interval: one agent is worse if the interval excludes 0. Therefore interval and verdict never contradict each other.
+
+Invariant: at the true difference each factor is positive and has mean 1 given the past. So E is a non-negative
+martingale that begins at 1. By Ville's inequality, the probability that E ever reaches 1 / alpha is at most alpha.
+Each factor is a positive, convex function of d. The factors of a sum are monotone in the same direction, so E is
+convex. At the observed mean, E is at most 1. The differences that are not rejected are therefore an interval around
+the mean, and bisection finds its ends.
+
+If the result of a trial is unknown, its pair counts with the greatest possible Z in the first sum, and with the least
+in the second. Both sums only become smaller. An interval and a verdict are therefore valid whatever the results are.
+
+At d = 0, the factors of concordant pairs are 1, and E is the evidence of McNemar's discordant pairs (1947). Without a
+difference, each of these is a fair coin. Half of the weight is on the shares of Krichevsky and Trofimov (1981), which
+detect any bias eventually: s = 2 q - 1, where q has the distribution Beta(1/2, 1/2). The sum uses the nodes of Gauss
+and Chebyshev. The other half bets that one side occurs three times as often as the other. Most changes of interest have
+such a bias, and this half detects them sooner.
+
+Sources: those of `_anytime_interval`. The bets on Z are those of Waudby-Smith and Ramdas (2024), with a mixture over
+fixed shares.
+
+Cost: a pair increments a counter. The bisection for one end of the interval evaluates E(d) 50 times. Each evaluation
+computes one logarithm for every component j and every different value of Z.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from crashhunt.statistics._anytime_interval import Interval
+from crashhunt.statistics._units import MAX_INVALID_SHARE, has_too_many_invalid
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from crashhunt.statistics._units import CountingRule, TrialFacts
+
+__all__ = ["Pair", "PairSequence", "PairTest", "PairVerdict", "PairWatch", "SideCounts", "failures_of"]
+
+PairVerdict = Literal["better", "worse", "no_difference", "undecided"]
+"""The verdict of pairs on the second agent, compared with the first."""
+
+_NODES = 256  # of the shares from 0 to 1; the mixture is exact up to 1,023 discordant pairs
+_BIASED_SHARE = 0.5  # 2 q - 1 for a coin with q = 3/4
+_SHARES: NDArray[np.float64] = np.append(np.cos(np.pi * (np.arange(_NODES) + 0.5) / (2 * _NODES)), _BIASED_SHARE)
+_LOG_WEIGHTS: NDArray[np.float64] = np.log(np.append(np.full(_NODES, 0.5 / _NODES), 0.5) / 2)
+_PRECISION = 1e-9  # of both ends
+
+Pair = tuple[tuple["TrialFacts", "TrialFacts"], ...]
+"""The trials of a pair that count, each as first and second: one, or those of a traffic."""
+
+
+class PairSequence:
+    """Combines trials of two agents, which end in any order, to pairs in the order of their numbers.
+
+    A trial that is invalid for both agents is excluded, and so is a trial that was not drawn at random. A trial that is
+    invalid for one agent only counts: it has failed if the agent's own code prevents its start. Otherwise, and if its
+    process was killed from outside, its result is unknown.
+
+    Args:
+        rules: counting rules for the trials of the first agent and of the second agent.
+        is_same: function that returns whether two trials of the same number have the same seed and traffic; by default,
+            all have.
+
+    Attributes:
+        rounds: number of trials in each pair.
+        invalid: number of pairs of trials that are invalid for both agents.
+    """
+
+    def __init__(
+        self,
+        rules: tuple[CountingRule, CountingRule],
+        is_same: Callable[[TrialFacts, TrialFacts], bool] = lambda _first, _second: True,
+    ) -> None:
+        self._rules, self._is_same = rules, is_same
+        self._waiting: tuple[dict[int, TrialFacts], dict[int, TrialFacts]] = ({}, {})
+        self._complete: dict[int, Pair] = {}
+        self._next = max(rule.first for rule in rules)  # trial, or traffic
+        self._traffics = rules[0].traffics
+        self.rounds = min(rule.trials_per_unit for rule in rules) if self._traffics else 1
+        self.valid = self.invalid = self.not_random = self.not_same = 0  # pairs of trials
+
+    def add(self, side: int, trial: TrialFacts) -> Iterator[Pair]:
+        """Add a trial, and yield the newly complete pairs, including pairs without a trial that counts.
+
+        Args:
+            side: 0 for a trial of the first agent, 1 for a trial of the second agent.
+            trial: trial of any number; a trial that was added before is ignored.
+        """
+        if self._has(trial.number) or not self._is_wanted(trial.number):
+            return
+        self._waiting[side][trial.number] = trial
+        while (numbers := self._numbers(self._next)) and all(
+            number in waiting for number in numbers for waiting in self._waiting
+        ):
+            self._next += 1
+            yield self._counted(numbers)
+
+    def _has(self, number: int) -> bool:
+        return (number % self._traffics if self._traffics else number) < self._next
+
+    def _is_wanted(self, number: int) -> bool:
+        return not self._traffics or number < self._traffics * self.rounds
+
+    def _numbers(self, place: int) -> list[int]:
+        """Return the numbers of the trials of a pair; empty if the hunt has no such traffic seed."""
+        if not self._traffics:
+            return [place]
+        if place >= self._traffics:
+            return []
+        return [place + turn * self._traffics for turn in range(self.rounds)]
+
+    def _counted(self, numbers: list[int]) -> Pair:
+        found = []
+        for number in numbers:
+            both = self._waiting[0].pop(number), self._waiting[1].pop(number)
+            if any(
+                rule.plain_origin and one.origin != rule.plain_origin
+                for rule, one in zip(self._rules, both, strict=True)
+            ):
+                self.not_random += 1
+            elif not self._is_same(*both):
+                self.not_same += 1
+            elif all(one.has_ended and not one.valid for one in both):
+                self.invalid += 1
+            else:
+                self.valid += 1
+                found.append(both)
+        return tuple(found)
+
+    @property
+    def position(self) -> int:
+        """The number of the first trial, or traffic seed, that has not ended for both agents."""
+        return self._next
+
+    @property
+    def excluded(self) -> int:
+        """The number of trials that have ended, but do not belong to a complete pair yet."""
+        return sum(map(len, self._waiting))
+
+    def waiting(self, side: int) -> bool:
+        """Return whether trials of an agent have ended for which the same trials of the other agent have not."""
+        return any(number not in self._waiting[1 - side] for number in self._waiting[side])
+
+    @property
+    def invalid_share(self) -> float:
+        """The share of pairs with an invalid trial."""
+        return self.invalid / (self.invalid + self.valid) if self.invalid else 0.0
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether too many pairs certainly have an invalid trial."""
+        return has_too_many_invalid(self.invalid, self.valid)
+
+    @property
+    def why_not(self) -> str:
+        """The reason why the pairs allow no verdict; empty if they allow one."""
+        if self.invalid_share <= MAX_INVALID_SHARE:
+            return ""
+        many = f"{self.invalid} of {self.invalid + self.valid} pairs have an invalid trial"
+        return f"{many}, more than {MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SideCounts:
+    """The trials of one agent that are invalid, although the same trials of the other agent are not.
+
+    Args:
+        not_started: number of trials that count as failures, because the user's code prevented their start.
+        killed: number of trials whose processes were killed from outside.
+        unknown: number of trials that are invalid for any other reason.
+        example: number of one of these trials, and the reason why it is invalid; empty if there is none.
+    """
+
+    not_started: int = 0
+    killed: int = 0
+    unknown: int = 0
+    example: str = ""
+
+    @property
+    def lost(self) -> int:
+        """The number of trials whose result is unknown."""
+        return self.killed + self.unknown
+
+    def __add__(self, other: SideCounts) -> SideCounts:
+        return SideCounts(
+            not_started=self.not_started + other.not_started, killed=self.killed + other.killed,
+            unknown=self.unknown + other.unknown, example=self.example or other.example,
+        )  # fmt: skip
+
+
+class PairTest:
+    """Counts pairs, and returns at any time the difference that is compatible with them.
+
+    Attributes:
+        pairs: number of added pairs with known results.
+        unknown: number of added pairs in which the result of a trial is unknown.
+        only_first: number of pairs in which the first agent fails and the second does not. If a pair has several
+            trials, number of pairs in which the first agent fails more often.
+        only_second: like ``only_first``, with the two agents exchanged.
+        both: number of pairs in which both agents fail, equally often.
+        failures: number of failures of the first agent and of the second agent.
+        trials: number of trials of each agent in the pairs that ``pairs`` counts.
+        unstarted: trials of the first agent and of the second agent that failed because the agent did not start.
+        lost: trials of the first agent and of the second agent whose result is unknown.
+    """
+
+    def __init__(self, rounds: int = 1) -> None:
+        self._rounds = max(1, rounds)
+        self.pairs = self.only_first = self.only_second = self.both = self.trials = self.unknown = 0
+        self.failures = (0, 0)
+        self.unstarted: tuple[list[TrialFacts], list[TrialFacts]] = ([], [])
+        self.lost: tuple[list[TrialFacts], list[TrialFacts]] = ([], [])
+        self._differences: Counter[tuple[float, float]] = Counter()  # the least and the greatest of each pair
+
+    def add(self, pair: Pair) -> None:
+        """Add a pair; a pair without a trial that counts is ignored."""
+        if not pair:
+            return
+        for both in pair:
+            for one, unstarted, lost in zip(both, self.unstarted, self.lost, strict=True):
+                if not one.valid:
+                    (unstarted if all(failures_of(one)) else lost).append(one)
+        least, most = ([sum(failures_of(both[side])[end] for both in pair) for side in (0, 1)] for end in (0, 1))
+        self._differences[(least[1] - most[0]) / self._rounds, (most[1] - least[0]) / self._rounds] += 1
+        if least != most:
+            self.unknown += 1
+            return
+        first, second = least
+        self.pairs += 1
+        self.trials += len(pair)
+        self.failures = (self.failures[0] + first, self.failures[1] + second)
+        self.only_first += first > second
+        self.only_second += second > first
+        self.both += first == second > 0
+
+    def add_counts(self, only_first: int, only_second: int, alike: int) -> None:
+        """Add the counts of pairs that have one trial per agent.
+
+        Args:
+            only_first: number of pairs in which only the first agent fails.
+            only_second: number of pairs in which only the second agent fails.
+            alike: number of pairs in which no agent fails, or both do.
+        """
+        self.pairs += only_first + only_second + alike
+        self.trials += only_first + only_second + alike
+        self.only_first += only_first
+        self.only_second += only_second
+        self.failures = (self.failures[0] + only_first, self.failures[1] + only_second)
+        self._differences.update({(-1.0, -1.0): only_first, (1.0, 1.0): only_second, (0.0, 0.0): alike})
+
+    def side(self, side: int) -> SideCounts:
+        """Return the trials of the first agent (0) or of the second (1) that are invalid for this agent only."""
+        unstarted, lost = self.unstarted[side], self.lost[side]
+        killed = sum(
+            not one.has_ended or (one.failure is not None and one.failure.exit_code is not None) for one in lost
+        )
+        example = next((f"trial {one.number}: {_reason_of(one)}" for one in (*unstarted, *lost)), "")
+        return SideCounts(not_started=len(unstarted), killed=killed, unknown=len(lost) - killed, example=example)
+
+    @property
+    def log_evidence(self) -> float:
+        """The logarithm of the evidence that the two agents do not fail equally often."""
+        return self._log_evidence_against(0.0)
+
+    def difference(self, alpha: float = 0.05) -> Interval | None:
+        """Return the interval of the difference in failures per trial, second minus first agent; None without a pair.
+
+        The probability that the interval ever excludes the true difference, after any number of pairs, is at most
+        `alpha`.
+        """
+        if not self._differences.total():
+            return None
+        least, greatest = (
+            sum(ends[end] * times for ends, times in self._differences.items()) / self._differences.total()
+            for end in (0, 1)
+        )
+        return Interval(self._end(least, -1.0, alpha), self._end(greatest, 1.0, alpha))
+
+    def verdict(self, alpha: float = 0.05) -> Literal["first", "second", ""]:
+        """Return which agent fails more often, on which side of 0 the interval lies; empty if it contains 0."""
+        if self.log_evidence < -math.log(alpha):
+            return ""
+        return "second" if self._total > 0 else "first"
+
+    def excludes(self, difference: float, alpha: float = 0.05) -> bool:
+        """Return whether the interval excludes the given difference."""
+        return self._log_evidence_against(difference) >= -math.log(alpha)
+
+    def is_within(self, margin: float, alpha: float = 0.05) -> bool:
+        """Return whether the interval of the difference lies between -margin and margin."""
+        if not self._differences.total() or not all(self.excludes(end, alpha) for end in (-margin, margin)):
+            return False
+        return abs(self._total) < margin * self._differences.total()
+
+    @property
+    def _total(self) -> float:
+        """The sum of the differences of all pairs; the middle of its bounds if results are unknown."""
+        return sum((least + most) / 2 * times for (least, most), times in self._differences.items())
+
+    def _log_evidence_against(self, difference: float) -> float:
+        """Return the logarithm of the evidence that the mean difference of pairs is not the given one."""
+        ends = np.array(list(self._differences), float).reshape(-1, 2)
+        times = np.array(list(self._differences.values()), float)
+        logs = np.concatenate([
+            np.log1p(-np.outer(_SHARES, side - sign * difference) / (1 - sign * difference)) @ times + _LOG_WEIGHTS
+            for sign, side in ((1, ends[:, 1]), (-1, -ends[:, 0]))
+        ])  # fmt: skip
+        top = float(logs.max())
+        return top + math.log(float(np.exp(logs - top).sum()))
+
+    def _end(self, inside: float, outside: float, alpha: float) -> float:
+        """Return the end of the interval between the observed mean and the greatest or the least difference."""
+        if abs(inside - outside) <= _PRECISION:
+            return outside
+        outside -= math.copysign(_PRECISION, outside)
+        if not self.excludes(outside, alpha):
+            return math.copysign(1.0, outside)
+        if inside * outside < 0:  # so that interval and verdict agree on 0, whatever is rounded
+            inside, outside = (inside, 0.0) if self.excludes(0.0, alpha) else (0.0, outside)
+        while abs(outside - inside) > _PRECISION:
+            middle = (inside + outside) / 2
+            if self.excludes(middle, alpha):
+                outside = middle
+            else:
+                inside = middle
+        return inside
+
+
+def failures_of(trial: TrialFacts) -> tuple[bool, bool]:
+    """Return whether a trial has certainly failed, and whether it may have failed."""
+    if trial.valid:
+        return trial.crashed, trial.crashed
+    return trial.has_ended and trial.failure is not None and trial.failure.is_of_users_code, True
+
+
+def _reason_of(trial: TrialFacts) -> str:
+    """Return the reason why a trial is invalid, in one line."""
+    failure = trial.failure
+    if failure is None:
+        return "invalid"
+    if failure.exit_code is not None or failure.kind == "timeout" or not failure.traceback:
+        return failure.message
+    place = f" ({failure.agent or failure.party}, {failure.place})" if failure.place else ""
+    return f"{failure.kind}: {failure.message}{place}"
+
+
+class PairWatch:
+    """Watches two agents until one agent certainly fails more often, or both certainly fail about equally often.
+
+    The pairs are evaluated in order, one after another. After a decision, later pairs do not count, so the verdict does
+    not depend on the number of workers. The probability of each wrong verdict is at most `alpha`: *better* or *worse*
+    if both agents fail equally often, and *no difference* if the difference is above the margin.
+
+    Args:
+        margin: the greatest difference in failures per trial that counts as no difference; 0 to disable this verdict.
+        alpha: maximum probability of a wrong verdict.
+        rounds: number of trials in each pair.
+    """
+
+    def __init__(self, margin: float, alpha: float = 0.05, rounds: int = 1) -> None:
+        self.margin, self.alpha = margin, alpha
+        self.test = PairTest(rounds)
+        self.verdict: PairVerdict = "undecided"
+
+    def add(self, pairs: Sequence[Pair] | Iterator[Pair], *, may_end: bool = True) -> None:
+        """Add pairs in their order until a pair decides.
+
+        Args:
+            pairs: the pairs, in the order of their numbers.
+            may_end: whether the verdicts *better* and *no difference* are allowed yet; *worse* is always allowed.
+        """
+        for pair in pairs:
+            if self.verdict != "undecided":
+                return
+            self.test.add(pair)
+            self.decide(may_end=may_end)
+
+    def decide(self, *, may_end: bool = True) -> PairVerdict:
+        """Return the verdict on the pairs that were added; the first verdict is final."""
+        if self.verdict == "undecided":
+            worse = self.test.verdict(self.alpha)
+            if worse == "second" or (worse and may_end):
+                self.verdict = "worse" if worse == "second" else "better"
+            elif not worse and may_end and self.margin and self.test.is_within(self.margin, self.alpha):
+                self.verdict = "no_difference"
+        return self.verdict

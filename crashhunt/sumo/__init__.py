@@ -1,0 +1,5 @@
+"""SUMO: the simulator, the description of its table in a scenario, and scenarios from maps."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

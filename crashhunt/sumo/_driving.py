@@ -1,0 +1,224 @@
+"""Applies actions and holds to SUMO's vehicles."""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import libsumo
+from libsumo import _libsumo as sumo
+
+from crashhunt.simulators import META_ACTIONS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from crashhunt.scenario import AgentSetup
+    from crashhunt.simulators import ActiveDisturbance
+
+
+__all__ = ["Driving", "hold_vehicle"]
+
+
+# Calls go to libsumo's extension module, because the wrapper functions of the package cost twice as much.
+
+
+class Driving:
+    """Applies actions to vehicles.
+
+    Args:
+        setups: The setups of all agents of a scenario, by agent.
+        step_length_s: Step length, in s.
+    """
+
+    def __init__(self, setups: Mapping[str, AgentSetup], step_length_s: float) -> None:
+        self._setups, self._step_length_s = setups, step_length_s
+        self._edges: dict[str, list[float]] = {}
+        self._closed_lanes: dict[tuple[str, str], bool] = {}
+        self._targets: dict[str, int] = {}
+        self._is_left_hand: bool | None = None
+
+    def begin(self, agents: Iterable[str]) -> None:
+        """Reset the state of the last episode, but keep data that was read from the network."""
+        self._targets = dict.fromkeys(agents, -1)
+
+    def apply(self, agent: str, action: NDArray[np.generic]) -> bool:
+        """Apply an encoded action; return whether the vehicle stays on the road."""
+        setup = self._setups[agent]
+        try:
+            if setup.action == "meta":
+                self._apply_meta(agent, setup, META_ACTIONS[int(action[0])])
+                return True
+            speed, change = action.tolist()
+            sumo.vehicle_setSpeed(agent, speed)
+            return not change or self._change_lane(agent, int(change))
+        except libsumo.TraCIException:
+            if agent in sumo.vehicle_getIDList():
+                raise
+            return True  # the vehicle has left: the agent's own code may have removed it
+
+    def _apply_meta(self, agent: str, setup: AgentSetup, action: str) -> None:
+        """Apply a meta-action as highway-env does: FASTER and SLOWER select the next target speed."""
+        targets = setup.target_speeds
+        if self._targets[agent] < 0:
+            speed = sumo.vehicle_getSpeed(agent)
+            self._targets[agent] = min(range(len(targets)), key=lambda index: abs(targets[index] - speed))
+        shift = {"FASTER": 1, "SLOWER": -1}.get(action, 0)
+        self._targets[agent] = max(0, min(len(targets) - 1, self._targets[agent] + shift))
+        sumo.vehicle_setSpeed(agent, targets[self._targets[agent]])
+        change = {"LANE_LEFT": 1, "LANE_RIGHT": -1}.get(action, 0)
+        if change:
+            self._change_lane(agent, change)  # a change without a neighbouring lane does nothing, as in highway-env
+
+    def _change_lane(self, agent: str, change: int) -> bool:
+        """Change to a neighbouring lane at once; return False if there is no lane that the vehicle may use."""
+        lane = self.neighboring_lane(agent, change)
+        if lane is None:
+            return True  # inside a junction there are no neighbouring lanes, and no road to leave
+        exists, direction = lane
+        if exists:
+            sumo.vehicle_changeLane(agent, sumo.vehicle_getLaneIndex(agent) + direction, self._step_length_s)
+        return exists
+
+    def neighboring_lane(self, agent: str, change: int) -> tuple[bool, int] | None:
+        """Return whether the vehicle may use a neighbouring lane, and the difference of SUMO's lane indices.
+
+        The result is None inside a junction, where lanes have no neighbours, and for a vehicle off its lane.
+
+        Args:
+            agent: identifier of the vehicle.
+            change: 1 to the left, -1 to the right.
+        """
+        edge, lane = sumo.vehicle_getRoadID(agent), sumo.vehicle_getLaneIndex(agent)
+        if edge.startswith(":") or lane < 0:
+            return None
+        lanes = self.lanes(edge)
+        direction = -change if self.left_hand else change
+        target = lane + direction
+        exists = 0 <= target < lanes
+        if exists and self._is_closed(f"{edge}_{target}", sumo.vehicle_getVehicleClass(agent)):
+            exists = False
+        return exists, direction
+
+    def lanes(self, edge: str) -> int:
+        """Return the number of lanes of an edge."""
+        return len(self._widths(edge))
+
+    def _widths(self, edge: str) -> list[float]:
+        """Return the widths in m of the lanes of an edge; sidewalks and bicycle lanes often have another."""
+        found = self._edges.get(edge)
+        if found is None:
+            lanes = sumo.edge_getLaneNumber(edge)
+            found = self._edges[edge] = [sumo.lane_getWidth(f"{edge}_{lane}") for lane in range(lanes)]
+        return found
+
+    @property
+    def left_hand(self) -> bool:
+        """Whether traffic drives on the left: SUMO then mirrors the network and numbers lanes from the left."""
+        if self._is_left_hand is None:
+            wide = (edge for edge in sumo.edge_getIDList() if edge[0] != ":" and sumo.edge_getLaneNumber(edge) > 1)
+            self._is_left_hand = any(_is_right_of(f"{edge}_1", f"{edge}_0") for edge in islice(wide, 1))
+        return self._is_left_hand
+
+    def from_left(self, edge: str, lane: int) -> float:
+        """Return the distance in m from the centre line of an edge's leftmost lane to that of the given lane."""
+        widths = self._widths(edge)
+        between = widths[: lane + 1] if self.left_hand else widths[lane:]
+        if all(width == between[0] for width in between):
+            return (len(between) - 1) * between[0]  # exact, where a sum would be rounded
+        return sum(between) - (between[0] + between[-1]) / 2
+
+    def aside(self, agent: str) -> tuple[float, float]:
+        """Return how far a vehicle is right of its lane's centre line, in m, and its speed to the right, in m/s."""
+        sign = 1.0 if self.left_hand else -1.0
+        return sign * sumo.vehicle_getLateralLanePosition(agent), sign * sumo.vehicle_getLateralSpeed(agent)
+
+    def _is_closed(self, lane: str, vehicle_class: str) -> bool:
+        found = self._closed_lanes.get((lane, vehicle_class))
+        if found is None:
+            allowed = sumo.lane_getAllowed(lane)
+            found = bool(allowed) and vehicle_class not in allowed and vehicle_class != "ignoring"
+            self._closed_lanes[lane, vehicle_class] = found
+        return found
+
+
+def _is_right_of(lane: str, other: str) -> bool:
+    """Return whether a lane lies to the right of another lane of the same edge."""
+    (x, y, *_), (to_x, to_y, *_) = sumo.lane_getShape(other)[:2]
+    at_x, at_y = sumo.lane_getShape(lane)[0][:2]
+    return bool((to_x - x) * (at_y - y) < (to_y - y) * (at_x - x))
+
+
+# Holds for counterfactual runs: keep a vehicle's speed or lane, or remove the vehicle.
+
+_NO_SPEED_CHECKS = 0  # speed mode: the vehicle drives the commanded speed
+_NO_LANE_CHANGES = 0  # lane change mode
+
+
+def hold_vehicle(vehicle: str, what: str) -> ActiveDisturbance | None:
+    """Apply a hold to a vehicle from the next step on; return None if the vehicle is not in the simulation.
+
+    Args:
+        vehicle: Identifier of the vehicle.
+        what: One of `HELD`.
+    """
+    if vehicle not in sumo.vehicle_getIDList():
+        return None
+    if what == "gone":
+        libsumo.vehicle.remove(vehicle)
+        return _Gone()
+    return _KeepsSpeed(vehicle) if what == "keep_speed" else _KeepsLane(vehicle)
+
+
+class _Gone:
+    """The hold of a vehicle that has been removed for the rest of the episode."""
+
+    how_strong = 1.0
+
+    def keep(self) -> None:
+        """Do nothing, because the vehicle is gone."""
+
+    def end(self) -> None:
+        """Do nothing, because the vehicle does not return."""
+
+
+class _KeepsSpeed:
+    """Makes the vehicle keep its speed, even with an obstacle ahead."""
+
+    def __init__(self, vehicle: str) -> None:
+        self.how_strong = float(sumo.vehicle_getSpeed(vehicle))
+        self._vehicle = vehicle
+        self._before = sumo.vehicle_getSpeedMode(vehicle)
+        sumo.vehicle_setSpeedMode(vehicle, _NO_SPEED_CHECKS)
+        sumo.vehicle_setSpeed(vehicle, self.how_strong)
+
+    def keep(self) -> None:
+        """Do nothing, because SUMO keeps the command."""
+
+    def end(self) -> None:
+        """Let the vehicle drive by itself again."""
+        if self._vehicle in sumo.vehicle_getIDList():
+            sumo.vehicle_setSpeedMode(self._vehicle, self._before)
+            sumo.vehicle_setSpeed(self._vehicle, -1.0)
+
+
+class _KeepsLane:
+    """Makes the vehicle keep its lane."""
+
+    how_strong = 1.0
+
+    def __init__(self, vehicle: str) -> None:
+        self._vehicle = vehicle
+        self._before = sumo.vehicle_getLaneChangeMode(vehicle)
+        sumo.vehicle_setLaneChangeMode(vehicle, _NO_LANE_CHANGES)
+
+    def keep(self) -> None:
+        """Do nothing, because SUMO keeps the command."""
+
+    def end(self) -> None:
+        """Let the vehicle change lanes by itself again."""
+        if self._vehicle in sumo.vehicle_getIDList():
+            sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)

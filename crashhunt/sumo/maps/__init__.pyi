@@ -1,0 +1,16 @@
+from ._cache import cached_scenario as cached_scenario
+from ._make import (
+    MadeScenario as MadeScenario,
+    MapOptions as MapOptions,
+    PlainTrial as PlainTrial,
+    describe_place as describe_place,
+    make_scenario as make_scenario,
+)
+from ._road_network import RoadNetwork as RoadNetwork, read_network as read_network
+from ._source import (
+    ENDINGS as ENDINGS,
+    MapSource as MapSource,
+    check_source as check_source,
+    parse_bbox as parse_bbox,
+    parse_shape as parse_shape,
+)

@@ -1,0 +1,72 @@
+"""Crashes of one type are divided by cause: few are judged, and the others get the nearest cause."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.analysis import _types_by_cause
+from crashhunt.analysis._types_by_cause import divide_by_cause
+from crashhunt.base.errors import CrashhuntError
+
+
+class AllChosen:
+    """A division that has every crash judged, in turn."""
+
+    def __init__(self, most):
+        self.most, self.judged, self._open, self._causes = most, {}, [], {}
+
+    def add(self, number, steps, features):
+        self._open.append(number)
+
+    def choose(self):
+        return self._open.pop(0) if self._open and len(self.judged) < self.most else None
+
+    def settle(self, place, cause):
+        if cause is not None:
+            self.judged[place] = self._causes[place] = cause
+
+    def causes(self):
+        return self._causes
+
+
+@pytest.fixture
+def bundles(monkeypatch):
+    """Five crashes with the causes b, a, b, an error and c."""
+    written = []
+    made = [SimpleNamespace(name=name, result=SimpleNamespace(steps=5)) for name in "babxc"]
+
+    def find_cause(bundle, options, *, parallel, stopped):
+        if bundle.name == "x":
+            raise CrashhuntError("no trial can be run")
+        judged = SimpleNamespace(write=lambda: written.append(bundle.name)) if bundle.name != "c" else bundle
+        return bundle.name, judged
+
+    monkeypatch.setattr(_types_by_cause, "find_cause", find_cause)
+    monkeypatch.setattr(_types_by_cause, "features_of", lambda bundle: None)
+    monkeypatch.setattr(_types_by_cause, "as_stored", lambda bundle: bundle)
+    monkeypatch.setattr(_types_by_cause, "judgement_of", lambda bundle: None)
+    monkeypatch.setattr(_types_by_cause, "Division", AllChosen)
+    return SimpleNamespace(group=SimpleNamespace(bundles=made), written=written, made=made)
+
+
+def test_most_frequent_cause_comes_first_and_an_error_costs_one_crash_only(bundles):
+    found = divide_by_cause(bundles.group)
+    assert [(one.cause, [member.name for member in one.members]) for one in found] == [
+        ("b", ["b", "b"]), ("a", ["a"]), ("c", ["c"])
+    ]  # fmt: skip
+    assert found[0].judged == (bundles.made[0], bundles.made[2])
+    assert bundles.written == ["b", "a", "b"]  # the results of the last were there before
+
+
+def test_results_are_written_if_that_is_asked_for(bundles):
+    divide_by_cause(bundles.group, write=False)
+    assert bundles.written == []
+
+
+def test_interrupted_judgement_divides_nothing(bundles):
+    answers = iter([False, False, False, True])  # it is stopped while the second crash is judged
+    found = divide_by_cause(bundles.group, stopped=lambda: next(answers))
+    assert [one.cause for one in found] == ["b"]
+    assert bundles.written == ["b"]

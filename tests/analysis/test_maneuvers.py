@@ -1,0 +1,95 @@
+"""What actors did before a crash that may have caused it, and which actors are examined."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.analysis._cause_runs import Maneuver, maneuvers_of, relevant_actors
+from crashhunt.world import Actor, Roster, Scene
+
+DT = 0.1
+
+
+def recording(ways, count, *, agents=("ego",)):
+    """Scenes of actors, each from a function of the time that returns x, y and speed, or None where it is away."""
+    scenes = []
+    for step in range(count):
+        there = {name: found for name, way in ways.items() if (found := way(step * DT)) is not None}
+        roster = Roster(tuple(Actor(name, "car", 5.0, 2.0) for name in there))
+        points = [(x, y) for x, y, _ in there.values()]
+        scenes.append(Scene(step * DT, roster, points, [0.0] * len(there), [speed for *_, speed in there.values()]))
+    return SimpleNamespace(
+        scenes=lambda: scenes,
+        all_steps=[SimpleNamespace(step=step, scene=scene) for step, scene in enumerate(scenes)],
+        prologue=SimpleNamespace(step_length_s=DT),
+        agents=agents,
+    )
+
+
+def speeds(*parts):
+    """A speed that changes by so many m/s² for so many s, part after part; it begins at 20 m/s."""
+
+    def way(time_s):
+        speed = 20.0
+        for acceleration, seconds in parts:
+            took = min(max(time_s, 0.0), seconds)
+            speed, time_s = speed + acceleration * took, time_s - seconds
+        return 0.0, 0.0, speed
+
+    return way
+
+
+def found(*parts, count=120, end=110):
+    return [
+        (one.what, one.step, round(one.speed, 3))
+        for one in maneuvers_of(recording({"x": speeds(*parts)}, count), "x", (), end)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("parts", "maneuvers"),
+    [
+        ([], []),
+        ([(0, 5), (-3, 1)], [("braked", 50, 20.0)]),
+        ([(0, 5), (-1.4, 3)], []),  # it drives along
+        ([(0, 5), (1.2, 2)], [("sped up", 50, 20.0)]),
+        ([(0, 5), (0.9, 3)], []),
+        ([(0, 5), (-3, 0.2)], []),  # 0.6 m/s make no difference
+        ([(0, 5), (-0.5, 0.5), (-3, 1)], [("braked", 50, 20.0)]),  # soft at first
+        ([(0, 2), (-3, 1), (0, 2), (-3, 1)], [("braked", 50, 17.0)]),  # the last one
+        ([(0, 2), (-3, 1), (0, 0.3), (-3, 1)], [("braked", 20, 20.0)]),  # a short pause does not end it
+        ([(0, 2), (-3, 1), (0, 2), (-3, 0.2)], [("braked", 20, 20.0)]),  # the last one makes no difference
+        ([(0, 2), (3, 1), (0, 2), (-3, 1)], [("braked", 50, 23.0), ("sped up", 20, 20.0)]),
+    ],
+    ids=str,
+)
+def test_last_maneuver_of_each_type_begins_where_the_speed_begins_to_change(parts, maneuvers):
+    assert found(*parts) == maneuvers
+
+
+def test_only_the_ten_seconds_before_the_crash_count():
+    assert found((0, 1), (-3, 1), count=150, end=120) == []
+    assert found((0, 2.1), (-3, 1), count=150, end=120) == [("braked", 21, 20.0)]
+    assert found((0, 5), (-3, 1), end=50) == []  # the collision itself changes speeds
+    assert found((0, 5), (-3, 1), end=1) == []
+    maneuver = maneuvers_of(recording({"x": speeds((0, 5), (-3, 1))}, 120), "x", (), 110)[0]
+    assert maneuver == Maneuver(actor="x", what="braked", step=50, speed=20.0)
+
+
+def stands(x, y=0.0, *, since=0.0, until=99.0):
+    return lambda time_s: (x, y, 0.0) if since <= time_s <= until else None
+
+
+def test_collision_partner_is_examined_first_and_then_the_nearest():
+    found = recording(
+        {
+            "ego": stands(0.0), "learner": stands(1.0), "far": stands(61.0), "b": stands(20.0), "a": stands(0.0, -20.0),
+            "near": stands(10.0), "early": stands(5.0, until=2.0), "hit": stands(50.0),
+        }, 100, agents=("ego", "learner"),
+    )  # fmt: skip
+    assert relevant_actors(found, "ego", "hit", 9) == ["hit", "near", "a", "b"]
+    assert relevant_actors(found, "ego", "", 2) == ["near", "a"]
+    assert relevant_actors(found, "ego", "gone", 1) == ["gone"]
+    assert relevant_actors(recording({}, 0), "ego", "", 9) == []

@@ -1,0 +1,525 @@
+"""Environments of Gymnasium as simulators: one of its own, one registered here, one made by a factory."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from crashhunt.base.boundaries import ForeignError
+from crashhunt.episode import Nearness
+from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError
+from crashhunt.gym import GymSimulator
+from crashhunt.gym._backend import BACKEND, CrashRule, GymSetup
+from crashhunt.oracles import ReportedCollision
+from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
+from crashhunt.testing import SimulatorContract
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
+
+
+class Tray(gymnasium.Env):
+    """A ball on a tray: structured observations and actions, and a crash in the info."""
+
+    observation_space = spaces.Dict(
+        {
+            "ball": spaces.Box(-10, 10, (2,), np.float64),
+            "side": spaces.Discrete(2),
+            "step": spaces.Box(0, 255, (1,), np.uint8),
+        }
+    )
+    action_space = spaces.Dict({"tilt": spaces.Box(-1, 1, (2,), np.float32), "kick": spaces.Discrete(2)})
+
+    def __init__(self, *, size=2.0, fails_at=0):
+        self.size, self.fails_at = size, fails_at
+
+    def _look(self):
+        return {"ball": self.ball, "side": int(self.ball[0] > 0), "step": np.array([self.steps], np.uint8)}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if self.size < 0:
+            raise ValueError("a tray has a size")
+        self.ball, self.steps = self.np_random.normal(size=2) * 0.1, 0
+        return self._look(), {}
+
+    def step(self, action):
+        assert isinstance(action, dict)
+        self.steps += 1
+        self.ball += 0.2 * action["tilt"] + 0.1 * action["kick"]  # the same array as before, as careless ones do
+        return (
+            self._look(),
+            float(-abs(self.ball).max()),
+            self.steps >= 40,
+            False,
+            {"fell": abs(self.ball).max() > self.size},
+        )
+
+
+# The checker would warn, because the ball is the same array in each observation.
+gymnasium.register("Tray-v0", entry_point=Tray, disable_env_checker=True)
+gymnasium.register("Short-v0", entry_point=Tray, disable_env_checker=True, max_episode_steps=10)
+
+
+def fell_hard(observation, reward, terminated, truncated, info):
+    return f"fell at {observation['step'][0]}" if info["fell"] else ""
+
+
+def scenario_of(name, *, crash=None, arguments=None, **kwargs):
+    setup = GymSetup(id=name, kwargs=kwargs, crash=CrashRule(**(crash or {})))
+    return Scenario(simulator="gym", tables={"gym": setup}, agents={"ball": AgentSetup()}, arguments=arguments or {})
+
+
+def simulator_of(tmp_path, *words, **options):
+    return GymSimulator(scenario_of(*words, **options), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["CartPole-v1", "MountainCarContinuous-v0", "FrozenLake-v1", "Blackjack-v1", "Tray-v0", "tests_tray:make_tray"],
+)
+class TestGym(SimulatorContract):
+    @pytest.fixture
+    def make(self, tmp_path, name, monkeypatch):
+        (tmp_path / "tests_tray.py").write_text(
+            "import gymnasium\ndef make_tray():\n    return gymnasium.make('Tray-v0', disable_env_checker=True)\n"
+        )
+        monkeypatch.syspath_prepend(tmp_path)
+        return lambda: GymSimulator(scenario_of(name), tmp_path)
+
+    def test_an_episode_depends_on_its_seed_alone(self, make, name):
+        if name == "FrozenLake-v1":  # it always begins in the same place, and the lake is slippery by chance
+            self.steps = 3
+        super().test_an_episode_depends_on_its_seed_alone(make)
+
+
+FALL = {"tilt": np.array([1.0, 0.0], np.float32), "kick": 0}
+
+
+def fall(simulator, steps=100):
+    simulator.reset(seed=1, options={"arguments": {}})
+    for step in range(1, steps + 1):
+        _, _, terminations, _, _ = simulator.step({"ball": simulator.actions["ball"].encode(FALL)})
+        if terminations["ball"]:
+            return step
+    return None
+
+
+@pytest.mark.parametrize(
+    ("crash", "says"),
+    [
+        ({"info": "fell"}, "fell"),
+        ({"reward_below": -2.0}, "reward -2."),
+        ({"function": f"{__name__}:fell_hard"}, "fell at "),
+        ({"termination": True}, "terminated"),
+    ],
+)
+def test_the_crash_rule_states_when_and_why(tmp_path, crash, says):
+    simulator = simulator_of(tmp_path, "Tray-v0", crash=crash)
+    step = fall(simulator)
+    (contact,) = simulator.scene().contacts
+    assert contact.kind.startswith(says)
+    assert step == 40 if says == "terminated" else 8 <= step <= 13
+    (finding,) = ReportedCollision().check(simulator.scene(), ("ball",))
+    assert (finding.collision.role, finding.collision.kind) == ("alone", contact.kind)
+
+
+def test_without_a_rule_the_episode_finishes_when_the_environment_terminates(tmp_path):
+    simulator = simulator_of(tmp_path, "Tray-v0")
+    assert fall(simulator) == 40
+    assert simulator.scene().contacts == ()
+    assert simulator.agents == []
+
+
+def was_cut(observation, reward, terminated, truncated, info):
+    return truncated and "cut"
+
+
+OWN_LIMIT = "the environment 'Short-v0' ends an episode after {} steps, which is its own time limit; set "
+
+
+@pytest.mark.parametrize(
+    ("limit", "kwargs", "ends", "told"),
+    [
+        ("registered", {}, 10, OWN_LIMIT.format(10)),
+        ("registered", {"max_episode_steps": 7}, 7, OWN_LIMIT.format(7).removesuffix("; set ")),
+        ("registered", {"max_episode_steps": -1}, 40, ""),
+        ("registered", {"max_episode_steps": 60}, 40, ""),
+        ("none", {}, 40, ""),
+        ("none", {"max_episode_steps": 7}, 7, OWN_LIMIT.format(7).removesuffix("; set ")),
+    ],
+)
+def test_registered_time_limit_ends_an_episode_unless_the_scenario_lifts_it(tmp_path, limit, kwargs, ends, told):
+    scenario = scenario_of("Short-v0", crash={"function": f"{__name__}:was_cut"}, **kwargs)
+    simulator = GymSimulator(scenario.with_table(replace(scenario.table(GymSetup), time_limit=limit)), tmp_path)
+    for _ in range(2):
+        assert fall(simulator) == ends
+    assert [contact.kind for contact in simulator.scene().contacts] == (["cut"] if ends < 40 else [])
+    assert [notice.partition("gym.time_limit")[0] for notice in simulator.notices] == ([told] if told else [])
+
+
+def test_limit_of_an_id_is_reported_where_its_class_is_named_and_runs_longer(tmp_path):
+    simulator = simulator_of(tmp_path, f"{__name__}:Tray")
+    fall(simulator, steps=6)
+    assert list(simulator.notices) == []
+    assert fall(simulator) == 40
+    told = "is registered as 'Doubled-v0' with a time limit of 9 steps, which only that id has"
+    assert list(simulator.notices) == [f"the environment '{__name__}:Tray' {told}"]
+
+
+def test_id_without_a_version_may_have_the_form_of_an_attribute(tmp_path):
+    gymnasium.register("TrayWithoutVersion", entry_point=Tray, disable_env_checker=True, max_episode_steps=6)
+    assert fall(simulator_of(tmp_path, f"{__name__}:TrayWithoutVersion")) == 6
+    del gymnasium.registry["TrayWithoutVersion"]
+    with pytest.raises(CrashhuntError, match="has no attribute 'TrayWithoutVersion'"):
+        simulator_of(tmp_path, f"{__name__}:TrayWithoutVersion")
+
+
+def test_scenario_that_lifts_the_time_limit_has_a_note():
+    for kwargs, limit, count in (({}, "registered", 0), ({}, "none", 1), ({"max_episode_steps": -1}, "registered", 1)):
+        scenario = scenario_of("Short-v0", crash={"info": "fell"}, **kwargs)
+        notes = list(BACKEND.notes(scenario.with_table(replace(scenario.table(GymSetup), time_limit=limit))))
+        assert len(notes) == count
+        assert all("'Short-v0' is registered is lifted" in note for note in notes)
+
+
+class Doubled(gymnasium.RewardWrapper, gymnasium.utils.RecordConstructorArgs):
+    def __init__(self, env):
+        gymnasium.utils.RecordConstructorArgs.__init__(self)
+        super().__init__(env)
+
+    def reward(self, reward):
+        return 2 * float(reward)
+
+
+gymnasium.register(
+    "Doubled-v0",
+    entry_point=Tray,
+    disable_env_checker=True,
+    additional_wrappers=(Doubled.wrapper_spec(),),
+    max_episode_steps=9,
+)
+
+
+def test_environment_has_the_wrappers_with_which_it_is_registered(tmp_path):
+    plain, doubled = simulator_of(tmp_path, "Tray-v0"), simulator_of(tmp_path, "Doubled-v0")
+    rewards = []
+    for simulator in (plain, doubled):
+        simulator.reset(seed=1)
+        rewards.append(simulator.step({"ball": simulator.actions["ball"].encode(FALL)})[1]["ball"])
+    assert rewards[1] == 2 * rewards[0]
+    assert fall(doubled) == 9
+
+
+def test_scenario_without_a_crash_rule_has_a_note():
+    for crash, count in (({}, 1), ({"kind": f"{__name__}:kind_of"}, 1), ({"info": "fell"}, 0)):
+        found = list(BACKEND.notes(scenario_of("Tray-v0", crash=crash)))
+        assert (
+            found == ["gym.crash has no rule, so only failures of the agent and of the environment are crashes"] * count
+        )
+
+
+@pytest.mark.parametrize(("key", "hint"), [("felt", "did you mean 'fell'?"), ("fell", ""), ("red light", "")])
+def test_misspelt_key_of_the_crash_rule_is_reported_once(tmp_path, key, hint):
+    simulator = simulator_of(tmp_path, "Tray-v0", crash={"info": key})
+    fall(simulator, steps=2)
+    fall(simulator, steps=2)
+    expected = f"gym.crash.info = {key!r} is not a key of the first step's info: {hint}"
+    assert list(simulator.notices) == [expected] * bool(hint)
+
+
+def test_observations_are_recorded_flat_and_shown_as_they_are(tmp_path):
+    simulator = simulator_of(tmp_path, "Tray-v0")
+    observations, _ = simulator.reset(seed=4)
+    flat, space = observations["ball"], simulator.shown_spaces["ball"]
+    assert flat.shape == (2 + 2 + 1,)
+    shown = spaces.unflatten(space, flat)
+    assert space.contains(shown)
+    assert np.array_equal(shown["ball"], simulator._env.unwrapped.ball)
+
+
+def test_scenario_arguments_are_keywords(tmp_path):
+    arguments = {"wide": ArgumentSetup(default=3.0, option="size")}
+    simulator = simulator_of(tmp_path, "Tray-v0", crash={"info": "fell"}, arguments=arguments)
+    assert simulator._env.unwrapped.size == 3.0
+    simulator.reset(seed=1, options={"arguments": {"wide": 0.5}})
+    assert simulator._env.unwrapped.size == 0.5
+    with pytest.raises(InvalidEpisodeError, match="a tray has a size"):
+        simulator.reset(seed=1, options={"arguments": {"wide": -1.0}})
+
+
+def make_nested(config=None, **kwargs):
+    """One that takes a table, and refuses what is in it."""
+    if config["friction"]["of"] < 0:
+        raise ValueError("friction is\nnegative")
+    made = Tray(**kwargs)
+    made.config = config
+    return made
+
+
+def make_nothing():
+    return "a tray"
+
+
+def test_a_dotted_option_is_an_entry_of_a_table_and_the_rest_of_it_stays(tmp_path):
+    config = {"friction": {"of": 0.1, "type": "dry"}}
+    arguments = {"wet": ArgumentSetup(default=0.5, option="config.friction.of")}
+    name = f"{__name__}:make_nested"
+    simulator = simulator_of(tmp_path, name, arguments=arguments, config=config, size=1.0)
+    assert simulator._env.config == {"friction": {"of": 0.5, "type": "dry"}}
+    simulator.reset(seed=1, options={"arguments": {"wet": 0.7}})
+    assert simulator._env.config == {"friction": {"of": 0.7, "type": "dry"}}
+    assert config == {"friction": {"of": 0.1, "type": "dry"}}
+    with pytest.raises(InvalidEpisodeError, match="friction is"):
+        simulator.reset(seed=1, options={"arguments": {"wet": -1.0}})
+
+
+class OldTray(Tray):
+    """Has the interface of the gym before Gymnasium."""
+
+    returned = (np.zeros(2), 0.0, False, {})
+
+    def reset(self, *, seed=None, options=None):
+        given = super().reset(seed=seed)
+        return given if self.size > 1 else np.zeros(2)
+
+    def step(self, action):
+        return self.returned if self.size > 2 else (np.zeros(2), 0.0, False, False, None)
+
+
+@pytest.mark.parametrize(
+    ("size", "says"),
+    [
+        (3.0, "step() returned 4 values, but step() of Gymnasium returns observation, reward, terminated, truncated"),
+        (2.0, "step() returned info = None, which is not a dictionary"),
+        (1.0, "reset() returned one ndarray, but reset() of Gymnasium returns observation, info"),
+    ],
+)
+def test_error_of_an_old_gym_environment_states_what_gymnasium_returns(tmp_path, size, says):
+    simulator = simulator_of(tmp_path, f"{__name__}:OldTray", size=size)
+    with pytest.raises((ForeignError, InvalidEpisodeError)) as caught:
+        fall(simulator, steps=1)
+    assert says in str(getattr(caught.value, "error", caught.value))
+
+
+gymnasium.register("OldTray-v0", entry_point=OldTray, max_episode_steps=5, disable_env_checker=True)
+
+
+def test_error_of_an_old_gym_environment_is_the_same_inside_a_wrapper(tmp_path):
+    simulator = simulator_of(tmp_path, "OldTray-v0", size=2.5)
+    simulator.reset(seed=1)
+    with pytest.raises(ForeignError) as caught:
+        simulator.step({"ball": simulator.actions["ball"].encode(FALL)})
+    assert str(caught.value.error) == (
+        "step() of Gymnasium returns observation, reward, terminated, truncated, info, but step() of the environment: "
+        "not enough values to unpack (expected 5, got 4)"
+    )
+
+
+def test_a_flattened_action_has_the_type_of_its_space_or_is_refused(tmp_path):
+    form = simulator_of(tmp_path, "Tray-v0").actions["ball"]
+    encoded = form.encode(FALL)
+    again = form.encode(encoded.astype(np.float16))
+    assert (again.dtype, again.tolist()) == (encoded.dtype, encoded.tolist())
+    with pytest.raises(ActionError, match="is not in"):
+        form.encode(encoded.astype(complex))
+
+
+class Spaceless(Tray):
+    observation_space = None
+
+
+gymnasium.register("Spaceless-v0", entry_point=Spaceless, disable_env_checker=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "says"),
+    [
+        ("Carpole-v1", {}, "Carpole"),
+        ("Tray-v0", {"colour": "red"}, "colour"),
+        ("Tray-v0", {"reset_options": {"low": 1}}, "; add reset_options = {} to the table [gym]"),
+        (f"{__name__}:Tray", {"max_episode_steps": 5}, "; remove max_episode_steps, or name the id with which the env"),
+        ("Spaceless-v0", {}, "the environment's observation_space is None, not a gymnasium.Space; set it"),
+        ("no_such_module:make", {}, "no_such_module"),
+        (f"{__name__}:make_nested", {"config": {"friction": {"of": -1}}}, "friction is negative"),
+        (f"{__name__}:make_nothing", {}, "this factory returned a str"),
+        ("CartPole-v1", {"crash": {"function": "math:cosine"}}, "cosine"),
+    ],
+)
+def test_a_mistake_is_one_line(tmp_path, name, options, says):
+    with pytest.raises((ScenarioError, CrashhuntError)) as caught:
+        simulator_of(tmp_path, name, **options)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+class Straying(gymnasium.Env):
+    """Shows what it does not promise: no number at step 2, too much at step 3."""
+
+    observation_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        shown = {2: np.nan, 3: 7.0}.get(self.steps, 0.5)
+        return np.array([shown, 0.0], np.float32), 0.0, False, False, {}
+
+
+def make_straying():
+    return Straying()
+
+
+def test_observations_that_the_environment_does_not_promise_are_reported_once(tmp_path):
+    simulator = simulator_of(tmp_path, f"{__name__}:make_straying")
+    for _ in range(2):
+        simulator.reset(seed=1)
+        for _ in range(4):
+            simulator.step({"me": np.array(1)} if "me" in simulator.agents else {simulator.agents[0]: np.array(1)})
+    nan, outside = simulator.notices
+    assert nan.endswith("shows its agent an observation that contains NaN")
+    assert outside.endswith("shows its agent an observation outside its own observation space")
+
+
+SCENARIO = """
+schema = 1
+title = "Strays"
+simulator = "gym"
+[gym]
+id = "straying:make_straying"
+[agents.me]
+agent = "random"
+"""
+
+
+def test_a_hunt_reports_it_in_its_summary(shell):
+    source = Path(__file__).read_text(encoding="utf-8")
+    body = source.partition("class Straying")[2].partition("\n\n\ndef test_")[0]
+    (shell.folder / "straying.py").write_text(
+        f"import gymnasium\nimport numpy as np\nfrom gymnasium import spaces\n\n\nclass Straying{body}\n"
+    )
+    (shell.folder / "strays.toml").write_text(SCENARIO)
+    done = shell.crashhunt("run", "h", "1", "2", "4", "--scenario", "strays.toml", "--seed", "1", "--json")
+    assert done.json["outcomes"] == {"survived": 2}
+    assert sum("contains NaN" in note for note in done.json["notes"]) == 1
+    assert "Note: the environment 'straying:make_straying' shows its agent an observation outside" in done.err
+
+
+class Near(Tray):
+    def step(self, action):
+        *rest, info = super().step(action)
+        left = self.size - abs(self.ball).max()
+        return *rest, {
+            **info,
+            "left": left if self.steps != 2 else math.nan,
+            "share": 1 - left / self.size,
+            "word": "far",
+        }
+
+
+gymnasium.register("Near-v0", entry_point=Near, disable_env_checker=True)
+
+
+@pytest.mark.parametrize(("danger", "most"), [("-info.left", 1 / 1.25), ("info.share", 0.875), ("info.other", None)])
+def test_where_no_scene_states_it_the_environment_names_its_danger(tmp_path, danger, most):
+    scenario = scenario_of("Near-v0")
+    simulator = GymSimulator(scenario.with_table(replace(scenario.table(GymSetup), danger=danger)), tmp_path)
+    for _ in range(2):  # of an episode, nothing is left in the next
+        simulator.reset(seed=1)
+        assert simulator.named_danger is None
+        nearness = Nearness(list)
+        nearness.begin(SimpleNamespace(names=("ball",), simulator=simulator))
+        simulator._env.unwrapped.ball[:] = 1.55
+        for tilt in (1.0, -1.0, -1.0):
+            action = simulator.actions["ball"].encode({"tilt": np.full(2, tilt, np.float32), "kick": 0})
+            simulator.step({"ball": action})
+        assert simulator.named_danger == (most and pytest.approx(most))
+        spec = TrialSpec(0, 1, {"ball": {}}, {}, max_steps=3)
+        assert nearness.end(TrialResult(spec, Outcome.SURVIVED)).danger == simulator.named_danger
+
+
+def test_a_danger_that_names_nothing_or_is_no_number_is_one_line(tmp_path):
+    scenario = scenario_of("Near-v0")
+    for danger in ("distance", "info.", "-reward"):
+        with pytest.raises(ScenarioError, match=f"gym.danger = '{danger}' is not of the form"):
+            BACKEND.check(scenario.with_table(replace(scenario.table(GymSetup), danger=danger)), "scenario.toml")
+    simulator = GymSimulator(scenario.with_table(replace(scenario.table(GymSetup), danger="info.word")), tmp_path)
+    simulator.reset(seed=1)
+    with pytest.raises(ForeignError) as caught:
+        simulator.step({"ball": simulator.actions["ball"].encode({"tilt": np.zeros(2, np.float32), "kick": 0})})
+    assert str(caught.value.error).startswith("gym.danger = 'info.word' is of type str: 'far' (allowed: a bool, ")
+
+
+class Kinds(Tray):
+    def step(self, action):
+        *rest, info = super().step(action)
+        kind = {1: "left  edge\n", 2: 7, 3: "", 4: "a" * 200}.get(self.size, "right edge")
+        return *rest, {**info, "crash_kind": kind}
+
+
+gymnasium.register("Kinds-v0", entry_point=Kinds, disable_env_checker=True)
+
+
+def kind_of(observation, reward, terminated, truncated, info):
+    return f"beyond {observation['ball'][0]:.0f}" if info["fell"] else 1 / 0
+
+
+@pytest.mark.parametrize(
+    ("size", "rule", "kind"),
+    [
+        (1, {"info": "fell"}, "left edge"),
+        (2, {"info": "fell"}, "fell"),  # a number is no text
+        (3, {"info": "fell"}, "fell"),
+        (4, {"info": "fell"}, "a" * 80),
+        (5, {"info": "fell"}, "right edge"),
+        (5, {"info": "fell", "kind": f"{__name__}:kind_of"}, "beyond 5"),
+    ],
+)
+def test_environment_or_function_names_the_crash_type(tmp_path, size, rule, kind):
+    simulator = simulator_of(tmp_path, "Kinds-v0", crash=rule, size=size)
+    fall(simulator)
+    (contact,) = simulator.scene().contacts
+    assert contact.kind == kind
+    # A cell describes the crash where neither the environment nor a function names its type.
+    assert (simulator.crash_cell == "") == (kind not in ("fell",))
+    simulator.reset(seed=2)
+    assert simulator.crash_cell == ""
+
+
+TWO_KINDS = """
+import gymnasium
+import numpy as np
+
+class Env(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-9, 9, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.side = int(self.np_random.integers(2))
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), -7.5 - self.side, True, False, {"crash_kind": ("ice", "wall 3")[self.side]}
+"""
+
+
+def test_hunt_groups_crashes_by_the_kind_that_the_environment_names(shell):
+    (shell.folder / "two.py").write_text(TWO_KINDS)
+    crash = "crash = { termination = true }"
+    scenario = SCENARIO.replace("straying:make_straying", "two:Env").replace("[agents", f"{crash}\n[agents")
+    (shell.folder / "two.toml").write_text(scenario)
+    done = shell.crashhunt(
+        "run", "h", "1", "6", "4", "--scenario", "two.toml", "--seed", "1", "--keep-going", "--keep", "1", "--json"
+    )
+    assert sorted(kind["words"] for kind in done.json["kinds"]) == ["ice", "wall #"]
+    assert sum(kind["count"] for kind in done.json["kinds"]) == 6

@@ -1,0 +1,103 @@
+"""Traffic that keeps to the left: SUMO mirrors everything, and left is left all the same."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from crashhunt.scenario import load_scenario
+from crashhunt.sumo import SumoSimulator
+from crashhunt.trial import Disturbance
+
+OTHER = '<vehicle id="{0}" type="car" route="st" depart="0" departPos="70" departLane="{0}" departSpeed="10"/>'
+NET = Path(__file__).with_name("nets") / "left.net.xml"
+SCENARIO = """
+schema = 1
+simulator = "sumo"
+step_length_s = 0.1
+
+[sumo]
+net = "left.net.xml"
+routes = ["r.rou.xml"]
+options = { %s }
+
+[agents.ego]
+agent = "keep-lane"
+type = "car"
+edges = ["st"]
+depart_lane = "1"
+depart_pos = "50"
+depart_speed = "10"
+action = "%s"
+"""
+
+
+@pytest.mark.parametrize("action", ["continuous", "meta"])
+@pytest.mark.parametrize("options", ["", "lateral-resolution = 0.8"])
+def test_a_change_to_the_left_is_one(tmp_path, options, action):
+    shutil.copy(NET, tmp_path)
+    (tmp_path / "r.rou.xml").write_text('<routes><vType id="car" sigma="0" speedFactor="1"/></routes>')
+    (tmp_path / "scenario.toml").write_text(SCENARIO % (options, action))
+    stage = tmp_path / "stage"
+    stage.mkdir()
+    with closing(SumoSimulator(load_scenario(str(tmp_path)), stage)) as simulator:
+        for side in (1, -1):
+            observations, *_ = simulator.reset(seed=1, options={})
+            before = observations["ego"][0]
+            y = simulator.scene().points[0][1]
+            form, step = simulator.actions["ego"], None
+            for number in range(40):
+                turn = number == 0
+                meant = (10.0, side if turn else 0) if action == "continuous" else (1 - side) if turn else 1
+                step = simulator.step({"ego": form.encode(meant)})
+            moved = simulator.scene().points[0][1] - y  # it drives towards x
+            assert 2.0 < side * moved < 3.3  # on the sublanes, most of it
+            shown = step[0]["ego"][0]
+            assert before[2] == pytest.approx(3.2)  # right of the leftmost lane, of three
+            assert shown[2] - before[2] == pytest.approx(-moved, abs=1e-3)
+
+
+def test_a_sidewalk_does_not_move_the_lanes_of_the_observation(tmp_path):
+    """The sidewalk is lane 0 and 2 m wide; the other lanes have 3.2 m."""
+    shutil.copy(NET.with_name("sidewalk.net.xml"), tmp_path / "left.net.xml")
+    (tmp_path / "r.rou.xml").write_text('<routes><vType id="car" sigma="0"/></routes>')
+    (tmp_path / "scenario.toml").write_text(SCENARIO.replace('"st"', '"e"') % ("", "continuous"))
+    stage = tmp_path / "stage"
+    stage.mkdir()
+    with closing(SumoSimulator(load_scenario(str(tmp_path)), stage)) as simulator:
+        observations, *_ = simulator.reset(seed=1, options={})
+        assert observations["ego"][0][2] == pytest.approx(3.2)
+        for _ in range(20):
+            observations, *_ = simulator.step({"ego": simulator.actions["ego"].encode((10.0, 1))})
+            if observations["ego"][0][2] == 0:
+                break
+            assert observations["ego"][0][2] == pytest.approx(3.2)
+        assert observations["ego"][0][2] == 0
+
+
+@pytest.mark.parametrize(("who", "lane", "side"), [("left ahead", "0", 1), ("right ahead", "2", -1)])
+def test_who_cuts_in_from_the_left_is_there(tmp_path, who, lane, side):
+    shutil.copy(NET, tmp_path)
+    traffic = '<vType id="car" sigma="0" speedFactor="1"/><route id="st" edges="st"/>' + "".join(
+        map(OTHER.format, "02")
+    )
+    (tmp_path / "r.rou.xml").write_text(f"<routes>{traffic}</routes>")
+    (tmp_path / "scenario.toml").write_text(SCENARIO % ("", "continuous"))
+    stage = tmp_path / "stage"
+    stage.mkdir()
+    with closing(SumoSimulator(load_scenario(str(tmp_path)), stage)) as simulator:
+        simulator.reset(seed=1, options={})
+        cut_in = Disturbance(1, who, "cut_in", 0.0, 2.0, "ego")
+        assert simulator.resolve_target(cut_in) == lane
+        scene = simulator.scene()
+        y = dict(zip([actor.id for actor in scene.roster.actors], [y for _, y in scene.points], strict=True))
+        assert side * (y[lane] - y["ego"]) > 3.0  # it drives towards x
+        assert simulator.disturb(lane, cut_in) is not None
+        for _ in range(5):
+            simulator.step({"ego": simulator.actions["ego"].encode((10.0, 0))})
+        scene = simulator.scene()
+        after = dict(zip([actor.id for actor in scene.roster.actors], [y for _, y in scene.points], strict=True))
+        assert after[lane] == after["ego"]

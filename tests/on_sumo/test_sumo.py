@@ -1,0 +1,298 @@
+"""SUMO for real, through the command line: bring your own, lane changes, broken files; and the observation's layout."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import libsumo
+import numpy as np
+import pytest
+
+from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.recording import read_log
+from crashhunt.scenario import ObservationSetup, load_scenario, shipped_folder
+from crashhunt.simulators import Kinematics
+from crashhunt.sumo import SumoSimulator
+from crashhunt.world import Actor, Roster, Scene
+
+AGENTS = """
+class Turns:
+    def __init__(self, at: int = 10, change: int = 1, action_space=None):
+        self.at, self.change, self.meta = at, change, getattr(action_space, "n", None)
+
+    def reset(self, seed):
+        self.step = 0
+
+    def act(self, observation):
+        self.step += 1
+        if self.meta:
+            return 0 if self.step >= self.at else 1
+        return 8.0, self.change if self.step >= self.at else 0
+"""
+
+
+@pytest.fixture
+def town(shell):
+    shutil.copy(shipped_folder() / "loop" / "loop.net.xml", shell.folder / "net.net.xml")
+    (shell.folder / "r.rou.xml").write_text(
+        '<routes><route id="way" edges="south east north west"/>'
+        '<flow id="odd.name#1" route="way" begin="3" end="60" number="5" departSpeed="max"/></routes>'
+    )
+    (shell.folder / "det.add.xml").write_text(
+        '<additional><inductionLoop id="d" lane="south_0" pos="50" period="10" file="detector.xml"/></additional>'
+    )
+    (shell.folder / "town.sumocfg").write_text(
+        '<configuration><input><net-file value="net.net.xml"/><route-files value="r.rou.xml"/>'
+        '<additional-files value="det.add.xml"/></input><output><tripinfo-output value="trips.xml"/></output>'
+        '<time><step-length value="0.2"/></time></configuration>'
+    )
+    (shell.folder / "turns.py").write_text(AGENTS)
+    return shell
+
+
+EGOS = {"odd.name#1.2": ("--ego", "odd.name#1.2"), "ego": ("--ego", "edges=-south,-north")}
+
+
+@pytest.mark.parametrize(
+    ("agent", "ego"),  # by day, the tests below name vehicles
+    [pytest.param(agent, ego, marks=[pytest.mark.nightly] * (ego != EGOS["ego"])) for agent, ego in EGOS.items()],
+    ids=["named", "added"],
+)
+def test_a_network_that_no_one_wrote_for_us(town, agent, ego):
+    before = sorted(path.name for path in town.folder.iterdir())
+    words = ("run", "h", "2", "3", "100", "--scenario", "town.sumocfg", *ego, "--arg", "speed=5:9", "--keep-going")
+    done = town.crashhunt(*words, "--keep-trials", "--json")
+    assert done.json["trials_run"] == 3
+    assert "invalid" not in done.json["outcomes"]
+    params = json.loads((town.folder / "h" / "trials" / "000000" / "params.json").read_text())
+    assert list(params["spec"]["arguments"]) == [agent]
+    # What SUMO writes beside its input files must not end up beside the user's.
+    assert sorted(path.name for path in town.folder.iterdir() if path.name != "__pycache__") == sorted([*before, "h"])
+
+
+def test_another_vehicle_is_driven_in_each_trial(town):
+    words = ("--scenario", "town.sumocfg", "--arg", "speed=5:9", "--keep-going", "--keep-trials", "--seed", "3")
+    done = town.crashhunt("run", "h", "2", "6", "100", *words, "--json")
+    assert "invalid" not in done.json["outcomes"]
+    assert "each trial replaces one random vehicle (3 candidates, entering at 2" in done.err
+    specs = [json.loads(path.read_text())["spec"] for path in (town.folder / "h" / "trials").glob("*/params.json")]
+    assert {"ego"} == {agent for spec in specs for agent in spec["arguments"]}
+    assert len({spec["scenario_arguments"]["vehicle"] for spec in specs}) > 1
+
+
+@pytest.mark.nightly  # by day, without a hunt below, and plans/ has arguments of scenarios
+def test_a_vehicle_that_is_asked_for_is_driven_or_reported_of(town):
+    words = ("--scenario", "town.sumocfg", "--arg", "speed=5:9", "--keep-going", "--keep-trials", "--seed", "3")
+    town.crashhunt("run", "one", "1", "1", "20", *words, "--set", "vehicle=odd.name#1.2", "--json")
+    (params,) = (town.folder / "one" / "trials").glob("*/params.json")
+    assert json.loads(params.read_text())["spec"]["scenario_arguments"]["vehicle"] == "odd.name#1.2"
+    nobody = town.crashhunt("run", "none", "1", "1", "20", *words, "--set", "vehicle=nobody", "--json", expect=3)
+    assert "the vehicle 'nobody' was not on the road" in nobody.err
+
+
+def test_who_takes_the_place_of_another_drives_on_from_there(town, tmp_path):
+    """The same traffic as with the other, whose way goes on, one step later, where it was."""
+    scenes = {}
+    for ego in ("odd.name#1.2", "any"):
+        scenario = load_scenario(town.folder / "town.sumocfg", ego=ego)
+        (agent,) = scenario.agents
+        with closing(SumoSimulator(scenario, tmp_path)) as simulator:
+            simulator.reset(seed=4, options={"arguments": {"scale": 1.0, "vehicle": "odd.name#1.2"}})
+            scenes[ego] = scene = simulator.scene()
+            row = scene.roster.index[agent]
+            assert libsumo.vehicle.getRoute(agent) == ("south", "east", "north", "west")
+            if ego == "any":
+                assert "odd.name#1.2" not in libsumo.vehicle.getIDList()
+                was = scenes["odd.name#1.2"]
+                before = was.roster.index["odd.name#1.2"]
+                assert scene.time_s == pytest.approx(was.time_s + scenario.step_length_s)
+                assert scene.points[row] == pytest.approx(was.points[before], abs=3.0)
+                assert scene.speeds[row] == pytest.approx(was.speeds[before], abs=1.0)
+
+
+def entered(town, tmp_path, vehicle, **changed):
+    """The agent in the place of somebody, or in that of each of two; where it is, and its route."""
+    scenario = load_scenario(town.folder / "town.sumocfg", ego="any")
+    (setup,) = scenario.agents.values()
+    with closing(SumoSimulator(replace(scenario, **{"agents": {"ego": setup}, **changed}), tmp_path)) as simulator:
+        simulator.reset(seed=4, options={"arguments": {"scale": 1.0, "vehicle": vehicle}})
+        return libsumo.vehicle.getRoadID("ego"), libsumo.vehicle.getRoute("ego")
+
+
+def test_who_departs_further_on_is_replaced_there(town, tmp_path):
+    (town.folder / "r.rou.xml").write_text(
+        '<routes><route id="way" edges="south east north west"/>'
+        '<vehicle id="first" route="way" depart="0"/>'
+        '<vehicle id="here" route="way" depart="3" departEdge="2" departPos="20"/>'
+        '<vehicle id="late" route="way" depart="9"/></routes>'
+    )
+    assert entered(town, tmp_path, "here") == ("north", ("north", "west"))
+
+
+def test_who_has_departed_in_the_warm_up_is_reported_of(town, tmp_path):
+    with pytest.raises(
+        InvalidEpisodeError, match=r"'odd.name#1.0' had departed in the warm-up already; lower warmup_s"
+    ):
+        entered(town, tmp_path, "odd.name#1.0", warmup_s=20.0)
+    assert entered(town, tmp_path, "odd.name#1.4", warmup_s=20.0)[0] == "south"
+
+
+def test_who_is_nowhere_is_reported_of(town, tmp_path):
+    with pytest.raises(InvalidEpisodeError, match=r"the vehicle 'nobody' was not on the road"):
+        entered(town, tmp_path, "nobody")
+    assert entered(town, tmp_path, "odd.name#1.2") == ("south", ("south", "east", "north", "west"))
+
+
+def test_two_agents_cannot_take_one_place(town, tmp_path):
+    (setup,) = load_scenario(town.folder / "town.sumocfg", ego="any").agents.values()
+    with pytest.raises(InvalidEpisodeError, match=r"a and b both replace the vehicle 'odd.name#1.2'"):
+        entered(town, tmp_path, "odd.name#1.2", agents={"a": setup, "b": setup})
+
+
+def test_a_vehicle_that_never_enters_is_invalid(town):
+    words = ("run", "h", "1", "4", "100", "--scenario", "town.sumocfg", "--ego", "odd.name#1.7", "--json")
+    done = town.crashhunt(*words, expect=3)  # the flow has five
+    assert done.json["stopped_because"] == "no_valid_trial"
+    assert "'odd.name#1.7' was not on the road" in done.err
+    scenario = load_scenario(town.folder / "town.sumocfg", ego="odd.name#1.7")
+    waited_s = scenario.agents["odd.name#1.7"].depart_s + scenario.insertion_timeout_s
+    assert done.json["steps_total"] == round(4 * waited_s / 0.2)  # none of which is a trial's own
+
+
+@pytest.mark.parametrize("only", [None, []])
+def test_what_is_simulated_before_the_first_step_is_counted(town, tmp_path, only):
+    scenario = load_scenario(town.folder / "town.sumocfg", ego="odd.name#1.3")
+    asked = {"options": {"arguments": {"scale": 1.0}, **({} if only is None else {"only": only})}}
+    with closing(SumoSimulator(replace(scenario, warmup_s=11.0), tmp_path)) as simulator:
+        for _ in range(2):  # it begins at 0 s each time
+            simulator.reset(seed=4, **asked)
+            assert simulator.setup_steps == round(simulator.scene().time_s / 0.2) > 11 / 0.2
+        simulator.step({agent: simulator.actions[agent].encode((8.0, 0)) for agent in simulator.agents})
+        assert simulator.setup_steps == round(simulator.scene().time_s / 0.2) - 1
+        (town.folder / "r.rou.xml").write_text("<routes")
+    with closing(SumoSimulator(scenario, tmp_path)) as simulator:
+        with pytest.raises(InvalidEpisodeError):
+            simulator.reset(seed=4, **asked)
+        assert simulator.setup_steps == 0
+
+
+@pytest.mark.parametrize("damage", ["</net", pytest.param("<net><edge", marks=pytest.mark.nightly)])
+def test_a_malformed_network_is_no_crash(town, damage):
+    (town.folder / "net.net.xml").write_text(damage)
+    done = town.crashhunt("run", "h", "1", "40", "100", "--scenario", "town.sumocfg", "--json", expect=3)
+    assert set(done.json["outcomes"]) == {"invalid"}
+    assert done.json["crashes"] == []
+
+
+def test_leaving_the_road_and_changing_lanes(town):
+    """To the left twice from any of two lanes is off the road; in the discrete form it is ignored."""
+    words = ("--agent", "turns:Turns", "--set", "vehicles=10", "--seed", "4", "--json")
+    (crash,) = town.crashhunt("run", "h", "1", "1", "100", *words).json["crashes"]
+    assert crash["outcome"] == "off_road"
+    assert crash["step"] in (10, 11, 12)
+    assert crash["confirmed"] is True
+    path = Path(town.folder / crash["path"])
+    assert json.loads((path / "crash.json").read_text())["collision"]["role"] == "alone"
+    observations = read_log(path / "log.mcap").observations("ego")
+    assert observations[-1][0, 2] == 0.0  # y: in the leftmost lane
+    own = town.folder / "meta"
+    shutil.copytree(shipped_folder() / "loop", own)
+    text = (own / "scenario.toml").read_text()
+    (own / "scenario.toml").write_text(text.replace('type = "ego"', 'type = "ego"\naction = "meta"'))
+    report = town.crashhunt("run", "m", "1", "1", "100", "--scenario", "meta", *words).json
+    assert report["outcomes"] in ({"survived": 1}, {"collision": 1})
+
+
+def test_two_agents_have_channels_and_arguments_of_their_own(shell):
+    words = ("run", "h", "1", "12", "400", "--scenario", "loop-two-agents", "--seed", "2", "--json")
+    crowded = ("--set", "vehicles=45")  # so that one of the first trials crashes
+    (crash,) = shell.crashhunt(*words, "--arg", "overtaker.blind_spot_m=8:10", *crowded).json["crashes"]
+    assert set(crash["arguments"]) == {"keeper", "overtaker"}
+    assert 8 <= crash["arguments"]["overtaker"]["blind_spot_m"] <= 10
+    recording = read_log(shell.folder / crash["path"] / "log.mcap")
+    assert recording.agents == ("keeper", "overtaker")
+    assert recording.actions("keeper").shape == recording.actions("overtaker").shape == (crash["step"], 2)
+    assert shell.crashhunt("replay", "h", "--json").json["verdict"] == "reproduced"
+    assert shell.crashhunt("replay", "h", "--from-log", "--json").json["verdict"] == "reproduced"
+    done = shell.crashhunt(
+        "run", "x", "1", "1", "10", "--scenario", "loop-two-agents", "--agent", "keep-lane", expect=2
+    )
+    assert "keeper=keep-lane" in done.err
+
+
+def test_seen_and_done_by_the_ego_is_what_the_log_states(shell):
+    shell.crashhunt("run", "h", "1", "30", "1500", "--arg", "speed=20:25", "--seed", "2")
+    (path,) = (shell.folder / "h" / "crashes").glob("*/log.mcap")
+    recording = read_log(path)
+    speeds = [scene.speeds[scene.roster.index["ego"]] for scene in recording.scenes()]
+    seen = recording.observations("ego")[:, 0, 3]
+    assert np.allclose(speeds[: len(seen)], seen)
+    assert np.all(np.abs(np.diff(speeds)) <= 0.1 * 9.0 + 1e-6)  # physical limits hold: speed mode 6
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_the_observation_has_the_layout_of_highway_env(normalize):
+    """The same vehicles on highway-env's own straight road, seen by highway-env's own observation."""
+    import gymnasium
+    import highway_env  # noqa: F401 - registers
+
+    features = ["presence", "x", "y", "vx", "vy", "cos_h", "sin_h"]
+    config = {
+        "observation": {
+            "type": "Kinematics",
+            "vehicles_count": 6,
+            "features": features,
+            "see_behind": True,
+            "normalize": normalize,
+        },
+        "vehicles_count": 20,
+    }
+    environment = gymnasium.make("highway-fast-v0", config=config)
+    theirs, _ = environment.reset(seed=3)
+    road = environment.unwrapped.road
+    ego = environment.unwrapped.vehicle
+    actors, points, headings, speeds = [], [], [], []
+    for number, vehicle in enumerate(road.vehicles):
+        actors.append(Actor("ego" if vehicle is ego else f"v{number}", "car", vehicle.LENGTH, vehicle.WIDTH))
+        x, y = vehicle.position
+        heading = -vehicle.heading  # their y points down
+        headings.append(heading)
+        speeds.append(float(vehicle.speed))
+        half = vehicle.LENGTH / 2
+        points.append((float(x + half * np.cos(heading)), float(-y + half * np.sin(heading))))
+    scene = Scene(0.0, Roster(tuple(actors)), points, headings, speeds)
+    row = scene.roster.index["ego"]
+    x, y = ego.position
+    setup = ObservationSetup(vehicles=6, features=tuple(features), normalize=normalize)
+    lanes = len(road.network.all_side_lanes(ego.lane_index))
+    ours = Kinematics(setup).observe(scene, row, distance=x, from_left=y, lateral_speed=0.0, lanes=lanes)
+    environment.close()
+    assert ours.shape == theirs.shape
+    assert ours.dtype == theirs.dtype
+    assert np.allclose(ours[0], theirs[0], atol=1e-5)
+    # They choose neighbours by distance along the lane, we by distance; the nearest is compared, and how it is shown.
+    shown = {tuple(np.round(other, 3)) for other in theirs[1:]}
+    assert sum(tuple(np.round(other, 3)) in shown for other in ours[1:]) >= 4
+
+
+def test_the_kind_is_shown_to_who_asks_for_it():
+    kinds = {"ego": "truck", "a": "pedestrian", "b": "bicycle", "c": "tram", "d": "Obstacle", "e": "passenger"}
+    roster = Roster(tuple(Actor(name, kind, 4.0, 1.8) for name, kind in kinds.items()))
+    points = [(10.0 * place, 0.0) for place in range(len(kinds))]
+    scene = Scene(0.0, roster, points, [0.0] * len(kinds), [1.0] * len(kinds))
+
+    def seen(**setup):
+        kinematics = Kinematics(ObservationSetup(**setup))
+        shown = kinematics.observe(scene, 0, distance=0, from_left=0, lateral_speed=0, lanes=1)
+        assert kinematics.space.contains(shown)
+        return shown
+
+    assert seen(vehicles=7, features=("kind", "presence"))[:, 0].tolist() == [1, 3, 2, 4, 5, 1, 0]
+    assert seen(vehicles=3, features=("presence", "kind"), normalize=True)[1, 1] == pytest.approx(0.6)
+    assert seen().shape == (8, 7)
+    scene.heights, scene.grades = (0.0, 8.0, 0.0, 0.0, 0.0, 0.0), (0.0,) * 6
+    assert seen(vehicles=7, features=("kind", "presence"))[:, 0].tolist() == [1, 2, 4, 5, 1, 0, 0]

@@ -1,0 +1,89 @@
+"""What a careful driver of a SUMO vehicle would consider, against the geometry of the scene."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from crashhunt.scenario import argument_values, load_scenario
+
+
+@pytest.fixture
+def merge(tmp_path):
+    from crashhunt.sumo import SumoSimulator
+
+    scenario = load_scenario("merge")
+    simulator = SumoSimulator(scenario, tmp_path)
+    simulator.reset(seed=3, options={"arguments": argument_values(scenario)})
+    yield simulator
+    simulator.close()
+
+
+def gap_between(scene, rear, front):
+    """The gap on a straight road, from poses and lengths."""
+    behind, ahead = scene.roster.index[rear], scene.roster.index[front]
+    c, s = math.cos(scene.headings[behind]), math.sin(scene.headings[behind])
+    (x, y), (to_x, to_y) = scene.points[behind], scene.points[ahead]
+    return (to_x - x) * c + (to_y - y) * s - scene.roster.actors[ahead].length
+
+
+def test_gaps_and_speeds_are_those_of_the_scene(merge):
+    seen = {"ahead": 0, 1: 0, -1: 0}
+    for step in range(160):
+        merge.step({"ego": merge.actions["ego"].encode((22.0, 1 if step == 60 else 0))})
+        if step % 8:
+            continue
+        around, scene = merge.surroundings("ego"), merge.scene()
+        if any(math.hypot(c, s) < 0.999 for c, s in [(1, 0)]) or around.speed_mps == 0:
+            continue
+        assert around.speed_mps == pytest.approx(scene.speeds[scene.roster.index["ego"]])
+        for one in around.ahead:
+            if one.actor in scene.roster.index:
+                seen["ahead"] += 1
+                assert one.gap_m == pytest.approx(gap_between(scene, "ego", one.actor), abs=0.6)
+                assert one.speed_mps == pytest.approx(scene.speeds[scene.roster.index[one.actor]])
+        for change, side in around.sides.items():
+            for one, rear, front in ((side.ahead, "ego", None), (side.behind, None, "ego")):
+                if one is not None and one.actor in scene.roster.index:
+                    seen[change] += 1
+                    wanted = gap_between(scene, rear or one.actor, front or one.actor)
+                    assert one.gap_m == pytest.approx(wanted, abs=0.6)
+    assert min(seen.values()) > 5
+
+
+def test_the_lane_to_the_left_has_vehicles_to_the_left(merge):
+    sides = {1: 0, -1: 0}
+    for step in range(160):
+        merge.step({"ego": merge.actions["ego"].encode((22.0, 1 if step == 60 else 0))})
+        around, scene = merge.surroundings("ego"), merge.scene()
+        row = scene.roster.index["ego"]
+        for change, side in around.sides.items():
+            for one in (side.ahead, side.behind):
+                if one is not None and one.actor in scene.roster.index:
+                    x, y = scene.points[row]
+                    to_x, to_y = scene.points[scene.roster.index[one.actor]]
+                    heading = scene.headings[row]
+                    left = -(to_x - x) * math.sin(heading) + (to_y - y) * math.cos(heading)
+                    assert left * change > 1.0
+                    sides[change] += 1
+    assert min(sides.values()) > 5
+
+
+def test_looking_changes_nothing_in_the_simulation(merge):
+    scenario = load_scenario("merge")
+    traces = []
+    for looks in (False, True):
+        merge.reset(seed=5, options={"arguments": argument_values(scenario)})
+        for _ in range(120):
+            merge.step({"ego": merge.actions["ego"].encode((20.0, 0))})
+            if looks:
+                merge.surroundings("ego")
+        scene = merge.scene()
+        traces.append((scene.points, scene.speeds, scene.roster.actors))
+    assert traces[0] == traces[1]
+
+
+def test_a_missing_lane_is_known(merge):
+    around = merge.surroundings("ego")
+    assert not around.sides[-1].exists
