@@ -8,6 +8,7 @@ from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
 
 from crashhunt.base.errors import CallError
+from crashhunt.base.removed import removed_fix
 from crashhunt.base.text import one_of
 
 if TYPE_CHECKING:
@@ -112,7 +113,7 @@ def _refuse(name: str, signature: inspect.Signature, args: tuple[object, ...], k
     known = _keywords(signature)
     for keyword in kwargs:
         if keyword not in known:
-            fix = one_of(keyword, known, give="it takes", none="no keywords")
+            fix = removed_fix(keyword) or one_of(keyword, known, give="it takes", none="no keywords")
             raise CallError(f"{name}() has no argument {keyword!r}", fix=fix)
     try:
         signature.bind(*args, **kwargs)

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
+from crashhunt.base.removed import removed_fix
 from crashhunt.base.text import any_of, did_you_mean
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ def _validated(kind: type[T], data: object, place: _Place) -> T:
         key = ".".join((place.under, *path) if place.under else path)
         if first["type"] in _UNKNOWN_KEY_ERRORS:
             known = list(place.keys()) if place.keys and len(path) == 1 else _known_keys(kind, path[:-1])
-            fix = did_you_mean(path[-1], known) or f"the keys here are {', '.join(known)}"
+            fix = removed_fix(path[-1]) or did_you_mean(path[-1], known) or f"the keys here are {', '.join(known)}"
             raise error(f"unknown key {key!r}", fix=fix, where=where) from None
         if first["type"] in _MISSING_KEY_ERRORS:
             raise error(f"the key {key!r} is missing", fix="add it", where=where) from None

@@ -14,10 +14,10 @@ import sys
 import textwrap
 import traceback
 from contextlib import suppress
-from itertools import pairwise
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import DISK, CrashhuntError, InternalError, UsageError, remedy
+from crashhunt.base.removed import refuse_removed_words
 from crashhunt.base.resources import error_of_next_thread, is_no_thread, limit_behind
 from crashhunt.base.signals import ended_by_signals, is_interrupt
 from crashhunt.base.temporary import remove_leftovers
@@ -226,15 +226,17 @@ def _check_names(words: Sequence[str]) -> None:
 def _spell_out(words: Sequence[str]) -> list[str]:
     """Return the command line in the form that argparse reads.
 
-    ``--splitting`` replaces the second word of ``--rare splitting``: if ``--rare`` had an optional value, ``run --rare
-    DIR`` would take DIR for this value. ``--bbox=-122.3,…`` replaces ``--bbox -122.3,…``, whose second word argparse
-    takes for an option.
+    ``--bbox=-122.3,…`` replaces ``--bbox -122.3,…``, whose second word argparse takes for an option.
+
+    Raises:
+        UsageError: a word is of an earlier version.
     """
+    refuse_removed_words(words)
     if "--bbox" in words[:-1]:
         at = words.index("--bbox")
         if re.match(r"-[\d.]", words[at + 1]):
             words = [*words[:at], f"--bbox={words[at + 1]}", *words[at + 2 :]]
-    return ["--splitting" if pair == ("--rare", "splitting") else pair[1] for pair in pairwise(["", *words])]
+    return list(words)
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 from crashhunt.base import layout
 from crashhunt.base.errors import FULL, CrashhuntError, UntrustedError, UsageError
 from crashhunt.base.files import cannot_write
+from crashhunt.base.removed import removed_fix
 from crashhunt.base.text import command_line, did_you_mean, one_line, one_of, visible
 from crashhunt.plans import hunt_options
 
@@ -83,7 +84,7 @@ class Parser(argparse.ArgumentParser):
                 break  # what follows is for the command
             name = word.partition("=")[0]
             if name.startswith("--") and " " not in name and not any(option.startswith(name) for option in known):
-                fix = f"{did_you_mean(name, known)} see {self.prog} --help".lstrip()
+                fix = removed_fix(name) or f"{did_you_mean(name, known)} see {self.prog} --help".lstrip()
                 raise UsageError(f"there is no option {name!r}", fix=fix)
         found, rest = super().parse_known_args(args, namespace)
         if rest and " " in self.prog:

@@ -18,7 +18,7 @@ from crashhunt.base.isolation import OWN_THREAD
 from crashhunt.base.resources import error_of_next_thread, limit_behind
 from crashhunt.base.text import command_line
 from crashhunt.cli._common import add_json, add_options, chosen_options, integer, make_console, unwritable_output
-from crashhunt.cli._exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_ANSWER, NO_VALID_TRIAL, THE_ANSWER_IS_NO
+from crashhunt.cli._exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_VALID_TRIAL, THE_ANSWER_IS_NO
 from crashhunt.cli._rate import exit_code_of
 from crashhunt.plans import hunt_options
 
@@ -152,8 +152,6 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         print(json.dumps(report.to_json()))
     if report.stopped_because == "no_valid_trial":
         return NO_VALID_TRIAL
-    if report.stopped_because == "refused":
-        return NO_ANSWER
     if report.stopped_because == "interrupted":
         return INTERRUPTED
     if report.unconfirmed:

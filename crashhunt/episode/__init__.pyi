@@ -37,10 +37,4 @@ from ._run_episode import (
     set_generators as set_generators,
     stage_of as stage_of,
 )
-from ._splitting import (
-    COPIES_PER_LEVEL as COPIES_PER_LEVEL,
-    SplitPath as SplitPath,
-    Splitter as Splitter,
-    run_path as run_path,
-)
 from ._worker_settings import WorkerSettings as WorkerSettings, answer_file as answer_file, scratch_of as scratch_of

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from crashhunt.episode._forks import FirstCopy
     from crashhunt.episode._observers import Observer
     from crashhunt.episode._probes import Prober
-    from crashhunt.episode._splitting import Splitter
     from crashhunt.episode._worker_settings import WorkerSettings
     from crashhunt.oracles import Oracle
     from crashhunt.recording import BlackBox
@@ -75,7 +74,7 @@ def run_episode(
     prober: Prober | None = None,
     brancher: Brancher | None = None,
     first_copy: FirstCopy | None = None,
-    forcer: OnsetForcer | Splitter | None = None,
+    forcer: OnsetForcer | None = None,
 ) -> TrialResult:
     """Seed the process's random generators, run one trial from its specification, and record and measure the trial.
 
@@ -91,8 +90,7 @@ def run_episode(
         prober: object that runs robustness probes; None for no probes.
         first_copy: object that checks in the first step whether the episode can be forked.
         brancher: Object that runs branches: forks with other disturbances, when other actors are near.
-        forcer: Object that makes forks with a forced first disturbance or with other random numbers; None if the trial
-            is not a root trial.
+        forcer: Object that makes forks with a forced first disturbance; None if the trial is not a root trial.
 
     Returns:
         The result of the trial, including exceptions of agent and simulator.

@@ -66,7 +66,6 @@ class WorkerSettings(Serializable):
         branch: The rates of disturbances in branches, each as ``NAME=RATE``; empty for no branches.
         force: The rates of disturbances in forks with a forced first disturbance, each as ``NAME=RATE``; empty for
             none.
-        splits: Whether root trials have forks with other random numbers of the traffic, instead of forced disturbances.
     """
 
     scenario: Scenario
@@ -85,12 +84,10 @@ class WorkerSettings(Serializable):
     probe_s: float = field(default=0.0, metadata=OMIT_DEFAULT)
     branch: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
     force: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
-    splits: bool = field(default=False, metadata=OMIT_DEFAULT)
 
     json_keys: ClassVar[tuple[str, ...]] = (
         "oracles", "crash_on", "scratch", "code", "argument_files", "timeout_s", "keep_trials", "sealed",
         "find_escapes", "audit", "hunt_seed", "warm_copies", "probe_s", "branch", "force",
-        "splits",
     )  # fmt: skip
 
     def is_audited(self, result: TrialResult) -> bool:

@@ -36,7 +36,6 @@ from crashhunt.episode import (
     Parts,
     Prober,
     ReferenceDriver,
-    Splitter,
     has_users_code,
     internal_error,
     is_tampered,
@@ -305,9 +304,9 @@ class TrialProcess:
             report["braking"] = said
         return report
 
-    def _copies(self) -> tuple[Prober | None, Brancher | None, OnsetForcer | Splitter | None]:
+    def _copies(self) -> tuple[Prober | None, Brancher | None, OnsetForcer | None]:
         settings, prober, brancher = self._settings, None, None
-        forcer: OnsetForcer | Splitter | None = None
+        forcer: OnsetForcer | None = None
         if settings.probe_s:
             budget = BUDGET_BESIDE if settings.branch else BUDGET
             prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget, self._notices.append)
@@ -316,10 +315,6 @@ class TrialProcess:
         if settings.force:
             forcer = OnsetForcer(
                 settings.force, settings.crash_on, settings.timeout_s, self._delay, self._notices.append
-            )
-        elif settings.splits:
-            forcer = Splitter(
-                settings.crash_on, settings.timeout_s, self._delay, self._notices.append, self._cannot_copy
             )
         self._fork_runners = tuple(each.fork_runner for each in (prober, brancher, forcer) if each is not None)
         return prober, brancher, forcer

@@ -325,13 +325,11 @@ def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport
             estimate, estimate=None, estimated=None, estimated_disturbed=None, why_not=why, why_not_disturbed=why,
             more_roots=None,
         )  # fmt: skip
-    return RareReport(
-        estimate=estimate, verified=verified, not_finished=not_finished, crashes=crashes, more=tuple(rule.lines)
-    )
+    return RareReport(estimate=estimate, verified=verified, not_finished=not_finished, crashes=crashes)
 
 
 def _crash_of_copy(result: TrialResult, copy: ForcedCopy) -> Found:
-    spec = replace(result.spec, disturbances=copy.disturbances, reseeding=copy.reseeding, forcing=None, origin="rare")
+    spec = replace(result.spec, disturbances=copy.disturbances, forcing=None, origin="rare")
     return Found(spec, copy.crash, copy.step)
 
 

@@ -500,7 +500,7 @@ class Hunt:
             while True:
                 if progress.rare is not None:
                     progress.rare.read(min(in_flight, default=trials.upcoming))
-                precise = progress.rare is not None and progress.rare.is_over
+                precise = progress.rare is not None and progress.rare.is_met
                 stopping = progress.last_wanted is not None or progress.time_left_s <= 0 or precise
                 room = self._room(trials, progress, executor.capacity)
                 for spec in [] if stopping else trials.take(min(room, _under_way(executor.capacity) - len(in_flight))):
@@ -559,8 +559,8 @@ class Hunt:
             confirmation.close(progress)
         if self._stops:
             return "interrupted"
-        if progress.rare is not None and progress.rare.is_over:
-            return "refused" if progress.rare.refusal else "precise"
+        if progress.rare is not None and progress.rare.is_met:
+            return "precise"
         if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
             return "no_valid_trial"
         return "all_trials" if trials.exhausted else "time"

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from crashhunt.plans import HuntSettings
     from crashhunt.samplers import NamedSampler
     from crashhunt.snapshots import Snapshot
-    from crashhunt.statistics import Forcings, SplittingForcings
+    from crashhunt.statistics import Forcings
     from crashhunt.trial import Disturbance, Forcing, TrialResult, Value
 
 
@@ -111,7 +111,7 @@ class Trials:
         begun_with: int | None = None,
         disturber: DisturbanceSampler | None = None,
         unanswered: Sequence[TrialSpec] = (),
-        forcings: Forcings | SplittingForcings | None = None,
+        forcings: Forcings | None = None,
         apart: Collection[int] = frozenset(),
     ) -> None:
         self._settings = settings
@@ -300,7 +300,7 @@ def spec_of(
     themselves.
 
     With a forcing, the trial is a root. In a root, no disturbance is drawn from the first step on in which a
-    disturbance may be forced. With splitting, a root has the disturbances of a plain trial.
+    disturbance may be forced.
 
     Raises:
         CrashhuntError: the sampler failed.
@@ -336,8 +336,7 @@ def spec_of(
 
 def _drawn(disturber: DisturbanceSampler, seed: int, steps: int, forcing: Forcing | None) -> tuple[Disturbance, ...]:
     """Return the disturbances of a trial; for a root, only those before the first step with a forced disturbance."""
-    forces = forcing is not None and forcing.levels is None
-    return disturber.draw(seed, min(steps, FIRST_STEP - 1) if forces else steps)
+    return disturber.draw(seed, steps if forcing is None else min(steps, FIRST_STEP - 1))
 
 
 # What the workers of a hunt need to know.
@@ -357,8 +356,7 @@ def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Pat
         hunt_seed=settings.seed,
         probe_s=settings.probe_s,
         branch=tuple(settings.disturb) if settings.branch else (),
-        force=tuple(settings.disturb) if settings.rare and not settings.splitting else (),
-        splits=settings.splitting,
+        force=tuple(settings.disturb) if settings.rare else (),
     )
 
 

@@ -186,14 +186,12 @@ class RareReport:
             weights are chosen.
         not_finished: number of runs from the start, requested for ``verified``, that did not finish.
         crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
-        more: further lines for the user, such as the levels of splitting.
     """
 
     estimate: RareEstimate
     verified: int
     not_finished: int
     crashes: tuple[Bundle, ...]
-    more: tuple[str, ...] = ()
 
     def to_json(self) -> JsonObject:
         """Return the result in the form that ``run --json`` prints."""
@@ -211,7 +209,7 @@ class RareReport:
         found = self.estimate
         if found.estimate is None:
             certain = [] if found.roots else self._certain_lines  # bounds that rest on plain trials alone
-            return [f"rare: no estimate: {found.why_not or 'no root has ended'}", *self.more, *certain]
+            return [f"rare: no estimate: {found.why_not or 'no root has ended'}", *certain]
         answer = f"rare: {found.estimate:.2g} per trial" if found.estimate else "rare: no crash yet"
         if found.estimated is not None:
             one = found.estimated
@@ -239,7 +237,7 @@ class RareReport:
             lines.append(f"  {spent}; plain trials alone need about {found.plain_equivalent_steps:.2g} steps")
         if self.verified:
             lines.append(f"  of the {self.verified} weightiest crashes, {len(self.crashes)} came again from the start")
-        lines += [*self.more, *self._certain_lines]
+        lines += self._certain_lines
         lines.append("  the estimate omits failures that no copy has met; the certain bounds include them")
         return lines
 
@@ -266,9 +264,7 @@ def kind_data(group: Group) -> KindData:
     }
 
 
-StoppedBecause = Literal[
-    "crash", "distinct", "rate", "all_trials", "interrupted", "no_valid_trial", "time", "precise", "refused"
-]
+StoppedBecause = Literal["crash", "distinct", "rate", "all_trials", "interrupted", "no_valid_trial", "time", "precise"]
 
 
 @dataclass(frozen=True, slots=True)

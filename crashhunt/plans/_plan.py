@@ -515,20 +515,12 @@ def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str]
     if not settings.rare:
         if run.until_error:
             raise UsageError(f"--until-error {run.until_error} needs --rare", fix="add --rare")
-        if settings.splitting:
-            raise UsageError("--splitting needs --rare", fix="add --rare")
         return
-    if not settings.splitting and not parse_rates(settings.disturb):
+    if not parse_rates(settings.disturb):
         fix = "give rates, such as --disturb brake=0.02,cut_in=0.02"
         raise UsageError("--rare needs disturbances with rates, but the hunt has none", fix=fix)
-    backend = backend_of(scenario.simulator)
-    if settings.splitting and backend is not None and not backend.shows_actors:
-        message = (
-            f"--rare splitting needs vehicles ahead, but scenes of the simulator {scenario.simulator!r} contain none"
-        )
-        raise UsageError(message, fix="omit --rare")
     agents = tuple(settings.agents)
-    if not settings.splitting and (fixed := parse_fixed(settings.disturb, agents)):
+    if fixed := parse_fixed(settings.disturb, agents):
         begun = word_of(fixed[0], agents)
         message = f"--rare needs disturbances with rates, but --disturb {begun} begins in every trial"
         raise UsageError(message, fix="give only rates, such as --disturb brake=0.02")
@@ -541,9 +533,9 @@ def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str]
     }  # fmt: skip
     if given := next((flag for flag, value in excluded.items() if value), None):
         raise UsageError(f"--rare and {given} exclude each other", fix=f"omit {given}")
-    sampler = None if settings.splitting else disturber(scenario, settings.disturb, agents, find=find)
-    for name, rate in sampler.rates.items() if sampler is not None else ():
-        assert sampler is not None
+    sampler = disturber(scenario, settings.disturb, agents, find=find)
+    assert sampler is not None
+    for name, rate in sampler.rates.items():
         if sampler.chance(name) > _MAX_RARE_CHANCE:
             most = _MAX_RARE_CHANCE / sampler.step_length_s
             message = (

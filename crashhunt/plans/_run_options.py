@@ -174,13 +174,6 @@ class TrialOptions(_Options):
         "needs --disturb with rates and implies --keep-going",
         flag="--rare", group="faults",
     )  # fmt: skip
-    splitting: bool = option(
-        False, "with ``rare``, whether forks of a trial differ by the random numbers of SUMO's drivers, and not by "
-        "disturbances",
-        help="with --rare: fork trials that come close to the vehicle ahead, each fork with other random numbers of "
-        "SUMO's drivers; the same as --rare splitting; needs no --disturb",
-        flag="--splitting", group="faults",
-    )  # fmt: skip
     seeds: int = option(
         0, "number of traffics, each used for many arguments of the agents; 0: a new traffic in each trial",
         help="use only N traffics (a traffic is a seed and the scenario's arguments): simulate the warm-up of a "

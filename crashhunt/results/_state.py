@@ -184,7 +184,7 @@ _HEARTBEAT_DELAY_S = 20.0  # how much later than its last heartbeat a running hu
 _SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
 _STATE_BY_REASON: dict[str, State] = {
     "crash": "crashed", "distinct": "crashed", "all_trials": "finished", "no_valid_trial": "error",
-    "rate": "finished", "interrupted": "interrupted", "time": "finished", "precise": "finished", "refused": "finished",
+    "rate": "finished", "interrupted": "interrupted", "time": "finished", "precise": "finished",
     "error": "error", "queued": "queued",
 }  # fmt: skip
 

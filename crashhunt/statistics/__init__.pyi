@@ -48,7 +48,6 @@ from ._rare import (
 from ._rate_of_running_hunt import (
     Forcings as Forcings,
     RareWatch as RareWatch,
-    SplittingForcings as SplittingForcings,
     bar_watch as bar_watch,
     counting_rule as counting_rule,
     crashed_copies as crashed_copies,
@@ -63,13 +62,6 @@ from ._running import (
     BarWatch as BarWatch,
     Paced as Paced,
     RateWatch as RateWatch,
-)
-from ._splitting import (
-    PILOT_ROOTS as PILOT_ROOTS,
-    choose_levels as choose_levels,
-    crash_shares as crash_shares,
-    tree_of as tree_of,
-    why_unfit as why_unfit,
 )
 from ._units import (
     MAX_INVALID_SHARE as MAX_INVALID_SHARE,

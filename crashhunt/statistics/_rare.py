@@ -468,7 +468,8 @@ class RareCounter:
         """
         if root is None:
             self.excluded += 1
-            self.add_plain(plain, invalid)
+            self._counts["invalid"] += invalid
+            self._add_plain(list(plain))
             return
         self.roots += 1
         self._whole.add(root.value)
@@ -493,16 +494,6 @@ class RareCounter:
             if root.bound:
                 copies.add(root.copies / root.bound, 1.0 / root.bound)
         self._add_plain([True] * root.plain_crashes + [False] * (root.plain - root.plain_crashes))
-
-    def add_plain(self, crashed: Iterable[bool], invalid: int = 0) -> None:
-        """Add plain trials that follow no valid root; they count for the certain interval.
-
-        Args:
-            crashed: whether each valid plain trial crashed.
-            invalid: number of invalid plain trials.
-        """
-        self._counts["invalid"] += invalid
-        self._add_plain(list(crashed))
 
     def _add_plain(self, crashed: Sequence[bool]) -> None:
         self._counts.update(plain=len(crashed), plain_crashes=sum(crashed))

@@ -15,17 +15,16 @@ from crashhunt.plans import rate_of, share_of
 from crashhunt.results import CodeVersions
 from crashhunt.statistics._rare import BLOCK, TRIALS_PER_ROOT, RareCounter, is_root, learn_forcing, root_of, with_plain
 from crashhunt.statistics._running import BarWatch, Paced, RateWatch
-from crashhunt.statistics._splitting import PILOT_ROOTS, choose_levels, crash_shares, tree_of, why_unfit
 from crashhunt.statistics._units import CountingRule, TrialFacts
 from crashhunt.trial import Forcing, Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator
 
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.ledger import Facts, Ledger, RunningRate
     from crashhunt.plans import HuntSettings
-    from crashhunt.statistics._rare import RareEstimate, Root
+    from crashhunt.statistics._rare import RareEstimate
     from crashhunt.training import HeldOutTraffics
     from crashhunt.trial import Forced, ForcedCopy, TrialResult
 
@@ -33,8 +32,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Forcings",
     "RareWatch",
-    "SplittingForcings",
-    "SplittingWatch",
     "bar_watch",
     "counting_rule",
     "crashed_copies",
@@ -190,24 +187,20 @@ class RareWatch:
     Args:
         settings: settings of the hunt.
         ledger: ledger of the hunt.
-        sampler: sampler of the hunt's disturbances; None for splitting.
+        sampler: sampler of the hunt's disturbances.
 
     Attributes:
         weightiest: the greatest weights of roots with a crashed copy, in descending order.
         is_met: whether the interval is narrow enough; no further trial is then read.
-        refusal: reason why the hunt is of no use according to its first trials; empty if it is of use.
         is_replanned: whether TRIALS was changed after results were known.
     """
 
-    def __init__(self, settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler | None) -> None:
+    def __init__(self, settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler) -> None:
         self.weightiest: list[TrialResult] = []
         self.is_met = False
-        self.refusal = ""
         self.is_replanned = False
         self._settings, self._ledger = settings, ledger
-        self._hazard = 1.0
-        if sampler is not None:
-            self._hazard = len(sampler.agents) * math.fsum(sampler.chance(name) for name in sampler.models)
+        self._hazard = len(sampler.agents) * math.fsum(sampler.chance(name) for name in sampler.models)
         self._counter = RareCounter(min(1.0, self._hazard * settings.max_steps))
         self._until = share_of(settings.run.until_error) if settings.run.until_error else 0.0
         self._read = 0  # trials
@@ -219,23 +212,13 @@ class RareWatch:
         """The number of roots that were read together with their plain trials."""
         return self._counter.roots + self._counter.excluded
 
-    @property
-    def is_over(self) -> bool:
-        """Whether the hunt ends after the trials that were read."""
-        return self.is_met or bool(self.refusal)
-
-    @property
-    def lines(self) -> list[str]:
-        """Return lines for the user that explain the estimate; empty if there are none."""
-        return []
-
     def read(self, finished: int | None = None) -> None:
         """Read the finished trials, up to the first trial that has not finished.
 
         Args:
             finished: number of first trials that have finished; None to read it from the ledger.
         """
-        while not self.is_over and (finished is None or self._read < finished):
+        while not self.is_met and (finished is None or self._read < finished):
             result = self._ledger.result(self._read)
             if result is None:
                 return
@@ -246,27 +229,19 @@ class RareWatch:
                 self._group.clear()
 
     def _count(self, first: TrialResult, *plain: TrialResult) -> None:
-        root = self._value_of(first, plain)
+        root = root_of(first, self._settings.crash_on, self._hazard)
         if root is None:
-            self._counter.add(None, *self._crashes_of(plain))
+            valid = [one for one in plain if one.outcome is not Outcome.INVALID]
+            crashed = [one.outcome in self._settings.crash_on for one in valid]
+            self._counter.add(None, crashed, len(plain) - len(valid))
         else:
-            self._counter.add(root)
+            self._counter.add(with_plain(root, plain, self._settings.crash_on))
             if any(crashed_copies(first)):
                 self.weightiest.append(first)
                 self.weightiest.sort(key=greatest_weight, reverse=True)
                 del self.weightiest[_MAX_VERIFIED_ROOTS:]
         if self._until and self.roots % BLOCK == 0:
             self.is_met = self.estimate().relative_error <= self._until
-
-    def _value_of(self, first: TrialResult, plain: Sequence[TrialResult]) -> Root | None:
-        """Return a root with its plain trials; None if it has no complete result."""
-        root = root_of(first, self._settings.crash_on, self._hazard)
-        return None if root is None else with_plain(root, plain, self._settings.crash_on)
-
-    def _crashes_of(self, plain: Sequence[TrialResult]) -> tuple[list[bool], int]:
-        """Return for each valid plain trial whether it crashed, and the number of invalid plain trials."""
-        valid = [one for one in plain if one.outcome is not Outcome.INVALID]
-        return [one.outcome in self._settings.crash_on for one in valid], len(plain) - len(valid)
 
     def estimate(self) -> RareEstimate:
         """Return the estimate from the trials that were read.
@@ -287,119 +262,13 @@ class RareWatch:
         Args:
             now: whether the rate must be up to date; otherwise it may be some moments old.
         """
-        return self._paced(self._read // TRIALS_PER_ROOT, now=now)  # pilots of splitting count for no root
+        return self._paced(self._read // TRIALS_PER_ROOT, now=now)
 
 
-class SplittingForcings:
-    """The levels of each root of ``--rare splitting``: none for the first pilots, then levels chosen from these pilots.
-
-    Args:
-        settings: settings of the hunt.
-        ledger: ledger of the hunt.
-    """
-
-    def __init__(self, settings: HuntSettings, ledger: Ledger) -> None:
-        self._ledger = ledger
-        self._levels: tuple[float, ...] | None = None
-
-    @staticmethod
-    def needed(number: int) -> int:
-        """Return the number of trials, from number 0 on, that must have ended before the given trial begins."""
-        return min(2, number // TRIALS_PER_ROOT // PILOT_ROOTS) * PILOT_ROOTS * TRIALS_PER_ROOT
-
-    def of(self, number: int) -> Forcing | None:
-        """Return the forcing of a root; None for a plain trial."""
-        if not is_root(number):
-            return None
-        if number < PILOT_ROOTS * TRIALS_PER_ROOT:
-            return Forcing(1.0, levels=())
-        if self._levels is None:
-            every = range(0, PILOT_ROOTS * TRIALS_PER_ROOT, TRIALS_PER_ROOT)
-            self._levels = choose_levels(_peaks_of(result for one in every if (result := self._ledger.result(one))))
-        return Forcing(1.0, levels=self._levels)
-
-
-class SplittingWatch(RareWatch):
-    """Like `RareWatch`, for ``--rare splitting``.
-
-    Pilot trials count for the certain interval, but not for the estimate.
-
-    Args:
-        settings: settings of the hunt.
-        ledger: ledger of the hunt.
-
-    Attributes:
-        levels: the levels; empty until the pilots from which they are chosen have ended.
-        shares: crash probability in the test trees, of all paths and of the paths from each level; empty until these
-            trees have ended.
-    """
-
-    def __init__(self, settings: HuntSettings, ledger: Ledger) -> None:
-        super().__init__(settings, ledger, None)
-        self.levels: tuple[float, ...] = ()
-        self.shares: tuple[float, ...] = ()
-        self._pilots: list[TrialResult] = []
-        self._trees: list[tuple[Forced, bool]] = []
-
-    def _count(self, first: TrialResult, *plain: TrialResult) -> None:
-        group = first.spec.number // TRIALS_PER_ROOT
-        if group < PILOT_ROOTS:  # without copies, so the root is a plain trial
-            self._pilots.append(first)
-            self._counter.add_plain(*self._crashes_of((first, *plain)))
-            if group == PILOT_ROOTS - 1:
-                self.levels = choose_levels(_peaks_of(self._pilots))
-                self.refusal = "" if self.levels else why_unfit([0.0])
-        elif group < 2 * PILOT_ROOTS:
-            if tree_of(first, self._settings.crash_on) is not None and first.forced is not None:
-                self._trees.append((first.forced, first.outcome in self._settings.crash_on))
-            self._counter.add_plain(*self._crashes_of(plain))
-            if group == 2 * PILOT_ROOTS - 1:
-                self.shares = tuple(crash_shares(self._trees, len(self.levels)))
-                self.refusal = why_unfit(self.shares)
-        else:
-            super()._count(first, *plain)
-
-    def _value_of(self, first: TrialResult, plain: Sequence[TrialResult]) -> Root | None:
-        tree = tree_of(first, self._settings.crash_on)
-        # A tree knows more of undisturbed crashes than a plain trial, so its plain trials stay out of its value.
-        if tree is None:
-            return None
-        counted = with_plain(tree, plain, self._settings.crash_on)
-        return replace(counted, undisturbed=tree.undisturbed, counted=0.0)
-
-    def estimate(self) -> RareEstimate:
-        """Return the estimate from the trials that were read."""
-        found = super().estimate()
-        if self.refusal:
-            return replace(found, why_not=self.refusal, why_not_disturbed=self.refusal)
-        if not self.roots and not found.why_not.endswith("described"):
-            why = f"{self._read // TRIALS_PER_ROOT} of {2 * PILOT_ROOTS} pilot roots have ended"
-            return replace(found, why_not=why, why_not_disturbed=why)
-        return found
-
-    @property
-    def lines(self) -> list[str]:
-        """Return the levels, and the probability of a crash after each level is reached, as lines for the user."""
-        if not self.shares:
-            return []
-        levels = ", ".join(f"{level:.2g}" for level in self.levels)
-        shares = ", ".join(f"{share:.2g}" for share in self.shares[1:])
-        what = f"  levels (closing speed by gap): {levels} per s"
-        return [f"{what}; P(crash) in {PILOT_ROOTS} pilot roots: {self.shares[0]:.2g}, from each level {shares}"]
-
-
-def _peaks_of(pilots: Iterable[TrialResult]) -> list[float]:
-    return [pilot.forced.peak for pilot in pilots if pilot.forced is not None and not pilot.forced.unanswered]
-
-
-def forcings_of(
-    settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler | None
-) -> Forcings | SplittingForcings | None:
+def forcings_of(settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler | None) -> Forcings | None:
     """Return the object that determines the forcing of roots; None if the hunt is not in rare mode."""
     if not settings.rare:
         return None
-    if settings.splitting:
-        return SplittingForcings(settings, ledger)
     assert sampler is not None
     return Forcings(settings, ledger, sampler)
 
@@ -408,7 +277,8 @@ def rare_watch(settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampl
     """Return the object that estimates the crash rate; None if the hunt is not in rare mode."""
     if not settings.rare:
         return None
-    watch = SplittingWatch(settings, ledger) if settings.splitting else RareWatch(settings, ledger, sampler)
+    assert sampler is not None
+    watch = RareWatch(settings, ledger, sampler)
     watch.is_replanned = bool(ledger.facts().get("replanned"))
     return watch
 

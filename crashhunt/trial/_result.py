@@ -11,7 +11,7 @@ from crashhunt.base.text import count_of
 from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._evidence import KILLED, Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
-from crashhunt.trial._specification import Reseeding, TrialSpec
+from crashhunt.trial._specification import TrialSpec
 from crashhunt.world import ClosestApproach, Event
 
 __all__ = ["Branch", "Branches", "Forced", "ForcedCopy", "Stress", "TrialResult", "in_effect", "summarize"]
@@ -95,8 +95,6 @@ class ForcedCopy(Serializable):
             disturbances are drawn as usual. With forced second disturbances, it is the probability of the forced second
             disturbance, or of none.
         second: the cell (model and strength) of the forced second disturbance; empty if there is none.
-        reseeding: with splitting, the steps after which the simulator got other seeds, with these seeds; None without
-            splitting.
     """
 
     cell: str
@@ -109,7 +107,6 @@ class ForcedCopy(Serializable):
     disturbances: tuple[Disturbance, ...] = field(default=(), metadata=OMIT_DEFAULT)
     within: float = field(default=1.0, metadata=OMIT_DEFAULT)
     second: str = field(default="", metadata=OMIT_DEFAULT)
-    reseeding: Reseeding | None = field(default=None, metadata=OMIT_DEFAULT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +114,7 @@ class Forced(Serializable):
     """The results of the copies of a root trial.
 
     Args:
-        survival: probability that no first disturbance begins before the root trial ends; with splitting, weight of the
-            root trial.
+        survival: probability that no first disturbance begins before the root trial ends.
         masses: probability, by cell, that the first disturbance belongs to the cell and begins before the root trial
             ends.
         copies: copies in the order of their first disturbances; each copy is followed by its own copies, with a second
@@ -127,7 +123,6 @@ class Forced(Serializable):
         unanswered: number of planned copies without a result.
         why_unanswered: the reason for the first missing result; empty if no result is missing.
         may_be_asked_again: whether a reason lies outside of the trial, so that another run may return all results.
-        peak: with splitting, the greatest value in the root trial of the measure that is compared with the levels.
     """
 
     survival: float
@@ -137,7 +132,6 @@ class Forced(Serializable):
     unanswered: int = field(default=0, metadata=_NOT_ALL_ANSWERED)
     why_unanswered: str = field(default="", metadata=_NOT_ALL_ANSWERED)
     may_be_asked_again: bool = field(default=False, metadata=_NOT_ALL_ANSWERED)
-    peak: float = field(default=0.0, metadata=OMIT_DEFAULT)
 
     def by_first_onset(self) -> list[tuple[ForcedCopy, ...]]:
         """Return the copies of each first disturbance: the copy of the root trial, then its own copies."""

@@ -76,16 +76,14 @@ class Reseeding(Serializable):
     Args:
         after: the step after which the seeds change; the next step is the first that uses the new seeds.
         seed: seed of all random generators of the simulator, from 0 to 2**31 - 1.
-        earlier: further re-seedings at earlier steps, each as its step and its seed.
     """
 
     after: int
     seed: int
-    earlier: tuple[tuple[int, int], ...] = field(default=(), metadata=_ESSENTIAL_METADATA)
 
     def seed_after(self, step: int) -> int | None:
         """Return the seed that the random generators get after a step; None if they are not re-seeded then."""
-        return self.seed if step == self.after else dict(self.earlier).get(step)
+        return self.seed if step == self.after else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,15 +96,12 @@ class Forcing(Serializable):
             cell is missing. A cell is a model with one strength, such as ``brake=4.0``.
         second: cells of first disturbances whose copies also get forced second disturbances.
         second_spacing: probability per forced second disturbance; 0 for none.
-        levels: with splitting, the levels at which a path of the root is copied; the copies then get other random
-            numbers, and no disturbance is forced. None without splitting.
     """
 
     spacing: float
     ratios: Mapping[str, float] = field(default_factory=dict)
     second: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
     second_spacing: float = field(default=0.0, metadata=OMIT_DEFAULT)
-    levels: tuple[float, ...] | None = field(default=None, metadata=OMIT_DEFAULT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@ from ._approach import (
     ClosestApproach as ClosestApproach,
     approaches as approaches,
     closest_approach as closest_approach,
-    closing_rate as closing_rate,
 )
 from ._contact import (
     MAX_CONTACT_GAP_M as MAX_CONTACT_GAP_M,

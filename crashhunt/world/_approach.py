@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from crashhunt.world._scene import Frame, Scene
 
 
-__all__ = ["ApproachMeter", "ClosestApproach", "approaches", "closest_approach", "closing_rate"]
+__all__ = ["ApproachMeter", "ClosestApproach", "approaches", "closest_approach"]
 
 
 # The closest approach.
@@ -83,29 +83,6 @@ class ApproachMeter:
                 min(closest.gap_m, float(gaps.min(initial=math.inf))),
                 max(closest.required_deceleration, float(brakes.max(initial=0.0))),
             )
-
-
-def closing_rate(frame: Frame, agent: str) -> float:
-    """Return the greatest ratio of closing speed to gap over the vehicles ahead of an agent in the last scene, in 1/s.
-
-    The ratio is the inverse of the time to collision with vehicles that drive in the same direction in the same lane;
-    it is 0 without such a vehicle. Oncoming and crossing traffic does not count, because in a bend constant velocities
-    lead to collisions everywhere.
-    """
-    roster, columns = frame.roster, frame.columns[-1]
-    count, own = len(roster.actors), roster.index.get(agent)
-    if own is None:
-        return 0.0
-    x, y = columns[0 : 2 * count : 2], columns[1 : 2 * count : 2]
-    heading, speed = columns[2 * count : 3 * count], columns[3 * count :]
-    cos, sin = math.cos(heading[own]), math.sin(heading[own])
-    along = (x - x[own]) * cos + (y - y[own]) * sin
-    across = (y - y[own]) * cos - (x - x[own]) * sin
-    ahead = (np.cos(heading - heading[own]) > _SAME_WAY) & (np.abs(across) < _HALF_LANE_M) & (along > 0)
-    if not ahead.any():
-        return 0.0
-    gaps = np.maximum(along[ahead] - np.array(roster.lengths)[ahead], _LEAST_GAP_M)
-    return float((np.maximum(speed[own] - speed[ahead], 0.0) / gaps).max())
 
 
 def closest_approach(scenes: Sequence[Scene], agents: Sequence[str]) -> ClosestApproach:

@@ -46,7 +46,7 @@ _TESTS_ELSEWHERE = {
     "base/integrity.py": ("base/test_integrity.py", "base/test_authentication.py"),
     "native/_generators.py": ("native/test_generator_seeds.py",),
     "panels": ("render/test_panels*.py", "render/test_pictures.py"),
-    "statistics/_rare.py": ("statistics/test_rare.py", "statistics/test_splitting.py", "hunts/test_rare_hunts.py"),
+    "statistics/_rare.py": ("statistics/test_rare.py", "hunts/test_rare_hunts.py"),
     # These are tested as users run them: as commands.
     "cli/__init__.py": ("cli/test_answers.py", "e2e/test_commands.py"),
     "cli/_bisect.py": (
@@ -131,7 +131,6 @@ _TESTS_ELSEWHERE = {
     ),
     "episode/_fast_path.py": ("native/test_usual_steps.py", "episode/test_episode*.py"),
     "episode/_branches.py": ("episode/test_branches_asked.py", "episode/test_branching.py"),
-    "episode/_splitting.py": ("episode/test_split_episodes.py", "statistics/test_splitting.py"),
     "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),
     "statistics/_hunt_pairs.py": ("e2e/test_gate.py",),
     # Processes of trials are seen by what is left of trials that harm them.

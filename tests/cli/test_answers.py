@@ -248,7 +248,6 @@ def test_each_hunt_of_a_suite_is_asked_for_once(monkeypatch):
 @pytest.mark.parametrize(
     ("words", "found"),
     [
-        (["run", "--rare", "splitting", "h"], ["run", "--rare", "--splitting", "h"]),
         (["run", "--rare", "h", "splitting"], ["run", "--rare", "h", "splitting"]),
         (["init", "--bbox", "-1.5,2", "x"], ["init", "--bbox=-1.5,2", "x"]),
         (["init", "--bbox", "1.5,2", "x"], ["init", "--bbox", "1.5,2", "x"]),

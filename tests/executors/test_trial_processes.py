@@ -130,7 +130,7 @@ def test_copies_of_a_trial_are_those_that_the_settings_ask_for(process, monkeypa
 
         return make
 
-    for name in ("Prober", "Brancher", "OnsetForcer", "Splitter"):
+    for name in ("Prober", "Brancher", "OnsetForcer"):
         monkeypatch.setattr(_trial_process, name, maker(name))
 
     def copies(**given):
@@ -152,15 +152,12 @@ def test_copies_of_a_trial_are_those_that_the_settings_ask_for(process, monkeypa
     assert (names, there) == (["Prober", "Brancher"], [True, True, False])
     assert probed[3] == _trial_process.BUDGET_BESIDE != _trial_process.BUDGET
     assert branched[:2] == ((1.0,), crash_on)
-    found, names, there, (forced,) = copies(force=("brake",), splits=True)
+    found, names, there, (forced,) = copies(force=("brake",))
     assert (names, there) == (["OnsetForcer"], [False, False, True])
     assert forced[:4] == (("brake",), crash_on, 9.0, found._delay)
-    found, names, there, (split,) = copies(splits=True)
-    assert (names, there) == (["Splitter"], [False, False, True])
-    assert split[:3] == (crash_on, 9.0, found._delay)
     found._cannot_copy("it has threads")
-    assert found._notices[-1] == "Splitter are left out: it has threads"
-    assert made[-1] == ("Splitter", "it has threads")
+    assert found._notices[-1] == "OnsetForcer are left out: it has threads"
+    assert made[-1] == ("OnsetForcer", "it has threads")
     assert found._fork_runners == ()
 
 

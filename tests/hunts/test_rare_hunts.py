@@ -16,14 +16,8 @@ from crashhunt.errors import UsageError
 from crashhunt.hunts._reports import RareReport
 from crashhunt.ledger import Ledger
 from crashhunt.results import hunt_state
-from crashhunt.statistics import (
-    BLOCK,
-    TRIALS_PER_ROOT,
-    _rate_of_running_hunt as rare_module,
-    _splitting as splitting,
-    is_root,
-)
-from crashhunt.statistics._rate_of_running_hunt import Forcings, RareWatch, SplittingWatch
+from crashhunt.statistics import BLOCK, TRIALS_PER_ROOT, _rate_of_running_hunt as rare_module, is_root
+from crashhunt.statistics._rate_of_running_hunt import Forcings, RareWatch
 from crashhunt.trial import (
     CRASHES,
     KILLED,
@@ -72,8 +66,6 @@ def _folder(tmp_path, monkeypatch):
         ({"disturb": ["stop=0.01"], "distinct": 2}, "--rare and --distinct exclude each other"),
         ({"disturb": ["stop=3"]}, "stop=3 begins with the probability 0.3 in each step"),
         ({"rare": False, "until_error": "30%"}, "--until-error 30% needs --rare"),
-        ({"rare": False, "splitting": True}, "--splitting needs --rare"),
-        ({"splitting": True, "sampler": "guided"}, "--sampler guided draws dependent trials"),
         ({"disturb": ["stop=0.01"], "until_error": "300%"}, "--until-error is 300%"),
         ({"disturb": ["stop=0.01"], "until_error": "soon"}, "--until-error is soon"),
     ],
@@ -82,16 +74,6 @@ def test_rare_mode_refuses_what_it_has_no_law_for(tmp_path, options, says):
     with pytest.raises(UsageError, match=says) as refused:
         crashhunt.prepare(tmp_path / "h", 1, 8, 20, **(OPTIONS | options))
     assert refused.value.fix
-
-
-def test_splitting_is_refused_before_any_trial_if_scenes_contain_no_actors(tmp_path):
-    gym = tmp_path / "gym.toml"
-    gym.write_text(
-        'title = "A pole"\nschema = 1\nsimulator = "gym"\n[gym]\nid = "CartPole-v1"\n[agents.ego]\nagent = "random"\n'
-    )
-    with pytest.raises(UsageError, match="scenes of the simulator 'gym' contain none; omit --rare"):
-        crashhunt.prepare(tmp_path / "h", 1, 400, 20, **(OPTIONS | {"scenario": gym, "splitting": True}))
-    assert not (tmp_path / "h").exists()
 
 
 def test_rare_mode_keeps_going_so_it_may_keep_a_few_bundles_of_each_type(tmp_path):
@@ -105,12 +87,6 @@ def test_a_box_of_western_longitudes_is_the_value_of_its_option():
     ]  # fmt: skip
     for words in (["init", "d", "--bbox"], ["init", "--bbox", "--json"], ["init", "d", "--bbox", "2,48,3,49"]):
         assert _spell_out(words) == words
-
-
-def test_splitting_needs_no_disturbance_and_is_written_as_the_second_word_of_rare(tmp_path):
-    assert crashhunt.prepare(tmp_path / "h", 1, 8, 20, **OPTIONS, splitting=True).settings.splitting
-    assert _spell_out(["run", "--rare", "splitting", "h"]) == ["run", "--rare", "--splitting", "h"]
-    assert _spell_out(["run", "splitting", "--rare", "h"]) == ["run", "splitting", "--rare", "h"]
 
 
 class Rows(dict):
@@ -225,21 +201,13 @@ def test_crashes_of_plain_trials_count_for_the_undisturbed_part_and_for_the_cert
 def test_estimate_after_a_change_of_trials_needs_an_interval(roots, is_kept):
     rows = rows_of([root(number, "collision" if number % 2 else "") for number in range(roots)])
     rows.replanned = True  # perhaps until a fork crashed
-    asked = SimpleNamespace(**vars(settings()) | {"rare": True, "splitting": False})
+    asked = SimpleNamespace(**vars(settings()) | {"rare": True})
     watch = rare_module.rare_watch(asked, rows, SAMPLER)
     watch.read()
     found = watch.estimate()
     assert ((found.estimate is None), found.estimated is None) == (not is_kept, not is_kept)
     assert found.why_not.startswith("TRIALS was changed after results were known, and ") != is_kept
     assert (watch.running()["estimate"], found.certain is None) == (found.estimate, False)
-
-
-def test_running_rate_of_splitting_counts_the_pilots():
-    rows = rows_of([root(number) for number in range(3)])
-    watch = SplittingWatch(settings(), rows)
-    for roots in (1, 3):
-        watch.read(roots * TRIALS_PER_ROOT)
-        assert watch.running(now=True)["why_not"] == f"{roots} of 128 pilot roots have ended"
 
 
 def test_too_many_invalid_plain_trials_leave_no_estimate():
@@ -272,128 +240,6 @@ def test_plain_trials_that_contradict_the_copies_withhold_the_interval():
     assert "plain trials crash more often than the copies explain" in found.why_not
 
 
-def tree(number, peak=0.5, crash="", **more):
-    """A result of rare mode with splitting."""
-    spec = TrialSpec(number, number, {}, {}, 50, forcing=Forcing(1.0, levels=(0.2, 0.4)))
-    forced = Forced(1.0, {}, (ForcedCopy("0", 3, 1.0, 2, crash, 9),), 90, peak=peak, **more)
-    return TrialResult(spec, Outcome.SURVIVED, 50, forced=forced)
-
-
-PILOT_TRIALS = splitting.PILOT_ROOTS * TRIALS_PER_ROOT
-
-
-def test_splitting_waits_for_its_pilots_and_then_for_the_trees_that_test_the_levels():
-    needed = rare_module.SplittingForcings.needed
-    asked = (0, 1, PILOT_TRIALS - 1, PILOT_TRIALS, 2 * PILOT_TRIALS - 1, 2 * PILOT_TRIALS, 9 * PILOT_TRIALS)
-    assert [needed(number) for number in asked] == [
-        0, 0, 0, PILOT_TRIALS, PILOT_TRIALS, 2 * PILOT_TRIALS, 2 * PILOT_TRIALS,
-    ]  # fmt: skip
-
-
-def test_levels_of_splitting_are_chosen_from_the_peaks_of_all_pilots(monkeypatch):
-    chosen = []
-    monkeypatch.setattr(rare_module, "choose_levels", lambda peaks: chosen.append(list(peaks)) or (0.25, 0.5))
-    rows = Rows({n: tree(n, peak=float(n)) for n in range(0, 2 * PILOT_TRIALS, TRIALS_PER_ROOT)})
-    del rows[5]
-    rows[10] = tree(10, unanswered=1, why_unanswered="a copy was killed")
-    rows[15] = plain(15)
-    forcings = rare_module.SplittingForcings(settings(), rows)
-    assert forcings.of(1) is None
-    assert forcings.of(PILOT_TRIALS - TRIALS_PER_ROOT) == Forcing(1.0, levels=())
-    assert chosen == []
-    for number in (PILOT_TRIALS, PILOT_TRIALS + TRIALS_PER_ROOT):
-        assert forcings.of(number) == Forcing(1.0, levels=(0.25, 0.5))
-    every = range(0, PILOT_TRIALS, TRIALS_PER_ROOT)
-    assert chosen == [[float(n) for n in every if n not in (5, 10, 15)]]
-
-
-@pytest.fixture
-def short(monkeypatch):
-    """Splitting with two pilot roots, and as many trees that test its levels."""
-    for module in (rare_module, splitting):
-        monkeypatch.setattr(module, "PILOT_ROOTS", 2)
-    found = SimpleNamespace(peaks=[], trees=[], levels=(0.25, 0.5), unfit=[], why="")
-
-    def levels(peaks):
-        found.peaks.append(list(peaks))
-        return found.levels
-
-    def shares(trees, count):
-        found.trees.append(([forced.peak for forced, _ in trees], [crashed for _, crashed in trees], count))
-        return [0.1, 0.2, 0.3]
-
-    def unfit(shares):
-        found.unfit.append(list(shares))
-        return found.why
-
-    monkeypatch.setattr(rare_module, "choose_levels", levels)
-    monkeypatch.setattr(rare_module, "crash_shares", shares)
-    monkeypatch.setattr(rare_module, "why_unfit", unfit)
-    return found
-
-
-def groups(count):
-    rows = Rows()
-    for place in range(count):
-        number = place * TRIALS_PER_ROOT
-        rows[number] = tree(number, peak=float(place), crash="collision" if place == 4 else "")
-        rows |= {other: plain(other) for other in range(number + 1, number + TRIALS_PER_ROOT)}
-    return rows
-
-
-def test_pilots_of_splitting_count_as_plain_trials_only(short):
-    rows = groups(6)
-    rows[1], rows[21] = plain(1, Outcome.COLLISION), plain(21, Outcome.COLLISION)
-    rows[15] = replace(rows[15], outcome=Outcome.COLLISION)
-    watch = SplittingWatch(settings(), rows)
-    watch.read(2 * TRIALS_PER_ROOT - 1)
-    assert (watch.levels, watch.roots, watch.lines) == ((), 0, [])
-    watch.read(2 * TRIALS_PER_ROOT)
-    assert watch.levels == (0.25, 0.5)
-    assert short.peaks == [[0.0, 1.0]]
-    found = watch.estimate()
-    assert (found.plain, found.plain_crashes) == (10, 1)  # both roots too
-    assert found.why_not == found.why_not_disturbed == "2 of 4 pilot roots have ended"
-    watch.read(4 * TRIALS_PER_ROOT)
-    assert short.trees == [([2.0, 3.0], [False, True], 2)]
-    assert short.unfit == [[0.1, 0.2, 0.3]]
-    assert watch.shares == (0.1, 0.2, 0.3)
-    assert (watch.estimate().plain, watch.roots) == (18, 0)
-    assert watch.lines == [
-        "  levels (closing speed by gap): 0.25, 0.5 per s; P(crash) in 2 pilot roots: 0.1, from each level 0.2, 0.3"
-    ]
-    watch.read(6 * TRIALS_PER_ROOT)
-    assert watch.roots == 2
-    assert [one.spec.number for one in watch.weightiest] == [20]
-    assert not watch.is_over
-    assert watch.running(now=True)["crashes"] == 2
-
-
-def test_invalid_pilots_leave_the_reason_that_they_are_invalid(short):
-    rows = groups(2)
-    rows[6] = plain(6, Outcome.INVALID)
-    watch = SplittingWatch(settings(), rows)
-    watch.read()
-    assert watch.estimate().why_not.startswith("1 of 10 plain trials are invalid")
-
-
-@pytest.mark.parametrize("late", [False, True])
-def test_splitting_that_is_of_no_use_ends_with_the_reason(short, late):
-    if late:
-        short.why = "unfit"
-    else:
-        short.levels = ()
-        short.why = "no levels"
-    watch = SplittingWatch(settings(), groups(8))
-    watch.read()
-    assert watch.is_over
-    assert watch.refusal == short.why
-    assert watch._read == (4 if late else 2) * TRIALS_PER_ROOT
-    assert short.unfit == ([[0.1, 0.2, 0.3]] if late else [[0.0]])
-    found = watch.estimate()
-    assert found.why_not == found.why_not_disturbed == short.why
-
-
 def test_weightiest_crashes_are_kept_in_order():
     def weighted(number, weight):
         copy = ForcedCopy("brake=6.0", 3, weight, 2, "collision", 9)
@@ -410,16 +256,9 @@ def test_weightiest_crashes_are_kept_in_order():
     assert list(rare_module.crashed_copies(plain(1))) == []
 
 
-def test_object_of_rare_mode_fits_its_kind(monkeypatch):
-    def of(**options):
-        return SimpleNamespace(**vars(settings()) | {"rare": True, "splitting": False} | options)
-
+def test_hunt_without_rare_mode_has_no_objects_of_it():
     for make in (rare_module.forcings_of, rare_module.rare_watch):
-        assert make(of(rare=False), Rows(), SAMPLER) is None
-    assert type(rare_module.forcings_of(of(), Rows(), SAMPLER)) is Forcings
-    assert type(rare_module.forcings_of(of(splitting=True), Rows(), None)) is rare_module.SplittingForcings
-    assert type(rare_module.rare_watch(of(), Rows(), SAMPLER)) is RareWatch
-    assert type(rare_module.rare_watch(of(splitting=True), Rows(), None)) is SplittingWatch
+        assert make(SimpleNamespace(**vars(settings()), rare=False), Rows(), SAMPLER) is None
 
 
 # The trials that count for a rate.
@@ -550,24 +389,3 @@ def test_result_with_copies_survives_json():
     lost = replace(result, forced=replace(result.forced, unanswered=1, may_be_asked_again=True))
     assert lost.is_to_be_run_again
     assert not lost.is_fully_asked
-
-
-@pytest.mark.nightly
-def test_hunt_with_splitting_copies_paths_whose_crashes_come_again_from_the_start(tmp_path, monkeypatch):
-    for module in (rare_module, splitting):
-        monkeypatch.setattr(module, "PILOT_ROOTS", 6)
-    monkeypatch.setattr(rare_module, "why_unfit", lambda shares: "")
-    (tmp_path / "toy.toml").write_text(TOY.replace("12.0", "5.0"))
-    options = OPTIONS | {"splitting": True, "keep": 1, "keep_going": True, "arguments": {"speed": 10.8}}
-    whole = crashhunt.run(tmp_path / "whole", 2, 90, 60, **options)
-    crashhunt.run(tmp_path / "again", 1, 63, 60, **options)
-    again = crashhunt.run(tmp_path / "again", 2, 90, 60, **options)
-    assert estimate_of(whole) == estimate_of(again)
-    with closing(Ledger(tmp_path / "whole" / "ledger.sqlite")) as ledger:
-        roots = [result for result in ledger.results() if is_root(result.spec.number)]
-    copies = [copy for result in roots for copy in result.forced.copies]
-    assert copies
-    assert not any(result.forced.copies for result in roots[:6])
-    assert whole.rare.estimate.roots == 6
-    assert whole.rare.verified == len(whole.rare.crashes) > 0
-    assert any("levels (closing speed by gap)" in line for line in whole.rare.lines)

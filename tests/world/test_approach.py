@@ -9,13 +9,9 @@ import pytest
 from scenes import in_line, scene
 
 from crashhunt.world import (
-    Actor,
     ApproachMeter,
-    Roster,
-    Scene,
     approaches,
     closest_approach,
-    closing_rate,
     rectangle_gap,
     time_to_contact,
 )  # fmt: skip
@@ -195,25 +191,3 @@ def test_a_bent_vehicle_is_where_its_parts_are():
     ] == pytest.approx([12.0])
     bridge = bus((30.0, 0.0, 9.0), (21.0, 0.0, 9.0), (12.0, 0.0, 9.0), heights=(0.0, 9.0))
     assert nearest(bridge) == [[math.inf], [math.inf], [0.0]]
-
-
-@pytest.mark.parametrize("turned", [0.0, 1.1, -2.5])
-@pytest.mark.parametrize(
-    ("place", "heading", "speed", "rate"),
-    [
-        ((25.0, 0.0), 0.0, 10.0, 0.5),  # 20 m ahead, 10 m/s slower
-        ((25.0, 1.5), 0.3, 10.0, 0.5),
-        ((25.0, 3.0), 0.0, 10.0, 0.0),  # in another lane
-        ((25.0, -3.0), 0.0, 10.0, 0.0),
-        ((-25.0, 0.0), 0.0, 30.0, 0.0),  # behind
-        ((25.0, 0.0), math.pi, 10.0, 0.0),  # oncoming
-        ((25.0, 0.0), 0.0, 25.0, 0.0),  # faster
-    ],
-)
-def test_closing_rate_is_that_of_slower_vehicles_ahead_in_the_lane(turned, place, heading, speed, rate):
-    c, s = math.cos(turned), math.sin(turned)
-    roster = Roster((Actor("ego", "car", 5.0, 2.0), Actor("x", "car", 5.0, 2.0)))
-    points = [(300.0, -700.0), (300.0 + c * place[0] - s * place[1], -700.0 + s * place[0] + c * place[1])]
-    view = Scene(0.0, roster, points, [turned, turned + heading], [20.0, speed])
-    assert closing_rate(view.frame, "ego") == pytest.approx(rate)
-    assert closing_rate(view.frame, "away") == 0.0

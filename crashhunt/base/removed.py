@@ -1,0 +1,41 @@
+"""Options of earlier versions, each with an instruction: what to do instead.
+
+`removed_fix` is consulted wherever an unknown option, key or argument is refused. A name is written once, as on the
+command line; the keys of Python and TOML follow from it (``--recycle-after``, ``recycle_after``).
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["refuse_removed_words", "removed_fix"]
+
+_RARE = "use --rare with --disturb and rates, such as --disturb brake=0.001: crashhunt no longer splits paths"
+_REMOVED = {"--splitting": _RARE, "--rare splitting": _RARE}
+"""Instructions by option, or by an option with its value."""
+
+
+def removed_fix(name: str) -> str:
+    """Return the instruction for an option of an earlier version; empty if there was no such option.
+
+    Args:
+        name: option as on the command line, or the key of a file, or the argument of a function.
+    """
+    return _REMOVED.get("--" + name.removeprefix("--").replace("_", "-"), "")
+
+
+def refuse_removed_words(words: Sequence[str]) -> None:
+    """Refuse a command line that gives an option a value which only earlier versions knew.
+
+    Raises:
+        UsageError: the value was removed.
+    """
+    for pair in map(" ".join, pairwise(words)):
+        if fix := _REMOVED.get(pair):
+            raise UsageError(f"there is no {pair!r}", fix=fix)
