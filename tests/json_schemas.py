@@ -10,6 +10,7 @@ from typing import Any
 import jsonschema
 
 import crashhunt
+from crashhunt.cli._list import with_list
 
 FOLDER = Path(crashhunt.__file__).parent / "guide" / "reference" / "schemas"
 
@@ -22,6 +23,7 @@ def validator(name: str) -> Any:
 
 def schema_of(words: tuple[str, ...]) -> str:
     """The name of the schema of what a command prints."""
+    words = tuple(with_list(words))
     return "-".join(words[:2]) if words[0] in ("corpus", "suite") else words[0]
 
 

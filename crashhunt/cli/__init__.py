@@ -37,7 +37,7 @@ from crashhunt.cli._gate import add_gate
 from crashhunt.cli._guide import add_guide
 from crashhunt.cli._init import add_init
 from crashhunt.cli._judge import add_judge
-from crashhunt.cli._list import add_lists
+from crashhunt.cli._list import add_list, with_list
 from crashhunt.cli._logs import add_logs
 from crashhunt.cli._rate import add_rate
 from crashhunt.cli._replay import add_replay
@@ -83,7 +83,7 @@ _COMMANDS = {
     "keep them fixed": (add_corpus, add_gate, add_split),
     "measure": (add_rate, add_compare, add_trials),
     "manage hunts": (add_status, add_logs, add_check, add_trust_command),
-    "look things up": (add_guide, add_lists, add_completion),
+    "look things up": (add_guide, add_list, add_completion),
 }
 
 
@@ -226,7 +226,8 @@ def _check_names(words: Sequence[str]) -> None:
 def _spell_out(words: Sequence[str]) -> list[str]:
     """Return the command line in the form that argparse reads.
 
-    ``--bbox=-122.3,…`` replaces ``--bbox -122.3,…``, whose second word argparse takes for an option.
+    ``--bbox=-122.3,…`` replaces ``--bbox -122.3,…``, whose second word argparse takes for an option. ``list
+    agents`` replaces ``agents``.
 
     Raises:
         UsageError: a word is of an earlier version.
@@ -236,7 +237,7 @@ def _spell_out(words: Sequence[str]) -> list[str]:
         at = words.index("--bbox")
         if re.match(r"-[\d.]", words[at + 1]):
             words = [*words[:at], f"--bbox={words[at + 1]}", *words[at + 2 :]]
-    return list(words)
+    return with_list(words)
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -1,4 +1,8 @@
-"""``crashhunt agents``, ``disturbances``, ``oracles`` and ``scenarios``."""
+"""``crashhunt list``: what crashhunt includes, and what is installed.
+
+`_KINDS` is the only place that names the kinds of things: help, completion, JSON and the words of earlier versions
+follow from it.
+"""
 
 from __future__ import annotations
 
@@ -7,76 +11,78 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from crashhunt import report
+from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line, one_line, visible
 from crashhunt.cli._common import add_json
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from crashhunt.cli._common import Commands
     from crashhunt.report import ListingEntry
 
-__all__ = ["add_lists"]
+__all__ = ["add_list", "with_list"]
 
 
-def add_lists(commands: Commands) -> None:
-    """Add the commands to the parser."""
-    for name, command, text in (
-        ("agents", _agents, "list the agents that crashhunt includes or that are installed, with their arguments"),
-        ("disturbances", _disturbances, "list the disturbances that crashhunt includes or that are installed"),
-        ("oracles", _oracles, "list the oracles that crashhunt includes or that are installed, with their arguments"),
-        ("scenarios", _scenarios, "list the scenarios that crashhunt includes, with their arguments, or copy one"),
-    ):
-        listing = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        if name == "scenarios":
-            listing.add_argument(
-                "--copy", nargs=2, metavar=("NAME", "DIR"), help="copy a scenario into a new folder, to edit it"
-            )
-        add_json(listing)
-        listing.set_defaults(command=command)
+_KINDS: dict[str, Callable[[], list[ListingEntry]]] = {
+    "agents": lambda: report.list_registered("agents"),
+    "disturbances": lambda: report.list_registered("disturbances"),
+    "oracles": lambda: report.list_registered("oracles"),
+    "scenarios": lambda: report.list_scenarios(),
+}
+"""Kinds of things that can be listed, each with a function that returns its entries."""
 
 
-def _agents(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.report import list_agents
-
-    return _print_listing("agents", list_agents(), as_json=options.json)
-
-
-def _disturbances(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.report import list_disturbances
-
-    return _print_listing("disturbances", list_disturbances(), as_json=options.json)
-
-
-def _oracles(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.report import list_oracles
-
-    return _print_listing("oracles", list_oracles(), as_json=options.json)
+def add_list(commands: Commands) -> None:
+    """Add the command to the parser."""
+    text = f"list the {', '.join([*_KINDS][:-1])} and {[*_KINDS][-1]} that crashhunt includes or that are installed"
+    listing = commands.add_parser("list", help=text, description=text[0].upper() + text[1:] + ".")
+    listing.add_argument(
+        "what", nargs="?", metavar="WHAT", choices=[*_KINDS],
+        help=f"{', '.join(_KINDS)}: describe each of this kind; without WHAT: print the names of all kinds",
+    )  # fmt: skip
+    listing.add_argument(
+        "--copy", nargs=2, metavar=("NAME", "DIR"), help="with scenarios: copy a scenario into a new folder, to edit it"
+    )
+    add_json(listing)
+    listing.set_defaults(command=_list)
 
 
-def _scenarios(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.report import list_scenarios
+def with_list(words: Sequence[str]) -> list[str]:
+    """Return a command line in which a kind alone, such as ``agents``, becomes ``list agents``."""
+    return ["list", *words] if words and words[0] in _KINDS else list(words)
 
+
+def _list(options: argparse.Namespace, _words: list[str]) -> int:
     if options.copy is not None:
-        from crashhunt.scenario import copy_shipped_scenario
-
-        name, folder = options.copy
-        copy_shipped_scenario(name, Path(folder))
-        if options.json:
-            entries = [entry for entry in list_scenarios() if entry.get("name") == name]
-            return _print_listing("scenarios", entries, as_json=True)
-        hunt = f"crashhunt run OUT 0 100 1000 {command_line('--scenario', folder)}"
-        print(visible(f"{command_line(folder)} has the files of {name}. Hunt in it: {hunt}"))
-        return 0
-    return _print_listing("scenarios", list_scenarios(), as_json=options.json)
-
-
-def _print_listing(name: str, entries: Sequence[ListingEntry], *, as_json: bool) -> int:
-    from crashhunt.report import describe
-
-    for entry in entries:
+        return _copy(options)
+    listed = {name: entries() for name, entries in _KINDS.items() if options.what in (None, name)}
+    for entry in (entry for entries in listed.values() for entry in entries):
         if "warning" in entry:
             print(one_line(f"crashhunt: warning: {entry['warning']}"), file=sys.stderr)
-    print(json.dumps({name: entries}) if as_json else visible(describe(entries)))
+    if options.json:
+        print(json.dumps(listed))
+    elif options.what is not None:
+        print(visible(report.describe(listed[options.what])))
+    else:
+        names = [f"{kind}: {', '.join(entry['name'] for entry in entries)}" for kind, entries in listed.items()]
+        print(visible("\n".join([*names, "crashhunt list WHAT describes each, such as crashhunt list agents"])))
+    return 0
+
+
+def _copy(options: argparse.Namespace) -> int:
+    from crashhunt.scenario import copy_shipped_scenario
+
+    name, folder = options.copy
+    if options.what != "scenarios":
+        fix = command_line("crashhunt", "list", "scenarios", "--copy", name, folder)
+        raise UsageError("--copy copies a scenario", fix=f"run {fix}")
+    copy_shipped_scenario(name, Path(folder))
+    if options.json:
+        print(json.dumps({"scenarios": [entry for entry in report.list_scenarios() if entry["name"] == name]}))
+    else:
+        hunt = f"crashhunt run OUT 0 100 1000 {command_line('--scenario', folder)}"
+        print(visible(f"{command_line(folder)} has the files of {name}. Hunt in it: {hunt}"))
     return 0

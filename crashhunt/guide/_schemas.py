@@ -704,27 +704,12 @@ class GateData(InvalidPairs):
     trained_on: int
 
 
-class AgentsData(TypedDict):
-    """``crashhunt agents``."""
+class ListData(TypedDict, total=False):
+    """``crashhunt list``; with WHAT, only its key."""
 
     agents: list[ListingEntry]
-
-
-class DisturbancesData(TypedDict):
-    """``crashhunt disturbances``."""
-
     disturbances: list[ListingEntry]
-
-
-class OraclesData(TypedDict):
-    """``crashhunt oracles``."""
-
     oracles: list[ListingEntry]
-
-
-class ScenariosData(TypedDict):
-    """``crashhunt scenarios``."""
-
     scenarios: list[ListingEntry]
 
 
@@ -773,10 +758,7 @@ SCHEMAS: dict[str, Any] = {
     "compare": CompareData,
     "gate": GateData,
     "rate": RatesData,
-    "agents": AgentsData,
-    "disturbances": DisturbancesData,
-    "oracles": OraclesData,
-    "scenarios": ScenariosData,
+    "list": ListData,
     "guide": TopicsData | TopicText,
     "error": ErrorData,
 }

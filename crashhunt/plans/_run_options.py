@@ -65,7 +65,8 @@ class Subject(_Options):
 
     scenario: Path | str = option(
         "loop", "name of an included scenario, or a path",
-        help="a shipped one (see crashhunt scenarios), a folder, a scenario.toml, a .sumocfg or a map (.osm, .xodr)",
+        help="a shipped one (see crashhunt list scenarios), a folder, a scenario.toml, a .sumocfg or a map (.osm, "
+        ".xodr)",
         brief="a shipped scenario, a folder, a scenario.toml, a .sumocfg or a map (.osm, .xodr)",
         flag="--scenario", metavar="NAME|PATH", group="what",
     )  # fmt: skip
@@ -85,9 +86,9 @@ class Subject(_Options):
     )  # fmt: skip
     agents: Mapping[str, Driver] | None = option(
         {}, "identifier of each controlled vehicle to its agent, if there are several",
-        help="the agent that drives: a class or function, or a name that crashhunt agents lists; if the scenario has "
-        "several controlled vehicles, ID= names the vehicle that this agent drives",
-        brief="the agent that drives: a class, a function, or a name that crashhunt agents lists",
+        help="the agent that drives: a class or function, or a name that crashhunt list agents shows; if the scenario "
+        "has several controlled vehicles, ID= names the vehicle that this agent drives",
+        brief="the agent that drives: a class, a function, or a name that crashhunt list agents shows",
         flag="--agent", metavar="[ID=]MODULE:ATTR", group="what", named=False,
     )  # fmt: skip
     arguments: Mapping[str, Spec] | None = option(
@@ -106,7 +107,7 @@ class Subject(_Options):
     oracles: Sequence[str] = option(
         (), "additional oracles; by default, oracles detect collisions that the simulator reports, overlaps, and "
         "leaving the road",
-        help="an additional oracle that detects crashes, with its arguments; crashhunt oracles lists all oracles; "
+        help="an additional oracle that detects crashes, with its arguments; crashhunt list oracles shows all oracles; "
         "none switches off the default oracles; the option may be given several times",
         flag="--oracle", metavar="NAME[:KEY=VALUE,…]", group="what",
     )  # fmt: skip

@@ -18,9 +18,7 @@ from ._listing import (
     ArgumentEntry as ArgumentEntry,
     ListingEntry as ListingEntry,
     describe as describe,
-    list_agents as list_agents,
-    list_disturbances as list_disturbances,
-    list_oracles as list_oracles,
+    list_registered as list_registered,
     list_scenarios as list_scenarios,
 )
 from ._page import (

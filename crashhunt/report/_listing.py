@@ -23,9 +23,7 @@ __all__ = [
     "ArgumentEntry",
     "ListingEntry",
     "describe",
-    "list_agents",
-    "list_disturbances",
-    "list_oracles",
+    "list_registered",
     "list_scenarios",
 ]
 
@@ -45,7 +43,7 @@ class ArgumentEntry(TypedDict):
 
 
 class ListingEntry(TypedDict):
-    """An entry of ``agents``, ``oracles`` and ``scenarios`` with ``--json``; only scenarios have the last two keys."""
+    """An entry of ``list`` with ``--json``; only scenarios have the last two keys."""
 
     name: str
     locator: str
@@ -56,22 +54,8 @@ class ListingEntry(TypedDict):
     agents: NotRequired[dict[str, list[ArgumentEntry]]]
 
 
-def list_agents() -> list[ListingEntry]:
-    """Return the registered agents. An agent that cannot be imported is listed with a warning."""
-    return _list("agents")
-
-
-def list_disturbances() -> list[ListingEntry]:
-    """Return the registered models of disturbances."""
-    return _list("disturbances")
-
-
-def list_oracles() -> list[ListingEntry]:
-    """Return the registered oracles with their arguments."""
-    return _list("oracles")
-
-
-def _list(group: Group) -> list[ListingEntry]:
+def list_registered(group: Group) -> list[ListingEntry]:
+    """Return the registered objects of a group. An object that cannot be imported is listed with a warning."""
     found: list[ListingEntry] = []
     for name, point in registered(group).items():
         entry: ListingEntry = {"name": name, "locator": point.value, "title": "", "arguments": []}

@@ -253,6 +253,8 @@ def test_each_hunt_of_a_suite_is_asked_for_once(monkeypatch):
         (["init", "--bbox", "1.5,2", "x"], ["init", "--bbox", "1.5,2", "x"]),
         (["init", "--bbox", "-x"], ["init", "--bbox", "-x"]),
         (["init", "--bbox"], ["init", "--bbox"]),
+        (["scenarios", "--json"], ["list", "scenarios", "--json"]),
+        (["trials", "agents"], ["trials", "agents"]),
     ],
 )
 def test_words_are_spelled_out_for_argparse(words, found):
@@ -327,7 +329,7 @@ def test_argument_that_is_no_text_is_named():
 def test_help_lists_every_command_once(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     text = cli.make_parser().format_help()
-    for name in ("run", "disturbances", "completion", "trust"):
+    for name in ("run", "list", "completion", "trust"):
         assert len([line for line in text.splitlines() if line.startswith(f"  {name} ") or line == f"  {name}"]) == 1
     assert max(map(len, text.partition("exit codes")[0].splitlines())) <= 120
     assert cli._listed("run", "a b") == "run         a b"

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_agents_are_listed_with_arguments_ranges_and_units(shell):
-    agents = {entry["name"]: entry for entry in shell.crashhunt("agents", "--json").json["agents"]}
+    agents = {entry["name"]: entry for entry in shell.crashhunt("list", "agents", "--json").json["agents"]}
     assert {"car-following", "keep-lane", "lane-changer", "random", "recorded"} <= set(agents)
     (speed,) = agents["keep-lane"]["arguments"]
     assert speed == {
@@ -22,12 +22,12 @@ def test_agents_are_listed_with_arguments_ranges_and_units(shell):
         "unit": "m/s",
         "help": "held for ever",
     }
-    text = shell.crashhunt("agents").out
+    text = shell.crashhunt("list", "agents").out
     assert all(entry["locator"] in text and entry["title"] in text for entry in agents.values())
 
 
 def test_every_listed_scenario_states_what_it_is(shell):
-    scenarios = shell.crashhunt("scenarios", "--json").json["scenarios"]
+    scenarios = shell.crashhunt("list", "scenarios", "--json").json["scenarios"]
     assert {entry["name"] for entry in scenarios} == set(shipped_scenarios())  # each of which test_scenarios hunts
     for entry in scenarios:
         assert entry["title"]
@@ -44,11 +44,35 @@ def test_copied_scenario_needs_no_file_of_the_package(name, tmp_path):
 
 
 def test_copy_of_a_scenario_is_refused_with_the_fix(shell):
-    assert "mine has the files of loop" in shell.crashhunt("scenarios", "--copy", "loop", "mine").out
-    assert shell.crashhunt("scenarios", "--copy", "loop", "more", "--json").json["scenarios"][0]["name"] == "loop"
-    assert "not empty; give a new folder" in shell.crashhunt("scenarios", "--copy", "loop", "mine", expect=2).err
-    assert "did you mean 'loop'?" in shell.crashhunt("scenarios", "--copy", "lop", "new", expect=2).err
+    assert "mine has the files of loop" in shell.crashhunt("list", "scenarios", "--copy", "loop", "mine").out
+    assert (
+        shell.crashhunt("list", "scenarios", "--copy", "loop", "more", "--json").json["scenarios"][0]["name"] == "loop"
+    )
+    assert (
+        "not empty; give a new folder" in shell.crashhunt("list", "scenarios", "--copy", "loop", "mine", expect=2).err
+    )
+    assert "did you mean 'loop'?" in shell.crashhunt("list", "scenarios", "--copy", "lop", "new", expect=2).err
     assert not (shell.folder / "new").exists()
+
+
+def test_list_without_a_kind_names_the_entries_of_every_kind(shell):
+    found = shell.crashhunt("list", "--json").json
+    assert [*found] == ["agents", "disturbances", "oracles", "scenarios"]
+    *lines, more = shell.crashhunt("list").out.splitlines()
+    assert lines == [f"{kind}: {', '.join(entry['name'] for entry in entries)}" for kind, entries in found.items()]
+    assert "crashhunt list agents" in more
+
+
+@pytest.mark.parametrize("kind", ["agents", "disturbances", "oracles", "scenarios"])
+def test_commands_of_earlier_versions_are_aliases_of_list(shell, kind):
+    assert shell.crashhunt(kind, "--json").json == shell.crashhunt("list", kind, "--json").json
+    assert f"  {kind} " not in shell.crashhunt("--help").out
+
+
+def test_list_refuses_an_unknown_kind_and_the_copy_of_anything_but_a_scenario(shell):
+    unknown = shell.crashhunt("list", "agent", expect=2).err
+    assert "WHAT 'agent' is none of its choices; did you mean 'agents'?" in unknown
+    assert "run crashhunt list scenarios --copy loop x" in shell.crashhunt("list", "--copy", "loop", "x", expect=2).err
 
 
 def test_listed_agents_can_be_hunted_by_name(shell):
