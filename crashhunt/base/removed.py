@@ -6,6 +6,7 @@ command line; the keys of Python and TOML follow from it (``--recycle-after``, `
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -14,10 +15,14 @@ from crashhunt.base.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["refuse_removed_words", "removed_fix"]
+__all__ = ["refuse_removed_words", "removed_fix", "removed_fix_in"]
 
 _RARE = "use --rare with --disturb and rates, such as --disturb brake=0.001: crashhunt no longer splits paths"
-_REMOVED = {"--splitting": _RARE, "--rare splitting": _RARE}
+_REMOVED = {
+    "--splitting": _RARE,
+    "--rare splitting": _RARE,
+    "--recycle-after": "omit it: every trial has its own process",
+}
 """Instructions by option, or by an option with its value."""
 
 
@@ -28,6 +33,14 @@ def removed_fix(name: str) -> str:
         name: option as on the command line, or the key of a file, or the argument of a function.
     """
     return _REMOVED.get("--" + name.removeprefix("--").replace("_", "-"), "")
+
+
+def removed_fix_in(text: str) -> str:
+    """Return the instruction for the option of an earlier version that an error message names; empty if there is none.
+
+    User code may pass such an option on, or require it as an argument.
+    """
+    return next((fix for word in re.findall(r"\w+", text) if (fix := removed_fix(word))), "")
 
 
 def refuse_removed_words(words: Sequence[str]) -> None:

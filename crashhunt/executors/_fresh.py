@@ -65,10 +65,9 @@ class FreshProcessExecutor:
     Args:
         settings: settings of the hunt.
         parallel: number of processes at a time.
-        recycle_after: ignored, because every trial has a new process.
     """
 
-    def __init__(self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1) -> None:
+    def __init__(self, settings: WorkerSettings, *, parallel: int = 1) -> None:
         self._settings = settings
         self.capacity = parallel
         self._notes = Notes(settings.scratch)

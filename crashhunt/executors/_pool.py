@@ -180,16 +180,13 @@ class PoolExecutor:
     Args:
         settings: settings of the hunt.
         parallel: number of slots.
-        recycle_after: ignored, because no process runs two trials.
         snapshot: whether the trials use the crashhunt of the settings' snapshot, in new Python processes.
 
     Attributes:
         held_back: number of slots that receive no further trial for now.
     """
 
-    def __init__(
-        self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1000, snapshot: bool = False
-    ) -> None:
+    def __init__(self, settings: WorkerSettings, *, parallel: int = 1, snapshot: bool = False) -> None:
         self.held_back = 0
         self._snapshot = snapshot
         self._settings = settings

@@ -13,6 +13,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.json_types import ErrorData, ErrorWords
+from crashhunt.base.removed import removed_fix_in
 from crashhunt.base.text import NOTICE_TOPIC
 from crashhunt.plans import ChoosesParallelism, executor_of
 
@@ -125,13 +126,12 @@ class ExecutorFactory(Protocol):
     any process. See also `ChoosesParallelism`.
     """
 
-    def __call__(self, settings: WorkerSettings, *, parallel: int, recycle_after: int) -> Executor:
+    def __call__(self, settings: WorkerSettings, *, parallel: int) -> Executor:
         """Create an executor for a hunt.
 
         Args:
             settings: settings of the hunt.
             parallel: number of trials that run at a time.
-            recycle_after: number of trials after which a worker is replaced; 0 for never.
         """
 
 
@@ -258,7 +258,7 @@ class Notes:
 # The executor that a hunt asks for.
 
 
-def make_executor(word: str, settings: WorkerSettings, *, parallel: int, recycle_after: int) -> Executor:
+def make_executor(word: str, settings: WorkerSettings, *, parallel: int) -> Executor:
     """Create the executor that ``--executor`` names.
 
     Raises:
@@ -267,11 +267,12 @@ def make_executor(word: str, settings: WorkerSettings, *, parallel: int, recycle
     """
     factory = executor_of(word)
     try:
-        made: Executor = factory(settings, parallel=parallel, recycle_after=recycle_after)
+        made: Executor = factory(settings, parallel=parallel)
     except CrashhuntError:
         raise
     except Exception as error:  # code of the user
-        raise blamed(f"the executor {word!r} cannot be created", error) from error
+        fix = removed_fix_in(str(error)) if isinstance(error, TypeError) else ""
+        raise blamed(f"the executor {word!r} cannot be created", error, fix=fix or "correct the code") from error
     return made
 
 

@@ -484,7 +484,7 @@ class Hunt:
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
         planned = settings.most_trials - len(finished) + len(self._unanswered)
         parallel = min(run.parallel, max(1, planned))
-        executor = make_executor(run.executor, worker_settings, parallel=parallel, recycle_after=run.recycle_after)
+        executor = make_executor(run.executor, worker_settings, parallel=parallel)
         audit, self._heard = Audit(worker_settings, progress.failed), WorkerNotices(settings, progress.outcomes)
         preflight = Preflight(
             settings, planned, files=snapshot.argument_files, code=snapshot.code,

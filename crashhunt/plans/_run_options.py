@@ -267,11 +267,6 @@ class RunOptions(_Options):
         help="run SUMO without the compiled core; trials stay bit-identical and take longer",
         flag="--no-native", group="run",
     )  # fmt: skip
-    recycle_after: int = option(
-        1000, "no effect, because every trial has its own process",
-        help="this option has no effect, because every trial has its own process",
-        flag="--recycle-after", group="run", metavar="N", check=at_least(0, zero="never"),
-    )  # fmt: skip
     warm_copies: int = option(
         8, "with ``seeds``, the number of traffics for which each worker keeps a suspended process with the "
         "simulation after its warm-up; 0: none",

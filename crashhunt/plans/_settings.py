@@ -56,7 +56,7 @@ _FIRST_KEYS = (
     "scenario_arguments", "events", "run", "schema",
 )  # fmt: skip
 _RUN_KEYS = (
-    "parallel", "keep_going", "deterministic", "keep_trials", "timeout_s", "recycle_after", "audit", "accelerate",
+    "parallel", "keep_going", "deterministic", "keep_trials", "timeout_s", "audit", "accelerate",
 )  # fmt: skip
 
 

@@ -873,7 +873,7 @@ def bench_replay() -> Iterator[Figure]:
 class Costless:
     """An executor of thousands of workers whose trials cost nothing, so that what is left is the hunt itself."""
 
-    def __init__(self, settings: object, *, parallel: int, recycle_after: int) -> None:
+    def __init__(self, settings: object, *, parallel: int) -> None:
         self.capacity = parallel
         self._waiting: deque[TrialSpec] = deque()
 

@@ -66,7 +66,6 @@ def test_a_neighbour_is_meant(tmp_path):
         ("trials o --outcome survivd", "did you mean 'survived'?"),
         ("run o -1 1 10", "PARALLEL is -1; give at least 0 (0: one per core)"),
         ("run o 1 0 10", "TRIALS is 0; give at least 1"),
-        ("run o 1 1 10 --recycle-after -1", "give at least 0 (0: never)"),
         ("run o 1 1 10 --timeout soon", "'soon' is not a number"),
         ("run o 1 1 10 --snapshot-limit -1", "--snapshot-limit is -1; give MB above 0, or --no-snapshot"),
         ("run o 1 1 10 --snapshot-limit nan", "--snapshot-limit is nan"),

@@ -20,11 +20,11 @@ from crashhunt.executors import PoolExecutor
 class Logged:
     """A pool that writes down what it is asked; it knows the protocol and nothing else."""
 
-    def __init__(self, settings, *, parallel, recycle_after, argument=""):
-        self._pool = PoolExecutor(settings, parallel=parallel, recycle_after=recycle_after)
+    def __init__(self, settings, *, parallel, argument=""):
+        self._pool = PoolExecutor(settings, parallel=parallel)
         self._log = Path("calls.log")
         self._said = ["an executor of mine was here"]
-        self._write(f"made {parallel} {recycle_after} {argument}")
+        self._write(f"made {parallel} {argument}")
 
     def _write(self, line):
         with self._log.open("a") as file:
@@ -61,8 +61,8 @@ class Everywhere(Logged):
 
     sizes_itself = True
 
-    def __init__(self, settings, *, parallel, recycle_after):
-        super().__init__(settings, parallel=parallel or 2, recycle_after=recycle_after, argument=f"asked {parallel}")
+    def __init__(self, settings, *, parallel):
+        super().__init__(settings, parallel=parallel or 2, argument=f"asked {parallel}")
 
     def nodes(self):
         from crashhunt.executors import NodeFigures
@@ -71,12 +71,12 @@ class Everywhere(Logged):
 
 
 class Broken:
-    def __init__(self, settings, *, parallel, recycle_after):
+    def __init__(self, settings, *, parallel):
         raise RuntimeError("no cluster\\nhere")
 
 
 class Refuses:
-    def __init__(self, settings, *, parallel, recycle_after):
+    def __init__(self, settings, *, parallel):
         from crashhunt.errors import UsageError
 
         raise UsageError("nobody answers at 10.0.0.1", fix="start it")
@@ -102,7 +102,7 @@ def test_an_executor_of_somebodys_own_runs_the_trials(mine):
     same = {"dir": "", "wall_s": 0}
     assert done.json | same == usual | same | {"notes": ["an executor of mine was here"]}
     found = calls(mine)
-    assert found[0] == "made 2 1000 there:10001"
+    assert found[0] == "made 2 there:10001"
     assert found[1:5] == [f"submit {number}" for number in range(4)]
     assert set(found[5:]) == {"close"}
     assert "an executor of mine was here" in mine.crashhunt("logs", "g").out
@@ -121,13 +121,13 @@ def test_ours_are_chosen_by_name(mine):
     assert done.json["outcomes"] == {"survived": 2}
     # A hunt that goes on may do so elsewhere: what a trial is does not change.
     mine.crashhunt(*WORDS[:2], "1", "3", *WORDS[4:], "--executor", "mine:Logged")
-    assert calls(mine)[:2] == ["made 1 1000 ", "submit 2"]
+    assert calls(mine)[:2] == ["made 1 ", "submit 2"]
 
 
 @pytest.mark.nightly  # by day, plans/test_what_is_resolved.py and cli/test_status.py
 def test_it_may_know_better_than_this_machine_what_0_represents(mine):
     mine.crashhunt(*WORDS[:2], "0", *WORDS[3:], "--executor", "mine:Everywhere")
-    assert calls(mine)[0] == "made 2 1000 asked 0"
+    assert calls(mine)[0] == "made 2 asked 0"
     assert tomllib.loads((mine.folder / "h" / "hunt.toml").read_text())["run"]["parallel"] == 0
     (state,) = mine.crashhunt("status", "h", "--json").json["hunts"]
     assert state["nodes"] == [{"name": "there", "parallel": 2, "trials": 3, "rate_per_s": 1.5}]
@@ -143,13 +143,13 @@ def test_suites_rerun_and_python_choose_it_too(mine, monkeypatch):
     (mine.folder / "s.toml").write_text(f"[[hunts]]\n{entry}")
     (mine.folder / "own.toml").write_text(f'[[hunts]]\n{entry}executor = "mine:Logged:own"\n')
     mine.crashhunt("suite", "run", "s.toml", "s", "1", "--executor", "mine:Logged:all")
-    assert calls(mine)[0] == "made 1 1000 all"
+    assert calls(mine)[0] == "made 1 all"
     mine.crashhunt("suite", "run", "own.toml", "own", "1")
-    assert calls(mine)[0] == "made 1 1000 own"
+    assert calls(mine)[0] == "made 1 own"
     mine.crashhunt("rerun", "own", "--all", "--parallel", "1")
-    assert calls(mine)[0] == "made 1 1000 own"
+    assert calls(mine)[0] == "made 1 own"
     mine.crashhunt("rerun", "own/a/0", "--to", "again", "--parallel", "1", "--executor", "mine:Logged:else")
-    assert calls(mine)[0] == "made 1 1000 else"
+    assert calls(mine)[0] == "made 1 else"
     monkeypatch.chdir(mine.folder)
     report = crashhunt.run("p", 1, 1, 20, scenario="toy", arguments={"speed": 5}, executor="mine:Logged", seed=1)
     assert report.stopped_because == "all_trials"

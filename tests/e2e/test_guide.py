@@ -148,7 +148,7 @@ def test_the_keys_are_those_of_the_files():
     assert "not part of" not in scenario
     assert "- `tables`" not in scenario
     assert "- `folder`" not in scenario
-    for key in ("id", "runs", "trials", "arguments", "keep_going", "recycle_after", "oracles"):
+    for key in ("id", "runs", "trials", "arguments", "keep_going", "oracles"):
         assert suite.count(f"- `{key}`: ") == 1
 
 

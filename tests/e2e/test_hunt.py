@@ -248,12 +248,6 @@ def test_the_smallest_time_limit_that_fits_is_no_hang(toy):
     assert report["outcomes"] == {"survived": 4}
 
 
-@pytest.mark.nightly  # by day, plans/test_run_options.py and hunts/test_hunt_loop.py
-def test_option_to_recycle_workers_is_still_taken(toy):
-    words = ("run", "h", "1", "6", "30", *FINE, "--recycle-after", "2", "--json")
-    assert toy.crashhunt(*words).json["outcomes"] == {"survived": 6}
-
-
 @pytest.mark.nightly  # by day, ledger/test_ledger_reads.py and hunts/test_whole_hunts.py
 def test_a_full_disk_is_one_clear_line_and_nothing_is_lost(shell):
     small = shell.folder / "small"

@@ -122,7 +122,7 @@ def begin(tmp_path, monkeypatch, clock):
         theirs, ours = socket.socketpair()
         ends.extend((theirs, ours))
         job = {
-            "settings": settings.to_json(), "parallel": parallel, "recycle_after": 0, "address": "x:1", "cpus": 2,
+            "settings": settings.to_json(), "parallel": parallel, "address": "x:1", "cpus": 2,
             "temporary": None, "versions": {}, "code": "", "resumed": resumed,
         }  # fmt: skip
         bridge = _bridge.Bridge(theirs, job)

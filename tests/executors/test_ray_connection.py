@@ -293,9 +293,9 @@ def survived(number):
 
 
 def test_hunt_submits_to_the_bridge_and_hears_of_results(executor):
-    found, (bridge,) = executor(parallel=3, recycle_after=5)
-    assert {name: bridge.job[name] for name in ("parallel", "recycle_after", "address", "cpus", "resumed")} == {
-        "parallel": 3, "recycle_after": 5, "address": "x:1", "cpus": 3, "resumed": False,
+    found, (bridge,) = executor(parallel=3)
+    assert {name: bridge.job[name] for name in ("parallel", "address", "cpus", "resumed")} == {
+        "parallel": 3, "address": "x:1", "cpus": 3, "resumed": False,
     }  # fmt: skip
     assert bridge.job["temporary"] is None
     assert bridge.environment["A"] == "1"
@@ -514,7 +514,7 @@ def node(settings, tmp_path, monkeypatch):
     made = []
 
     def make(*ends, slots=1):
-        job = {"settings": settings.to_json(), "recycle_after": 0, "digest": "", "folders": {}, "home": "",
+        job = {"settings": settings.to_json(), "digest": "", "folders": {}, "home": "",
                "slots": slots}  # fmt: skip
         work = Work(job)
         work._place = work._store.place()

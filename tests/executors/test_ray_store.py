@@ -213,7 +213,7 @@ def test_of_a_black_box_only_what_is_in_it_travels(settings, tmp_path, monkeypat
     box = BlackBox(tmp_path / layout.BLACK_BOX)
     box.begin(pid=1, trial=0, started=0.0)
     box.append(Tag.ROSTER, 0, bytes(range(1, 200)))
-    job = {"settings": settings.to_json(), "recycle_after": 0, "digest": "", "folders": {}, "home": "", "slots": 1}
+    job = {"settings": settings.to_json(), "digest": "", "folders": {}, "home": "", "slots": 1}
     content = Work(job)._content(tmp_path / layout.BLACK_BOX)
     assert len(content) < 1000
     (tmp_path / "there").write_bytes(content)
@@ -257,7 +257,7 @@ def work(settings, tmp_path, monkeypatch):
     made = []
 
     def make(*ending):
-        job = {"settings": settings.to_json(), "recycle_after": 0, "digest": "", "folders": {}, "home": "", "slots": 4}
+        job = {"settings": settings.to_json(), "digest": "", "folders": {}, "home": "", "slots": 4}
         made.append(Work(job))
         made[-1]._place = made[-1]._store.place()
         made[-1]._pool = Pool(*ending)
@@ -280,7 +280,7 @@ def test_a_node_asks_for_code_once_and_keeps_what_is_whole(settings, tmp_path, m
         "crashhunt.executors.ray._node_worker.PoolExecutor", lambda given, **more: made.append((given, more)) or Pool()
     )
     parcel = CodeArchive.of(settings)
-    job = {"settings": settings.to_json(), "recycle_after": 9, "digest": parcel.digest(), "folders": parcel.folders,
+    job = {"settings": settings.to_json(), "digest": parcel.digest(), "folders": parcel.folders,
            "home": "", "slots": 4}  # fmt: skip
     first, second, third = (Work(job) for _ in range(3))
     assert first.begin() == "lacks"
@@ -289,7 +289,7 @@ def test_a_node_asks_for_code_once_and_keeps_what_is_whole(settings, tmp_path, m
     assert first.deliver(parcel.packed()) == "ready"
     assert second.begin() == "ready"
     (given, more), _ = made
-    assert more == {"parallel": 4, "recycle_after": 9}
+    assert more == {"parallel": 4}
     assert (Path(given.code[0]) / "mine" / "agent.py").read_text() == "x = 1"
     assert given.scratch != settings.scratch
     first._store.keep(parcel.digest(), b"damaged later")

@@ -217,21 +217,21 @@ def test_each_note_is_reported_once(tmp_path):
 
 def test_an_executor_that_cannot_be_made_is_one_line(monkeypatch):
     def factory(error):
-        def make(settings, *, parallel, recycle_after):
+        def make(settings, *, parallel):
             if error:
                 raise error
-            return settings, parallel, recycle_after
+            return settings, parallel
 
         return lambda word: make
 
     monkeypatch.setattr(_protocol, "executor_of", factory(None))
-    assert _protocol.make_executor("w", "settings", parallel=3, recycle_after=5) == ("settings", 3, 5)
+    assert _protocol.make_executor("w", "settings", parallel=3) == ("settings", 3)
     monkeypatch.setattr(_protocol, "executor_of", factory(UsageError("no cluster")))
     with pytest.raises(UsageError, match="no cluster"):
-        _protocol.make_executor("w", None, parallel=1, recycle_after=0)
+        _protocol.make_executor("w", None, parallel=1)
     monkeypatch.setattr(_protocol, "executor_of", factory(ValueError("no cluster")))
     with pytest.raises(PluginError, match="the executor 'w' cannot be created"):
-        _protocol.make_executor("w", None, parallel=1, recycle_after=0)
+        _protocol.make_executor("w", None, parallel=1)
 
 
 @pytest.mark.parametrize(("began_ago_s", "given_ago_s", "hangs"), [(50, 5, False), (5, 50, False), (50, 50, True)])

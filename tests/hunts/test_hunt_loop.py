@@ -48,8 +48,8 @@ class Inline:
 
     capacity, first = 2, 0
 
-    def __init__(self, settings, *, parallel, recycle_after, ends):
-        self.settings, self.parallel, self.recycle_after, self.ends = settings, parallel, recycle_after, ends
+    def __init__(self, settings, *, parallel, ends):
+        self.settings, self.parallel, self.ends = settings, parallel, ends
         self.waiting, self.submitted, self.most, self.cancelled, self.closed, self.said = [], [], 0, [], 0, ["a note"]
 
     def submit(self, spec):
@@ -84,8 +84,8 @@ def run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     def hunt(trials, ends=survives, *, parallel=2, **options):
-        def make(name, settings, *, parallel, recycle_after):
-            found.executor = Inline(settings, parallel=parallel, recycle_after=recycle_after, ends=ends)
+        def make(name, settings, *, parallel):
+            found.executor = Inline(settings, parallel=parallel, ends=ends)
             return found.executor
 
         found = SimpleNamespace(seen=[], path=tmp_path / "h", executor=None)

@@ -181,7 +181,6 @@ keep_going = true
 deterministic = true
 keep_trials = true
 timeout_s = 5.0
-recycle_after = 0
 audit = 0.25
 accelerate = false
 """
@@ -189,7 +188,7 @@ accelerate = false
 
 def test_hunt_toml_is_what_it_was_to_the_byte(tmp_path):
     run = RunSettings(
-        parallel=3, keep_going=True, deterministic=True, keep_trials=True, timeout_s=5.0, recycle_after=0, audit=0.25,
+        parallel=3, keep_going=True, deterministic=True, keep_trials=True, timeout_s=5.0, audit=0.25,
         accelerate=False,
     )  # fmt: skip
     asked = Request(
@@ -210,7 +209,6 @@ def test_hunt_toml_is_what_it_was_to_the_byte(tmp_path):
         ({"points": True}, "--points is True; give a whole number"),
         ({"points": 0}, "--points is 0; give at least 1"),
         ({"seed": -1}, "--seed is -1; give at least 0"),
-        ({"recycle_after": -1}, "--recycle-after is -1; give at least 0 (0: never)"),
         ({"timeout_s": float("inf")}, "--timeout is inf; give seconds above 0"),
         ({"timeout_s": float("nan")}, "--timeout is nan; give seconds above 0"),
         ({"timeout_s": "long"}, "--timeout is 'long'; give a number"),
@@ -238,18 +236,18 @@ def test_a_suite_has_every_option(tmp_path):
     assert {option.name for option in hunt_options(SuiteEntry)} | {"agent", "agents"} == {
         option.name for option in hunt_options()
     }
-    lacked = "accelerate = false\nrecycle_after = 7\nsnapshot_limit_mb = 3\nsnapshot_code = false\n"
+    lacked = "accelerate = false\ntimeout_s = 7.0\nsnapshot_limit_mb = 3\nsnapshot_code = false\n"
     (tmp_path / "s.toml").write_text(f'[defaults]\n{lacked}[[hunts]]\nid = "a"\nscenario = "toy"\n')
     (folder,) = Suite.read(tmp_path / "s.toml").plan(tmp_path / "s")
     planned = json.loads((folder / "request.json").read_text())
     assert planned["request"]["run"]["accelerate"] is False
-    assert planned["request"]["run"]["recycle_after"] == 7
+    assert planned["request"]["run"]["timeout_s"] == 7.0
     assert (planned["snapshot_limit_mb"], planned["snapshot_code"], planned["snapshot_roots"]) == (3.0, False, [])
     assert Suite.read(tmp_path / "s.toml").entries[0] == SuiteEntry(
-        id="a", scenario="toy", accelerate=False, recycle_after=7, snapshot_limit_mb=3.0, snapshot_code=False
+        id="a", scenario="toy", accelerate=False, timeout_s=7.0, snapshot_limit_mb=3.0, snapshot_code=False
     )
-    (tmp_path / "s.toml").write_text('[[hunts]]\nid = "a"\nrecycle_afer = 3\n')
-    with pytest.raises(UsageError, match="unknown key 'recycle_afer'; did you mean 'recycle_after'"):
+    (tmp_path / "s.toml").write_text('[[hunts]]\nid = "a"\ntimeut_s = 3\n')
+    with pytest.raises(UsageError, match="unknown key 'timeut_s'; did you mean 'timeout_s'"):
         Suite.read(tmp_path / "s.toml")
 
 

@@ -203,7 +203,7 @@ def test_only_hunts_that_need_it_run_again_unless_all_are_asked_for(folders, sta
     assert RunRequest.read(replaced[0] / REQUEST) == ASKED
 
 
-@pytest.mark.parametrize(("parallel", "machine"), [(-1, None), (1, {"executor": "gone"}), (1, {"recycle_after": -1})])
+@pytest.mark.parametrize(("parallel", "machine"), [(-1, None), (1, {"executor": "gone"}), (1, {"audit": -1})])
 def test_options_of_the_machine_are_checked_before_any_hunt_runs(parallel, machine):
     check_machine(1, {"executor": "fresh", "continue_with_new_code": True})
     with pytest.raises(Exception, match=r".+") as caught:

@@ -276,7 +276,6 @@ class Bridge:
         elif node.doing == "differs":
             job: NodeJob = {
                 "settings": self._job["settings"],
-                "recycle_after": self._job["recycle_after"],
                 "digest": self._digest,
                 "folders": self._parcel.folders,
                 "home": self._parcel.home,

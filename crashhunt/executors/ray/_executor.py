@@ -51,7 +51,6 @@ class RayExecutor:
         settings: settings of the hunt.
         parallel: number of trials at a time in the whole cluster; 0 for all CPUs of the cluster, including CPUs that
             are added later.
-        recycle_after: number of trials after which a worker is replaced; 0 for never.
         argument: argument of ``--executor ray:ADDRESS``, as for `cluster_of`.
 
     Raises:
@@ -61,15 +60,12 @@ class RayExecutor:
 
     sizes_itself: ClassVar[bool] = True
 
-    def __init__(
-        self, settings: WorkerSettings, *, parallel: int = 0, recycle_after: int = 1000, argument: str = ""
-    ) -> None:
+    def __init__(self, settings: WorkerSettings, *, parallel: int = 0, argument: str = "") -> None:
         require_ray()
         self._address, self._environment, self._spare = cluster_of(argument)
         CodeArchive.of(settings)
         self._settings = settings
         self._parallel = parallel
-        self._recycle_after = recycle_after
         self._slots: int | None = None
         self._tickets = itertools.count()
         self._open: dict[int, TrialSpec] = {}  # ticket to trial
@@ -161,7 +157,6 @@ class RayExecutor:
         content: BridgeJob = {
             "settings": self._settings.to_json(),
             "parallel": self._parallel,
-            "recycle_after": self._recycle_after,
             "address": self._address,
             "cpus": self._parallel or len(os.sched_getaffinity(0)),
             "temporary": None if self._folder is None else str(self._folder.path),

@@ -26,7 +26,6 @@ class BridgeJob(TypedDict):
 
     settings: JsonObject
     parallel: int
-    recycle_after: int
     address: str
     cpus: int
     temporary: str | None
@@ -42,7 +41,6 @@ class NodeJob(TypedDict):
     """
 
     settings: JsonObject
-    recycle_after: int
     digest: str
     folders: dict[str, str]
     home: str

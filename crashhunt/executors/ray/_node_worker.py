@@ -90,8 +90,7 @@ class Work:
         self._renamed = sorted(pairs.items(), key=lambda pair: -len(pair[0]))
         if self._job["home"]:  # an agent may open its files by names that count from there
             os.chdir(self._place.code / self._job["home"])
-        recycle_after = self._job["recycle_after"]
-        self._pool = PoolExecutor(here, parallel=self._job["slots"], recycle_after=recycle_after)
+        self._pool = PoolExecutor(here, parallel=self._job["slots"])
         return True
 
     def submit(self, trials: Sequence[Submitted]) -> None:
