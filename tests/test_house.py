@@ -268,4 +268,4 @@ ROLES = frozenset({"_backend", "_disturbances", "_protocol", "_scripted", "_simu
 def test_a_file_name_stands_once():
     """The second file of a name is what a first guess misses."""
     names = Counter(file.stem for file in ROOT.rglob("*.py") if not file.stem.startswith("__"))
-    assert {name for name, count in names.items() if count > 1} <= ROLES | {"_splitting"}
+    assert {name for name, count in names.items() if count > 1} <= ROLES

@@ -8,7 +8,11 @@ from ._action_override import (
 from ._blame import has_users_code as has_users_code, internal_error as internal_error
 from ._branches import Brancher as Brancher
 from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
-from ._failures import failure_of as failure_of, is_tampered as is_tampered, message_of_error as message_of_error
+from ._failures import (
+    are_functions_replaced as are_functions_replaced,
+    failure_of as failure_of,
+    message_of_error as message_of_error,
+)
 from ._fast_path import FastEpisode as FastEpisode
 from ._forced_onsets import OnsetForcer as OnsetForcer
 from ._forks import FirstCopy as FirstCopy, ForkRunner as ForkRunner

@@ -6,7 +6,7 @@ import resource
 import sys
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from types import FunctionType, ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -44,11 +44,11 @@ if TYPE_CHECKING:
 __all__ = [
     "Attribution",
     "Ending",
+    "are_functions_replaced",
     "attribute_error",
     "close_agent",
     "failure_of",
     "is_emptied",
-    "is_tampered",
     "message_of_error",
     "record_originals",
 ]
@@ -158,7 +158,7 @@ _USED_FUNCTIONS: Final = frozenset(
     {"collections", "contextlib", "dataclasses", "functools", "hashlib", "io", "json", "json.decoder", "json.encoder",
      "logging", "mmap", "os", "pathlib", "re", "resource", "signal", "struct", "sys", "threading", "traceback"}
 )  # fmt: skip
-"""Modules of Python that crashhunt itself needs to record and to report; see `is_tampered`."""
+"""Modules of Python that crashhunt itself needs to record and to report; see `are_functions_replaced`."""
 _LIMITS: Final = {
     "RLIMIT_AS": resource.RLIMIT_AS,
     "RLIMIT_DATA": resource.RLIMIT_DATA,
@@ -235,7 +235,7 @@ def _callables(thing: ModuleType | type) -> dict[str, object]:
     return {key: value for key, value in vars(thing).items() if callable(value)}
 
 
-def is_tampered() -> bool:
+def are_functions_replaced() -> bool:
     """Return whether functions of crashhunt, or functions that it needs, have been replaced since `record_originals`.
 
     If so, a failure of crashhunt itself is not a defect of crashhunt. A library or a simulator may replace its own
@@ -248,17 +248,11 @@ def is_tampered() -> bool:
     before = _originals[0]
     if before.was_emptied:
         return True
-    for name, held in before.used.items():
-        now = vars(sys.modules[name]) if name in sys.modules else {}
-        if any(now.get(key) is not value and _is_users_or_nothing(now.get(key)) for key, value in held.items()):
-            return True
-    for name, held in before.functions.items():
-        now = vars(sys.modules[name]) if name in sys.modules else {}
-        if any(now.get(key) is not value and _is_users_or_nothing(now.get(key)) for key, value in held.items()):
-            return True
+    modules = chain(before.used.items(), before.functions.items())
+    parts = chain(((sys.modules.get(name), held) for name, held in modules), _recorded_classes(before))
     return any(
-        vars(kind).get(key) is not value and _is_users_or_nothing(vars(kind).get(key))
-        for kind, held in _recorded_classes(before)
+        (now := getattr(part, "__dict__", {}).get(key)) is not value and _is_users_or_nothing(now)
+        for part, held in parts
         for key, value in held.items()
     )
 

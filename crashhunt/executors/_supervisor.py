@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import secrets
 import select
 import shutil
 import signal
@@ -26,7 +25,7 @@ from crashhunt.base.processes import die_with, resume
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import internal_error, scratch_of
-from crashhunt.executors._postmortem import KEY_BYTES, Report, check_report, damaged, died, hung, read_map, read_tail
+from crashhunt.executors._postmortem import Report, check_report, damaged, died, hung, read_map, read_tail
 from crashhunt.executors._time_limits import START_UP_S, PauseMeter, has_hung
 from crashhunt.recording import BlackBoxFile, Recording, read_black_box
 from crashhunt.simulators import FullBraking
@@ -141,21 +140,19 @@ class Supervisor:
     def _run(self, spec: TrialSpec) -> EndedTrial:
         self._await_zygote()
         box, folder = self._prepare(spec)
-        key = secrets.token_bytes(KEY_BYTES)
         given_at = time.monotonic()
         self._trials += 1
         job: Job = {
             "spec": spec.to_json(),
             "folder": str(folder),
             "reserved": box.reserved,
-            "key": key.hex(),
             "wants_map": not (self._settings.scratch / layout.MAP).exists(),
             "tries_copy": self._trials == 1,
         }
         self._send(job)
         said, was_killed = self._wait(box, given_at)
         self.retires = self.retires or said.get("unfit", False)
-        ended = self._judge(spec, box, key, said, was_killed=was_killed)
+        ended = self._judge(spec, box, said, was_killed=was_killed)
         notices = (*ended.notices, *said.get("notices", ()))
         wall_s = max(ended.result.wall_s, time.monotonic() - given_at)
         result = replace(ended.result, worker=os.getpid(), wall_s=wall_s)
@@ -163,13 +160,11 @@ class Supervisor:
             self._folder = None  # it belongs to the hunt now; the next trial gets another one
         return replace(ended, result=result, notices=notices)
 
-    def _judge(
-        self, spec: TrialSpec, box: BlackBoxFile, key: bytes, said: FromZygote, *, was_killed: bool
-    ) -> EndedTrial:
+    def _judge(self, spec: TrialSpec, box: BlackBoxFile, said: FromZygote, *, was_killed: bool) -> EndedTrial:
         """Determine the result of a trial whose process has ended."""
         scratch, code, pid = self._settings.scratch, said["ended"], said["pid"]
-        is_there = self._is_ours(scratch_of(scratch, spec.number))
-        self._secure(spec)
+        is_there = self._is_whole(scratch_of(scratch, spec.number))
+        self._restore(spec)
         header = box.header()
         report = box.read_report(header) if header is not None else b""
         is_whole = box.is_reusable()
@@ -190,9 +185,9 @@ class Supervisor:
             if is_sent_from_outside(code):
                 raise LostTrialError(code)
             return EndedTrial(died(spec, scratch, code, self._modules()))
-        found = check_report(report, key=key, spec=spec, header=header, records=box.read_records(header), pid=pid)
+        found = check_report(report, spec=spec, header=header, records=box.read_records(header), pid=pid)
         if isinstance(found, str):
-            return EndedTrial(self._damaged(spec, f"the process may not be believed: {found}"))
+            return EndedTrial(self._damaged(spec, f"the process damaged its result: {found}"))
         return self._keep(*found)
 
     def _modules(self) -> dict[str, str]:
@@ -310,7 +305,7 @@ class Supervisor:
         """Provide a scratch folder for the trial: that of the last trial, whose pages are in memory, or a new one."""
         folder = scratch_of(self._settings.scratch, spec.number)
         _remove(folder)  # of an earlier attempt at the same trial
-        if self._folder is None or self._box is None or not self._box.is_reusable() or not self._is_ours(self._folder):
+        if self._folder is None or self._box is None or not self._box.is_reusable() or not self._is_whole(self._folder):
             self._make_folder()
         assert self._folder is not None
         assert self._box is not None
@@ -340,28 +335,26 @@ class Supervisor:
         self._box = BlackBoxFile(folder / layout.BLACK_BOX)
         self._folder = folder
 
-    def _is_ours(self, folder: Path) -> bool:
-        """Return whether a folder exists and contains the files that this process has opened."""
+    def _is_whole(self, folder: Path) -> bool:
+        """Return whether a folder contains the files that this process has opened; an agent may have deleted them."""
         assert self._box is not None
+        opened = {
+            layout.BLACK_BOX: self._box.identity,
+            layout.RUN_LOG: os.fstat(self._output),
+            layout.STACK: os.fstat(self._stack),
+        }
         try:
-            return not folder.is_symlink() and all(
-                os.path.samestat(os.lstat(folder / name), found)
-                for name, found in (
-                    (layout.BLACK_BOX, self._box.identity),
-                    (layout.RUN_LOG, os.fstat(self._output)),
-                    (layout.STACK, os.fstat(self._stack)),
-                )
-            )
+            return all(os.path.samestat(os.stat(folder / name), found) for name, found in opened.items())  # noqa: PTH116
         except OSError:
             return False
 
-    def _secure(self, spec: TrialSpec) -> None:
-        """Restore the files in the scratch folder of a trial, in case the trial has moved or deleted them."""
+    def _restore(self, spec: TrialSpec) -> None:
+        """Restore the scratch folder of a trial: the files of this process, and no other file."""
         folder = scratch_of(self._settings.scratch, spec.number)
-        if self._is_ours(folder):
+        if self._is_whole(folder):
             for entry in os.scandir(folder):
                 if entry.name not in (layout.BLACK_BOX, layout.RUN_LOG, layout.STACK):
-                    _remove(folder / entry.name)  # a file there has a meaning, and this one is not ours
+                    _remove(folder / entry.name)  # the next trial gets this folder
             return
         _remove(folder)
         self._restore_scratch()

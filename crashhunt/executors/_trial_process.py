@@ -36,9 +36,9 @@ from crashhunt.episode import (
     Parts,
     Prober,
     ReferenceDriver,
+    are_functions_replaced,
     has_users_code,
     internal_error,
-    is_tampered,
     overruled_agent,
     ready_recorder,
     run_episode,
@@ -80,15 +80,13 @@ _dumps, _leave, _open, _dup2, _close = json.dumps, os._exit, os.open, os.dup2, o
 class Job(TypedDict):
     """The job that the process of a trial receives.
 
-    ``folder`` is the folder of the trial, and ``reserved`` the size of its black box in bytes. ``key`` is a secret for
-    its report, in hexadecimal. ``wants_map`` requests the map in any case. ``tries_copy`` requests a test whether the
-    trial can be forked.
+    ``folder`` is the folder of the trial, and ``reserved`` the size of its black box in bytes. ``wants_map``
+    requests the map in any case. ``tries_copy`` requests a test whether the trial can be forked.
     """
 
     spec: JsonObject
     folder: str
     reserved: int
-    key: str
     wants_map: bool
     tries_copy: bool
 
@@ -171,7 +169,9 @@ class TrialProcess:
                 try:
                     block_signals()
                     if self._box is not None:
-                        if attempt == 1 and (self._is_mistake(error) or not (has_users_code(error) or is_tampered())):
+                        if attempt == 1 and (
+                            self._is_mistake(error) or not (has_users_code(error) or are_functions_replaced())
+                        ):
                             self._report_fault(error, job)
                         else:
                             self._box.announce_damage()
@@ -232,7 +232,7 @@ class TrialProcess:
                 self._notices.append(f"{runner.what}{_EXCLUDED_FROM_HERE_WORDS}{runner.why_not}")
         wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
         report = self._report(replace(result, wall_s=wall_s, setup_s=setup_s), simulator, job)
-        box.report(encode_report(report, bytes.fromhex(job["key"]), result.digest, dumps=_dumps))
+        box.report(encode_report(report, dumps=_dumps))
         return 0
 
     def _enter_home(self) -> None:
@@ -260,7 +260,7 @@ class TrialProcess:
         fault: FaultReport = {"fault": said.to_json()}
         if not self._has_begun:
             self._box.begin(pid=self._pid, trial=number, started=time.monotonic())
-        self._box.report(encode_report(fault, bytes.fromhex(job["key"]), "", dumps=_dumps))
+        self._box.report(encode_report(fault, dumps=_dumps))
 
     def _redirect(self, folder: Path) -> None:
         """Redirect the output, and the stack of a dying process, into the folder of the trial."""

@@ -43,7 +43,7 @@ def test_suite_refuses_a_removed_key_with_what_to_do(tmp_path):
         Suite.read(tmp_path / "suite.toml")
 
 
-def test_executor_that_requires_a_removed_argument_is_told_to_omit_it(monkeypatch):
+def test_executor_that_requires_a_removed_argument_is_refused_with_what_to_do(monkeypatch):
     class Old:
         def __init__(self, settings, *, parallel, recycle_after): ...
 

@@ -11,7 +11,7 @@ import pytest
 
 from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.episode import Episode, Nearness, Observer, Recorder, failure_of, run_episode
-from crashhunt.episode._failures import is_tampered, record_originals
+from crashhunt.episode._failures import are_functions_replaced, record_originals
 from crashhunt.errors import RecorderError, SimulatorError
 from crashhunt.oracles import Overlap, ReportedCollision
 from crashhunt.recording import BlackBox
@@ -398,7 +398,7 @@ def test_trial_that_empties_sys_modules_has_the_digest_and_the_measures_of_its_s
             return result
 
     def facts(result):
-        return f"{result.steps}|{result.digest}|{result.closest}|{is_tampered()}"
+        return f"{result.steps}|{result.digest}|{result.closest}|{are_functions_replaced()}"
 
     options = {"arguments": arguments, "steps": 6, "observers": (Imports(),)}
     plain = run(tmp_path, **options)

@@ -1,4 +1,4 @@
-"""What the process of a trial leaves behind is believed only where all of it agrees."""
+"""What the process of a trial leaves behind is accepted only where all of it agrees."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import Parts, WorkerSettings, run_episode
 from crashhunt.executors._postmortem import (
-    _contradiction,
     _fault_of,
     agent_in_stack,
     check_report,
@@ -20,9 +19,8 @@ from crashhunt.executors._postmortem import (
 )
 from crashhunt.recording import BlackBox, BlackBoxFile, read_header
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import Outcome, TrialSpec
 
-KEY = bytes(range(16))
 SPEC = TrialSpec(3, 7, {"ego": {"speed": 5.0}}, {}, 12)
 
 
@@ -42,16 +40,16 @@ def left_behind(tmp_path_factory):
     return header, records, result
 
 
-def report_of(result, key=KEY, **changes):
+def report_of(result, **changes):
     data = {**result.to_json(), **changes}
     del data["spec"]
-    return encode_report({"result": data, "notices": []}, key, result.digest)
+    return encode_report({"result": data, "notices": []})
 
 
 def check(left_behind, report, *, records=None, header=None, spec=SPEC, pid=41):
     was, whole, _ = left_behind
     found = whole if records is None else records
-    return check_report(report, key=KEY, spec=spec, header=header or was, records=found, pid=pid)
+    return check_report(report, spec=spec, header=header or was, records=found, pid=pid)
 
 
 def test_whole_evidence_gives_the_result(left_behind):
@@ -64,27 +62,30 @@ def test_whole_evidence_gives_the_result(left_behind):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"digest": "0" * 32}, "its recording has"),
-        ({"steps": 11}, "11 steps|after 11 of 12"),
-        ({"steps": 40}, "40 steps"),
-        ({"steps": 5, "outcome": "finished"}, "5 steps"),
-        ({"outcome": "hang"}, "cannot report hang"),
-        ({"outcome": "process_died"}, "cannot report process_died"),
-        ({"outcome": "agent_error"}, "no reason"),
-        ({"outcome": "invalid"}, "no reason"),
-        ({"outcome": "no such outcome"}, "cannot be read"),
-        ({"sim_time_s": 3.5}, "simulation time of 3.5 s"),
-        ({"closest": "near"}, "cannot be read"),
+        ({"digest": "0" * 32}, "it reports the digest 00000000000000000000000000000000, and its recording has "),
+        ({"digest": ""}, "it reports the digest none, and its recording has "),
+        ({"digest": "1", "outcome": "agent_error"}, "it reports the digest 1, and its recording has "),
+        ({"outcome": "no such outcome"}, "its report cannot be read (ValueError)"),
+        ({"closest": "near"}, "its report cannot be read ("),
     ],
 )
 def test_report_that_contradicts_the_recording_is_refused(left_behind, change, reason):
     found = check(left_behind, report_of(left_behind[2], **change))
     assert isinstance(found, str)
-    assert any(part in found for part in reason.split("|")), found
+    assert found.startswith(reason)
 
 
-def test_report_with_another_key_is_refused(left_behind):
-    assert check(left_behind, report_of(left_behind[2], key=bytes(16))) == "its report was not written by crashhunt"
+@pytest.mark.parametrize("change", [{"digest": "", "outcome": "agent_error"}, {"digest": "1", "outcome": "invalid"}])
+def test_failed_or_invalid_trial_may_have_no_whole_recording(left_behind, change):
+    found, _ = check(left_behind, report_of(left_behind[2], **change))
+    assert (found.outcome, found.digest) == (change["outcome"], change["digest"])
+
+
+def test_report_that_was_overwritten_is_refused(left_behind):
+    report = report_of(left_behind[2])
+    assert (
+        check(left_behind, report[:-1]) == check(left_behind, bytes(16) + report[16:]) == "its report was overwritten"
+    )
 
 
 def test_report_of_another_trial_is_refused(left_behind):
@@ -170,36 +171,9 @@ def test_stack_of_a_dead_process_names_the_agent_whose_code_ran(frames, agent):
     assert agent_in_stack(stack, {"a": "planner", "c": "planner"}) == ""  # either of both
 
 
-@pytest.mark.parametrize(
-    ("changes", "steps", "time_s", "says"),
-    [
-        ({}, 12, 1.2, ""),
-        ({"digest": "1"}, 12, 1.2, "it reports the digest 1, and its recording has 0"),
-        ({"outcome": Outcome.AGENT_ERROR, "digest": "1"}, 12, 1.2, "it reports the digest 1, and its recording has 0"),
-        ({"outcome": Outcome.AGENT_ERROR, "digest": ""}, 12, 1.2, ""),
-        ({"digest": ""}, 12, 1.2, "it reports the digest none, and its recording has 0"),
-        ({}, 11, 1.2, "it reports 12 steps, and its recording has 11"),
-        ({"steps": 5, "outcome": Outcome.FINISHED}, 6, 9.9, ""),
-        ({"steps": 5, "outcome": Outcome.FINISHED}, 7, 1.2, "it reports 5 steps, and its recording has 7"),
-        ({"steps": 13, "outcome": Outcome.FINISHED}, 13, 1.2, "it reports finished after 13 of 12 steps"),
-        ({"steps": 11}, 11, 1.2, "it reports survived after 11 of 12 steps"),
-        ({}, 12, 1.3, "it reports a simulation time of 1.2 s, and its recording has 1.3 s"),
-        ({"outcome": Outcome.AGENT_ERROR}, 12, 1.3, ""),
-        ({}, 12, float("nan"), ""),
-        ({"outcome": Outcome.INVALID, "digest": "1"}, 3, 7.0, ""),
-    ],
-)
-def test_result_and_recording_may_not_contradict_each_other(changes, steps, time_s, says):
-    failure = Failure("ValueError", "odd")
-    result = replace(
-        TrialResult(SPEC, Outcome.SURVIVED, steps=12, sim_time_s=1.2, digest="0", failure=failure), **changes
-    )
-    assert _contradiction(result, SPEC, steps, time_s, "0") == says
-
-
 def test_fault_of_crashhunt_itself_in_a_trial_ends_the_hunt(left_behind):
     records = left_behind[1]
-    fault = encode_report({"fault": CrashhuntError("no map", fix="draw one").to_json()}, KEY, "")
+    fault = encode_report({"fault": CrashhuntError("no map", fix="draw one").to_json()})
     with pytest.raises(CrashhuntError, match="no map"):
         check(left_behind, fault, records=records)
     assert "cannot be read" in _fault_of({}).message

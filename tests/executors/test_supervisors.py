@@ -78,7 +78,7 @@ class Zygote:
         del data["spec"]
         report = {"result": data, "notices": ["a notice"], **self.report}
         if not self.harms.get(given.number, lambda *_: None)(folder, box):
-            box.report(encode_report(report, bytes.fromhex(job["key"]), result.digest))
+            box.report(encode_report(report))
         box.close()
         said = {"ended": 0, "pid": PID, **self.says.get(given.number, {})}
         return json.dumps(said).encode() + b"\n"
@@ -122,7 +122,6 @@ def test_supervisor_gives_each_trial_a_folder_and_returns_its_result(zygote, set
     assert supervisor.retires
     assert [job["tries_copy"] for job in zygote.jobs] == [True, False, False]
     assert [job["wants_map"] for job in zygote.jobs] == [True] * 3
-    assert len({job["key"] for job in zygote.jobs}) == 3
     # The files of the last trial are those of the next one, whose pages are in memory.
     assert [path.name for path in settings.scratch.glob("trial-*")] == [scratch_of(settings.scratch, 5).name]
 
@@ -149,8 +148,8 @@ def test_kept_trial_keeps_its_folder_and_what_was_reported(zygote, settings):
         assert Recording(read_black_box(scratch_of(settings.scratch, number) / layout.BLACK_BOX)).steps > 0
 
 
-def forge(folder, box):
-    box.report(encode_report({"result": {}, "notices": []}, bytes(16), ""))
+def scribble(folder, box):
+    box.report(encode_report({"result": {}, "notices": []}))
     return True
 
 
@@ -160,7 +159,7 @@ def forge(folder, box):
         (lambda folder, box: os.truncate(folder / layout.BLACK_BOX, 70) or True, {}, "its recording was truncated"),
         (lambda folder, box: box.begin(pid=PID, trial=8, started=0.0) or True, {}, "its recording was overwritten"),
         (lambda folder, box: box.announce_damage() or True, {}, "could not report the result, as it is damaged"),
-        (forge, {}, "the process may not be believed: "),
+        (scribble, {}, "the process damaged its result: "),
         (lambda folder, box: True, {"ended": 3}, "the process exited with 3 after the last step"),
         (lambda folder, box: True, {"ended": -signal.SIGSEGV}, "the process died of SIGSEGV after the last step"),
         (lambda folder, box: None, {"ended": 3}, "the process exited with 3 after the last step"),

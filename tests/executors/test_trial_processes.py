@@ -242,20 +242,17 @@ def test_process_ends_with_a_report_or_an_announcement(process, monkeypatch, err
     monkeypatch.setattr(_trial_process, "_leave", leave)
     monkeypatch.setattr(_trial_process, "block_signals", lambda: None)
     monkeypatch.setattr(_trial_process, "has_users_code", lambda error: users)
-    monkeypatch.setattr(_trial_process, "is_tampered", lambda: tampered)
-    monkeypatch.setattr(
-        _trial_process, "encode_report", lambda report, key, digest, dumps: (report["fault"], key, digest)
-    )
+    monkeypatch.setattr(_trial_process, "are_functions_replaced", lambda: tampered)
+    monkeypatch.setattr(_trial_process, "encode_report", lambda report, dumps: report["fault"])
     monkeypatch.setattr(found, "_run", run)
-    job = {"spec": SPEC.to_json(), "key": "0a0b"}
+    job = {"spec": SPEC.to_json()}
     with pytest.raises(Left, match="0"):
         found.run(job)
     if said in ([], ["damage"]):
         assert heard == said
         return
     assert heard[:-1] == [("begin", 41, 3)] * (not begun)
-    fault, key, digest = heard[-1]
-    assert (key, digest) == (b"\x0a\x0b", "")
+    fault = heard[-1]
     assert (fault["error"]["message"] == "no map") is (said == ["no map"])
     found._box = None
     with pytest.raises(Left, match="0"):
@@ -327,12 +324,10 @@ def test_trial_runs_in_its_folder_and_reports(process, monkeypatch, tmp_path):
     monkeypatch.setattr(os, "setsid", lambda: called.append("own session"))
     monkeypatch.setattr(os, "chdir", lambda path: called.append(("in", path)))
     monkeypatch.setattr(found, "_redirect", lambda folder: called.append(("redirect", folder)))
-    monkeypatch.setattr(
-        _trial_process, "encode_report", lambda report, key, digest, dumps: (report["result"], key, digest)
-    )
+    monkeypatch.setattr(_trial_process, "encode_report", lambda report, dumps: report["result"])
     asked = SimpleNamespace(what="probes", why_not="a thread", stop=lambda why: None)
     found._copies = lambda: setattr(found, "_fork_runners", (asked,)) or ("prober", "brancher", "forcer")
-    job = {"spec": SPEC.to_json(), "folder": str(tmp_path), "reserved": 64, "key": "0a", "wants_map": False,
+    job = {"spec": SPEC.to_json(), "folder": str(tmp_path), "reserved": 64, "wants_map": False,
            "tries_copy": True}  # fmt: skip
     assert found._run(job, None) == 0
     expected = [
@@ -340,8 +335,8 @@ def test_trial_runs_in_its_folder_and_reports(process, monkeypatch, tmp_path):
         ("begin", os.getpid(), 3), ("arm", 9.0, "stack"), "block",
     ]  # fmt: skip
     assert called[:-1] == expected
-    data, key, digest = called[-1]
-    assert (key, digest, data["outcome"]) == (b"\x0a", FINE.digest, "survived")
+    data = called[-1]
+    assert (data["digest"], data["outcome"]) == (FINE.digest, "survived")
     assert data["setup_s"] > 1.0
     assert data["wall_s"] > 0
     assert found._notices[-1] == "probes are left out from here on: a thread"
