@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 
 __all__ = [
+    "ABSENT_WORDS",
     "NOTICE_TOPIC",
+    "PRESENT_WORDS",
     "any_of",
     "command_line",
     "count_of",
@@ -37,6 +39,9 @@ __all__ = [
 
 NOTICE_TOPIC = "\t"
 """Separates the topic of a notice of a worker from its text; of each topic, a hunt prints one notice."""
+ABSENT_WORDS, PRESENT_WORDS = " names nothing that occurred: ", " names something that occurred"
+"""Follow a condition in a notice of one trial, such as ``gym.crash.info = 'crash'``. What follows the first words
+describes what occurred instead; a hunt prints the notice if the condition is absent from its trials."""
 
 # Control and format characters, lone surrogates, and separators of lines that are no newline.
 _INVISIBLE_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}

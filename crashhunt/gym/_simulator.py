@@ -20,7 +20,16 @@ from crashhunt.base.exceptions import in_words, place_of
 from crashhunt.base.plugins import load_object
 from crashhunt.base.scalars import number_of, truth_of
 from crashhunt.base.signals import InterruptedCodeError, interrupted_after
-from crashhunt.base.text import count_of, did_you_mean, encodable, one_of
+from crashhunt.base.text import (
+    ABSENT_WORDS,
+    NOTICE_TOPIC,
+    PRESENT_WORDS,
+    count_of,
+    did_you_mean,
+    encodable,
+    listed,
+    one_of,
+)
 from crashhunt.gym._backend import GymSetup
 from crashhunt.gym._gym_crash_types import crash_cell
 from crashhunt.gym._pettingzoo import OneLearner, is_parallel, takes_turns
@@ -60,6 +69,7 @@ _STEP_PARTS = ("observation", "reward", "terminated", "truncated", "info")
 _LIMIT = "max_episode_steps"
 _CRASH_KIND_KEY = "crash_kind"
 _MAX_KIND_CHARACTERS = 80
+_MAX_LISTED_KEYS = 12
 _MAX_CLOSE_S = 5.0
 """Wall time that an environment may need to close; Unity and CARLA need some seconds."""
 _WRAP_FIX = "return a number from step(), or name a function in gym.id that wraps the environment"
@@ -99,7 +109,10 @@ class GymSimulator:
         self.named_danger: float | None = None
         self.crash_cell = ""
         self.agents: list[str] = []
-        self.notices: dict[str, None] = {}
+        self._notices: dict[str, None] = {}
+        self._named = _named_keys(self._setup)
+        self._missing = set(self._named)
+        self._keys: dict[str, None] = {}
         self._steps = 0
         self._is_open = False
         try:
@@ -109,6 +122,21 @@ class GymSimulator:
             place = place_of(error.error)
             what = f"its {error.place} fails{f' at {place}' if place else ''}: {in_words(error.error)}"
             raise self._mistake(what) from error.error
+
+    @property
+    def notices(self) -> list[str]:
+        """Notices about the environment, and for each key of ``info`` that the scenario names, whether it occurred."""
+        told = list(self._notices)
+        for condition, key in self._named.items() if self._steps else ():
+            if condition not in self._missing:
+                told.append(f"{condition}{PRESENT_WORDS}")
+                continue
+            what = f"info had only the keys {listed(self._keys)}" if self._keys else "info was empty"
+            fix = did_you_mean(key, self._keys) or "name one of its keys."
+            if key == self._setup.crash.info:
+                fix += " Keep it if info has this key only in the step of a crash"
+            told.append(f"{condition}{ABSENT_WORDS}{what}{NOTICE_TOPIC}{condition}{ABSENT_WORDS}{what}. Fix: {fix}")
+        return told
 
     party = Party.ENVIRONMENT
     foreign_packages = ()  # boundaries are around all calls
@@ -162,8 +190,7 @@ class GymSimulator:
             terminated = truth_of(ended, "terminated", _WRAP_FIX)
             truncated = truth_of(cut, "truncated", _WRAP_FIX)
         with _INFO:  # the crash rule may be a function of the user's
-            if self._steps == 1 and (key := self._setup.crash.info) and key not in info:
-                self._report_misspelt_key(key, info)
+            self._note_keys(info)
             what = self._rule(observation, reward, terminated, truncated, info)
             if what and not self._crashed:
                 self.crash_cell = "" if self._rule.has_named else crash_cell(info)
@@ -230,17 +257,19 @@ class GymSimulator:
         return array
 
     def _notice(self, notice: str) -> None:
-        if notice not in self.notices:
-            self.notices[notice] = None
+        if notice not in self._notices:
+            self._notices[notice] = None
             logging.getLogger("crashhunt").warning("%s, for the first time at step %d", notice, self._steps)
 
-    def _report_misspelt_key(self, key: str, info: Info) -> None:
-        """Report a key of the crash rule that ``info`` lacks, if a similar key exists.
+    def _note_keys(self, info: Info) -> None:
+        """Note the keys of a step's info, and which of the keys that the scenario names occurred.
 
-        Many environments add the key only in the step of a crash, so a missing key alone is no mistake.
+        Many environments add a key only in the step of a crash, so one trial without the key is no mistake.
         """
-        if hint := did_you_mean(key, map(str, info)):
-            self._notice(f"gym.crash.info = {key!r} is not a key of the first step's info: {hint}")
+        if self._missing:
+            self._missing = {condition for condition in self._missing if self._named[condition] not in info}
+            if len(self._keys) < _MAX_LISTED_KEYS:
+                self._keys |= dict.fromkeys(map(str, info))
 
     def _report_time_limit(self) -> None:
         is_default = self._is_registered and self._setup.time_limit == "registered"
@@ -366,6 +395,13 @@ class GymSimulator:
                 ),
             )
         self._scene = Scene(self._steps * self.step_length_s, _NO_ACTORS, [], [], [], contacts)
+
+
+def _named_keys(setup: GymSetup) -> dict[str, str]:
+    """Return the keys of ``info`` that a scenario names, by the condition as the user wrote it."""
+    named = {f"gym.crash.info = {setup.crash.info!r}": setup.crash.info}
+    named[f"gym.danger = {setup.danger!r}"] = setup.danger.partition("info.")[2]
+    return {condition: key for condition, key in named.items() if key}
 
 
 def _parts(method: str, returned: Any, wanted: tuple[str, ...]) -> Sequence[Any]:

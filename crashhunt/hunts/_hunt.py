@@ -536,6 +536,7 @@ class Hunt:
                     ledger.note(**progress.noted())
                 watch(self._status(progress, "hunting", executor.where()))
             executor.cancel()
+            self._receive_results(executor, audit, ledger, progress, at_end=True)
             if (crash := progress.unsaved) is not None:
                 watch(self._status(progress, "saving"))
                 self._save(crash, ledger, snapshot, progress)
@@ -596,14 +597,25 @@ class Hunt:
         return max(GREATEST_LAG, under_way), True
 
     def _receive_results(
-        self, executor: Executor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0
+        self,
+        executor: Executor,
+        audit: Audit,
+        ledger: Ledger,
+        progress: Progress,
+        *,
+        wait_s: float = 0.0,
+        at_end: bool = False,
     ) -> None:
         """Record notices about the execution of trials, and the results of the audit."""
-        for note in self._heard.take(executor):
+        for note in (*self._heard.take(executor), *self._heard.absent(at_end=at_end)):
             ledger.remark(note)
             progress.notes.append(note)
             if note not in (known := ledger.facts().get("notices") or []):
                 ledger.note(notices=[*known, note])
+        if occurred := self._heard.newly_occurred():
+            progress.notes[:] = [note for note in progress.notes if not note.startswith(occurred)]
+            known = ledger.facts().get("notices") or []
+            ledger.note(notices=[note for note in known if not note.startswith(occurred)] or None)
         progress.look_at(executor)
         for difference in audit.look(wait_s):
             ledger.remark(f"audit: {difference}")

@@ -20,6 +20,7 @@ from crashhunt.base.exceptions import is_users
 from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import is_sent_from_outside, stop_requests
 from crashhunt.base.temporary import temporary_folder
+from crashhunt.base.text import ABSENT_WORDS, PRESENT_WORDS, count_of
 from crashhunt.executors import EXCLUDED_WORDS, worker_environment
 from crashhunt.plans import read_settings
 from crashhunt.scenario import as_plain_data, scenario_digest
@@ -40,6 +41,9 @@ __all__ = ["Preflight", "TrafficSurveyor", "WorkerNotices", "is_hopeless", "unus
 
 
 _MAX_INVALID_AT_START = 10  # trials; if none of so many could begin, the setup is wrong, not the seed
+_ENOUGH_TRIALS = 10
+"""Trials after which a hunt reports that a name of the scenario has not occurred; later trials may still correct it."""
+_ABSENT_SO_FAR = " names nothing that occurred "
 _ENOUGH_CANDIDATES = 4
 """Trials; one that fails by chance would do so as often as this only rarely."""
 
@@ -148,6 +152,11 @@ class WorkerNotices:
         self._settings = settings
         self._outcomes = outcomes
         self._notes: list[str] = []
+        self._absent: dict[str, str] = {}
+        self._is_resumed = any(outcomes.values())
+        self._settled: set[str] = set()  # conditions that were reported
+        self._occurred: set[str] = set()
+        self._refuted: set[str] = set()
 
     def hear(self, executor: Executor) -> None:
         """Read the notices of an executor's workers.
@@ -160,7 +169,13 @@ class WorkerNotices:
             what, left_out, why = note.partition(EXCLUDED_WORDS)
             if left_out and what in ("probes", "branches", "rare") and not sum(self._outcomes.values()):
                 raise self._refusal(why)
-            self._notes.append(note)
+            condition, is_absent, rest = note.partition(ABSENT_WORDS)
+            if is_absent:
+                self._absent.setdefault(condition, rest)
+            elif note.endswith(PRESENT_WORDS):
+                self._occurred.add(note.removesuffix(PRESENT_WORDS))
+            else:
+                self._notes.append(note)
 
     def take(self, executor: Executor) -> list[str]:
         """Return the notices that were not returned before.
@@ -171,6 +186,28 @@ class WorkerNotices:
         self.hear(executor)
         notes, self._notes = self._notes, []
         return notes
+
+    def absent(self, *, at_end: bool = False) -> list[str]:
+        """Return new notices about conditions of the scenario whose names have not occurred in any trial of the hunt.
+
+        A resumed hunt reports none, because trials of earlier runs may have had the names.
+
+        Args:
+            at_end: whether no further trial follows.
+        """
+        unknown = (Outcome.INVALID, Outcome.HANG, Outcome.PROCESS_DIED)
+        count = sum(number for outcome, number in self._outcomes.items() if outcome not in unknown)
+        if self._is_resumed or not count or not (at_end or count >= _ENOUGH_TRIALS):
+            return []
+        new = {name: rest for name, rest in self._absent.items() if name not in self._occurred | self._settled}
+        self._settled |= new.keys()
+        where = f"in the first {count_of(count, 'trial')}" if count > 1 else "in the first trial"
+        return [f"{name}{_ABSENT_SO_FAR}{where}: {rest}" for name, rest in new.items()]
+
+    def newly_occurred(self) -> tuple[str, ...]:
+        """Return how the notices of `absent` begin that trials have refuted since the last call."""
+        new, self._refuted = self._occurred - self._refuted, set(self._occurred)
+        return tuple(f"{name}{_ABSENT_SO_FAR}" for name in new)
 
     def _refusal(self, why: str) -> UsageError:
         asked = (

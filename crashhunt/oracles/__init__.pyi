@@ -6,6 +6,7 @@ from ._crash_oracles import (
 )
 from ._protocol import (
     DEFAULT_ORACLES as DEFAULT_ORACLES,
+    ORACLES_OF_ACTORS as ORACLES_OF_ACTORS,
     BringsOutcomes as BringsOutcomes,
     Finding as Finding,
     Oracle as Oracle,

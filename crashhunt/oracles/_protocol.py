@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DEFAULT_ORACLES",
+    "ORACLES_OF_ACTORS",
     "BringsOutcomes",
     "Finding",
     "Oracle",
@@ -104,6 +105,9 @@ def merge_findings(findings: Sequence[Finding]) -> Finding | None:
 
 DEFAULT_ORACLES = ("reported-collision", "overlap", "off-road")
 """Who looks at every hunt, unless ``none`` is among those that are chosen."""
+
+ORACLES_OF_ACTORS = ("overlap", "off-road", "too-close")
+"""Oracles of crashhunt that detect nothing if scenes contain no actors."""
 
 _NONE = "none"
 # A colon may belong to module:attribute; one that is followed by key= begins the arguments.

@@ -14,12 +14,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from crashhunt.base import layout
 from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, UsageError
 from crashhunt.base.plugins import is_foreign, registered
 from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import ModelApart, disturber_of, locate_model, parse_fixed, parse_rates, word_of
 from crashhunt.native import HOW_TO_REBUILD, outdated_modules
-from crashhunt.oracles import chosen_oracles, outcomes_brought
+from crashhunt.oracles import ORACLES_OF_ACTORS, chosen_oracles, oracle_name, outcomes_brought
 from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code
 from crashhunt.plans._run_options import TrialOptions
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances import DisturbanceModel, DisturbanceSampler
     from crashhunt.plans._settings import Request
-    from crashhunt.trial import Value
+    from crashhunt.trial import Category, Value
 
     Surveyor = Callable[[Scenario, Request, HuntSettings], Scenario]
 
@@ -331,7 +332,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     if request.action:
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
-    scenario = _with_defaults(_with_notes(scenario, request.run), crash_on)
+    scenario = _with_notes_on_crashes(_with_notes(scenario, request.run), settings, request, code.oracles)
     scenario = replace(scenario, notes=(*scenario.notes, *_notes_on_statistics(settings, signatures)))
     find = partial(_model_apart, code, request.run.timeout_s)
     with _name_scenario_in_errors(request, scenario):
@@ -547,20 +548,41 @@ def _check_rare(settings: HuntSettings, scenario: Scenario, find: Callable[[str]
         raise UsageError("--rare forks processes, which needs Linux", fix="omit --rare")
 
 
-def _with_defaults(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
-    """Add a note on events that this simulator never reports; refuse a hunt that looks only for such events."""
+def _with_notes_on_crashes(
+    scenario: Scenario, settings: HuntSettings, request: Request, described: Mapping[str, Mapping[str, Category]]
+) -> Scenario:
+    """Add notes on oracles and outcomes that never occur with this simulator; refuse a hunt that looks only for them.
+
+    The user's own oracles may report these outcomes from other evidence.
+    """
     backend = backend_of(scenario.simulator)
-    told = backend.reported_events if backend is not None else None
-    never = [kind for kind in crash_on if kind in EVENTS and told is not None and kind not in told]
-    if not never:
+    if backend is None:
         return scenario
-    names = ",".join(never)
-    if len(never) == len(crash_on):
-        fix = f"it reports {', '.join(told)}" if told else "remove it"
-        raise UsageError(
-            f"--crash-on {names}: the simulator {scenario.simulator!r} cannot report these outcomes", fix=fix
-        )
-    return replace(scenario, notes=(*scenario.notes, f"the simulator {scenario.simulator!r} never reports {names}"))
+    told, crash_on = backend.reported_events, settings.crash_on
+    own = [text for text in settings.oracles if not _is_built_in(text)]
+    brought = outcomes_brought(own, described)
+    never = [kind for kind in crash_on if kind in EVENTS and told is not None and kind not in (*told, *brought)]
+    blind: list[str] = []
+    if not backend.shows_actors:
+        blind = [text for text in request.oracles if oracle_name(text) in ORACLES_OF_ACTORS]
+        if set(request.crash_on) != set(CRASHES) and not own:
+            without = {Outcome.OFF_ROAD, *outcomes_brought(blind, described)}
+            never += [kind for kind in crash_on if kind in without and kind not in never]
+    notes = [f"--oracle {text} detects nothing: {backend.title} shows no vehicles" for text in blind]
+    if never:
+        names = ",".join(never)
+        if len(never) == len(crash_on):
+            fix = f"it reports {', '.join(told)}" if told else "remove it"
+            raise UsageError(
+                f"--crash-on {names}: the simulator {scenario.simulator!r} cannot report these outcomes", fix=fix
+            )
+        notes.append(f"the simulator {scenario.simulator!r} never reports {names}")
+    return replace(scenario, notes=(*scenario.notes, *notes))
+
+
+def _is_built_in(oracle: str) -> bool:
+    point = registered("oracles").get(oracle_name(oracle))
+    return point is not None and point.value.startswith(f"{layout.PACKAGE.name}.")
 
 
 def parse_crash_on(

@@ -190,7 +190,8 @@ class ReportsNotices(Protocol):
         """The notices as lines of text. A hunt reads them after each episode and prints each line once.
 
         A line may begin with a topic and ``base.text.NOTICE_TOPIC``, which are not printed; of each topic, only the
-        first line is printed.
+        first line is printed. A line with ``ABSENT_WORDS`` or ``PRESENT_WORDS`` of the same module says whether a name
+        in the scenario occurred in this episode. A hunt prints such a notice only if the name was absent from all.
         """
 
 

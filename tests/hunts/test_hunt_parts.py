@@ -122,7 +122,11 @@ def test_notices_of_workers_and_differences_of_the_audit_are_noted(hunt):
     progress = SimpleNamespace(notes=[], look_at=looks.append)
     for share in (0.0, 0.5):
         found = hunt(audit=share)
-        found._heard = SimpleNamespace(take=lambda executor: ["a", "b"] if executor == "executor" else [])
+        found._heard = SimpleNamespace(
+            take=lambda executor: ["a", "b"] if executor == "executor" else [],
+            absent=lambda *, at_end: [],
+            newly_occurred=lambda: (),
+        )
         found._audits_left = SimpleNamespace(note=lambda *given: counted.append(given))
         audit = SimpleNamespace(look=lambda wait_s: ["differs"] if wait_s == 0.25 else [])
         found._receive_results("executor", audit, ledger, progress, wait_s=0.25)
@@ -131,6 +135,22 @@ def test_notices_of_workers_and_differences_of_the_audit_are_noted(hunt):
     assert ledger.noted == [{"notices": ["a"]}, {"notices": ["a", "b"]}]  # each once
     assert looks == ["executor"] * 2
     assert counted == [(audit, progress)]
+
+
+def test_notice_of_an_absent_name_is_kept_until_the_name_occurs(hunt):
+    ledger, occurred = Notes(), [(), ("x names",)]
+    progress = SimpleNamespace(notes=[], look_at=lambda executor: None)
+    found, audit = hunt(), SimpleNamespace(look=lambda wait_s: [])
+    found._heard = SimpleNamespace(
+        take=lambda executor: ["a"],
+        absent=lambda *, at_end: ["x names nothing"] * at_end,
+        newly_occurred=lambda: occurred.pop(0),
+    )
+    found._receive_results(None, audit, ledger, progress, at_end=True)
+    assert progress.notes == ledger.facts()["notices"] == ["a", "x names nothing"]
+    found._receive_results(None, audit, ledger, progress)
+    assert progress.notes == ["a", "a"]
+    assert ledger.facts()["notices"] == ["a"]
 
 
 def test_rest_of_an_audit_is_a_phase_of_its_own(hunt):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
 from crashhunt.base import layout
+from crashhunt.base.text import ABSENT_WORDS, PRESENT_WORDS
 from crashhunt.errors import ArgumentError, ScenarioError, UsageError
 from crashhunt.executors import EXCLUDED_WORDS
 from crashhunt.hunts import Preflight
@@ -130,6 +132,42 @@ def test_notices_are_returned_once_and_in_order():
         "a", f"logs{EXCLUDED_WORDS}there is no room", "b", "probes are slow",
     ]  # fmt: skip
     assert heard.take(Says()) == []
+
+
+ABSENT = f"gym.danger = 'info.x'{ABSENT_WORDS}info was empty. Fix: name one of its keys"
+
+
+def test_name_that_no_trial_had_is_reported_once_after_enough_trials_or_at_the_end():
+    outcomes = Counter()
+    heard = WorkerNotices(asking(), outcomes)
+    assert heard.take(Says(ABSENT, ABSENT.replace("empty", "full"), "a")) == ["a"]
+    assert heard.absent(at_end=True) == []  # no trial has finished
+    outcomes.update({Outcome.FINISHED: 1, Outcome.HANG: 30})  # what hung has not reported its keys
+    assert heard.absent() == []
+    told = (
+        "gym.danger = 'info.x' names nothing that occurred in the first {}: info was empty. Fix: name one of its keys"
+    )
+    assert heard.absent(at_end=True) == [told.format("trial")]
+    assert heard.absent(at_end=True) == []
+    again = WorkerNotices(asking(), Counter())
+    again._outcomes[Outcome.FINISHED] = 10
+    again.hear(Says(ABSENT))
+    assert again.absent() == [told.format("10 trials")]
+    assert again.newly_occurred() == ()
+    again.hear(Says(f"gym.danger = 'info.x'{PRESENT_WORDS}"))
+    (refuted,) = again.newly_occurred()
+    assert told.startswith(refuted)
+    assert again.newly_occurred() == ()
+
+
+def test_name_that_some_trial_had_and_hunts_that_resume_have_no_such_notice():
+    heard = WorkerNotices(asking(), outcomes := Counter())
+    assert heard.take(Says(ABSENT, f"gym.danger = 'info.x'{PRESENT_WORDS}")) == []
+    outcomes[Outcome.FINISHED] = 30
+    assert heard.absent(at_end=True) == []
+    resumed = WorkerNotices(asking(), outcomes)
+    resumed.hear(Says(ABSENT))
+    assert resumed.absent(at_end=True) == []
 
 
 def test_first_result_is_counted_after_the_notices_were_read():

@@ -13,6 +13,7 @@ import pytest
 from gymnasium import spaces
 
 from crashhunt.base.boundaries import ForeignError
+from crashhunt.base.text import ABSENT_WORDS, NOTICE_TOPIC, PRESENT_WORDS
 from crashhunt.episode import Nearness
 from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.gym import GymSimulator
@@ -224,13 +225,17 @@ def test_scenario_without_a_crash_rule_has_a_note():
         )
 
 
-@pytest.mark.parametrize(("key", "hint"), [("felt", "did you mean 'fell'?"), ("fell", ""), ("red light", "")])
-def test_misspelt_key_of_the_crash_rule_is_reported_once(tmp_path, key, hint):
-    simulator = simulator_of(tmp_path, "Tray-v0", crash={"info": key})
+def test_keys_that_the_scenario_names_are_reported_as_present_or_absent(tmp_path):
+    scenario = scenario_of("Tray-v0", crash={"info": "felt"})
+    scenario = scenario.with_table(replace(scenario.table(GymSetup), danger="-info.fell"))
+    simulator = GymSimulator(scenario, tmp_path)
+    assert simulator.notices == []
     fall(simulator, steps=2)
-    fall(simulator, steps=2)
-    expected = f"gym.crash.info = {key!r} is not a key of the first step's info: {hint}"
-    assert list(simulator.notices) == [expected] * bool(hint)
+    absent, present = simulator.notices
+    assert present == f"gym.danger = '-info.fell'{PRESENT_WORDS}"
+    topic, _, text = absent.partition(NOTICE_TOPIC)
+    assert text == f"{topic}. Fix: did you mean 'fell'? Keep it if info has this key only in the step of a crash"
+    assert topic == f"gym.crash.info = 'felt'{ABSENT_WORDS}info had only the keys fell"
 
 
 def test_observations_are_recorded_flat_and_shown_as_they_are(tmp_path):

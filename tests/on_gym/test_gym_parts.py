@@ -472,7 +472,7 @@ def test_nan_is_reported_once_for_each_value_and_is_no_crash(make, monkeypatch):
     names = [notice.partition(" is NaN in the environment 'm:Environment'")[0] for notice in made.notices]
     assert names[:4] == ["the reward", "info['hit']", "the result of ", "gym.danger = 'info.d'"]
     assert names[4].endswith("an observation that contains NaN")
-    assert len(names) == 5
+    assert len([name for name in names if "names something that occurred" not in name]) == 5
 
 
 def test_nan_as_the_end_of_an_episode_is_refused(make):

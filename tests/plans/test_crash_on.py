@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import ClassVar
 
 import pytest
 
@@ -78,6 +79,46 @@ def test_what_a_simulator_never_reports(tmp_path):
         plan(Request(trials=1, max_steps=10, scenario="highway", crash_on=("red_light",)))
     scenario, _ = plan(Request(trials=1, max_steps=10, scenario="highway", crash_on=("red_light", "collision")))
     assert "the simulator 'highway' never reports red_light" in scenario.notes
+
+
+@pytest.mark.parametrize(
+    ("options", "note"),
+    [
+        (
+            {"oracles": ("too-close:gap_m=1",)},
+            "--oracle too-close:gap_m=1 detects nothing: Gymnasium shows no vehicles",
+        ),
+        ({"crash_on": ("collision", "off_road")}, "the simulator 'gym' never reports off_road"),
+        ({"oracles": ("red-light",)}, "the simulator 'gym' never reports red_light"),
+        ({"oracles": (f"{__name__}:RedLamp",)}, ""),
+        ({"oracles": (f"{__name__}:RedLamp",), "crash_on": ("red_light",)}, ""),
+        ({}, ""),
+    ],
+)
+def test_oracle_or_outcome_that_never_occurs_with_a_simulator_has_a_note(tmp_path, options, note):
+    request = Request(trials=1, max_steps=10, scenario=str(environment_in(tmp_path)), **options)
+    scenario, _ = plan(request)
+    assert [text for text in scenario.notes if "nothing" in text or "never" in text] == [note] * bool(note)
+    with pytest.raises(UsageError, match="the simulator 'gym' cannot report these outcomes"):
+        plan(replace(request, oracles=("too-close",), crash_on=("too_close", "off_road")))
+
+
+class RedLamp:
+    """An oracle that reports an event from evidence of its own."""
+
+    name = "red-lamp"
+    outcomes: ClassVar = {"red_light": "traffic event"}
+
+    def check(self, scene, agents):
+        return []
+
+
+def environment_in(folder):
+    (folder / "scenario.toml").write_text(
+        'schema = 1\nsimulator = "gym"\nstep_length_s = 1.0\n[agents.ego]\nagent = "crashhunt.agents:RandomAgent"\n'
+        '[gym]\nid = "CartPole-v1"\n[gym.crash]\ntermination = true\n'
+    )
+    return folder
 
 
 @pytest.mark.parametrize(("key", "message"), [("red_light = 3", "has no limit"), ("not_moving = 0", "is not a limit")])
