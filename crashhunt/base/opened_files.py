@@ -1,4 +1,4 @@
-"""The files that a process opens, loads or starts.
+"""The files that a process opens, loads or starts, and the files to which its output goes.
 
 An audit hook of Python (PEP 578) reports what Python code opens, loads with ctypes, and starts. The kernel reports what
 is mapped and still open, which includes what compiled code has opened. A file that compiled code has opened and closed
@@ -14,9 +14,10 @@ import shlex
 import sys
 import time
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
-__all__ = ["OpenedFiles"]
+__all__ = ["OpenedFiles", "output_files"]
 
 
 class OpenedFiles:
@@ -67,6 +68,67 @@ class OpenedFiles:
             for part in {text, *(shlex.split(text) if " " in text else ())}:
                 if os.path.isfile(os.path.join(os.fsdecode(folder or ""), part)) or part.startswith("/"):  # noqa: PTH113, PTH118
                     self._add(part, folder)
+
+
+def output_files() -> set[str]:
+    """Return the absolute paths of the files to which the output of this command goes: they grow, and are no code.
+
+    They are the files to which the shell has redirected this command or a command that started it, such as a suite or
+    a script, and the files of programs that read its output through a pipe, such as ``tee``.
+    """
+    found: set[str] = set()
+    waiting = [target for pid in _ancestors() for stream in (1, 2) if (target := _target(pid, stream))]
+    readers: dict[str, list[str]] | None = None
+    while waiting:
+        target = waiting.pop()
+        if target in found:
+            continue
+        found.add(target)
+        if target.startswith("pipe:"):
+            readers = _readers_of_pipes() if readers is None else readers
+            waiting += [file for pid in readers.get(target, ()) for file in _written_by(pid)]
+    return {target for target in found if target.startswith("/")}
+
+
+def _ancestors() -> list[str]:
+    found, pid = [], str(os.getpid())
+    while pid not in ("0", "1"):
+        found.append(pid)
+        try:
+            pid = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()[1]
+        except OSError:
+            break
+    return found
+
+
+def _target(pid: str, stream: int | str) -> str:
+    """Return what a file descriptor of a process refers to; empty if the process has ended or is another user's."""
+    try:
+        return os.readlink(f"/proc/{pid}/fd/{stream}")  # noqa: PTH115
+    except OSError:
+        return ""
+
+
+def _readers_of_pipes() -> dict[str, list[str]]:
+    """Return for each pipe the processes whose standard input it is."""
+    found: dict[str, list[str]] = {}
+    for pid in filter(str.isdigit, os.listdir("/proc")):  # noqa: PTH208
+        if (target := _target(pid, 0)).startswith("pipe:"):
+            found.setdefault(target, []).append(pid)
+    return found
+
+
+def _written_by(pid: str) -> list[str]:
+    """Return the files and pipes that a process only writes."""
+    found = []
+    with suppress(OSError):
+        for stream in os.listdir(f"/proc/{pid}/fd"):  # noqa: PTH208
+            with suppress(OSError, ValueError, IndexError):
+                text = Path(f"/proc/{pid}/fdinfo/{stream}").read_text(encoding="ascii")
+                flags = int(text.partition("flags:")[2].split()[0], 8)
+                if flags & os.O_ACCMODE == os.O_WRONLY:
+                    found.append(_target(pid, stream))
+    return found
 
 
 _EVENTS = frozenset({"open", "ctypes.dlopen", "subprocess.Popen", "os.exec", "os.posix_spawn", "os.system"})

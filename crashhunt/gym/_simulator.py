@@ -67,12 +67,15 @@ _NO_ACTORS = Roster(())
 _RESET_PARTS = ("observation", "info")
 _STEP_PARTS = ("observation", "reward", "terminated", "truncated", "info")
 _LIMIT = "max_episode_steps"
+_LIMIT_FIX = 'give 1 or more steps, or set gym.time_limit = "none" to lift the limit'
 _CRASH_KIND_KEY = "crash_kind"
 _MAX_KIND_CHARACTERS = 80
 _MAX_LISTED_KEYS = 12
 _MAX_CLOSE_S = 5.0
 """Wall time that an environment may need to close; Unity and CARLA need some seconds."""
-_WRAP_FIX = "return a number from step(), or name a function in gym.id that wraps the environment"
+_OR_WRAP = "or name a function in gym.id that wraps the environment"
+_REWARD_FIX, _FLAG_FIX = f"return a number from step(), {_OR_WRAP}", f"return a bool from step(), {_OR_WRAP}"
+_CHECKER = "gymnasium.utils.passive_env_checker"
 _INFO_FIX = "set gym.crash.function to a function that returns a bool, instead of gym.crash.info"
 _FUNCTION_FIX = "return True or False from gym.crash.function, or a text that describes the crash"
 _DANGER_FIX = "name a key of info in gym.danger whose value is a number"
@@ -121,7 +124,8 @@ class GymSimulator:
         except ForeignError as error:
             place = place_of(error.error)
             what = f"its {error.place} fails{f' at {place}' if place else ''}: {in_words(error.error)}"
-            raise self._mistake(what) from error.error
+            fix = self._checker_fix() if _is_of_checker(error.error) else ""
+            raise self._mistake(what, fix=fix) from error.error
 
     @property
     def notices(self) -> list[str]:
@@ -152,12 +156,15 @@ class GymSimulator:
                 given = {} if reset_options is None else {"options": reset_options}
                 observation, info = _parts("reset", self._env.reset(seed=seed, **given), _RESET_PARTS)
         except ForeignError as error:
-            raise InvalidEpisodeError(f"the environment could not be set up: {in_words(error.error)}") from error.error
+            fix = self._checker_fix() if _is_of_checker(error.error) else ""
+            what = f"the environment could not be set up: {in_words(error.error)}"
+            raise InvalidEpisodeError(what, fix=fix) from error.error
         self.agents = [self._agent]
         self._steps = 0
         self._info: Info = info if isinstance(info, Mapping) else {}
         self._masks_are_used = False
         self._crashed = False
+        self.was_truncated = False
         self.crash_cell = ""
         self.named_danger = None
         self._look("")
@@ -182,13 +189,17 @@ class GymSimulator:
                 returned = self._env.step(action)
             except ValueError as error:
                 raise _as_raised_without_wrappers(error) from error
+            except AssertionError as error:
+                if not _is_of_checker(error):
+                    raise
+                raise AssertionError(f"{error}; {self._checker_fix()}") from error
             observation, reward, ended, cut, info = _parts("step", returned, _STEP_PARTS)
         self._steps += 1
         self._info = info
         with _REWARD:  # these may be objects of any class
-            reward = self._number(reward, "the reward", _WRAP_FIX)
-            terminated = truth_of(ended, "terminated", _WRAP_FIX)
-            truncated = truth_of(cut, "truncated", _WRAP_FIX)
+            reward = self._number(reward, "the reward", _REWARD_FIX)
+            terminated = truth_of(ended, "terminated", _FLAG_FIX)
+            truncated = truth_of(cut, "truncated", _FLAG_FIX)
         with _INFO:  # the crash rule may be a function of the user's
             self._note_keys(info)
             what = self._rule(observation, reward, terminated, truncated, info)
@@ -199,8 +210,9 @@ class GymSimulator:
                 danger = self._number(info[self._key], f"gym.danger = {self._setup.danger!r}", _DANGER_FIX)
         self._look(what)
         self._record_danger(danger)
-        if truncated and not terminated and self._steps == time_limit_of(self._env):
-            self._report_time_limit()
+        self.was_truncated = truncated and not terminated and not self._crashed
+        if truncated and not terminated:
+            self._report_truncation()
         elif self._steps == self._limit_of_other_id[0] + 1:
             limit, other = self._limit_of_other_id
             what = f"is registered as {other!r} with a time limit of {count_of(limit, 'step')}"
@@ -271,7 +283,18 @@ class GymSimulator:
             if len(self._keys) < _MAX_LISTED_KEYS:
                 self._keys |= dict.fromkeys(map(str, info))
 
-    def _report_time_limit(self) -> None:
+    def _checker_fix(self) -> str:
+        """Return the fix if the checker of `gymnasium.make` refuses an environment that works without it."""
+        without = "set kwargs.disable_env_checker = true in the table [gym]"
+        if not self._is_registered:
+            without = "give gymnasium.make disable_env_checker=True"
+        return f"correct the environment, or {without}"
+
+    def _report_truncation(self) -> None:
+        if self._steps != time_limit_of(self._env):
+            what = f"the environment {self._setup.id!r} truncates an episode itself or by a wrapper"
+            self._notice(f"{what}, so the trial ends as finished before MAX_STEPS")
+            return
         is_default = self._is_registered and self._setup.time_limit == "registered"
         fix = '; set gym.time_limit = "none" to lift it' if is_default and _LIMIT not in self._setup.kwargs else ""
         what = f"ends an episode after {count_of(self._steps, 'step')}, which is its own time limit"
@@ -317,9 +340,13 @@ class GymSimulator:
             if isinstance(error.error, gymnasium.error.Error | ImportError | TypeError):
                 is_of_reset = _RESET_OPTIONS in keywords and self._setup.reset_options is None
                 fix = "add reset_options = {} to the table [gym]" if is_of_reset else ""
-                if _LIMIT in keywords and not self._is_registered:
+                if _LIMIT in keywords and self._is_registered:
+                    fix = _LIMIT_FIX * (_LIMIT in str(error.error))
+                elif _LIMIT in keywords:
                     fix = f"remove {_LIMIT}, or name the id with which the environment is registered"
                 raise self._mistake(str(error.error), fix=fix) from None
+            if isinstance(error.error, ValueError) and _LIMIT in keywords and _LIMIT in str(error.error):
+                raise self._mistake(str(error.error), fix=_LIMIT_FIX * self._is_registered) from None
             raise
         if is_parallel(made):
             learner, names = self._setup.learner, list(map(str, made.possible_agents))
@@ -420,13 +447,22 @@ def _parts(method: str, returned: Any, wanted: tuple[str, ...]) -> Sequence[Any]
 
 def _as_raised_without_wrappers(error: ValueError) -> Exception:
     """Return the error that names the environment if a wrapper of Gymnasium cannot unpack what it has returned."""
+    if not _module_of(error).startswith("gymnasium.") or "to unpack" not in str(error):
+        return error
+    return TypeError(f"step() of Gymnasium returns {', '.join(_STEP_PARTS)}, but step() of the environment: {error}")
+
+
+def _is_of_checker(error: BaseException) -> bool:
+    """Return whether an error was raised by the checker that `gymnasium.make` wraps around an environment."""
+    return _module_of(error) == _CHECKER
+
+
+def _module_of(error: BaseException) -> str:
+    """Return the name of the module that has raised an error; empty if it is unknown."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    inside = trace is not None and str(trace.tb_frame.f_globals.get("__name__")).startswith("gymnasium.")
-    if not inside or "to unpack" not in str(error):
-        return error
-    return TypeError(f"step() of Gymnasium returns {', '.join(_STEP_PARTS)}, but step() of the environment: {error}")
+    return "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
 
 
 class _Rule:

@@ -35,7 +35,8 @@ class HighwaySetup:
             replaces the default.
         off_road: whether leaving the lanes is a crash; by default yes, except in car parks, whose lanes are parking
             bays.
-        time_limit: ``registered`` keeps the ``max_episode_steps`` with which the id is registered; ``none`` lifts it.
+        time_limit: ``registered`` keeps the ``max_episode_steps`` with which the id is registered, and the ``duration``
+            of the environment's own configuration; ``none`` lifts both. A ``duration`` in ``config`` always holds.
         accelerate: whether the accelerator is used; results are bit-identical with and without it.
     """
 

@@ -43,8 +43,8 @@ def configured(default: Config, scenario: Scenario, arguments: Mapping[str, Valu
     for table in tables:
         _check_keys(scenario, config, table)
         merge(config, table)
-    if "duration" in config and not any("duration" in table for table in tables):
-        config["duration"] = math.inf
+    if scenario.table(HighwaySetup).time_limit == "none" and not any("duration" in table for table in tables):
+        config |= {"duration": math.inf} if "duration" in config else {}
     policy, simulation = config["policy_frequency"], config["simulation_frequency"]
     if not 0 < policy <= simulation:
         message = f"must be above 0 and at most simulation_frequency, {simulation}"

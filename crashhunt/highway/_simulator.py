@@ -84,8 +84,8 @@ assert highway_env  # importing it registers its environments
 class HighwaySimulator:
     """Runs the episodes of a scenario on highway-env, each in a new environment.
 
-    A control step is a step of the policy. An episode ends after ``max_steps``, the ``duration`` in the scenario's
-    configuration, or the registered ``max_episode_steps``. A terminated agent idles until the episode ends.
+    A control step is a step of the policy. An episode ends after ``max_steps``, the ``duration`` of the configuration,
+    or the registered ``max_episode_steps``. A terminated agent idles until the episode ends.
 
     Args:
         scenario: The scenario to run.
@@ -135,6 +135,7 @@ class HighwaySimulator:
         self._counts: Counter[str] = Counter()
         self._seen: tuple[int, ...] = ()
         self._crashed: set[str] = set()
+        self.was_truncated = False
         self._contacts: list[Contact] = []
         self._steps = 0
         self._taking_part: VehicleFilter | None = None
@@ -176,7 +177,7 @@ class HighwaySimulator:
         if self._steps >= self._lifted_at:
             self._notice(
                 f"trials run beyond the {self._own_duration_s:g} s after which {self._setup.id!r} ends its episodes: "
-                "set highway.config.duration to end them there"
+                'set highway.time_limit = "registered" to end them there'
             )
         with self._skipping:
             shown, reward, terminated, truncated, info = self._env.step(tuple(given) if self._many_act else given[0])
@@ -197,14 +198,23 @@ class HighwaySimulator:
                 (arrived if self._is_at_an_end(vehicle) else off_road).append(agent)
         self._read_scene(tuple(off_road))
         self._scene.events = tuple([event for agent in actions for event in self._events_of(agent)])
-        ended = truth_of(terminated, "terminated", _STEP_FIX) or truth_of(truncated, "truncated", _STEP_FIX)
-        ended = ended or self._steps == self._max_episode_steps
+        is_terminated = truth_of(terminated, "terminated", _STEP_FIX)
+        is_cut = truth_of(truncated, "truncated", _STEP_FIX)
+        if self._steps >= self._kept_until:
+            self._notice(
+                f"the environment {self._setup.id!r} ends an episode after {self._own_duration_s:g} s, which is its "
+                'own duration; set highway.time_limit = "none" to lift it'
+            )
+        is_cut = is_cut or self._steps == self._max_episode_steps
+        ended = is_terminated or is_cut
         rewards = info.get("agents_rewards", (reward,) * len(self._possible))
         arrived += [
             agent
             for agent, over in zip(self._possible, info.get("agents_terminated", ()), strict=False)
             if truth_of(over, "info['agents_terminated']", _STEP_FIX)
         ]
+        at_an_end = self._crashed.union(arrived, off_road)
+        self.was_truncated = is_cut and not is_terminated and at_an_end.isdisjoint(actions)
         terminations = {agent: ended or agent in self._crashed or agent in arrived for agent in actions}
         self.agents = [agent for agent in self.agents if not terminations.get(agent, False)]
         return (
@@ -323,9 +333,12 @@ class HighwaySimulator:
         own = env.config.get("duration")
         env.config = configured(env.config, self._scenario, arguments)
         tables = (self._setup.config, *as_tables(self._scenario, arguments))
-        is_lifted = isinstance(own, int | float) and not any("duration" in table for table in tables)
-        self._own_duration_s = own if is_lifted else math.inf
-        self._lifted_at = self._own_duration_s * env.config["policy_frequency"]
+        is_default = isinstance(own, int | float) and not any("duration" in table for table in tables)
+        self._own_duration_s = own if is_default else math.inf
+        at_step: float = self._own_duration_s * env.config["policy_frequency"]
+        is_lifted = self._setup.time_limit == "none"
+        self._lifted_at = at_step if is_lifted else math.inf
+        self._kept_until = math.inf if is_lifted else at_step
         return env
 
     def _construct(self) -> AbstractEnv:

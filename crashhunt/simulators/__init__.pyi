@@ -40,6 +40,7 @@ from ._protocol import (
     ReportsEvents as ReportsEvents,
     ReportsNotices as ReportsNotices,
     ReportsSurroundings as ReportsSurroundings,
+    ReportsTruncation as ReportsTruncation,
     RestoresObservations as RestoresObservations,
     RestoresState as RestoresState,
     RunsForeignCode as RunsForeignCode,

@@ -41,6 +41,7 @@ __all__ = [
     "ReportsEvents",
     "ReportsNotices",
     "ReportsSurroundings",
+    "ReportsTruncation",
     "RestoresObservations",
     "RestoresState",
     "RunsForeignCode",
@@ -244,6 +245,13 @@ class ReportsDanger(Protocol):
     @property
     def named_danger(self) -> float | None:
         """The highest criticality of the episode until now, from 0 (nothing near) to 1 (contact); None if unknown."""
+
+
+class ReportsTruncation(Protocol):
+    """A simulator whose episodes may end by a time limit of the simulator."""
+
+    was_truncated: bool
+    """Whether the last step ended the episode by a limit, and not because an agent crashed or arrived."""
 
 
 class ReportsCrashCell(Protocol):

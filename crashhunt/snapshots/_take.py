@@ -19,6 +19,7 @@ from crashhunt.base.errors import BundleError, SnapshotError, UsageError, remedy
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree
 from crashhunt.base.git import query
 from crashhunt.base.integrity import describe_files, digest_of_content, digest_of_data, digest_of_file
+from crashhunt.base.opened_files import output_files
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, load_order_of, write_settings
 from crashhunt.scenario import Scenario, as_plain_data
@@ -226,7 +227,7 @@ def _take_tree(
         hunts = _hunts_in(tree, names)
         if without is not None and without.resolve().is_relative_to(tree) and without.resolve() != tree:
             hunts.append(f"{without.resolve().relative_to(tree).as_posix()}/")
-        outputs = _own_outputs()
+        outputs = output_files()
         listed = [n for n in names if not n.startswith(tuple(hunts)) and f"{tree.resolve()}/{n}" not in outputs]
         for name in listed:
             for place, path in _resolved(tree, name, listed, found):
@@ -237,11 +238,6 @@ def _take_tree(
             place = base if below == "." else f"{base}/{below}"
             if place not in found.paths and any(file.startswith(f"{place}/") for file in found.files):
                 found.paths.append(place)
-
-
-def _own_outputs() -> set[str]:
-    """Return the files to which the shell redirects the output of this command: they grow, and are no code."""
-    return {os.path.realpath(f"/proc/self/fd/{stream}") for stream in (1, 2)}
 
 
 def _hunts_in(tree: Path, names: Iterable[str]) -> list[str]:

@@ -26,7 +26,7 @@ from crashhunt.crashes import read_bundle
 from crashhunt.episode import Episode, Parts, observation_restorers
 from crashhunt.plans import disturber, read_settings
 from crashhunt.replays import ReplayOptions, prepare
-from crashhunt.simulators import FlattensObservations
+from crashhunt.simulators import FlattensObservations, ReportsTruncation
 from crashhunt.trial import Outcome, TrialSpec
 
 if TYPE_CHECKING:
@@ -156,6 +156,8 @@ class CrashEpisodes:
         info["outcome"] = str(result.outcome)
         has_crashed = info["has_crashed"] = result.outcome in stage.settings.crash_on
         terminated = has_crashed or is_over or result.outcome == Outcome.FINISHED
+        if not has_crashed and supports(stage.simulator, ReportsTruncation) and stage.simulator.was_truncated:
+            terminated = False  # a learner expects further rewards after a time limit
         return observation, reward, terminated, not terminated, info
 
     def close(self) -> None:

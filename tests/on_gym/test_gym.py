@@ -164,6 +164,58 @@ def test_registered_time_limit_ends_an_episode_unless_the_scenario_lifts_it(tmp_
     assert [notice.partition("gym.time_limit")[0] for notice in simulator.notices] == ([told] if told else [])
 
 
+class CutEarly(gymnasium.Wrapper):
+    def step(self, action):
+        *rest, _, info = self.env.step(action)
+        return *rest, self.env.steps >= 7, info
+
+
+def make_cut():
+    return CutEarly(Tray())
+
+
+def test_truncation_by_a_wrapper_is_reported_and_told_apart_from_a_termination(tmp_path):
+    cut, whole = simulator_of(tmp_path, f"{__name__}:make_cut"), simulator_of(tmp_path, "Tray-v0")
+    assert (fall(cut), cut.was_truncated) == (7, True)
+    what = "truncates an episode itself or by a wrapper, so the trial ends as finished before MAX_STEPS"
+    assert cut.notices == [f"the environment '{__name__}:make_cut' {what}"]
+    cut.reset(seed=1)
+    assert not cut.was_truncated
+    assert (fall(whole), whole.was_truncated) == (40, False)
+
+
+class Unchecked(Tray):
+    """Its observation has a part that its space lacks, which only Gymnasium's checker refuses."""
+
+    def _look(self):
+        return {**super()._look(), "more": 1} if self.steps >= self.fails_at else super()._look()
+
+
+gymnasium.register("Unchecked-v0", entry_point=Unchecked)
+
+
+def make_unchecked(fails_at=0):
+    return gymnasium.make("Unchecked-v0", fails_at=fails_at)
+
+
+@pytest.mark.parametrize("fails_at", [0, 1])
+@pytest.mark.parametrize(
+    ("name", "fix"),
+    [
+        ("Unchecked-v0", "set kwargs.disable_env_checker = true in the table [gym]"),
+        (f"{__name__}:make_unchecked", "give gymnasium.make disable_env_checker=True"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_refusal_by_the_checker_of_gymnasium_names_the_option_that_disables_it(tmp_path, name, fix, fails_at):
+    simulator = simulator_of(tmp_path, name, fails_at=fails_at)
+    with pytest.raises((ForeignError, InvalidEpisodeError)) as caught:
+        fall(simulator, steps=2)
+    error = getattr(caught.value, "error", caught.value)
+    assert "keys is not same as the observation space keys" in str(error)
+    assert f"correct the environment, or {fix}" in (getattr(error, "fix", "") or str(error))
+
+
 def test_limit_of_an_id_is_reported_where_its_class_is_named_and_runs_longer(tmp_path):
     simulator = simulator_of(tmp_path, f"{__name__}:Tray")
     fall(simulator, steps=6)
@@ -349,6 +401,8 @@ gymnasium.register("Spaceless-v0", entry_point=Spaceless, disable_env_checker=Tr
         ("Tray-v0", {"colour": "red"}, "colour"),
         ("Tray-v0", {"reset_options": {"low": 1}}, "; add reset_options = {} to the table [gym]"),
         (f"{__name__}:Tray", {"max_episode_steps": 5}, "; remove max_episode_steps, or name the id with which the env"),
+        ("Short-v0", {"max_episode_steps": 0}, "; give 1 or more steps, or set gym.time_limit = "),
+        ("Short-v0", {"max_episode_steps": "9"}, "; give 1 or more steps, or set gym.time_limit = "),
         ("Spaceless-v0", {}, "the environment's observation_space is None, not a gymnasium.Space; set it"),
         ("no_such_module:make", {}, "no_such_module"),
         (f"{__name__}:make_nested", {"config": {"friction": {"of": -1}}}, "friction is negative"),

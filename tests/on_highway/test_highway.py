@@ -276,20 +276,29 @@ def test_what_one_episode_changes_in_classes_does_not_reach_the_next(tmp_path):
     assert IDMVehicle.DISTANCE_WANTED == 10
 
 
-def test_an_episode_has_no_end_in_time_unless_asked_for(tmp_path):
-    quiet = {"vehicles_count": 0}
-    assert len(list(drive(simulator_of(tmp_path, "highway-fast-v0", config=quiet), "IDLE", 50))) == 50
-    ends = simulator_of(tmp_path, "highway-fast-v0", config={**quiet, "duration": 7})
-    assert len(list(drive(ends, "IDLE", 50))) == 7
+KEPT = "the environment 'highway-fast-v0' ends an episode after 30 s, which is its own duration; set highway.time_limit"
+LIFTED = "trials run beyond the 30 s after which 'highway-fast-v0' ends its episodes: set highway.time_limit"
 
 
-def test_end_of_time_that_does_not_apply_is_reported_when_an_episode_passes_it(tmp_path):
-    quiet = {"vehicles_count": 0}
-    for config, steps, count in ((quiet, 30, 0), (quiet, 31, 1), ({**quiet, "duration": math.inf}, 31, 0)):
-        simulator = simulator_of(tmp_path, "highway-fast-v0", config=config)
-        list(drive(simulator, "IDLE", steps))
-        assert len(simulator.notices) == count
-        assert all("beyond the 30 s after which 'highway-fast-v0' ends" in notice for notice in simulator.notices)
+@pytest.mark.parametrize(
+    ("limit", "config", "steps", "ends", "told"),
+    [
+        ("registered", {}, 29, 29, None),
+        ("registered", {}, 50, 30, KEPT),
+        ("registered", {"duration": 7}, 50, 7, None),
+        ("registered", {"duration": math.inf}, 31, 31, None),
+        ("none", {}, 30, 30, None),
+        ("none", {}, 50, 50, LIFTED),
+        ("none", {"duration": 7}, 50, 7, None),
+    ],
+)
+def test_own_duration_of_an_environment_is_kept_unless_the_scenario_lifts_it(
+    tmp_path, limit, config, steps, ends, told
+):
+    simulator = simulator_of(tmp_path, "highway-fast-v0", config={"vehicles_count": 0, **config}, time_limit=limit)
+    assert len(list(drive(simulator, "IDLE", steps))) == ends
+    assert simulator.was_truncated is (ends < 29 or told == KEPT)
+    assert [notice.partition(" = ")[0] for notice in simulator.notices] == ([told] if told else [])
 
 
 @pytest.mark.parametrize(("limit", "steps"), [("registered", 6), ("none", 20)])

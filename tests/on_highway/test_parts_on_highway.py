@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -631,10 +632,13 @@ DEFAULT = {"duration": 40, "policy_frequency": 1, "simulation_frequency": 15, "c
 def test_configuration_is_the_default_with_the_entries_of_the_scenario_and_its_arguments():
     arguments = {"rows": ArgumentSetup(default=4, option="observation.rows")}
     found = _config.configured(DEFAULT, scenario(arguments=arguments, cars=7), {"rows": 6})
-    assert found == {**DEFAULT, "duration": math.inf, "cars": 7, "observation": {**DEFAULT["observation"], "rows": 6}}
+    assert found == {**DEFAULT, "cars": 7, "observation": {**DEFAULT["observation"], "rows": 6}}
     assert "rows" not in DEFAULT["observation"]
     assert _config.configured(DEFAULT, scenario(duration=7), {})["duration"] == 7
-    assert _config.configured(DEFAULT, scenario(), {"duration": 9})["duration"] == 9
+    lifted = scenario()
+    lifted = lifted.with_table(replace(lifted.table(HighwaySetup), time_limit="none"))
+    for given, is_lifted, duration in (({}, False, 40), ({}, True, math.inf), ({"duration": 9}, True, 9)):
+        assert _config.configured(DEFAULT, lifted if is_lifted else scenario(), given)["duration"] == duration
     assert "duration" not in _config.configured({k: v for k, v in DEFAULT.items() if k != "duration"}, scenario(), {})
     assert _config.configured(DEFAULT, scenario(my_reward=2.0), {})["my_reward"] == 2.0
     for wrong in ({"car": 3}, {"reward": 2.0}):

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shlex
 import subprocess
 import sys
 import zipfile
@@ -59,6 +60,19 @@ def test_a_file_that_takes_the_output_of_the_command_is_no_code(tmp_path):
         os.dup2(earlier, 2)
         os.close(earlier)
     assert [place for place in found.files if place.endswith(".txt")] == [f"code/@{tmp_path.name}/kept.txt"]
+
+
+def test_files_of_a_pipeline_and_of_the_command_that_started_this_one_are_its_outputs(tmp_path):
+    """A suite starts hunts whose own output goes elsewhere; `tee` writes a file that its reader may also have open."""
+    program = "from crashhunt.base.opened_files import output_files as f; import sys; print(*f(), file=sys.stderr)"
+    (tmp_path / "read.txt").touch()
+    inner = f"{shlex.quote(sys.executable)} -c {shlex.quote(program)} 2> errors.txt | cat | tee -a log.txt > /dev/null"
+    with (tmp_path / "suite.txt").open("w") as output:
+        subprocess.run(["bash", "-c", f"{inner}; true"], stdout=output, cwd=tmp_path, check=True)
+    found = {
+        Path(name).name for name in (tmp_path / "errors.txt").read_text().split() if name.startswith(f"{tmp_path}/")
+    }
+    assert found == {"errors.txt", "log.txt", "suite.txt"}
 
 
 @pytest.mark.nightly

@@ -31,6 +31,7 @@ from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.training import CrashEnv, _training_episodes as _episodes, is_test_traffic
 from crashhunt.training._prioritized_replay import CrashReplay
 from crashhunt.training._training_episodes import _Start
+from crashhunt.trial import Outcome
 
 TOY = """
 title = "A toy"
@@ -357,6 +358,30 @@ def test_wrong_use_is_reported(env):
         env.reset(options={"crashes": "x"})
     with pytest.raises(UsageError, match="there is no crash '000999-collision'"):
         env.reset(options={"crash": "000999-collision"})
+
+
+@pytest.mark.parametrize(
+    ("outcome", "was_truncated", "ends"),
+    [
+        (Outcome.FINISHED, True, (False, True)),
+        (Outcome.FINISHED, False, (True, False)),
+        (Outcome.FINISHED, None, (True, False)),  # by a simulator without this report
+        (Outcome.COLLISION, True, (True, False)),
+        (Outcome.SURVIVED, False, (False, True)),
+    ],
+)
+def test_time_limit_of_an_environment_truncates_an_episode(outcome, was_truncated, ends):
+    episodes, simulator = object.__new__(_episodes.CrashEpisodes), SimpleNamespace(was_truncated=was_truncated)
+    simulator.actions = {"ego": SimpleNamespace(encode=lambda action: action)}
+    episode = SimpleNamespace(
+        result=None, spec=SimpleNamespace(reseeding=None), steps=3, scene=SimpleNamespace(time_s=0.3),
+        observations={"ego": 1}, rewards={"ego": 1.0}, terminations={"ego": outcome == Outcome.FINISHED},
+        step=lambda actions: SimpleNamespace(outcome=outcome),
+    )  # fmt: skip
+    settings = SimpleNamespace(crash_on=(Outcome.COLLISION,))
+    episodes._episode = episode
+    episodes._running = SimpleNamespace(simulator=simulator, agent="ego", settings=settings)
+    assert episodes.step(1)[2:4] == ends
 
 
 # The other simulators, and other libraries' vectors of environments.
