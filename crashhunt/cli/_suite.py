@@ -106,10 +106,12 @@ def add_rerun(commands: Commands) -> None:
 
 def _run(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.results import find_hunts, hunt_state
-    from crashhunt.suites import Suite
+    from crashhunt.suites import Suite, describe_finished
 
     suite = Suite.read(options.file)
     cases = checked_cases(options)
+    if options.directory.is_dir() and (kept := describe_finished(options.directory)):
+        say(kept, as_json=options.json)
     watch, finish = _watcher(as_json=options.json)
     try:
         machine = chosen_of_machine(options)

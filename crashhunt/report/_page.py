@@ -401,6 +401,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
             "drawn": _plot_counts(trials, total, crashes, settings) if len(trials) < total else None,
             "importance": importance_of(unchosen),
             "rate": _rate(facts.get("running_rate"), describe_versions(map(asdict, versions)) if versions else ""),
+            "notices": facts.get("notices") or [],
             "typesByCause": facts.get("types_by_cause"),
             "weighed": [min(len(unchosen), _MOST), unchosen_in_all] if unchosen_in_all > _MOST else None,
         }

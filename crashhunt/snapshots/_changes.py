@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from crashhunt.snapshots._snapshot import Snapshot
 
-__all__ = ["CodeChanges", "code_changes"]
+__all__ = ["CodeChanges", "code_changes", "is_page"]
 
 _OWN_CODE = f"{layout.CODE}/crashhunt/"
 _PAGES = frozenset((
@@ -61,7 +61,7 @@ def code_changes(then: Snapshot, now: Snapshot) -> CodeChanges:
     changed, added, own, moves = [], [], 0, set()
     for name in sorted(before.keys() | after.keys()):
         was, is_now = before.get(name, set()), after.get(name, set())
-        if was == is_now or _is_page(name):
+        if was == is_now or is_page(name):
             continue
         if name.startswith(_OWN_CODE):
             own += 1
@@ -95,7 +95,8 @@ def _files(snapshot: Snapshot) -> Mapping[str, set[str]]:
     return found
 
 
-def _is_page(name: str) -> bool:
+def is_page(name: str) -> bool:
+    """Return whether a file of a project is no condition of a trial, such as a README or a file of git."""
     path = PurePosixPath(name)
-    is_page = path.stem.upper() in _PAGES and path.suffix.lower() in _PAGE_SUFFIXES
-    return is_page or path.name in _FILES_OF_TOOLS or path.parts[0] == ".github"
+    is_text = path.stem.upper() in _PAGES and path.suffix.lower() in _PAGE_SUFFIXES
+    return is_text or path.name in _FILES_OF_TOOLS or path.parts[0] == ".github"

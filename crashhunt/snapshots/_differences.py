@@ -12,6 +12,7 @@ from crashhunt.base import layout
 from crashhunt.base.exceptions import shown_path
 from crashhunt.base.integrity import changed_file
 from crashhunt.base.plugins import registered
+from crashhunt.snapshots._changes import is_page
 from crashhunt.snapshots._take import code_of_tree
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ def code_differences(snapshot: Snapshot, locators: Iterable[str]) -> list[str] |
     for base, folder in folders.items():
         below = {name: folder / name.removeprefix(f"{base}/") for name in files if name.startswith(f"{base}/")}
         below |= {base: folder} if base in files else {}
+        below = {name: file for name, file in below.items() if not is_page(name.removeprefix(f"{base}/"))}
         changes = {name: why for name, file in below.items() if (why := changed_file(file, files[name]))}
         if folder == layout.PACKAGE:
             found += [f"crashhunt itself ({len(changes)} files)"] if changes else []

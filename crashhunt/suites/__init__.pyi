@@ -6,4 +6,9 @@ from ._processes import (
     trust_hunt as trust_hunt,
 )
 from ._rerun import rerun as rerun
-from ._suite_file import Suite as Suite, SuiteEntry as SuiteEntry, default_suite as default_suite
+from ._suite_file import (
+    Suite as Suite,
+    SuiteEntry as SuiteEntry,
+    default_suite as default_suite,
+    describe_finished as describe_finished,
+)

@@ -6,6 +6,7 @@ import json
 import re
 import secrets
 import tomllib
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,12 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.base.calls import clear_constructor
-from crashhunt.base.errors import HuntDirectoryError, UsageError
-from crashhunt.base.text import near_path
+from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, UsageError
+from crashhunt.base.text import command_line, listed, near_path
 from crashhunt.base.validation import validate
 from crashhunt.plans import HuntOptions, Request, SnapshotChoices, fields_of, hunt_options, request_of
-from crashhunt.results import HuntState, hunt_state, is_hunt
+from crashhunt.results import HuntState, find_hunts, hunt_state, is_hunt
 from crashhunt.scenario import load_scenario, shipped_scenarios
+from crashhunt.snapshots import code_differences, latest_snapshot
 from crashhunt.suites._processes import (
     REQUEST,
     RunRequest,
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 
     from crashhunt.plans import Given
 
-__all__ = ["Suite", "SuiteEntry", "default_suite"]
+__all__ = ["Suite", "SuiteEntry", "default_suite", "describe_finished"]
 
 _ENTRY_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]*")
 
@@ -253,6 +255,28 @@ class Suite:
         drawn = np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]
         asked = replace(entry, scenario=scenario, seed=int(drawn))
         return request_of(asked, trials=entry.trials, max_steps=entry.max_steps)
+
+
+def describe_finished(directory: Path) -> str:
+    """Return that `Suite.run` does not run finished hunts again, and which files have changed since; may be empty.
+
+    Versions of libraries are not compared, because their comparison would take a process for each hunt.
+    """
+    hunts = [hunt for hunt in find_hunts(directory) if hunt_state(hunt).state in ("finished", "crashed")]
+    changed: dict[str, None] = {}
+    for snapshot in {found.digest: found for hunt in hunts if (found := latest_snapshot(hunt)) is not None}.values():
+        with suppress(CrashhuntError, OSError):  # a damaged snapshot is reported by `check`
+            agents = [setup.agent for setup in snapshot.scenario().agents.values()]
+            changed |= dict.fromkeys(code_differences(snapshot, agents) or ())
+    if not hunts:
+        return ""
+    count, were = (f"{len(hunts)} hunts", "were") if len(hunts) > 1 else ("1 hunt", "was")
+    said = f"{count} had finished before and {were} not run again"
+    if not changed:
+        return said
+    names = listed(changed)
+    again = command_line("crashhunt", "rerun", directory, "--all")
+    return f"{said}, although files have changed since: {names}. Fix: {again} runs all hunts with today's files"
 
 
 def default_suite() -> str:

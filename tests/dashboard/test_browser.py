@@ -14,6 +14,7 @@ from dashboard_hunts import hunted
 from served import served
 
 from crashhunt.base.integrity import digest_of_row
+from crashhunt.ledger import Ledger
 
 pytestmark = pytest.mark.long
 STRANGE = "<img src=x onerror='window.hacked=1'><script>window.hacked=1</script>&amp;"
@@ -90,6 +91,8 @@ def test_texts_of_strangers_are_text_on_every_page(hunts, page):
         (kinds,) = database.execute("SELECT value FROM hunt WHERE key = 'kinds'").fetchone()
         row = ("kinds", kinds.replace('"words": "', f'"words": "{STRANGE}'))
         database.execute("UPDATE hunt SET value = ?, digest = ? WHERE key = ?", (row[1], digest_of_row(row), "kinds"))
+    with closing(Ledger(one / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(notices=[f"a notice {STRANGE}"])
     shutil.copytree(one, hunts / "two")
     page.size(360, 900)
     with served(hunts) as dashboard:
@@ -106,6 +109,7 @@ def test_texts_of_strangers_are_text_on_every_page(hunts, page):
         ):
             page.open(url)
             page.wait("document.body.innerText.includes(arguments[0])", expected)
+            assert url != address or page.text("#notices") == f"a notice {STRANGE}"
             assert page.run("return window.hacked") is None
             assert page.run("return document.querySelectorAll('img, main script').length") == 0
             assert page.run("return document.documentElement.scrollWidth") <= 360, url

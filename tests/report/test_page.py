@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import shlex
 import time
+from contextlib import closing
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
+from crashhunt.base import layout
 from crashhunt.crashes import list_bundles
+from crashhunt.ledger import Ledger
 from crashhunt.report import describe_running
 from crashhunt.results import HuntResults, hunt_state
 
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
 def hunted(shell):
     words = ("--arg", "speed=20:25", "--seed", "1", "--keep-going")
     shell.crashhunt("run", "<b>bold&", "2", "3", "800", *words)
+    with closing(Ledger(shell.folder / "<b>bold&" / layout.LEDGER, writable=True)) as ledger:
+        ledger.note(notices=["SUMO omits <b>"])
 
 
 @pytest.fixture
@@ -59,6 +64,7 @@ def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
     opened(browser, hunt.folder / done["file"])
     bundles = list_bundles(hunt.folder / "<b>bold&")
     assert text(browser, "title") == "<b>bold&"  # as text, not as markup
+    assert text(browser, "notices") == "SUMO omits <b>"
     assert text(browser, "tiles").split("\n")[:4] == ["3 of 3", "trials", str(len(bundles)), "crashes"]
     assert "collision" in text(browser, "outcomes")
     rate = hunt_state(hunt.folder / "<b>bold&").rate

@@ -394,6 +394,29 @@ def test_hunts_of_a_suite_run_until_they_have_ended(tmp_path, monkeypatch):
     assert len(checked) == 3
 
 
+def test_finished_hunts_that_a_suite_does_not_run_again_are_reported_with_changed_files(tmp_path, monkeypatch):
+    states = ["queued", "finished", "crashed", "error"]
+    snapshot = SimpleNamespace(digest="d", scenario=lambda: SimpleNamespace(agents={"a": SimpleNamespace(agent="m:A")}))
+    compared, changed = [], None
+    monkeypatch.setattr(_suite, "hunt_state", lambda hunt: SimpleNamespace(state=states[hunt]))
+    monkeypatch.setattr(_suite, "latest_snapshot", lambda hunt: snapshot)
+    monkeypatch.setattr(_suite, "code_differences", lambda *given: compared.append(given) or changed)
+
+    def describe(*hunts):
+        monkeypatch.setattr(_suite, "find_hunts", lambda directory: hunts)
+        return _suite.describe_finished(tmp_path)
+
+    assert describe(0, 3) == ""
+    assert describe(1) == "1 hunt had finished before and was not run again"
+    assert compared == [(snapshot, ["m:A"])]
+    changed = ["my.py has changed"]
+    assert describe(0, 1, 2, 3) == (
+        "2 hunts had finished before and were not run again, although files have changed since: my.py has changed. "
+        f"Fix: crashhunt rerun {tmp_path} --all runs all hunts with today's files"
+    )
+    assert len(compared) == 2  # one for each snapshot
+
+
 def test_default_suite_has_every_scenario_with_its_agents():
     text = _suite.default_suite()
     data = tomllib.loads(text)

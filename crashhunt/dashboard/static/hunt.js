@@ -59,6 +59,9 @@ function showHunt() {
   const problems = [hunt.detail, ...hunt.problems].filter((part) => part);
   $("detail").hidden = !problems.length;
   setText($("detail"), problems.join("\n"));
+  const notices = hunt.notices ?? [];
+  $("notices").hidden = !notices.length;
+  renew("notices", notices, () => $("notices").replaceChildren(...notices.map((notice) => make("li", notice))));
   $("progress").hidden = !(hunt.trials_planned >= hunt.trials_run && hunt.trials_planned) || hunt.state !== "running";
   $("progress").value = hunt.trials_planned ? hunt.trials_run / hunt.trials_planned : 0;
   const rate = hunt.rate, newest = sinceNewestKind(hunt);
