@@ -29,6 +29,7 @@ __all__ = [
     "Group",
     "ImportedModules",
     "add_current_folder",
+    "describe_unused_clone",
     "distributions",
     "import_module",
     "is_foreign",
@@ -270,6 +271,9 @@ def add_current_folder(*, always_last: bool | None = None) -> CurrentFolder:
     return made
 
 
+_INSTALLED = frozenset(("site-packages", "dist-packages"))
+
+
 class CurrentFolder:
     """Finds modules in the current folder that neither Python nor crashhunt's dependencies have, installed or not."""
 
@@ -305,6 +309,16 @@ def _dependencies() -> frozenset[str]:
     names = {re.split(r"[^\w.-]", requirement, maxsplit=1)[0].lower() for requirement in needed}
     known = {"eclipse-sumo": "sumo", "pillow": "PIL", "protobuf": "google", "mcap-protobuf-support": "mcap_protobuf"}
     return frozenset(known.get(name, name.replace("-", "_")) for name in names)
+
+
+def describe_unused_clone(module: types.ModuleType) -> str:
+    """Return that a package of the current folder is not used, because the installed one is; empty if there is none."""
+    name, used = module.__name__, Path(module.__file__ or "")
+    clone = Path.cwd() / name / "__init__.py"
+    if _INSTALLED.isdisjoint(used.parts) or not clone.is_file() or clone.resolve() == used.resolve():
+        return ""
+    fix = "install your clone with pip install -e, or rename its folder"
+    return f"the package ./{name} in the current folder is not used: {name} is imported from {used.parent}. Fix: {fix}"
 
 
 def _hidden(name: str) -> str:

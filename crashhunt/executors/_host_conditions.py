@@ -11,6 +11,7 @@ environment variable ``TMPDIR`` in its own process, changes none of these condit
 from __future__ import annotations
 
 import os
+import time
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -28,6 +29,8 @@ __all__ = ["HostConditions"]
 _MIN_FREE_BYTES: Final = 1 << 20
 """With less free space on a disk, it counts as full: no recording of a trial fits."""
 _AGAIN: Final = "and run the same command again: the trials that failed because of it run again"
+_REMOVAL_S: Final = 1.0
+"""Time in which a removed folder disappears after its first file, in s."""
 _CURRENT, _TEMPORARY = "the current folder of the command", "the folder for temporary files (TMPDIR)"
 
 
@@ -90,7 +93,12 @@ class HostConditions:
 
     def _check_file(self, path: Path) -> None:
         if not os.path.lexists(path):
-            fix = f"delete its folder with {command_line('rm', '-r', self._snapshot or '')}, {_AGAIN}"
+            time.sleep(_REMOVAL_S)  # whoever deletes a whole hunt deletes the files of its snapshot first
+            for folder in self._folders:
+                _check_folder(folder)
+            fix = _AGAIN.removeprefix("and ")
+            if self._snapshot is not None and self._snapshot.exists():
+                fix = f"delete its folder with {command_line('rm', '-r', self._snapshot)}, {_AGAIN}"
             raise HostError("a file of the snapshot was deleted while trials ran", fix=fix, where=str(path))
 
     @cached_property

@@ -29,6 +29,7 @@ from highway_env.vehicle.objects import Obstacle, RoadObject
 
 from crashhunt.base.boundaries import Boundary, Party
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
+from crashhunt.base.plugins import describe_unused_clone
 from crashhunt.base.scalars import number_of, truth_of
 from crashhunt.highway._backend import BACKEND, HighwaySetup
 from crashhunt.highway._config import configured, mistake, restore_classes
@@ -110,6 +111,8 @@ class HighwaySimulator:
         self.notices: dict[str, None] = {}
         self._lane_names: dict[tuple[str, str, int], str] = {}
         self._spare: AbstractEnv | None = None
+        if notice := describe_unused_clone(highway_env):
+            self._notice(notice)
         try:
             self.reset(seed=0, options={"arguments": argument_values(scenario)})  # to read its spaces
         except InvalidEpisodeError as error:

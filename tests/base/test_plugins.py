@@ -6,12 +6,13 @@ import os
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated
 
 import pytest
 
 import crashhunt
-from crashhunt.base.plugins import CurrentFolder, import_module, locate, registered
+from crashhunt.base.plugins import CurrentFolder, describe_unused_clone, import_module, locate, registered
 from crashhunt.errors import ArgumentError, PluginError
 from crashhunt.space import Argument, Range
 from crashhunt.trial import signature_of
@@ -195,3 +196,23 @@ def test_an_import_that_fails_states_where(tmp_path, monkeypatch, content, name,
     sys.modules.pop("broken", None)
     assert caught.value.where == where
     assert says in str(caught.value)
+
+
+def test_clone_in_the_current_folder_is_reported_where_the_installed_package_is_used(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    installed = SimpleNamespace(__name__="highway_env", __file__="/v/lib/site-packages/highway_env/__init__.py")
+    assert describe_unused_clone(installed) == ""
+    (tmp_path / "highway_env").mkdir()
+    assert describe_unused_clone(installed) == ""  # a folder without a package
+    clone = tmp_path / "highway_env" / "__init__.py"
+    clone.touch()
+    said = describe_unused_clone(installed)
+    assert said.startswith(
+        "the package ./highway_env in the current folder is not used: highway_env is imported from /v/"
+    )
+    copy = SimpleNamespace(__name__="highway_env", __file__="/hunt/snapshots/1/code/highway_env/__init__.py")
+    assert (
+        describe_unused_clone(copy)
+        == describe_unused_clone(SimpleNamespace(__name__="highway_env", __file__=None))
+        == ""
+    )

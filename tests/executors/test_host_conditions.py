@@ -27,6 +27,7 @@ def place(tmp_path, monkeypatch):
         (tmp_path / name).mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
+    monkeypatch.setattr(_host_conditions, "_REMOVAL_S", 0.0)
     (tmp_path / "hunt" / SNAPSHOT / layout.MANIFEST).write_text("{}")
     return tmp_path
 
@@ -89,6 +90,18 @@ def test_missing_files_of_the_snapshot_are_named(place, settings, monkeypatch):
     with pytest.raises(HostError) as caught:
         conditions.check_hunt()
     assert caught.value.where == str(manifest)
+    shutil.rmtree(manifest.parent)
+    with pytest.raises(HostError) as caught:
+        conditions.check_hunt()
+    assert caught.value.fix.startswith("run the same command again")  # there is no folder to delete
+
+
+def test_hunt_whose_files_are_being_removed_is_reported_as_removed(place, settings, monkeypatch):
+    conditions = HostConditions(settings)
+    (place / "hunt" / SNAPSHOT / layout.MANIFEST).unlink()
+    monkeypatch.setattr(_host_conditions.time, "sleep", lambda _: shutil.rmtree(place / "hunt"))
+    with pytest.raises(HostError, match="the directory of the hunt was deleted or moved"):
+        conditions.check_hunt()
 
 
 def test_disk_that_becomes_full_is_named_and_one_that_was_full_is_not(place, settings, monkeypatch):
