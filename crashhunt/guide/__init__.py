@@ -10,7 +10,7 @@ from crashhunt.guide._pages import (
     pages_folder,
     search_pages,
 )
-from crashhunt.guide._reference import describe_api, describe_commands, describe_keys, describe_modules
+from crashhunt.guide._reference import describe_api, describe_commands, describe_json, describe_keys, describe_modules
 
 __all__ = [
     "SECTIONS",
@@ -18,6 +18,7 @@ __all__ = [
     "completed",
     "describe_api",
     "describe_commands",
+    "describe_json",
     "describe_keys",
     "describe_modules",
     "find_page",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_of
-from crashhunt.guide._reference import describe_api, describe_commands, describe_keys, describe_modules
+from crashhunt.guide._reference import describe_api, describe_commands, describe_json, describe_keys, describe_modules
 
 if TYPE_CHECKING:
     import argparse
@@ -118,13 +118,14 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
     """Return the text of a page, with its generated parts inserted.
 
     Args:
-        text: Markdown text, in which ``<!-- made from the code: commands -->`` is a placeholder; ``api``, ``keys`` and
-            ``modules`` are further placeholders.
+        text: Markdown text, in which ``<!-- made from the code: commands -->`` is a placeholder; ``api``, ``json``,
+            ``keys`` and ``modules`` are further placeholders.
         parser: parser of the command line.
     """
     makers = {
         "commands": lambda: describe_commands(parser),
         "api": describe_api,
+        "json": describe_json,
         "keys": describe_keys,
         "modules": describe_modules,
     }

@@ -11,15 +11,22 @@ import ast
 import functools
 import importlib
 import inspect
+import json
 import re
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from crashhunt.base.codec import JsonObject
 
-__all__ = ["as_markdown", "definition", "describe_api", "describe_commands", "describe_keys", "describe_modules"]
+
+__all__ = [
+    "as_markdown", "definition", "describe_api", "describe_commands", "describe_json", "describe_keys",
+    "describe_modules",
+]  # fmt: skip
 
 
 _PUBLIC_MODULES = {
@@ -378,6 +385,58 @@ def _plain(text: str | None) -> str:
     """Return a text in which characters with a meaning in Markdown are escaped."""
     said = " ".join((text or "").split())
     return "".join(f"\\{letter}" if letter in "*<[`" else letter for letter in said)
+
+
+# The keys of each `--json` output, made from the JSON Schema files that tests compare with all outputs.
+
+_SCHEMA_FOLDER = Path(__file__).parent / "reference" / "schemas"
+_MIN_REPEATED_KEYS = 4  # an object with fewer keys is shorter than a reference to it
+_MIN_BROKEN_VALUES = 10  # a list with more values may continue in the next line
+
+
+def describe_json() -> str:
+    """Return the keys of the ``--json`` output of each command, as Markdown."""
+    return "\n".join(line for file in sorted(_SCHEMA_FOLDER.glob("*.json")) for line in _output(file))
+
+
+def _output(file: Path) -> Iterator[str]:
+    shape = _shape(json.loads(file.read_text(encoding="utf-8")), "", {})
+    yield f"`{file.stem.replace('-', ' ', 1)}` ([JSON Schema](schemas/{file.name})):\n"
+    yield "```text"
+    yield textwrap.fill(shape, 100, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    yield "```\n"
+
+
+def _shape(schema: JsonObject, key: str, shown: dict[str, str]) -> str:
+    """Return the keys of a JSON Schema in one line; empty for a plain value.
+
+    Args:
+        schema: the schema of a value.
+        key: the key of the value.
+        shown: the objects with many keys that were shown, each with its key. Such an object is not shown again.
+    """
+    if "enum" in schema:
+        separator = "|" if len(schema["enum"]) < _MIN_BROKEN_VALUES else " | "
+        return separator.join(json.dumps(value) for value in schema["enum"])
+    if "anyOf" in schema:
+        return "|".join(_shape(option, key, shown) or str(option.get("type", "…")) for option in schema["anyOf"])
+    if properties := schema.get("properties"):
+        first = shown.setdefault(json.dumps(schema, sort_keys=True), key)
+        if first != key and len(properties) >= _MIN_REPEATED_KEYS:
+            return f'{{as "{first}"}}'
+        required = schema.get("required", ())
+        members = [
+            (name if name in required else f"{name}?", _shape(properties[name], name, shown)) for name in properties
+        ]
+        return "{" + ", ".join(f'"{name}": {shape}' if shape else f'"{name}"' for name, shape in members) + "}"
+    types = [schema["type"]] if isinstance(schema.get("type"), str) else schema.get("type", [])
+    if "array" in types:
+        return f"[{_shape(schema.get('items') or {}, key, shown)}]"
+    if "object" in types:
+        values = schema.get("additionalProperties")
+        values = _shape(values, key, shown) if isinstance(values, dict) else ""
+        return f"{{…: {values}}}" if values else "{…}"
+    return "|".join(types) if "null" in types else ""
 
 
 # The list of all modules with what each is about, made from what it says first of itself.

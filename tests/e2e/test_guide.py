@@ -21,6 +21,7 @@ from crashhunt.errors import UsageError
 from crashhunt.guide import (
     describe_api,
     describe_commands,
+    describe_json,
     describe_keys,
     describe_modules,
     find_page,
@@ -152,6 +153,14 @@ def test_the_keys_are_those_of_the_files():
         assert suite.count(f"- `{key}`: ") == 1
 
 
+def test_keys_of_outputs_are_those_of_the_schemas():
+    text = describe_json()
+    assert '{"commit": string|null, "subject", "candidates": [], "tried": {…:\n' in text  # of bisect
+    assert '"warnings": [], "kept?"}]}' in text  # of corpus run: a key that may be missing
+    assert '"training": [{"id", "hunt", "path", "seed"}], "held_out": [{as "training"}]' in text
+    assert '"certain": {"low": number|null, "high": number|null}|null, "estimated": {"low"' in " ".join(text.split())
+
+
 def test_every_module_is_listed_with_what_it_is_about():
     text = describe_modules()
     package = Path(crashhunt.__file__).parent
@@ -189,7 +198,7 @@ def test_a_topic_that_is_none_is_refused_from_python_too():
 
 
 def test_what_represents_the_reference_in_the_file_is_not_shown():
-    for topic in ("commands", "api", "toml", "modules"):
+    for topic in ("commands", "api", "json", "toml", "modules"):
         page = find_page(topic)
         assert "shows them" in page.file.read_text()
         assert "shows them" not in page.text(make_parser())
