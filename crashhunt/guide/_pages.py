@@ -33,16 +33,16 @@ _PAGE_ORDER = [
     "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
     "kinds-of-crashes", "fault", "judge", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
-    "criticality", "at-fault", "determinism", "search", "counterfactuals", "crash-rates",
+    "criticality", "determinism", "search", "counterfactuals", "crash-rates",
     "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "security",
-    "disturbance-kinds", "forks", "fault-rules", "minimization", "export", "clusters",
+    "disturbance-kinds", "forks", "minimization", "export", "clusters",
     "gallery", "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
 """Topics in reading order; all other topics follow them."""
 
 _FORMER_PAGES = {
     "first-hunt": "find-a-crash", "causes": "judge", "omissions": "judge", "what-if": "judge", "from-a-map": "map",
-    "train-on-crashes": "train", "learn-from-crashes": "train",
+    "train-on-crashes": "train", "learn-from-crashes": "train", "at-fault": "fault", "fault-rules": "fault",
 }  # fmt: skip
 """Topics that were renamed, and their present names: `crashhunt guide` still takes them."""
 
