@@ -36,8 +36,8 @@ CRASHES = {
 INTRODUCTION = """\
 # Crash gallery
 
-Ten crashes of ten scenarios that crashhunt includes. Each command finds the crash that its film shows. The sentences
-below the films are from `crashhunt show`. `scripts/tools/gallery` runs the commands and writes this page.
+Ten scenarios that crashhunt includes: each command finds the crash of its film. The sentences are from `crashhunt
+show`. `scripts/tools/gallery` runs the commands and writes this page.
 """
 
 
@@ -94,15 +94,12 @@ def exhibit(scenario: str, folder: Path) -> Exhibit:
 
 def page(exhibits: list[Exhibit]) -> str:
     """Return the page of the guide."""
-    parts = [INTRODUCTION]
-    for shown in exhibits:
-        picture = f"../../.github/images/gallery/{shown.scenario}.gif"
-        parts.append(
-            f"## {shown.title}\n\n![The last seconds of a crash in the scenario {shown.scenario}]({picture})\n\n"
-            f"> {shown.verdict}\n\n<!-- not run: scripts/tools/gallery runs it -->\n"
-            f"```console\n$ {shown.command}\n```\n"
-        )
-    return "\n".join(parts)
+    rows = [
+        f"| ![{shown.scenario}](../../.github/images/gallery/{shown.scenario}.gif) | **{shown.title}.** {shown.verdict} "
+        f"`{shown.command}` |\n"
+        for shown in exhibits
+    ]
+    return f"{INTRODUCTION}\n| film | crash, command |\n| --- | --- |\n{''.join(rows)}"
 
 
 def main(names: list[str]) -> None:
