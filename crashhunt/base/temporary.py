@@ -90,6 +90,7 @@ _WRITTEN_MEANWHILE = "another process has written there in the meantime"
 _BOOT_ID = "/proc/sys/kernel/random/boot_id"
 _NAMESPACE_FOLDER = "/proc/self/ns"  # of PIDs since Linux 3.8, of times since 5.6
 _BOOT_DIGITS = 12
+_MAX_READ_BYTES = 4096  # of a file of the kernel, which has some hundred
 _UNKNOWN_BOOT = "0" * _BOOT_DIGITS  # where there is no /proc: such an owner counts as alive
 _TOKEN = re.compile(r"(?<![0-9])([0-9]{1,10})-([0-9]{1,20})-([0-9a-f]{12})-([0-9a-f]{8})(?![0-9a-f])")
 
@@ -123,23 +124,46 @@ def this_process() -> OwnerProcess:
 
 @cache
 def _owner(pid: int) -> OwnerProcess:
+    unknown = OwnerProcess(pid=pid, started=0, boot=_UNKNOWN_BOOT, namespace="0" * 8)
+    boot = _boot()
     try:
-        boot = Path(_BOOT_ID).read_text(encoding="ascii").replace("-", "")[:_BOOT_DIGITS]
         names = [_namespace(kind) for kind in ("pid", "time")]
-    except (OSError, UnicodeError):
-        return OwnerProcess(pid=pid, started=0, boot=_UNKNOWN_BOOT, namespace="0" * 8)
+    except OSError:
+        return unknown
     started = start_time(pid)
-    if started <= 0 or len(boot) < _BOOT_DIGITS:
-        return OwnerProcess(pid=pid, started=0, boot=_UNKNOWN_BOOT, namespace="0" * 8)
+    if started <= 0 or boot == _UNKNOWN_BOOT:
+        return unknown
     return OwnerProcess(pid=pid, started=started, boot=boot, namespace=f"{zlib.crc32(' '.join(names).encode()):08x}")
+
+
+@cache
+def _boot() -> str:
+    """Return the first digits of the kernel's boot id, which forks of this process do not read again."""
+    try:
+        boot = _read(_BOOT_ID).decode("ascii").replace("-", "")[:_BOOT_DIGITS]
+    except (OSError, UnicodeError):
+        return _UNKNOWN_BOOT
+    return boot if len(boot) == _BOOT_DIGITS else _UNKNOWN_BOOT
 
 
 def _namespace(kind: str) -> str:
     """Return the identifier of a namespace of this process; empty if the kernel has no namespaces of this kind."""
     try:
-        return str(Path(_NAMESPACE_FOLDER, kind).readlink())
+        return os.readlink(f"{_NAMESPACE_FOLDER}/{kind}")  # noqa: PTH115 - once for each trial, as `_read`
     except FileNotFoundError:
         return ""
+
+
+def _read(path: str) -> bytes:
+    """Return the first bytes of a file of the kernel.
+
+    Each trial calls this function in a new fork, in which `Path.read_text` would copy 200 more pages of memory.
+    """
+    file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        return os.read(file, _MAX_READ_BYTES)
+    finally:
+        os.close(file)
 
 
 def owner_in(name: str) -> OwnerProcess | None:
@@ -169,9 +193,9 @@ def start_time(pid: int) -> int:
         The start time; 0 if the process does not exist or only a zombie is left, -1 if the system does not report it.
     """
     try:
-        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        stat = _read(f"/proc/{pid}/stat").rpartition(b")")[2].split()
         # The first thread of a process may have ended before the others: it is a zombie then, and the process is not.
-        if stat[0] in "ZX" and len(os.listdir(f"/proc/{pid}/task")) <= 1:  # noqa: PTH208 - how many is enough
+        if stat[0] in b"ZX" and len(os.listdir(f"/proc/{pid}/task")) <= 1:  # noqa: PTH208 - how many is enough
             return 0
         return int(stat[19])
     except OSError:
@@ -202,7 +226,7 @@ _SHARED_MEMORY_FOLDER = Path("/dev/shm")
 _CREATE_FLAGS = os.O_CREAT | os.O_EXCL  # with both, shm_open has made the segment
 _OPENED, _USED = "opened", "used"  # first words of lines in records; the line of a new segment begins with its device
 _CLOCK_NS = 20_000_000  # the time of a file is that of the last tick of the kernel's clock
-_recording_owner: list[OwnerProcess] = []  # of this process and its forks; else each process records for itself
+_recording_process: list[int] = []  # for this process and its forks; else each process records for itself
 _records: list[Callable[[object, object, str], None]] = []  # writes a line of a record
 _listed: list[tuple[int, frozenset[tuple[str, int]]]] = []  # time of the last change of the folder, and its files
 _before: list[frozenset[tuple[str, int]]] = []  # name and inode of the files before the trial of this process
@@ -216,9 +240,10 @@ def record_shared_memory(scratch: Path) -> None:
             folder.
     """
     folder = scratch.absolute()
+    _boot()  # here, or each fork reads it again
 
     def record(kind: object, value: object, name: str) -> None:
-        owner = _recording_owner[0] if _recording_owner else this_process()
+        owner = _owner(_recording_process[0]) if _recording_process else this_process()
         with suppress(OSError, ValueError):
             path = folder / _SHARED_MEMORY_RECORD.format(owner.token)
             # Not by open(), whose audit event would call `look` again.
@@ -265,12 +290,19 @@ def record_shared_memory(scratch: Path) -> None:
 
     vars(module)["shm_open"] = shm_open
     sys.addaudithook(look)
+    os.register_at_fork(before=_know_owner)
     _records[:] = [record]
+
+
+def _know_owner() -> None:
+    """Look up the owner of the records before this process forks, because a fork may outlive it."""
+    for pid in _recording_process:
+        _owner(pid)
 
 
 def begin_records() -> None:
     """Record shared memory of this process and its forks until this process ends, and not each fork for itself."""
-    _recording_owner[:] = [this_process()]
+    _recording_process[:] = [os.getpid()]
     _before[:] = [_shared_memory()]
 
 

@@ -414,7 +414,7 @@ class Episode(Forkable, Ending):
         except BaseException as error:
             return self._fail_in_set_up(error)
         for oracle in self._oracles:
-            if isinstance(oracle, SeesMap):
+            if supports(oracle, SeesMap):
                 lanes = simulator.lanes() if supports(simulator, HasMap) else ()
                 (oracle.see_map if is_ours(oracle) else _MAP_BOUNDARY.around(oracle.see_map))(lanes)
         # Oracles of a user's are asked inside a boundary; crashhunt's own fail only by a fault of crashhunt.

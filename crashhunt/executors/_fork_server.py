@@ -215,7 +215,7 @@ def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool)
     adopt_orphans()
     try:
         report = lambda importing: _send(orders, {"importing": importing})  # noqa: E731
-        imported = import_nothing(settings) if late else import_parts(settings, report)
+        imported = import_nothing(settings) if late else import_parts(settings, report, rehearses=True)
     except CrashhuntError as error:
         _send(orders, error.to_json())
         return
@@ -266,12 +266,13 @@ def _parse_request(data: bytes) -> FromForkServer:
     return said
 
 
-def fork_zygote(settings: WorkerSettings, *, late: bool = False) -> socket.socket:
+def fork_zygote(settings: WorkerSettings, *, late: bool = False, rehearses: bool = False) -> socket.socket:
     """Fork a zygote that imports the modules that trials need; return a socket to it. The zygote ends with the socket.
 
     Args:
         settings: settings of the hunt.
         late: whether each trial imports its agents itself.
+        rehearses: whether to rehearse a trial, as for `import_parts`.
 
     Raises:
         ImportKilledError: the zygote was killed during its imports, by a signal that may come from outside.
@@ -287,7 +288,7 @@ def fork_zygote(settings: WorkerSettings, *, late: bool = False) -> socket.socke
             ours.close()
             reports.close()
             die_with(parent)
-            _import_for_zygote(theirs, reported, settings, late=late)
+            _import_for_zygote(theirs, reported, settings, late=late, rehearses=rehearses)
         finally:
             os._exit(1)
     theirs.close()
@@ -298,14 +299,14 @@ def fork_zygote(settings: WorkerSettings, *, late: bool = False) -> socket.socke
 
 
 def _import_for_zygote(
-    control: socket.socket, reported: socket.socket, settings: WorkerSettings, *, late: bool
+    control: socket.socket, reported: socket.socket, settings: WorkerSettings, *, late: bool, rehearses: bool
 ) -> None:
     def report(importing: str) -> None:
         with suppress(OSError):  # the parent listens until everything has been imported, and no longer
             reported.send(json.dumps(importing).encode())
 
     try:
-        imported = import_nothing(settings) if late else import_parts(settings, report)
+        imported = import_nothing(settings) if late else import_parts(settings, report, rehearses=rehearses)
     except CrashhuntError as error:
         control.sendall(json.dumps(error.to_json()).encode() + b"\n")
         imported = None

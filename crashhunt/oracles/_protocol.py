@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
+from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError, CrashhuntError, UsageError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.plugins import locate
@@ -136,7 +137,7 @@ class OracleChoice:
         """
         try:
             made = self.factory(**self.arguments)
-            if isinstance(made, BringsOutcomes):
+            if supports(made, BringsOutcomes):
                 for name, category in made.outcomes.items():
                     Outcome.own(name, category)
         except CrashhuntError:

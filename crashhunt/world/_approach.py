@@ -76,6 +76,8 @@ class ApproachMeter:
     def measure(self, frames: Sequence[Frame]) -> None:
         """Measure further scenes, and update the closest approach."""
         for agent in self._agents:
+            if not any(agent in frame.roster.index for frame in frames):
+                continue  # quickly: an environment whose scenes have no actors may run thousands of short trials
             closest = self.closest
             times, gaps, brakes = approaches(frames, agent, closest, only_best=True)
             self.closest = ClosestApproach(

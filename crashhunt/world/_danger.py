@@ -125,6 +125,8 @@ class DangerMeter:
     def _summed(self, until: int) -> dict[str, float | None]:
         sums = dict(self._sums)
         for agent, before in self._sums.items():
+            if not any(agent in frame.roster.index for frame in self._frames):
+                continue
             # Actors that the agent does not touch add nothing to the sum.
             measured = _measured(self._frames, agent, self._dt, Reach(AHEAD_M, _BEHIND_M, _UNKNOWN_M))
             if measured is not None:

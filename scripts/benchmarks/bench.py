@@ -100,7 +100,7 @@ class Slot:
 
         os.environ.update(worker_environment())
         before = set(children_of(os.getpid()))
-        self._supervisor = Supervisor(settings, fork_zygote(settings))
+        self._supervisor = Supervisor(settings, fork_zygote(settings, rehearses=True))
         (self.zygote,) = set(children_of(os.getpid())) - before
 
     def run(self, spec: TrialSpec) -> TrialResult:
@@ -382,11 +382,51 @@ def bench_parallel() -> Iterator[Figure]:
     )
 
 
+def child_price() -> dict[str, float]:
+    """CPU time of trials of one step that costs nothing, and of forks that exit at once, in turns."""
+    from crashhunt.episode import Parts, WorkerSettings
+    from crashhunt.scenario import AgentSetup, Scenario
+    from crashhunt.trial import TrialSpec
+
+    rounds, at_once = 6, 50
+    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
+    spent: dict[str, list[float]] = {"trial": [], "fork": []}
+    with folder() as scratch:
+        settings = WorkerSettings(scenario=scenario, oracles=("overlap",), crash_on=(), scratch=scratch)
+        slot = Slot(settings)
+        Parts(settings).load()  # so that a fork of this process is as large as one of the zygote
+        for number in range(rounds + 1):
+            began = slot.cpu_s()
+            for again in range(at_once):
+                trial = number * at_once + again
+                arguments = {"ego": {"speed": 8.0}}
+                slot.run(TrialSpec(number=trial, seed=trial, arguments=arguments, scenario_arguments={}, max_steps=1))
+            trials_s, before = slot.cpu_s() - began, sum(os.times()[:4])
+            for _ in range(at_once):
+                if (pid := os.fork()) == 0:
+                    os._exit(0)
+                os.waitpid(pid, 0)
+            if number:  # the first warms everything up
+                spent["trial"].append(trials_s / at_once)
+                spent["fork"].append((sum(os.times()[:4]) - before) / at_once)
+    return {name: statistics.median(seconds) for name, seconds in spent.items()}
+
+
 def bench_orchestration() -> Iterator[Figure]:
-    """What a trial costs besides its steps, with few and with many trials in the ledger."""
+    """What a trial costs besides its steps: against a bare fork, and with few and many trials in the ledger."""
     from crashhunt.ledger import Ledger
     from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
+    price = in_child("child_price")
+    note = f"CPU time: {price['trial'] * 1e3:.1f} ms a trial of one free step, {price['fork'] * 1e3:.1f} ms a bare fork"
+    yield Figure(
+        name="orchestration_forks",
+        value=price["trial"] / price["fork"],
+        unit="x",
+        better="lower",
+        target=2.5,
+        note=note,
+    )
     costs = {}
     for already in (100, 100_000):
         with folder() as place:

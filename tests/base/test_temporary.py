@@ -251,10 +251,12 @@ def test_where_a_process_does_not_know_itself_it_removes_nothing_of_others(place
 def fresh():
     """Nothing is remembered of this process, before and after."""
     temporary._owner.cache_clear()
+    temporary._boot.cache_clear()
     try:
         yield
     finally:
         temporary._owner.cache_clear()
+        temporary._boot.cache_clear()
 
 
 def ended() -> OwnerProcess:
@@ -775,3 +777,11 @@ def test_existing_folder_stays_itself_and_receives_the_contents(tmp_path, monkey
     with pytest.raises(FileExistsError, match="another process has written there"), new_folder(Path()) as building:
         (building / "folder").touch()
     assert (place / "folder").is_dir()
+
+
+def test_owner_of_records_is_known_before_a_fork_that_may_outlive_it(monkeypatch):
+    with monkeypatch.context() as patched, fresh():
+        patched.setattr(temporary, "_recording_process", [os.getpid()])
+        temporary._know_owner()
+        patched.setattr(temporary, "start_time", lambda _: 0)  # the process of the trial has ended
+        assert temporary._owner(os.getpid()).started > 0

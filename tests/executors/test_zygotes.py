@@ -15,7 +15,7 @@ import pytest
 from crashhunt.base import forks
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import stage_of
-from crashhunt.executors import _fork_server, _time_limits, _zygote
+from crashhunt.executors import _fork_server, _rehearsal, _time_limits, _zygote
 from crashhunt.executors._time_limits import ImportKilledError
 from crashhunt.executors._zygote import Imported, WarmTraffics
 from crashhunt.trial import TrialSpec
@@ -541,7 +541,7 @@ def test_import_that_ends_its_process_or_hangs_is_named(imports, monkeypatch):
 @pytest.fixture
 def template(monkeypatch):
     """What a template or a fork server is made of: `imported` is the result of its imports, or its error."""
-    found = SimpleNamespace(imported="imported", late=[], forked=0, called=[], orphans=[], signals=[])
+    found = SimpleNamespace(imported="imported", late=[], rehearsed=0, forked=0, called=[], orphans=[], signals=[])
     made = []
 
     class Tracked(socket.socket):
@@ -554,7 +554,8 @@ def template(monkeypatch):
     monkeypatch.setattr(socket, "socket", Tracked)
     found.pool, found.orders = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
-    def imports(settings, report=None):
+    def imports(settings, report=None, *, rehearses=False):
+        found.rehearsed += rehearses
         if report:
             report("a module")
         found.late.append(report is None)
@@ -613,6 +614,7 @@ def test_template_reports_imports_and_readiness(template, monkeypatch):
     template.imported = None
     _fork_server._be_template(template.orders, "settings", late=False)
     assert sent(template.pool) == [{"importing": "a module"}, {"unfit": True}]
+    assert template.rehearsed == 1
     template.imported = CrashhuntError("no planner", fix="write one")
     _fork_server._be_template(template.orders, "settings", late=True)
     assert sent(template.pool) == [template.imported.to_json()]
@@ -664,6 +666,7 @@ def test_fork_zygote_imports_early_by_default(template):
     with pytest.raises(Left):
         _fork_server.fork_zygote(SimpleNamespace(timeout_s=9.0))
     assert template.late == [False]
+    assert template.rehearsed == 0  # a replay runs one trial, and would wait for ten
 
 
 def test_imports_of_a_new_process_are_reported_with_their_error(template):
@@ -673,7 +676,7 @@ def test_imports_of_a_new_process_are_reported_with_their_error(template):
             reports, reported = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with reports, reported:
                 template.imported = imported
-                _fork_server._import_for_zygote(theirs, reported, "settings", late=False)
+                _fork_server._import_for_zygote(theirs, reported, "settings", late=False, rehearses=False)
                 assert sent(control) == [said or imported.to_json()]
                 assert sent(reports) == ["a module", ""]
                 assert reported.fileno() == -1
@@ -803,6 +806,28 @@ def test_traffic_is_that_of_seed_and_arguments_of_the_scenario():
     assert _zygote._traffic_key(spec(1, a=1, b=2)) == _zygote._traffic_key(spec(1, b=2, a=1))
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_rehearsal_comes_before_the_imports_and_leaves_nothing(tmp_path, monkeypatch, fails):
+    said = []
+    settings = SimpleNamespace(scenario=SimpleNamespace(backend=SimpleNamespace(forkable=True)), scratch=tmp_path)
+    parts = SimpleNamespace(load=lambda report: report(f"a module, {len(rehearsed)} rehearsals"))
+    rehearsed = []
+    run = _rehearsal.run_episode
+
+    def run_episode(*given, **options):
+        rehearsed.append(given)
+        if fails:
+            raise RuntimeError("whatever it is")
+        return run(*given, **options)
+
+    monkeypatch.setattr(_rehearsal, "run_episode", run_episode)
+    monkeypatch.setattr(_zygote, "Parts", lambda _: parts)
+    monkeypatch.setattr(_zygote, "_can_be_forked", lambda: True)
+    assert _zygote.import_parts(settings, said.append, rehearses=True) is not None
+    assert said[:2] == ["Gymnasium cannot be imported", f"a module, {1 if fails else 10} rehearsals"]
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("forkable", "forks_well", "makes"), [(True, None, True), (False, True, True), (False, False, False)]
 )
@@ -810,10 +835,11 @@ def test_imports_decide_who_makes_the_simulator(monkeypatch, forkable, forks_wel
     said = []
     backend = SimpleNamespace(forkable=forkable)
     settings = SimpleNamespace(scenario=SimpleNamespace(backend=backend, simulator="toy"))
-    monkeypatch.setattr(_zygote, "loaded", lambda given, report: report("a module") or "parts")
-    monkeypatch.setattr(_zygote, "_is_forkable_with", lambda parts: forks_well if parts == "parts" else None)
+    parts = SimpleNamespace(load=lambda report: report("a module"))
+    monkeypatch.setattr(_zygote, "Parts", lambda given: parts if given is settings else None)
+    monkeypatch.setattr(_zygote, "_is_forkable_with", lambda given: forks_well if given is parts else None)
     monkeypatch.setattr(_zygote, "_can_be_forked", lambda: True)
-    assert _zygote.import_parts(settings, said.append) == Imported("parts", makes_simulator=makes)
+    assert _zygote.import_parts(settings, said.append) == Imported(parts, makes_simulator=makes)
     assert said == ["a module", "the simulator cannot be made", ""]
     monkeypatch.setattr(_zygote, "_can_be_forked", lambda: False)
     assert _zygote.import_parts(settings, said.append) is None
