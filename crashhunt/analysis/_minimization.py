@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.analysis._shrink_runs import Runs, is_same
 from crashhunt.analysis._shrink_stages import Ended, Form, Minimizer
 from crashhunt.base import layout
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.base.files import put_in_place, sync_folder
 from crashhunt.base.temporary import temporary_beside, temporary_folder
-from crashhunt.crashes import is_bundle_made_here, signature_of, write_bundle
+from crashhunt.crashes import Bundle, is_bundle_made_here, signature_of, write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import read_map, run_alone
 from crashhunt.plans import takes_of
 from crashhunt.replays import ReplayOptions, confirm, prepare
-from crashhunt.trial import Outcome
+from crashhunt.trial import Outcome, Value
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
     from pathlib import Path
 
-    from crashhunt.base.codec import JsonObject
     from crashhunt.base.progress import Watch
-    from crashhunt.crashes import Bundle, Signature
+    from crashhunt.crashes import Signature
     from crashhunt.replays import Rerun
-    from crashhunt.trial import TrialSpec, Value
+    from crashhunt.trial import TrialSpec
 
 __all__ = ["Shrunk", "shrink", "shrunk_name"]
 
@@ -37,7 +38,7 @@ _DISK_FIX = "free some space and run the same command again, which reuses the re
 
 
 @dataclass(frozen=True, slots=True)
-class Shrunk:
+class Shrunk(Serializable):
     """The result of a minimization.
 
     Args:
@@ -70,6 +71,13 @@ class Shrunk:
     steps_cut: int = 0
     notes: tuple[str, ...] = ()
 
+    json_keys = (
+        "crash=bundle.id", "path=small.path", "verdict", "ended", "why", "signature_kept", "confirmed=after.confirmed",
+        "actors_before=actors.0", "actors_after=actors.1", "steps_before=bundle.result.steps",
+        "steps_after=after.result.steps", "trials_run=trials", "steps_run=steps", "removed", "changed", "scripted",
+        "steps_cut", "notes",
+    )  # fmt: skip
+
     @property
     def others(self) -> tuple[int, int]:
         """The number of actors other than the agents, before and after the minimization."""
@@ -82,29 +90,15 @@ class Shrunk:
         script = self.small.result.spec.script if self.small is not None else None
         return None if script is None else script.names
 
-    def to_json(self) -> JsonObject:
-        """Return the result in the form that ``shrink --json`` prints."""
-        after = self.small or self.bundle
-        return {
-            "crash": self.bundle.id,
-            "path": str(self.small.path) if self.small else None,
-            "verdict": self.verdict,
-            "ended": self.ended,
-            "why": self.why,
-            "signature_kept": self.verdict != "not_reproduced",
-            "confirmed": after.confirmed,
-            "actors_before": self.actors[0],
-            "actors_after": self.actors[1],
-            "steps_before": self.bundle.result.steps,
-            "steps_after": after.result.steps,
-            "trials_run": self.trials,
-            "steps_run": self.steps,
-            "removed": list(self.removed),
-            "changed": {name: list(values) for name, values in self.changed.items()},
-            "scripted": None if self.scripted is None else list(self.scripted),
-            "steps_cut": self.steps_cut,
-            "notes": list(self.notes),
-        }
+    @property
+    def after(self) -> Bundle:
+        """The minimized crash; the crash itself if it could not be made smaller."""
+        return self.small or self.bundle
+
+    @property
+    def signature_kept(self) -> bool:
+        """Whether the result has the crash type of the crash."""
+        return self.verdict != "not_reproduced"
 
 
 def shrunk_name(crash: str) -> str:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence, Set as AbstractSet
+from contextlib import suppress
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -60,6 +61,7 @@ __all__ = [
     "merged",
     "not_understood",
     "null_is",
+    "plain",
     "plain_types",
     "prepare",
     "required_in",
@@ -68,6 +70,7 @@ __all__ = [
     "to_plain",
     "typed_where_there",
     "written_if",
+    "written_keys",
 ]
 
 JsonObject: TypeAlias = dict[str, Any]
@@ -96,7 +99,11 @@ class Serializable:
     __slots__ = ()
 
     json_keys: ClassVar[tuple[str, ...]] = ()
-    """The fields and properties that are written, in this order; by default all fields. ``NAME?``: not where None."""
+    """The fields and properties that are written, in this order; by default all fields.
+
+    ``KEY?`` is not written where it is None. ``KEY=PATH`` writes an attribute of another name, or of an object inside
+    this one, such as ``crash=bundle.id`` and ``first=pair.0``; None where an object on the way is None.
+    """
 
     def to_json(self) -> JsonObject:
         """Return the object as dicts, lists, strings and numbers."""
@@ -176,16 +183,24 @@ def _hints(kind: Any) -> dict[str, Any]:
     return {item.name: eval(str(item.type), names) for item in fields(kind)}
 
 
+def _resolvable_hints(kind: Any) -> dict[str, Any]:
+    """Return the types of the fields, without those that the module imports for the type checker only."""
+    found, names = {}, vars(sys.modules[kind.__module__])
+    for item in fields(kind):
+        with suppress(NameError):
+            found[item.name] = eval(str(item.type), names)
+    return found
+
+
 @cache
 def _write_function(kind: Any) -> _Convert:
     # Made from source, as `dataclasses` makes __init__: a loop over the keys takes three times as long.
-    hints, known = _hints(kind), {item.name: item for item in fields(kind)}
+    hints, known = _resolvable_hints(kind), {item.name: item for item in fields(kind)}
     names: dict[str, object] = {}
     lines = ["def write(value):", " data = {}"]
-    for name in kind.json_keys or known:
-        key = name.removesuffix("?")
-        metadata = known[key].metadata if key in known else {}
-        convert = _finite if "null" in metadata else _writer(hints[key]) if key in hints else _plain_property
+    for key, path, is_optional in written_keys(kind):
+        metadata = known[key].metadata if key == path and key in known else {}
+        convert = _finite if "null" in metadata else _writer(hints[key]) if key == path and key in hints else plain
         condition = ""
         names |= {
             f"to_{key}": convert,
@@ -197,9 +212,12 @@ def _write_function(kind: Any) -> _Convert:
         elif "omit_default" in metadata:
             names[f"no_{key}"] = _default(known[key])
             condition = f"if value.{key} != no_{key}: "
-        elif key != name:
-            condition = f"if value.{key} is not None: "
-        held = f"value.{key}" if convert is None else f"None if value.{key} is None else to_{key}(value.{key})"
+        elif is_optional:
+            condition = f"if value.{path} is not None: "
+        held = f"value.{path}" if convert is None else f"None if value.{path} is None else to_{key}(value.{path})"
+        if "." in path:
+            names[f"to_{key}"] = _plain_at(path.split("."))
+            held = f"to_{key}(value)"
         lines.append(f" {condition}data[{key!r}] = {held}")
     exec("\n".join([*lines, " return data"]), names)
     return cast(_Convert, names["write"])
@@ -209,9 +227,43 @@ def _default(item: Field[Any]) -> object:
     return item.default_factory() if item.default_factory is not MISSING else item.default
 
 
-def _plain_property(value: object) -> object:
-    """Return the value of a property for JSON: a tuple becomes a list."""
-    return list(value) if isinstance(value, tuple) else value
+def written_keys(kind: Any) -> list[tuple[str, str, bool]]:
+    """Return the keys that `to_plain` writes, each with the path of its attribute, and whether None is not written."""
+    found = []
+    for entry in kind.json_keys or [item.name for item in fields(kind)]:
+        key, _, path = entry.partition("=")
+        name = key.removesuffix("?")
+        found.append((name, path or name, name != key))
+    return found
+
+
+def _plain_at(path: list[str]) -> _Convert:
+    def get(value: Any) -> Any:
+        for name in path:
+            value = None if value is None else value[int(name)] if name.isdigit() else getattr(value, name)
+        return plain(value)
+
+    return get
+
+
+def plain(value: object) -> Any:
+    """Return a value for JSON by its class, where no annotation of a field determines the conversion.
+
+    A named tuple becomes an object, and null replaces a number that is not finite.
+    """
+    if isinstance(value, Serializable):
+        return value.to_json()
+    if isinstance(value, Enum | Path):
+        return str(value)
+    if isinstance(value, float):
+        return _finite(value)
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return plain(value._asdict())
+    if isinstance(value, Mapping):
+        return {str(key): plain(held) for key, held in value.items()}
+    if isinstance(value, AbstractSet):
+        return sorted(map(plain, value))
+    return [plain(held) for held in value] if isinstance(value, list | tuple) else value
 
 
 def _finite(value: float) -> float | None:
@@ -221,6 +273,8 @@ def _finite(value: float) -> float | None:
 def _writer(hint: Any) -> _Convert | None:
     """Return the function that converts values of a type to JSON data; None if they need no conversion."""
     kind, inner = _kind_of(hint)
+    if issubclass(kind, tuple) and hasattr(kind, "_fields"):
+        return plain
     of_item = _writer(inner[-1 if issubclass(kind, Mapping) else 0]) if inner else None
     if issubclass(kind, Mapping):
         return dict if of_item is None else _of_values(of_item)

@@ -55,7 +55,7 @@ def _trust(options: argparse.Namespace, _words: list[str]) -> int:
         for origin in removed:
             say(f"no longer trusted: {_line(origin)}", as_json=options.json)
         if options.json:
-            print(json.dumps({"removed": [_data(origin) for origin in removed]}))
+            print(json.dumps({"removed": [origin.to_json() for origin in removed]}))
         return 0
     if options.places:
         found = {origin.fingerprint: origin for place in options.places for origin in _trust_place(place)}
@@ -68,7 +68,7 @@ def _trust(options: argparse.Namespace, _words: list[str]) -> int:
         if not found:
             say("You trust no code besides what you made on this machine.", as_json=options.json)
     if options.json:
-        print(json.dumps({"trusted": [_data(origin) for origin in found.values()]}))
+        print(json.dumps({"trusted": [origin.to_json() for origin in found.values()]}))
     return 0
 
 
@@ -107,9 +107,3 @@ def _trust_place(place: Path) -> list[TrustedOrigin]:
 
 def _line(origin: TrustedOrigin) -> str:
     return f"{origin.id}  {origin.trusted_at}  {command_line(origin.path)}: {origin.runs}"
-
-
-def _data(origin: TrustedOrigin) -> dict[str, str]:
-    return {
-        "fingerprint": origin.fingerprint, "path": origin.path, "runs": origin.runs, "trusted_at": origin.trusted_at
-    }  # fmt: skip

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections import deque
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
-from crashhunt.base.codec import OMIT_DEFAULT, Serializable
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.base.text import command_line, in_lines, one_line
@@ -65,9 +65,9 @@ class CaseReport(Serializable):
     now: str = ""
     note: str = ""
     warnings: tuple[str, ...] = ()
-    kept: Path | None = field(default=None, metadata=OMIT_DEFAULT)
+    kept: Path | None = None
 
-    json_keys = ("path", "expected", "got", "ok", "may_be_tightened", "was", "now", "warnings", "kept")
+    json_keys = ("path", "expected", "got", "ok", "may_be_tightened", "was", "now", "warnings", "kept?")
 
     @property
     def ok(self) -> bool:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.git import git_directory, tracked_files, work_tree
@@ -64,7 +65,7 @@ _MIN_FINGERPRINT_CHARACTERS = 6  # characters of a fingerprint that name an orig
 
 
 @dataclass(frozen=True, slots=True)
-class TrustedOrigin:
+class TrustedOrigin(Serializable):
     """Code that this user has decided to trust.
 
     Args:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from crashhunt.base import layout
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.crashes._contact_record import SAME_WAY, contact_record
 from crashhunt.snapshots import Snapshot
@@ -18,7 +19,6 @@ from crashhunt.world import STANDS_MPS, is_person
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle
     from crashhunt.crashes._contact_record import ContactRecord
     from crashhunt.recording import Recording
@@ -57,7 +57,7 @@ _RED_S = 8.0  # s: a vehicle that ran a red light has left the junction after th
 
 
 @dataclass(frozen=True, slots=True)
-class FaultFinding:
+class FaultFinding(Serializable):
     """The verdict of a fault rule.
 
     Args:
@@ -71,6 +71,13 @@ class FaultFinding:
     blames: Blame
     words: str
     source: str
+
+    json_keys = ("rule", "blames=blamed", "words", "source")
+
+    @property
+    def blamed(self) -> Verdict:
+        """The party at fault, in the words of a `Verdict`."""
+        return _VERDICT_BY_ACTOR[self.blames]
 
 
 def safe_gap_m(speed: float, ahead: float) -> float:
@@ -340,7 +347,7 @@ _DECISIVE_RULES = ("red light", "wrong way")
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class Fault(Serializable):
     """The vehicle at fault for a crash.
 
     Args:
@@ -351,20 +358,12 @@ class Fault:
     verdict: Verdict
     findings: tuple[FaultFinding, ...] = ()
 
+    json_keys = ("verdict", "findings")
+
     @property
     def is_egos(self) -> bool:
         """Return whether the agent was at fault, alone or together with the other actor."""
         return self.verdict in ("ego", "both")
-
-    def to_json(self) -> JsonObject:
-        """Return the fault as JSON-compatible data."""
-        return {
-            "verdict": self.verdict,
-            "findings": [
-                {"rule": one.rule, "blames": _VERDICT_BY_ACTOR[one.blames], "words": one.words, "source": one.source}
-                for one in self.findings
-            ],
-        }
 
 
 def fault_of(bundle: Bundle, recording: Recording | None = None, record: ContactRecord | None = None) -> Fault:

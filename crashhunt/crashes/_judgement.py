@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from crashhunt.base.codec import JsonObject, Serializable
+from crashhunt.base.codec import Serializable
 from crashhunt.base.integrity import typed
+from crashhunt.crashes._last_avoidable_step import Ending
 from crashhunt.crashes._omission import Reference, Without
 from crashhunt.trial import Value
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from crashhunt.crashes._bundle import Bundle
-    from crashhunt.crashes._last_avoidable_step import Ending
 
 
 __all__ = [
@@ -191,7 +190,7 @@ avoidable, so the trial says nothing about the agent. The verdict ``unknown`` me
 
 
 @dataclass(frozen=True, slots=True)
-class Attempt:
+class Attempt(Serializable):
     """One evasive manoeuvre, tried from several steps on.
 
     Args:
@@ -208,6 +207,11 @@ class Attempt:
     endings: Mapping[int, Ending]
     deceleration: float | None = None
     changed: tuple[str, ...] = ()
+
+    json_keys = (
+        "manoeuvre", "endings=endings_by_step", "last_step", "too_late_step", "all_later_run", "deceleration",
+        "changed",
+    )  # fmt: skip
 
     @property
     def last_step(self) -> int | None:
@@ -232,21 +236,14 @@ class Attempt:
         """Return whether the runs from this step and from every later step up to the crash were made and crashed."""
         return all(self.endings.get(each) in ("hit", "other") for each in range(step, self.end))
 
-    def to_json(self) -> JsonObject:
-        """Return the attempt as JSON-compatible data."""
-        return {
-            "manoeuvre": self.manoeuvre,
-            "endings": {str(step): self.endings[step] for step in sorted(self.endings)},
-            "last_step": self.last_step,
-            "too_late_step": self.too_late_step,
-            "all_later_run": self.all_later_run,
-            "deceleration": self.deceleration,
-            "changed": list(self.changed),
-        }
+    @property
+    def endings_by_step(self) -> dict[str, Ending]:
+        """The endings in the order of the steps, for JSON."""
+        return {str(step): self.endings[step] for step in sorted(self.endings)}
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class Judgement(Serializable):
     """The results for all evasive manoeuvres of the agent; every result comes from a run.
 
     Args:
@@ -263,6 +260,11 @@ class Judgement:
     why: Why | None = None
     visible_step: int | None = None
     reference: Reference | None = None
+
+    json_keys = (
+        "avoidable", "manoeuvre", "last_step=best.last_step", "runs", "why_not", "attempts", "verdict", "visible_step",
+        "why?", "reference?",
+    )  # fmt: skip
 
     @property
     def verdict(self) -> JudgementVerdict:
@@ -302,24 +304,10 @@ class Judgement:
         settled = all(ending in ("hit", "other") for attempt in self.attempts for ending in attempt.endings.values())
         return False if from_the_first and all(from_the_first) and settled and not self.why_not else None
 
-    def to_json(self) -> JsonObject:
-        """Return the judgement as JSON-compatible data."""
-        best = self.best
-        found: JsonObject = {
-            "avoidable": self.avoidable,
-            "manoeuvre": best.manoeuvre if best else "",
-            "last_step": best.last_step if best else None,
-            "runs": self.runs,
-            "why_not": self.why_not,
-            "attempts": [attempt.to_json() for attempt in self.attempts],
-            "verdict": self.verdict,
-            "visible_step": self.visible_step,
-        }
-        if self.why is not None:
-            found["why"] = self.why.to_json()
-        if self.reference is not None:
-            found["reference"] = self.reference.to_json()
-        return found
+    @property
+    def manoeuvre(self) -> str:
+        """The name of the manoeuvre that avoids the crash from the latest step; empty if there is none."""
+        return self.best.manoeuvre if self.best else ""
 
 
 def judgement_of(bundle: Bundle) -> Judgement | None:

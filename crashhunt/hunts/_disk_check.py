@@ -6,10 +6,11 @@ import json
 import shutil
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, cast
 
 from crashhunt.base import layout
-from crashhunt.base.codec import JsonObject, Serializable
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError, remedy
 from crashhunt.base.files import cannot_write, is_empty_folder, sync_folder, sync_tree
 from crashhunt.base.resources import error_of_next_files, limit_behind
@@ -23,7 +24,6 @@ from crashhunt.trial import TrialResult
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from crashhunt.ledger import Noted, Row
 
@@ -55,7 +55,7 @@ class CheckFinding(Serializable):
 
 
 @dataclass(slots=True)
-class Checked:
+class Checked(Serializable):
     """The result of the check of a hunt, a crash or an exported crash.
 
     Args:
@@ -72,7 +72,7 @@ class Checked:
     """
 
     dir: Path
-    kind: str = "hunt"
+    kind: Literal["hunt", "crash", "file"] = "hunt"
     protected: bool = True
     trials: set[int] = field(default_factory=set)
     damaged_trials: set[int] = field(default_factory=set)
@@ -81,6 +81,11 @@ class Checked:
     damaged_crashes: list[str] = field(default_factory=list)
     findings: list[CheckFinding] = field(default_factory=list)
     dropped: set[int] = field(default_factory=set)
+
+    json_keys = (
+        "dir", "kind", "fine", "protected", "trials=trial_count", "damaged_trials", "crashes", "damaged_crashes",
+        "findings",
+    )  # fmt: skip
 
     @property
     def minimized(self) -> int:
@@ -97,19 +102,10 @@ class Checked:
         """Whether no data are damaged."""
         return not any(finding.damaged for finding in self.findings)
 
-    def to_json(self) -> JsonObject:
-        """Return the result for one hunt in the form that ``check --json`` prints."""
-        return {
-            "dir": str(self.dir),
-            "kind": self.kind,
-            "fine": self.fine,
-            "protected": self.protected,
-            "trials": len(self.trials),
-            "damaged_trials": sorted(self.damaged_trials),
-            "crashes": self.crashes,
-            "damaged_crashes": self.damaged_crashes,
-            "findings": [finding.to_json() for finding in self.findings],
-        }
+    @property
+    def trial_count(self) -> int:
+        """The number of trials whose rows are unchanged."""
+        return len(self.trials)
 
 
 def check(directory: Path) -> list[Checked]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
-from crashhunt.base.codec import known_values
+from crashhunt.base.codec import Serializable, known_values
 from crashhunt.world import Roster
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ class Reading:
 
 
 @dataclass(frozen=True, slots=True)
-class Divergence:
+class Divergence(Serializable):
     """The first difference between a recording and its replay.
 
     Args:

@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError, UsageError
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.episode import scratch_of
 from crashhunt.executors import run_alone
 from crashhunt.plans import load_order_change
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, read_black_box, values_around
-from crashhunt.replays._prepare import ReplayOptions, prepare
+from crashhunt.replays._prepare import ReplayOptions, Rerun, prepare
 from crashhunt.snapshots import environment_changes
-from crashhunt.trial import Outcome
+from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
-    from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle
     from crashhunt.executors import SharedExecutors
     from crashhunt.recording import AgentChannel, Prologue
-    from crashhunt.replays._prepare import Code, Look, Rerun
-    from crashhunt.trial import TrialResult
+    from crashhunt.replays._prepare import Code, Look
 
 
 __all__ = ["ReplayReport", "Verdict", "confirm", "judged", "replay", "up_to"]
@@ -38,7 +38,7 @@ Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"
 
 
 @dataclass(frozen=True, slots=True)
-class ReplayReport:
+class ReplayReport(Serializable):
     """The result of a replay.
 
     Args:
@@ -61,6 +61,13 @@ class ReplayReport:
     reason: str = ""
     verdicts: Mapping[Verdict, int] = field(default_factory=dict)
 
+    json_keys = (
+        "crash=bundle.id", "verdict", "code=rerun.code", "steps_recorded=rerun.recorded.steps", "steps_replayed",
+        "digest_recorded=bundle.result.digest", "digest_replayed=replayed.digest", "divergence",
+        "outcome_recorded=bundle.result.outcome", "outcome_replayed=replayed.outcome", "reason", "edits=rerun.edits",
+        "code_differences=rerun.code_differences", "warnings=rerun.warnings", "times", "agreed", "verdicts",
+    )  # fmt: skip
+
     @property
     def bundle(self) -> Bundle:
         """The bundle of the crash."""
@@ -71,27 +78,15 @@ class ReplayReport:
         """The number of completed steps of the replay."""
         return self.recording.steps
 
-    def to_json(self) -> JsonObject:
-        """Return the report in the form that ``replay --json`` prints."""
-        return {
-            "crash": self.bundle.id,
-            "verdict": self.verdict,
-            "code": self.rerun.code,
-            "steps_recorded": self.rerun.recorded.steps,
-            "steps_replayed": self.steps_replayed,
-            "digest_recorded": self.bundle.result.digest,
-            "digest_replayed": self.replayed.digest,
-            "divergence": self.divergence.to_json() if self.divergence else None,
-            "outcome_recorded": str(self.bundle.result.outcome),
-            "outcome_replayed": str(self.replayed.outcome),
-            "reason": self.reason,
-            "edits": list(self.rerun.edits),
-            "code_differences": self.rerun.code_differences,
-            "warnings": list(self.rerun.warnings),
-            "times": sum(self.verdicts.values()),
-            "agreed": self.verdicts.get("reproduced", 0),
-            "verdicts": dict(self.verdicts),
-        }
+    @property
+    def times(self) -> int:
+        """The number of replays."""
+        return sum(self.verdicts.values())
+
+    @property
+    def agreed(self) -> int:
+        """The number of replays that reproduced the crash."""
+        return self.verdicts.get("reproduced", 0)
 
 
 def judged(
@@ -264,7 +259,13 @@ def confirm(
     except UntrustedError:  # which says nothing about the crash
         raise
     except _NotSetUpError as error:
-        failure: JsonObject = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": str(error)}
+        failure: dict[str, object] = {
+            "step": 0,
+            "agent": "",
+            "field": "replay",
+            "recorded": None,
+            "replayed": str(error),
+        }
         return replace(bundle, confirmed=False, divergence=failure, why_unconfirmed="")
     except CrashhuntError as error:  # it did not take place, or not to its end
         return replace(bundle, confirmed=None, divergence=None, why_unconfirmed=error.message)

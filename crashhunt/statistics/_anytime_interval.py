@@ -38,7 +38,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -61,6 +61,9 @@ _PRECISION = 1e-9  # relative, of both ends
 _MAX_EXPOSURES = 512  # different ones; more are spread over the grid
 _MAX_EVENTS = 8  # different numbers of events where exposures are spread
 _GRID_PARTS = 256  # parts of the greatest exposure
+
+
+BarVerdict = Literal["below", "above", "undecided"]
 
 
 class Interval(NamedTuple):
@@ -255,7 +258,7 @@ class RateTest:
                 outside = middle
         return outside
 
-    def verdict(self, bar: float, alpha: float = 0.05) -> str:
+    def verdict(self, bar: float, alpha: float = 0.05) -> BarVerdict:
         """Return ``below`` or ``above`` if the interval lies on one side of a threshold, else ``undecided``."""
         if self.exposure <= 0 or self.log_evidence(bar) < -math.log(alpha):
             return "undecided"

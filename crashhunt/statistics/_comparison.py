@@ -12,16 +12,16 @@ import json
 import math
 from collections import Counter
 from contextlib import closing
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Literal, TextIO
 
 import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
+from crashhunt.base.codec import Serializable, null_is
 from crashhunt.base.errors import HuntDirectoryError, UsageError
-from crashhunt.base.json_types import finite_values
 from crashhunt.base.text import count_of, one_of
 from crashhunt.ledger import Ledger
 from crashhunt.results import HuntResults
@@ -30,7 +30,7 @@ from crashhunt.statistics._hunt_rate import measure_rates
 from crashhunt.statistics._paired_rates import difference_of_rates
 from crashhunt.statistics._paired_test import PairSequence, PairTest
 from crashhunt.statistics._rate_of_running_hunt import counting_rule
-from crashhunt.statistics._units import PER_WORDS, PERS, facts_of_plain
+from crashhunt.statistics._units import PER_WORDS, PERS, Per, facts_of_plain
 from crashhunt.training import HeldOutTraffics, held_out_traffics
 from crashhunt.trial import Constant, Outcome
 
@@ -43,17 +43,18 @@ if TYPE_CHECKING:
     from crashhunt.plans import HuntSettings
     from crashhunt.statistics._crash_rate import CrashRate
     from crashhunt.statistics._paired_test import Pair as TrialPair
-    from crashhunt.statistics._units import CountingRule, Per, TrialFacts
+    from crashhunt.statistics._units import CountingRule, TrialFacts
     from crashhunt.training import TrainedOn
 
 __all__ = ["Comparison", "HuntFigures", "Pair", "compare", "held_out_by_seed", "why_unpaired"]
 
+Answer = Literal["first", "second", "undecided", ""]
 _CONFIDENCE = 0.95
 _ALPHA = 1 - _CONFIDENCE
 
 
 @dataclass(frozen=True, slots=True)
-class HuntFigures:
+class HuntFigures(Serializable):
     """The figures of one hunt in a comparison.
 
     Args:
@@ -86,11 +87,11 @@ class HuntFigures:
     agents: dict[str, str]
     trials: int
     crashes: int
-    crash_rate: float
+    crash_rate: float = field(metadata=null_is(math.nan))
     interval: tuple[float, float] | None
     why_not: str
-    median_steps_to_crash: float
-    median_time_to_collision_s: float
+    median_steps_to_crash: float = field(metadata=null_is(math.nan))
+    median_time_to_collision_s: float = field(metadata=null_is(math.inf))
     outcomes: dict[str, int]
     counted: str = ""
     disturbed: int | None = None
@@ -98,9 +99,20 @@ class HuntFigures:
     exclusions: dict[str, int] = field(default_factory=dict)
     per: Per = "trial"
 
+    json_keys = (
+        "dir", "state", "agents", "trials", "crashes", "crash_rate", "interval=bounds", "why_not",
+        "median_steps_to_crash", "median_time_to_collision_s", "outcomes", "counted", "disturbed", "excluded",
+        "left_out=exclusions", "per",
+    )  # fmt: skip
+
+    @property
+    def bounds(self) -> tuple[float, float | None] | None:
+        """The interval; an infinite end becomes null in JSON."""
+        return self.interval
+
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class Pair(Serializable):
     """Comparison of two hunts.
 
     Trials with the same number, seed and traffic are compared in pairs. If there are no such trials, the crash rates of
@@ -147,17 +159,23 @@ class Pair:
     both: int
     p_value: float | None
     caution: str = ""
-    test: str = "pairs"
+    test: Literal["pairs", "intervals", ""] = "pairs"
     why_unpaired: str = ""
     counts: tuple[int, int, int, int] = (0, 0, 0, 0)
-    evidence: float | None = None
+    evidence: float | None = field(default=None, metadata=null_is(None))
     difference: Interval | None = None
     units: int = 0
     excluded: int = 0
-    answer: str = ""
+    answer: Answer = ""
     not_started: tuple[int, int] = (0, 0)
     without_result: int = 0
     per: Per = "trial"
+
+    json_keys = (
+        "first", "second", "trials", "only_first", "only_second", "both", "p_value", "caution", "test", "why_unpaired",
+        "counts", "evidence", "difference", "units", "excluded", "answer", "not_started", "without_result", "per",
+        "verdict",
+    )  # fmt: skip
 
     @property
     def verdict(self) -> str:
@@ -205,7 +223,7 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class Comparison(Serializable):
     """The comparison of several hunts.
 
     Args:
@@ -220,13 +238,6 @@ class Comparison:
     def per(self) -> Per:
         """The unit of all rates: ``trial``, ``hour`` or ``1000km``."""
         return self.hunts[0].per
-
-    def to_json(self) -> dict[str, object]:
-        """Return the comparison in the form that ``compare --json`` prints; numbers that are not finite are null."""
-        return {
-            "hunts": [_plain_figures(hunt) for hunt in self.hunts],
-            "pairs": [_plain(pair) for pair in self.pairs],
-        }
 
     def write_csv(self, out: TextIO) -> None:
         """Write one CSV line for each hunt."""
@@ -243,17 +254,6 @@ class Comparison:
     def __repr__(self) -> str:
         rates = ", ".join(f"{hunt.dir}: {hunt.crashes} of {hunt.trials}" for hunt in self.hunts)
         return f"<comparison {rates}>"
-
-
-def _plain_figures(hunt: HuntFigures) -> dict[str, object]:
-    found = finite_values(asdict(hunt))
-    found["left_out"] = found.pop("exclusions")  # as rate --json has it
-    return found
-
-
-def _plain(pair: Pair) -> dict[str, object]:
-    difference = None if pair.difference is None else finite_values(pair.difference._asdict())
-    return {**finite_values(asdict(pair)), "difference": difference, "verdict": pair.verdict}
 
 
 @clear_calls()
@@ -487,7 +487,7 @@ def _by_pairs(
     )
 
 
-def _answer_of(difference: Interval | None) -> str:
+def _answer_of(difference: Interval | None) -> Answer:
     """Return which hunt crashes less, from the interval of the difference; the only place that decides."""
     if difference is None:
         return ""

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import UsageError
-from crashhunt.statistics._units import MAX_INVALID_SHARE
+from crashhunt.statistics._anytime_interval import BarVerdict, Interval
+from crashhunt.statistics._units import MAX_INVALID_SHARE, Per
 
 if TYPE_CHECKING:
-    from crashhunt.base.codec import JsonObject
-    from crashhunt.statistics._anytime_interval import Interval
-    from crashhunt.statistics._units import Per, RateCounter, UnitSequence
+    from crashhunt.statistics._units import RateCounter, UnitSequence
 
 __all__ = ["CrashRate", "RatePart", "check_confidence", "make_rate"]
 
@@ -21,7 +20,7 @@ _MIN_CONFIDENCE, _MAX_CONFIDENCE = 50.0, 99.9999  # percent; above that, six dig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RatePart:
+class RatePart(Serializable):
     """The rate of a part of the crashes, or in a part of the trials.
 
     Args:
@@ -40,16 +39,18 @@ class RatePart:
     estimate: float | None
     certain: Interval | None
 
-    def to_json(self) -> JsonObject:
-        """Return the part as JSON-compatible data."""
-        return {
-            "by": self.by, "name": self.name, "trials": self.trials, "crashes": self.crashes,
-            "estimate": self.estimate, "certain": _plain(self.certain),
-        }  # fmt: skip
+
+@dataclass(frozen=True, slots=True)
+class Exposure(Serializable):
+    """The distance and time that the agents drove, in a number of trials."""
+
+    trials: int
+    hours: float
+    km: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CrashRate:
+class CrashRate(Serializable):
     """The crash rate of the agents of a hunt.
 
     Args:
@@ -76,7 +77,7 @@ class CrashRate:
     dir: str
     per: Per
     confidence: float
-    method: str = "plain"
+    method: Literal["plain", "rare"] = "plain"
     units: int
     crashes: int
     trials: int
@@ -89,35 +90,34 @@ class CrashRate:
     parts: tuple[RatePart, ...] = ()
     steps: int = 0
     bar: float | None = None
-    verdict: str = ""
+    verdict: BarVerdict | Literal[""] = ""
     why_undecided: str = ""
 
-    def to_json(self) -> JsonObject:
-        """Return an entry of the output of ``rate --json``; values that are not finite numbers are null."""
-        found: JsonObject = {
-            "dir": self.dir,
-            "per": self.per,
-            "confidence": self.confidence,
-            "method": self.method,
-            "units": self.units,
-            "crashes": self.crashes,
-            "exposure": {
-                "trials": self.trials,
-                "hours": self.driven_s / _S_PER_HOUR,
-                "km": self.driven_m / _M_PER_KM,
-            },
-            "estimate": self.estimate,
-            "certain": _plain(self.certain),
-            "estimated": None,
-            "why_not": self.why_not,
-            "left_out": self.excluded,
-            "parts": [part.to_json() for part in self.parts],
-            "steps": self.steps,
-            "plain_equivalent_steps": self.steps,
-        }
-        if self.bar is not None:
-            found |= {"bar": self.bar, "verdict": self.verdict}
-        return found
+    json_keys = (
+        "dir", "per", "confidence", "method", "units", "crashes", "exposure", "estimate", "certain", "estimated",
+        "why_not", "left_out=excluded", "parts", "steps", "plain_equivalent_steps", "bar?",
+        "verdict?=verdict_on_bar",
+    )  # fmt: skip
+
+    @property
+    def exposure(self) -> Exposure:
+        """The exposure of the counted trials."""
+        return Exposure(self.trials, self.driven_s / _S_PER_HOUR, self.driven_m / _M_PER_KM)
+
+    @property
+    def estimated(self) -> Interval | None:
+        """An estimated interval, which a rate from plain trials lacks."""
+        return None
+
+    @property
+    def plain_equivalent_steps(self) -> float | None:
+        """The number of steps that plain trials would need for the same result."""
+        return self.steps
+
+    @property
+    def verdict_on_bar(self) -> BarVerdict | None:
+        """The verdict; None without a threshold."""
+        return self.verdict or None
 
 
 def check_confidence(percent: float) -> None:
@@ -167,7 +167,7 @@ def make_rate(
         why_not = f"{many}, more than {MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
     alpha = 1 - confidence / 100
     certain = None if why_not else counter.interval(alpha)
-    verdict = "" if bar is None else "undecided"
+    verdict: BarVerdict | Literal[""] = "" if bar is None else "undecided"
     if bar is not None and certain is not None and counter.test is not None:
         verdict = counter.test.verdict(bar, alpha)
     excluded = {
@@ -195,9 +195,3 @@ def make_rate(
         bar=bar,
         verdict=verdict,
     )
-
-
-def _plain(interval: Interval | None) -> JsonObject | None:
-    if interval is None:
-        return None
-    return {"low": interval.low, "high": interval.high if math.isfinite(interval.high) else None}

@@ -10,9 +10,10 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.text import near_path
 from crashhunt.crashes import Bundle, list_bundles, read_bundle
@@ -56,7 +57,7 @@ def check_test_share(test: float, shown: str) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class SavedCrash:
+class SavedCrash(Serializable):
     """A saved crash, for training or for tests.
 
     Args:
@@ -66,6 +67,8 @@ class SavedCrash:
 
     bundle: Bundle
     is_test: bool
+
+    json_keys = ("id=bundle.id", "hunt=bundle.hunt", "path=bundle.path", "seed")
 
     @property
     def seed(self) -> int:
@@ -79,7 +82,7 @@ class SavedCrash:
 
 
 @dataclass(frozen=True, slots=True)
-class Split:
+class Split(Serializable):
     """Saved crashes, split into a training part and a test part.
 
     Args:
@@ -92,6 +95,8 @@ class Split:
     crashes: tuple[SavedCrash, ...]
     faults: int = 0
 
+    json_keys = ("test", "training", "held_out", "software_faults=faults")
+
     @property
     def training(self) -> tuple[SavedCrash, ...]:
         """The crashes of the training part."""
@@ -101,20 +106,6 @@ class Split:
     def held_out(self) -> tuple[SavedCrash, ...]:
         """The crashes of the test part."""
         return tuple(crash for crash in self.crashes if crash.is_test)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the split in the form that ``split --json`` prints."""
-        return {
-            "test": self.test,
-            "training": [_to_json(crash) for crash in self.training],
-            "held_out": [_to_json(crash) for crash in self.held_out],
-            "software_faults": self.faults,
-        }
-
-
-def _to_json(crash: SavedCrash) -> dict[str, Any]:
-    bundle = crash.bundle
-    return {"id": bundle.id, "hunt": str(bundle.hunt), "path": str(bundle.path), "seed": crash.seed}
 
 
 def split_crashes(places: Iterable[Path | str], test: float) -> Split:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal, NotRequired, TypedDict
+from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
 
 import json_schemas
 import jsonschema
@@ -21,6 +21,7 @@ from crashhunt.base.schemas import describe_type, json_schema
 from crashhunt.cli import make_parser
 from crashhunt.guide import find_page
 from crashhunt.guide._schemas import SCHEMAS, describe_schemas
+from crashhunt.trial import Outcome
 
 
 class Colour(StrEnum):
@@ -30,6 +31,10 @@ class Colour(StrEnum):
 class Shape(TypedDict):
     name: str
     sides: NotRequired[int]
+
+
+class Bounds(NamedTuple):
+    low: float
 
 
 class Partial(TypedDict, total=False):
@@ -48,6 +53,15 @@ class Part(Serializable):
         return self.size > 1
 
     json_keys = ("where", "size", "note", "hint?", "is_big")
+
+
+@dataclass(frozen=True)
+class Whole(Serializable):
+    part: Part
+    bounds: tuple[int, str]
+    spare: Part | None = None
+
+    json_keys = ("size=part.size", "first=bounds.0", "spare=spare.where", "hint?=part.hint")
 
 
 @dataclass(frozen=True)
@@ -75,6 +89,13 @@ class Own(Serializable):
         (dict[str, int] | None, {"anyOf": [{"type": "object", "additionalProperties": {"type": "integer"}},
                                            {"type": "null"}]}),
         (Own, {"type": "object"}),
+        (Bounds, {"type": "object", "properties": {"low": {"type": ["number", "null"]}}, "required": ["low"]}),
+        ({"a": int, "b?": [str]}, {"type": "object", "required": ["a"], "properties": {
+            "a": {"type": "integer"}, "b": {"type": "array", "items": {"type": "string"}}}}),
+        ({"**": Shape, "sides": str}, {"type": "object", "required": ["name", "sides"], "properties": {
+            "name": {"type": "string"}, "sides": {"type": "string"}}}),
+        ((int, None), {"type": ["integer", "null"]}),
+        (Outcome, {"type": "string"}),  # oracles add further ones
         (Partial, {"type": "object", "properties": {"name": {"type": "string"}}}),
     ],
 )  # fmt: skip
@@ -97,10 +118,28 @@ def test_optional_keys_of_a_typed_dictionary_are_not_required():
 def test_schema_of_a_dataclass_accepts_what_the_codec_writes(part):
     schema = describe_type(Part)
     assert schema["required"] == ["is_big", "size", "where"]
-    assert schema["properties"]["hint"] == {"type": ["string", "null"]}
+    assert schema["properties"]["hint"] == {"type": "string"}  # not written where it is None
     jsonschema.validate(part.to_json(), schema)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate({**part.to_json(), "where": 3}, schema)
+
+
+def test_keys_of_objects_inside_have_the_types_of_their_attributes():
+    whole = Whole(Part(Path("a"), float("inf")), (3, "x"))
+    assert whole.to_json() == {"size": None, "first": 3, "spare": None}
+    assert Whole(Part(Path("a"), 2.0, hint="h"), (3, "x"), Part(Path("b"))).to_json() == {
+        "size": 2.0, "first": 3, "spare": "b", "hint": "h"
+    }  # fmt: skip
+    assert describe_type(Whole) == {
+        "type": "object",
+        "properties": {
+            "size": {"type": ["number", "null"]},
+            "first": {"type": "integer"},
+            "spare": {"type": ["string", "null"]},
+            "hint": {"type": "string"},
+        },
+        "required": ["first", "size", "spare"],
+    }
 
 
 def test_name_that_is_nowhere_is_an_error():

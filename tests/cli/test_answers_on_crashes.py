@@ -14,7 +14,7 @@ import pytest
 from crashhunt import cli
 from crashhunt.cli import _check, _guide, _judge, _replay, _shrink, _trust, _whatif
 from crashhunt.corpus import KnownType
-from crashhunt.crashes import Cause
+from crashhunt.crashes import Cause, TrustedOrigin
 from crashhunt.errors import BundleError, HuntDirectoryError, UsageError
 from crashhunt.trial import Outcome
 
@@ -714,8 +714,7 @@ def test_guide_shows_a_page_or_the_pages_with_a_word(capsys):
 @pytest.fixture
 def origins(monkeypatch):
     def origin(number):
-        mark = f"{number}" * 4
-        return SimpleNamespace(id=mark, fingerprint=mark * 4, path=f"p{number}", runs="code", trusted_at="today")
+        return TrustedOrigin(f"{number}" * 16, path=f"p{number}", runs="code", trusted_at="today")
 
     monkeypatch.setattr("crashhunt.crashes.list_trusted", lambda: [origin(1), origin(2)])
     monkeypatch.setattr("crashhunt.crashes.remove_trusted", lambda names: [origin(len(names))])
@@ -725,7 +724,7 @@ def origins(monkeypatch):
 
 def test_trust_lists_adds_and_removes_code(origins, monkeypatch, capsys, tmp_path):
     assert run("trust") == 0
-    assert capsys.readouterr().out == "1111  today  p1: code\n2222  today  p2: code\n"
+    assert capsys.readouterr().out == "111111111111  today  p1: code\n222222222222  today  p2: code\n"
     assert run("trust", "--json") == 0
     out, err = capsys.readouterr()
     assert [one["path"] for one in json.loads(out)["trusted"]] == ["p1", "p2"]
@@ -736,12 +735,12 @@ def test_trust_lists_adds_and_removes_code(origins, monkeypatch, capsys, tmp_pat
     assert run("trust", "--remove", "a", "--remove", "b", "--json") == 0
     out, err = capsys.readouterr()
     assert [one["path"] for one in json.loads(out)["removed"]] == ["p2"]
-    assert err == "no longer trusted: 2222  today  p2: code\n"
+    assert err == "no longer trusted: 222222222222  today  p2: code\n"
     for name in ("ab", "abc"):
         (tmp_path / name).mkdir()
     monkeypatch.setattr("crashhunt.results.find_hunts", lambda place: [place])
     assert run("trust", tmp_path / "abc", tmp_path / "ab", tmp_path / "ab") == 0
-    assert capsys.readouterr().out == "trusted: 3333  today  p3: code\ntrusted: 2222  today  p2: code\n"
+    assert capsys.readouterr().out == "trusted: 333333333333  today  p3: code\ntrusted: 222222222222  today  p2: code\n"
     monkeypatch.setattr("crashhunt.crashes.list_trusted", list)
     assert run("trust", "--json") == 0
     assert capsys.readouterr() == (

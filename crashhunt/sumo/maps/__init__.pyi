@@ -14,3 +14,4 @@ from ._source import (
     parse_bbox as parse_bbox,
     parse_shape as parse_shape,
 )
+from ._traffic_flow import PlainRun as PlainRun

@@ -135,7 +135,7 @@ class MadeScenario:
             "routes": len(self.demand.routes),
             "ego_routes": len(self.demand.ego_routes),
             "vehicles_per_hour": round(self.demand.vehicles_per_hour, 1),
-            "plain": [_run_to_json(run) for run in (self.plain, self.busy)],
+            "plain": [self.plain.to_json(), self.busy.to_json()],
             "trial": None
             if self.trial is None
             else {"outcome": self.trial.outcome, "steps": self.trial.steps, "wall_s": round(self.trial.wall_s, 3)},
@@ -143,14 +143,6 @@ class MadeScenario:
             "notes": list(self.notes),
             "next": self.commands,
         }
-
-
-def _run_to_json(run: PlainRun) -> dict[str, object]:
-    return {
-        "demand": run.demand, "simulated_s": RUN_S, "wanted": run.wanted, "entered": run.entered,
-        "arrived": run.arrived, "running": run.running, "halting": run.halting, "teleports": run.teleports,
-        "collisions": run.collisions, "mean_speed_mps": run.mean_speed_mps, "persons": run.persons,
-    }  # fmt: skip
 
 
 def make_scenario(

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import string
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import ScenarioError
 from crashhunt.sumo.maps._demand import route_file
 from crashhunt.sumo.maps._tools import first_error
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
     from crashhunt.sumo.maps._demand import Demand
@@ -39,7 +40,7 @@ _MAX_PROBE_DELAY_S = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlainRun:
+class PlainRun(Serializable):
     """The result of a simulation of the traffic without an agent for `RUN_S` seconds.
 
     Args:
@@ -70,6 +71,16 @@ class PlainRun:
     persons: int
     edge_vehicles: Mapping[str, float] = field(default_factory=dict)
     probe_delays_s: Mapping[str, float] = field(default_factory=dict)
+
+    json_keys = (
+        "demand", "simulated_s", "wanted", "entered", "arrived", "running", "halting", "teleports", "collisions",
+        "mean_speed_mps", "persons",
+    )  # fmt: skip
+
+    @property
+    def simulated_s(self) -> float:
+        """The simulated time, in s."""
+        return RUN_S
 
     @property
     def jam(self) -> str:
