@@ -12,7 +12,6 @@ from ._interventions import (
     step_before as step_before,
 )
 from ._minimization import Shrunk as Shrunk, shrink as shrink, shrunk_name as shrunk_name
-from ._reruns import EndedRun as EndedRun, Reruns as Reruns, StoppedError as StoppedError
 from ._types_by_cause import (
     REPRESENTATIVES as REPRESENTATIVES,
     divide_by_cause as divide_by_cause,

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from crashhunt.analysis._cause_runs import find_why
 from crashhunt.analysis._omissions import find_omission
-from crashhunt.analysis._reruns import NotUnderstoodError, Reruns, StoppedError
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.base.temporary import temporary_folder
@@ -25,17 +24,18 @@ from crashhunt.crashes import (
     visible_from,
 )
 from crashhunt.recording import read_lanes
-from crashhunt.replays import ReplayOptions, prepare
+from crashhunt.replays import ReplayOptions, prepare, reruns_of
+from crashhunt.reruns import NotUnderstoodError, StoppedError
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from crashhunt.analysis._reruns import EndedRun
     from crashhunt.base.progress import Watch
     from crashhunt.crashes import Bundle, Ending
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
+    from crashhunt.reruns import EndedRun, Reruns
     from crashhunt.trial import TrialResult
 
 
@@ -255,7 +255,7 @@ def judge(
     _require_judgeable(bundle, of_two=of_two, why=why)
     rerun = prepare(bundle, options or ReplayOptions())
     with temporary_folder("judge") as scratch:
-        reruns = Reruns(rerun, scratch, parallel=parallel, stopped=stopped)
+        reruns = reruns_of(rerun, scratch, parallel=parallel, stopped=stopped)
 
         def tell(done: int) -> None:
             if watch is not None:

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.analysis._reruns import StoppedError
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why, changes_of, partner, signature_of_fault
 from crashhunt.plans import read_settings
 from crashhunt.recording import has_same_scenes, read_lanes
+from crashhunt.reruns import StoppedError
 from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled
 from crashhunt.world import first_contact
 
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.analysis._reruns import EndedRun, Reruns
     from crashhunt.crashes import Without
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
+    from crashhunt.reruns import EndedRun, Reruns
     from crashhunt.trial import Distribution, TrialResult, TrialSpec, Value
     from crashhunt.world import Scene
 

@@ -15,10 +15,9 @@ from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.base.files import put_in_place, sync_folder
 from crashhunt.base.temporary import temporary_beside, temporary_folder
 from crashhunt.crashes import Bundle, is_bundle_made_here, signature_of, write_bundle
-from crashhunt.episode import scratch_of
-from crashhunt.executors import read_map, run_alone
 from crashhunt.plans import takes_of
 from crashhunt.replays import ReplayOptions, confirm, prepare
+from crashhunt.reruns import run_alone
 from crashhunt.trial import Outcome, Value
 
 if TYPE_CHECKING:
@@ -262,16 +261,15 @@ def _confirm_smallest(small: Bundle, final: Path) -> Bundle:
 
 def _run_fresh(rerun: Rerun, spec: TrialSpec, name: str) -> Bundle:
     bundle = rerun.bundle
-    with temporary_folder("shrink") as scratch:
-        result = run_alone(replace(rerun.worker, scratch=scratch), spec)
-        assert result is not None  # it is never stopped
+    for ended in run_alone(rerun.worker, spec):
+        result = ended.result
         if result.was_killed_from_outside:
             raise CrashhuntError(f"a trial was {result.summary}", fix="run the same command again", where=bundle.id)
-        trial = scratch_of(scratch, spec.number)
         return write_bundle(
-            bundle.hunt, result, trial, hunt_seed=bundle.hunt_seed, snapshot=bundle.snapshot,
-            lanes=read_map(scratch, trial), name=name, authenticate=is_bundle_made_here(bundle),
+            bundle.hunt, result, ended.folder, hunt_seed=bundle.hunt_seed, snapshot=bundle.snapshot,
+            lanes=ended.lanes, name=name, authenticate=is_bundle_made_here(bundle),
         )  # fmt: skip
+    raise AssertionError("a run that nothing stops ends")
 
 
 def _plain(search: Minimizer) -> dict[str, list[Value | None]]:

@@ -17,7 +17,6 @@ from dataclasses import replace
 from itertools import takewhile
 from typing import TYPE_CHECKING
 
-from crashhunt.analysis._reruns import Reruns, StoppedError
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.crashes import (
@@ -32,18 +31,19 @@ from crashhunt.crashes import (
 )
 from crashhunt.plans import with_recorded_load_order
 from crashhunt.recording import has_same_scenes, read_lanes
-from crashhunt.replays import is_current_code
+from crashhunt.replays import is_current_code, reruns_of
+from crashhunt.reruns import StoppedError
 from crashhunt.trial import Outcome, Overruled
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from crashhunt.analysis._reruns import EndedRun
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Without
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
+    from crashhunt.reruns import EndedRun, Reruns
     from crashhunt.trial import TrialResult, TrialSpec
 
 __all__ = ["find_omission"]
@@ -93,7 +93,7 @@ def find_omission(
         rerun = replace(
             rerun, worker=replace(rerun.worker, scenario=with_recorded_load_order(rerun.worker.scenario, order))
         )
-    runs = Reruns(rerun, scratch, parallel=parallel, stopped=stopped, todays=True)
+    runs = reruns_of(rerun, scratch, parallel=parallel, stopped=stopped, todays=True)
     search = _Search(rerun, runs, most, tell)
     try:
         return search.find(_OLD_SNAPSHOT_REASON if old else _NOT_IDENTICAL_REASON)

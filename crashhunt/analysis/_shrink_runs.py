@@ -4,32 +4,27 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.analysis._reruns import Reruns, StoppedError
 from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError
 from crashhunt.base.integrity import digest_of_data
 from crashhunt.crashes import signature_of, write_bundle
-from crashhunt.executors import read_map
+from crashhunt.replays import reruns_of
+from crashhunt.reruns import Budget, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from crashhunt.analysis._reruns import EndedRun
     from crashhunt.base.progress import Watch
     from crashhunt.crashes import Signature
     from crashhunt.replays import Rerun
-    from crashhunt.trial import TrialResult, TrialSpec
+    from crashhunt.reruns import EndedRun
+    from crashhunt.trial import TrialSpec
 
-__all__ = ["OutOfTimeError", "Ran", "Runs", "is_same"]
-
-
-class OutOfTimeError(StoppedError):
-    """The user's time limit has been reached."""
+__all__ = ["Ran", "Runs", "is_same"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,15 +82,10 @@ class Runs:
         self._rerun, self._signature, self._memory_file = rerun, signature, memory
         self._budget, self._watch, self._scratch = budget, watch, scratch
         self._memory = _remembered(memory)
-        until = None if time_s is None else time.monotonic() + time_s
-
-        def is_over() -> bool:
-            if until is not None and not stopped() and time.monotonic() >= until:
-                raise OutOfTimeError
-            return stopped()
-
         # The traffic of most candidates differs, so a suspended set-up would rarely serve two of them.
-        self._reruns = Reruns(rerun, scratch, parallel=parallel, stopped=is_over, keep_all=False, warm_copies=0)
+        self._reruns = reruns_of(
+            rerun, scratch, parallel=parallel, stopped=Budget(stopped, time_s).require, keep_all=False, warm_copies=0
+        )
 
     def first(self, candidates: Sequence[TrialSpec], *, again: bool = False) -> int | None:
         """Return the index of the first candidate that crashes in the same manner; None if no candidate does.
@@ -177,17 +167,17 @@ class Runs:
                 result.collision.agent, result.collision.role,
             )  # fmt: skip
         if same:
-            same = is_same(self._signature_of(result, ended.folder), self._signature, result.spec)
+            same = is_same(self._signature_of(ended), self._signature, result.spec)
         return Ran(same, result.steps, result.digest)
 
-    def _signature_of(self, result: TrialResult, folder: Path) -> Signature | None:
+    def _signature_of(self, ended: EndedRun) -> Signature | None:
+        result = ended.result
         if result.collision is None and result.failure is not None:
             return signature_of(replace(self._rerun.bundle, result=result))
         try:
-            lanes = read_map(self._scratch, folder)
             made = self._scratch / "made"
-            copy = Path(shutil.copytree(folder, self._scratch / "copy"))
-            bundle = write_bundle(made, result, copy, hunt_seed=0, snapshot="0", lanes=lanes)
+            copy = Path(shutil.copytree(ended.folder, self._scratch / "copy"))
+            bundle = write_bundle(made, result, copy, hunt_seed=0, snapshot="0", lanes=ended.lanes)
             return signature_of(bundle)
         except BundleError:  # it died before it had recorded anything
             return None

@@ -9,10 +9,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.analysis._delta_debugging import as_type_of, fewest, plainest
-from crashhunt.analysis._reruns import StoppedError
 from crashhunt.analysis._scripting import Part, Scripting, can_be_scripted
-from crashhunt.analysis._shrink_runs import OutOfTimeError
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.reruns import OutOfTimeError, StoppedError
 from crashhunt.trial import ALL_AGENTS, SENSOR_KINDS
 
 if TYPE_CHECKING:

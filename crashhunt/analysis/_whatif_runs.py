@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import itertools
 import statistics
-import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -27,23 +26,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.analysis._interventions import LeaveOut, Reseed, SetArguments
-from crashhunt.analysis._reruns import NotUnderstoodError, Reruns, StoppedError
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import UsageError, WorkerError
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes import wilson
 from crashhunt.recording import first_divergence
-from crashhunt.replays import ReplayOptions, is_current_code, prepare, up_to
+from crashhunt.replays import ReplayOptions, is_current_code, prepare, reruns_of, up_to
+from crashhunt.reruns import Budget, NotUnderstoodError, StoppedError
 from crashhunt.trial import ALL_AGENTS, Outcome, Reseeding
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from crashhunt.analysis._interventions import Intervention
-    from crashhunt.analysis._reruns import EndedRun
     from crashhunt.base.progress import Watch
     from crashhunt.crashes import Bundle
     from crashhunt.replays import Code, Rerun
+    from crashhunt.reruns import EndedRun, Reruns
     from crashhunt.trial import TrialSpec
 
 
@@ -54,7 +53,6 @@ FUTURES = 50
 _SELF_TEST_RUNS = 4  # futures to begin with, of which one is run twice
 _COMPARED_FUTURES = 20  # futures that must not all be equal
 _HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)
-_INTERRUPTED_REASON = "stopped"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +67,7 @@ class WhatIfOptions:
         trusted: whether the code of the crash may run; None to determine it.
         force: whether to run even from a damaged snapshot.
         watch: function called with the number of finished runs and the number of all runs.
-        stopped: function that returns whether to stop; called about twice a second.
+        stopped: function that returns whether to stop; called repeatedly.
     """
 
     code: Code = "snapshot"
@@ -110,10 +108,9 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
     recorded_spec = rerun.spec
     for one in interventions:
         rerun = one.applied(rerun)
-    until = None if options.time_s is None else time.monotonic() + options.time_s
-    why = _Stop(options.stopped, until)
+    budget = Budget(options.stopped, options.time_s)
     with temporary_folder("whatif") as scratch:
-        reruns = Reruns(rerun, scratch, parallel=max(1, options.parallel), stopped=why.is_asked)
+        reruns = reruns_of(rerun, scratch, parallel=max(1, options.parallel), stopped=budget.require)
         runs = _Runs(rerun, reruns, _from_step(interventions), options, times)
         try:
             if exclusions := [one for one in interventions if isinstance(one, LeaveOut)]:
@@ -142,7 +139,7 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
         recorded_steps=bundle.result.steps,
         asked=times,
         each=runs.counted,
-        interrupted=why.reason if len(runs.found) < times else "",
+        interrupted=budget.why if len(runs.found) < times else "",
         warnings=rerun.warnings,
     )
 
@@ -179,21 +176,6 @@ def _from_step(interventions: Iterable[Intervention]) -> int | None:
 def _too_old(reason: str = "") -> UsageError:
     message = "the crashhunt in the snapshot of this crash is too old for this change"
     return UsageError(f"{message}: {reason}" if reason else message, fix="add --code current")
-
-
-class _Stop:
-    """Decides whether to stop, and stores the reason."""
-
-    def __init__(self, stopped: Callable[[], bool], until: float | None) -> None:
-        self._stopped, self._until = stopped, until
-        self.reason = ""
-
-    def is_asked(self) -> bool:
-        if self._stopped():
-            self.reason = _INTERRUPTED_REASON
-        elif self._until is not None and time.monotonic() >= self._until:
-            self.reason = "the time is over"
-        return bool(self.reason)
 
 
 class _Runs:

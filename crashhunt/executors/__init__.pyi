@@ -1,10 +1,5 @@
 from ._fork_server import fork_zygote as fork_zygote
-from ._fresh import (
-    FreshProcessExecutor as FreshProcessExecutor,
-    SharedExecutors as SharedExecutors,
-    run_alone as run_alone,
-    snapshot_executor as snapshot_executor,
-)
+from ._fresh import FreshProcessExecutor as FreshProcessExecutor
 from ._host_conditions import HostConditions as HostConditions
 from ._pool import PoolExecutor as PoolExecutor
 from ._postmortem import read_map as read_map
@@ -14,8 +9,8 @@ from ._protocol import (
     ExecutorFactory as ExecutorFactory,
     HasNodes as HasNodes,
     NodeFigures as NodeFigures,
+    has_fork_server as has_fork_server,
     make_executor as make_executor,
-    run_trials as run_trials,
     snapshot_environment as snapshot_environment,
     worker_environment as worker_environment,
 )

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import deque
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -26,9 +23,8 @@ from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
 from crashhunt.executors._fork_server import fork_zygote
 from crashhunt.executors._host_conditions import HostConditions
-from crashhunt.executors._pool import PoolExecutor
 from crashhunt.executors._postmortem import TrialAttempt, damaged, hung, result_of_death, where_it_is
-from crashhunt.executors._protocol import Notes, has_fork_server, run_trials, snapshot_environment
+from crashhunt.executors._protocol import Notes, has_fork_server, snapshot_environment
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError, with_escape
 from crashhunt.executors._time_limits import START_UP_S, ImportKilledError, PauseMeter, has_hung, import_died
 from crashhunt.trial import TrialResult, TrialSpec
@@ -36,11 +32,11 @@ from crashhunt.trial import TrialResult, TrialSpec
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from crashhunt.executors._protocol import Answer, Executor, FreshJob
+    from crashhunt.executors._protocol import Answer, FreshJob
     from crashhunt.recording import BlackBoxHeader
 
 
-__all__ = ["FreshProcessExecutor", "SharedExecutors", "run_alone", "snapshot_executor"]
+__all__ = ["FreshProcessExecutor"]
 
 
 _LOOK_EVERY_S = 0.01  # starting one takes thirty times as long
@@ -259,117 +255,6 @@ def _run(job: FreshJob, answer: Callable[[Answer], None]) -> int:
     except CrashhuntError as error:
         answer(error.to_json())
     return 0
-
-
-# Trials run again with the code of a snapshot: in forks of one new Python process, where the snapshot can do that.
-
-_STOP_CHECK_INTERVAL_S = 0.1  # how late a request to stop may be
-
-
-def snapshot_executor(settings: WorkerSettings, *, parallel: int = 1) -> Executor:
-    """Return an executor that runs trials with the code of a snapshot, including the crashhunt in the snapshot.
-
-    Snapshots of crashhunt 0.1.0 and before have no fork server: with them, every trial starts a new Python process.
-    """
-    if has_fork_server(settings):
-        return PoolExecutor(settings, parallel=parallel, snapshot=True)
-    return FreshProcessExecutor(settings, parallel=parallel)
-
-
-def run_alone(
-    settings: WorkerSettings, spec: TrialSpec, stopped: Callable[[], bool] = lambda: False
-) -> TrialResult | None:
-    """Run one trial in a new Python process; return the result, or None if it was stopped.
-
-    Raises:
-        CrashhuntError: the crash cannot be run.
-    """
-    with closing(FreshProcessExecutor(settings)) as executor:
-        runs = run_trials(executor, [spec], stopped=stopped, check_every_s=_STOP_CHECK_INTERVAL_S)
-        return next((result for _, result in runs), None)
-
-
-class SharedExecutors:
-    """Executors for trials from several threads; trials with equal settings share an executor.
-
-    Args:
-        scratch: folder for the files of the executors.
-        parallel: number of trials at a time.
-    """
-
-    def __init__(self, scratch: Path, *, parallel: int) -> None:
-        self._scratch = scratch
-        self._parallel = parallel
-        self._lock = threading.Lock()
-        self._shared: dict[str, _Shared] = {}
-
-    def run(
-        self, settings: WorkerSettings, spec: TrialSpec, stopped: Callable[[], bool] = lambda: False
-    ) -> tuple[TrialResult, Path] | None:
-        """Run one trial, and wait for its result.
-
-        Returns:
-            The result of the trial, and the folder with its recording; None if it was stopped.
-
-        Raises:
-            CrashhuntError: the crash cannot be run.
-        """
-        key = json.dumps(replace(settings, scratch=self._scratch).to_json(), sort_keys=True)
-        with self._lock:
-            shared = self._shared.get(key)
-            if shared is None:
-                scratch = self._scratch / f"shared-{len(self._shared)}"
-                scratch.mkdir(parents=True)
-                executor = snapshot_executor(replace(settings, scratch=scratch), parallel=self._parallel)
-                shared = self._shared[key] = _Shared(executor, scratch)
-        return shared.run(spec, stopped)
-
-    def close(self) -> None:
-        """End all processes of the executors."""
-        for shared in self._shared.values():
-            shared.executor.close()
-
-
-class _Shared:
-    """An executor for several threads, each of which waits for its own trial.
-
-    A cancelled trial may still be running when the same trial is submitted again. Therefore each run has its own
-    number, which is the name of its folder.
-
-    If an executor can run no trial, it reports this error only once. The error is stored for all threads, which would
-    otherwise wait forever.
-    """
-
-    def __init__(self, executor: Executor, scratch: Path) -> None:
-        self.executor, self._scratch = executor, scratch
-        self._lock = threading.Lock()
-        self._ended: dict[int, TrialResult] = {}
-        self._error: Exception | None = None
-        self._numbers = itertools.count()
-
-    def run(self, spec: TrialSpec, stopped: Callable[[], bool]) -> tuple[TrialResult, Path] | None:
-        with self._lock:
-            number = next(self._numbers)
-            if self._error is None:
-                self.executor.submit(replace(spec, number=number))
-        while number not in self._ended:
-            if stopped():
-                return None
-            with self._lock:
-                if number not in self._ended:
-                    self._receive()
-        return replace(self._ended.pop(number), spec=spec), scratch_of(self._scratch, number)
-
-    def _receive(self) -> None:
-        """Collect the trials that have ended."""
-        if self._error is not None:
-            raise self._error
-        try:
-            for result in self.executor.completed(_STOP_CHECK_INTERVAL_S):
-                self._ended[result.spec.number] = result
-        except Exception as error:
-            self._error = error
-            raise
 
 
 def _not_started(number: int, log: Path, exit_code: int) -> WorkerError:

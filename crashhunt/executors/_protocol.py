@@ -18,7 +18,7 @@ from crashhunt.base.text import NOTICE_TOPIC
 from crashhunt.plans import ChoosesParallelism, executor_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.episode import WorkerSettings
@@ -44,7 +44,6 @@ __all__ = [
     "ToForkServer",
     "has_fork_server",
     "make_executor",
-    "run_trials",
     "snapshot_environment",
     "worker_environment",
 ]
@@ -274,54 +273,6 @@ def make_executor(word: str, settings: WorkerSettings, *, parallel: int) -> Exec
         fix = removed_fix_in(str(error)) if isinstance(error, TypeError) else ""
         raise blamed(f"the executor {word!r} cannot be created", error, fix=fix or "correct the code") from error
     return made
-
-
-# Trials of one caller, from the first to the last.
-
-_STOP_CHECK_INTERVAL_S = 0.5
-
-
-def run_trials(
-    executor: Executor,
-    specs: Sequence[TrialSpec],
-    *,
-    stopped: Callable[[], bool] = lambda: False,
-    needed: Callable[[int], bool] = lambda _: True,
-    check_every_s: float = _STOP_CHECK_INTERVAL_S,
-) -> Iterator[tuple[int, TrialResult]]:
-    """Yield for each trial its index in the specifications and its result, in the order in which trials end.
-
-    If the caller stops the iteration, the trials that have not ended are cancelled.
-
-    Args:
-        executor: the executor, which must run no other trials at the same time.
-        specs: specifications of the trials, in ascending order of their numbers.
-        stopped: function called before each wait for results, and thus at least once; True ends the iteration. The
-            function may raise an exception.
-        needed: function that returns whether the trial at an index is still needed, called after each result. If a
-            trial is not needed, the trials after it are not needed either.
-        check_every_s: maximum time between two calls of ``stopped``, in s of wall time.
-
-    Raises:
-        CrashhuntError: no trial can be run, for a reason outside of the trials.
-    """
-    places = {spec.number: place for place, spec in enumerate(specs)}
-    try:
-        for spec in specs:
-            executor.submit(spec)
-        while places and not stopped():
-            for result in list(executor.completed(check_every_s)):
-                place = places.pop(result.spec.number, None)
-                if place is None:
-                    continue  # cancelled, here or by an earlier caller
-                yield place, result
-                needless = [number for number, other in places.items() if not needed(other)]
-                if needless:
-                    executor.cancel(above=min(needless) - 1)
-                    places = {number: other for number, other in places.items() if number < min(needless)}
-    finally:
-        if places:
-            executor.cancel()
 
 
 # The environment variables of every process that runs trials: fixed hashes, one thread a library, whose code.

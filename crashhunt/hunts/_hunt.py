@@ -19,7 +19,7 @@ from crashhunt.base.temporary import release_shared_memory, remove_at_once, remo
 from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, trust_repositories, write_bundle, write_trial
 from crashhunt.episode import internal_error, scratch_of
-from crashhunt.executors import HostConditions, SharedExecutors, make_executor, read_map
+from crashhunt.executors import HostConditions, make_executor, read_map
 from crashhunt.hunts._fork_results import ForkCrashes, keep_near_misses, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._preflight import Preflight, WorkerNotices, is_hopeless, unusable_value, why_invalid
@@ -28,6 +28,7 @@ from crashhunt.hunts._reports import HuntReport, StoppedBecause
 from crashhunt.hunts._verification import Audit, Confirmation, PendingAudits, TrialReruns, VerificationRuns, is_settled
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import core_of, disturber_apart, parallel_here, sampler_of
+from crashhunt.reruns import SharedReruns
 from crashhunt.results import (
     HEARTBEAT_S,
     CodeVersions,
@@ -335,7 +336,7 @@ class Hunt:
             notes=progress.notes,
             failed=progress.failed,
             stops=self._stops,
-            executors=SharedExecutors(self._place.scratch / "confirmations", parallel=self._parallel_here),
+            executors=SharedReruns(self._place.scratch / "confirmations", parallel=self._parallel_here),
             phases=PhaseClock(self._show_phase(ledger, progress, watch), self._parallel_here),
             taken=snapshot.digest,
             newest=code.newest,

@@ -6,9 +6,7 @@ import math
 import statistics
 import time
 from collections import Counter, deque
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field
-from itertools import islice
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from crashhunt.base.capabilities import supports
@@ -19,6 +17,7 @@ from crashhunt.crashes import (
 )
 from crashhunt.executors import HasNodes
 from crashhunt.hunts._reports import kind_data
+from crashhunt.reruns import call_in_threads
 from crashhunt.results import CrashTally, Kinds
 from crashhunt.trial import Outcome
 
@@ -578,14 +577,9 @@ class PhaseClock:
             items: arguments of the calls, one for each call.
             counts: function that returns whether a result counts as a finished run.
         """
-        with ThreadPoolExecutor(self._parallel) as threads:
-            futures = [threads.submit(function, item) for item in items]
-            pending = dict.fromkeys(futures)
-            while pending:
-                first = list(islice(pending, 8 * self._parallel))  # a wait for 10,000 futures takes longer than a tick
-                for future in wait(first, timeout=_TICK_S, return_when=FIRST_COMPLETED).done:
-                    del pending[future]
-                    if counts(future.result()):
-                        self.advance()
-                self.tick()
-            return [future.result() for future in futures]
+
+        def ended(result: R) -> None:
+            if counts(result):
+                self.advance()
+
+        return call_in_threads(function, items, self._parallel, ended=ended, tick=self.tick)

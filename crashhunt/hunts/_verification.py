@@ -17,18 +17,12 @@ from crashhunt.base.temporary import remove_at_once, remove_scratch
 from crashhunt.base.text import command_line
 from crashhunt.crashes import as_stored, is_bundle_made_here, is_snapshot_trusted, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
-from crashhunt.executors import (
-    FreshProcessExecutor,
-    PoolExecutor,
-    SharedExecutors,
-    read_map,
-    run_trials,
-    snapshot_executor,
-)
+from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.hunts._next_trials import settings_again
 from crashhunt.hunts._reports import AuditReport, Difference
 from crashhunt.recording import Recording, first_divergence, read_black_box
 from crashhunt.replays import ReplayOptions, confirm
+from crashhunt.reruns import Reruns, StoppedError
 from crashhunt.results import Judged
 from crashhunt.snapshots import Snapshot
 
@@ -42,6 +36,7 @@ if TYPE_CHECKING:
     from crashhunt.hunts._progress import PhaseClock, PhaseName, Progress
     from crashhunt.ledger import Facts, Ledger
     from crashhunt.plans import HuntSettings
+    from crashhunt.reruns import EndedRun, SharedReruns
     from crashhunt.results import HuntDirectory
     from crashhunt.trial import TrialResult, TrialSpec
 
@@ -151,8 +146,6 @@ _END, _JUDGE, _CONFIRM = range(3)  # what the thread does first
 
 # Trials of a hunt that are run again in fresh processes, by the code that they ran with, for their recordings.
 
-_STOP_CHECK_S = 0.1  # how late Ctrl-C may be
-
 
 @dataclass(frozen=True, slots=True)
 class TrialReruns:
@@ -179,7 +172,7 @@ class TrialReruns:
     notes: list[str]
     failed: list[TrialResult]
     stops: Sized
-    executors: SharedExecutors
+    executors: SharedReruns
     phases: PhaseClock
     taken: str = ""
     newest: tuple[str, ...] = ()
@@ -210,11 +203,10 @@ class TrialReruns:
             scratch.mkdir(exist_ok=True)
             try:
                 again = settings_again(self.settings, snapshot, scratch)
-                with closing(snapshot_executor(again, parallel=self.parallel)) as executor:
-                    for _, result in run_trials(
-                        executor, group, stopped=self._show_progress, check_every_s=_STOP_CHECK_S
-                    ):
-                        yield Again(result=result, runs=self, snapshot=digest, scratch=scratch, folder=folder)
+                runs = Reruns(again, "snapshot", parallel=self.parallel, stopped=self._show_progress)
+                with closing(runs), suppress(StoppedError):
+                    for ended in runs.run(group, recorded=False):
+                        yield Again(ended=ended, runs=self, snapshot=digest, folder=folder)
             finally:
                 remove_scratch(scratch)
 
@@ -322,25 +314,27 @@ class Again:
     """A trial that has been run again.
 
     Args:
-        result: result of the second run.
+        ended: the second run.
         runs: the object that ran the trial.
         snapshot: digest of the snapshot that was run.
-        scratch: scratch folder of the workers.
         folder: subfolder of the hunt's directory for the bundle.
     """
 
-    result: TrialResult
+    ended: EndedRun
     runs: TrialReruns
     snapshot: str
-    scratch: Path
     folder: str
+
+    @property
+    def result(self) -> TrialResult:
+        """The result of the second run."""
+        return self.ended.result
 
     def write(self, result: TrialResult, *, confirmed: bool | None = None) -> Bundle:
         """Write the bundle of the trial with a result; return the bundle."""
-        trial = scratch_of(self.scratch, result.spec.number)
         return write_bundle(
-            self.runs.place.path, result, trial, hunt_seed=self.runs.settings.seed, snapshot=self.snapshot,
-            lanes=read_map(self.scratch, trial), place=self.folder, confirmed=confirmed,
+            self.runs.place.path, result, self.ended.folder, hunt_seed=self.runs.settings.seed, snapshot=self.snapshot,
+            lanes=self.ended.lanes, place=self.folder, confirmed=confirmed,
         )  # fmt: skip
 
 
@@ -641,7 +635,6 @@ def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, li
     try:
         for one in again.run([result.spec for result in wanted.values()], _AUDIT_FOLDER):
             now, was = one.result, wanted[one.result.spec.number]
-            shutil.rmtree(scratch_of(one.scratch, now.spec.number), ignore_errors=True)
             if now.was_killed_from_outside:
                 continue
             left.discard(now.spec.number)

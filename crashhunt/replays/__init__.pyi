@@ -6,6 +6,7 @@ from ._prepare import (
     Rerun as Rerun,
     is_current_code as is_current_code,
     prepare as prepare,
+    reruns_of as reruns_of,
 )
 from ._replaying import (
     ReplayReport as ReplayReport,

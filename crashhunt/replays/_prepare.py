@@ -15,16 +15,18 @@ from crashhunt.crashes import is_bundle_trusted, refuse_side_effects, refuse_unt
 from crashhunt.episode import WorkerSettings
 from crashhunt.plans import load_order_change, read_settings, with_recorded_load_order, with_settings
 from crashhunt.replays._edits import edited_spec
+from crashhunt.reruns import Reruns
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.snapshots import Snapshot, code_differences, environment_changes, processor
 from crashhunt.trial import SENSOR_KINDS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from crashhunt.crashes import Bundle
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import Recording
+    from crashhunt.reruns import Where
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialSpec, Value
 
@@ -36,6 +38,7 @@ __all__ = [
     "Rerun",
     "is_current_code",
     "prepare",
+    "reruns_of",
 ]
 
 
@@ -282,3 +285,32 @@ def _is_ours(name: str, size: int) -> bool:
         return os.stat(path).st_size == size  # noqa: PTH116
     except OSError:
         return False
+
+
+_SUSPENDED_SETUPS = 2  # suspended set-ups of each worker: most runs begin as the crash did
+
+
+def reruns_of(
+    rerun: Rerun,
+    scratch: Path,
+    *,
+    parallel: int,
+    stopped: Callable[[], bool],
+    keep_all: bool = True,
+    warm_copies: int = _SUSPENDED_SETUPS,
+    todays: bool | None = None,
+) -> Reruns:
+    """Return an object that runs trials that differ from the trial of a crash.
+
+    Args:
+        rerun: the crash whose trial is changed.
+        scratch: folder for the files of the workers.
+        parallel: number of trials at a time.
+        stopped: function that returns whether to stop, or raises an exception; called repeatedly.
+        keep_all: whether trials without a crash are recorded as well.
+        warm_copies: number of suspended simulators for each worker, which have already been set up.
+        todays: whether trials run with the current crashhunt and not with the snapshot's; None to determine it.
+    """
+    worker = replace(rerun.worker, scratch=scratch, keep_trials=keep_all, warm_copies=warm_copies)
+    where: Where = "current" if (is_current_code(rerun) if todays is None else todays) else "alone"
+    return Reruns(worker, where, parallel=parallel, stopped=stopped, numbered=True)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
-from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError, UsageError
-from crashhunt.base.temporary import temporary_folder
-from crashhunt.episode import scratch_of
-from crashhunt.executors import run_alone
+from crashhunt.base.errors import CrashhuntError, UntrustedError, UsageError
 from crashhunt.plans import load_order_change
-from crashhunt.recording import Divergence, Recording, Tag, first_divergence, read_black_box, values_around
+from crashhunt.recording import Divergence, Recording, Tag, first_divergence, values_around
 from crashhunt.replays._prepare import ReplayOptions, Rerun, prepare
+from crashhunt.reruns import StoppedError, run_alone
 from crashhunt.snapshots import environment_changes
 from crashhunt.trial import Outcome, TrialResult
 
@@ -24,9 +20,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from crashhunt.crashes import Bundle
-    from crashhunt.executors import SharedExecutors
     from crashhunt.recording import AgentChannel, Prologue
     from crashhunt.replays._prepare import Code, Look
+    from crashhunt.reruns import SharedReruns
 
 
 __all__ = ["ReplayReport", "Verdict", "confirm", "judged", "replay", "up_to"]
@@ -231,7 +227,7 @@ def confirm(
     stopped: Callable[[], bool] = lambda: False,
     *,
     failed: list[TrialResult] | None = None,
-    executors: SharedExecutors | None = None,
+    executors: SharedReruns | None = None,
     trusted: bool | None = None,
 ) -> Bundle | None:
     """Return the bundle with the verdict of a first replay, and with the last step from which braking avoids the crash.
@@ -254,7 +250,7 @@ def confirm(
     try:
         rerun = prepare(bundle, ReplayOptions(force=True, trusted=trusted))
         report = _run(replace(rerun, worker=replace(rerun.worker, find_escapes=True)), stopped, executors)
-    except _StoppedError:
+    except StoppedError:
         return None
     except UntrustedError:  # which says nothing about the crash
         raise
@@ -279,44 +275,34 @@ def confirm(
     return replace(bundle, result=result, confirmed=confirmed, divergence=divergence, why_unconfirmed="")
 
 
-class _StoppedError(Exception):
-    pass
-
-
 class _NotSetUpError(CrashhuntError):
     """The replay ran, but ended before its first step."""
 
 
 def _run(
-    rerun: Rerun, stopped: Callable[[], bool] = lambda: False, executors: SharedExecutors | None = None
+    rerun: Rerun, stopped: Callable[[], bool] = lambda: False, executors: SharedReruns | None = None
 ) -> ReplayReport:
-    with temporary_folder("replay") as scratch:
-        found = None
-        if executors is not None:
-            found = executors.run(rerun.worker, rerun.spec, stopped)
-        elif alone := run_alone(replace(rerun.worker, scratch=scratch), rerun.spec, stopped):
-            found = alone, scratch_of(scratch, rerun.spec.number)
-        if found is None:
-            raise _StoppedError
-        result, recorded_in = found
-        message = result.failure.message if result.failure else "it left no recording"
-        if result.was_killed_from_outside:
-            raise CrashhuntError(
-                f"the replay was {message}",
-                fix="run it again; if memory is short, end other processes first",
-                where=rerun.bundle.id,
-            )
-        try:
-            if result.outcome is Outcome.INVALID:
-                raise _not_set_up(rerun, message)
-            replayed = Recording(read_black_box(recorded_in / layout.BLACK_BOX))
-        except BundleError as error:
-            raise _not_set_up(rerun, message) from error
-        finally:
-            shutil.rmtree(recorded_in, ignore_errors=True)
-    recorded = rerun.recorded
+    """Run the trial and compare it with the recording.
+
+    Raises:
+        StoppedError: the user has stopped the run.
+    """
+    if executors is not None:
+        ended = executors.run(rerun.worker, rerun.spec, stopped)
+    else:
+        (ended,) = run_alone(rerun.worker, rerun.spec, stopped)
+    result, recorded, replayed = ended.result, rerun.recorded, ended.recording
+    message = result.failure.message if result.failure else "it left no recording"
+    if result.was_killed_from_outside:
+        raise CrashhuntError(
+            f"the replay was {message}",
+            fix="run it again; if memory is short, end other processes first",
+            where=rerun.bundle.id,
+        )
+    if result.outcome is Outcome.INVALID or replayed is None:
+        raise _not_set_up(rerun, message)
     if rerun.code == "log":
-        return judged(rerun, up_to(recorded, recorded.steps), up_to(replayed, replayed.steps), result)
+        recorded, replayed = up_to(recorded, recorded.steps), up_to(replayed, replayed.steps)
     return judged(rerun, recorded, replayed, result)
 
 

@@ -10,13 +10,14 @@ import pytest
 pytest.importorskip("highway_env")
 from highway_env.vehicle.kinematics import Vehicle
 
-from crashhunt.analysis import EndedRun, _omissions
+from crashhunt.analysis import _omissions
 from crashhunt.episode import overruled_agent, run_episode
 from crashhunt.highway import HighwaySimulator
 from crashhunt.highway._backend import HighwaySetup
 from crashhunt.oracles import OffRoad, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.report._words import about_reference
+from crashhunt.reruns import EndedRun
 from crashhunt.scenario import AgentSetup, ObservationSetup, Scenario
 from crashhunt.trial import Outcome, Overruled, TrialSpec
 from crashhunt.world import Motion

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.analysis import SetArguments, WhatIfOptions, _whatif_runs as _engine, judge, what_if
-from crashhunt.analysis._reruns import NotUnderstoodError, _require_same_trial
 from crashhunt.base.errors import UsageError, WorkerError
 from crashhunt.crashes import find_bundle, open_archive
 from crashhunt.replays import ReplayOptions
+from crashhunt.reruns import NotUnderstoodError, _require_same_trial
 from crashhunt.trial import Disturbance, Overruled, TrialSpec
 
 SPEC = TrialSpec(1, 2, {"ego": {"speed": 3.0}}, {}, 9)
@@ -52,7 +52,7 @@ def test_snapshot_that_does_not_know_a_change_is_too_old_for_it(monkeypatch, err
     monkeypatch.setattr(_engine, "_check", lambda *given: None)
     monkeypatch.setattr(_engine, "prepare", lambda bundle, options: rerun)
     monkeypatch.setattr(_engine, "is_current_code", lambda given: is_current)
-    monkeypatch.setattr(_engine, "Reruns", lambda *given, **more: reruns)
+    monkeypatch.setattr(_engine, "reruns_of", lambda *given, **more: reruns)
     monkeypatch.setattr(SetArguments, "applied", lambda self, given: given)
     with pytest.raises(UsageError if says else WorkerError) as caught:
         what_if(SimpleNamespace(id="c"), [SetArguments(changes={"speed": 5.0})], WhatIfOptions())

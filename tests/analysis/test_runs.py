@@ -7,9 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.analysis import EndedRun, StoppedError, _reruns, _shrink_runs as _runs
+from crashhunt import reruns
+from crashhunt.analysis import _shrink_runs as _runs
 from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError
 from crashhunt.crashes import Bundle, Signature, signature_of
+from crashhunt.replays import _prepare
+from crashhunt.reruns import EndedRun, OutOfTimeError, StoppedError
 from crashhunt.trial import ALL_AGENTS, Collision, Failure, Outcome, TrialResult, TrialSpec
 
 
@@ -30,7 +33,7 @@ class Refuses:
 
     error = CrashhuntError
 
-    def __init__(self, worker, *, parallel):
+    def __init__(self, worker, *, parallel, snapshot):
         pass
 
     def submit(self, spec):
@@ -44,7 +47,7 @@ class Refuses:
 
 
 def test_an_older_crashhunt_that_refuses_to_leave_others_out_has_no_one_excluded(tmp_path, monkeypatch):
-    monkeypatch.setattr(_reruns, "PoolExecutor", Refuses)
+    monkeypatch.setattr(reruns, "PoolExecutor", Refuses)
     rerun = SimpleNamespace(worker=Worker(), bundle=SimpleNamespace(result=SimpleNamespace(steps_begun=9)))
     words = {"parallel": 1, "budget": 9, "time_s": None, "stopped": lambda: False, "watch": None}
     runs = _runs.Runs(rerun, None, tmp_path, tmp_path / "memory", **words)
@@ -68,7 +71,7 @@ class Instant:
     made = ()
     place = -1  # of those that wait, the one that ends next
 
-    def __init__(self, worker, *, parallel):
+    def __init__(self, worker, *, parallel, snapshot):
         self.worker, self.parallel, self.waiting, self.ran, self.cancelled, self.closed = (
             worker,
             parallel,
@@ -106,8 +109,8 @@ def candidate(same, steps=5, name=0):
 @pytest.fixture
 def make_runs(tmp_path, monkeypatch):
     """Makes runs of a crash of 20 steps; the memory of what came of candidates is a file."""
-    monkeypatch.setattr(_reruns, "PoolExecutor", Instant)
-    monkeypatch.setattr(_reruns, "is_current_code", lambda rerun: True)
+    monkeypatch.setattr(reruns, "PoolExecutor", Instant)
+    monkeypatch.setattr(_prepare, "is_current_code", lambda rerun: True)
     monkeypatch.setattr(Instant, "made", ())
     result = TrialResult(candidate("yes", 20), Outcome.AGENT_ERROR, steps=20, failure=FAILED, digest="f" * 32)
     bundle = Bundle(tmp_path / "b", result, 1, "abc")
@@ -174,7 +177,7 @@ def test_more_than_the_budget_is_not_run(make_runs):
     runs = make_runs(budget=3)
     with pytest.raises(StoppedError) as error:
         runs.first([candidate("no", name=name) for name in range(4)])
-    assert not isinstance(error.value, _runs.OutOfTimeError)
+    assert not isinstance(error.value, OutOfTimeError)
     assert runs.count == len(Instant.made[0].ran) == 3
     with pytest.raises(StoppedError):
         runs.first([candidate("yes")])
@@ -182,7 +185,7 @@ def test_more_than_the_budget_is_not_run(make_runs):
 
 
 @pytest.mark.parametrize(
-    ("options", "error"), [({"stopped": lambda: True}, StoppedError), ({"time_s": 1e-9}, _runs.OutOfTimeError)]
+    ("options", "error"), [({"stopped": lambda: True}, StoppedError), ({"time_s": 1e-9}, OutOfTimeError)]
 )
 def test_it_stops_when_asked_and_when_time_is_over(make_runs, options, error):
     runs = make_runs(**options)
@@ -199,8 +202,8 @@ def test_who_enters_is_what_the_same_trial_has_written(make_runs, tmp_path, monk
     folder = tmp_path / "entered"
     folder.mkdir()
     (folder / "entered.json").write_text('["a", "b", "a"]')
-    monkeypatch.setattr(_reruns, "scratch_of", lambda scratch, number: folder)
-    monkeypatch.setattr(_reruns.layout, "ENTERED", "entered.json")
+    monkeypatch.setattr(reruns, "scratch_of", lambda scratch, number: folder)
+    monkeypatch.setattr(reruns.layout, "ENTERED", "entered.json")
     result = runs._rerun.bundle.result
     runs._rerun = SimpleNamespace(bundle=SimpleNamespace(result=replace(result, digest=digest)))
     everybody = replace(candidate("yes", 4), only=(ALL_AGENTS,))
@@ -241,7 +244,7 @@ def test_of_a_collision_the_signature_is_made_only_where_it_may_be_the_same(
     was = replace(bundle.result, outcome=Outcome.COLLISION, failure=None, collision=HIT)
     runs._rerun = SimpleNamespace(bundle=replace(bundle, result=was))
     asked = []
-    monkeypatch.setattr(runs, "_signature_of", lambda result, folder: asked.append(result) or runs._signature)
+    monkeypatch.setattr(runs, "_signature_of", lambda ended: asked.append(ended) or runs._signature)
     result = TrialResult(candidate("yes"), outcome, steps=7, collision=collision, digest="d")
     assert runs._judged(EndedRun(0, result, None, bundle.path)) == _runs.Ran(same, 7, "d")
     assert len(asked) == same
@@ -263,8 +266,8 @@ def test_a_bundle_that_is_made_for_its_signature_is_removed(make_runs, tmp_path,
         return "bundle"
 
     monkeypatch.setattr(_runs, "write_bundle", write_bundle)
-    monkeypatch.setattr(_runs, "read_map", lambda scratch, folder: None)
+    monkeypatch.setattr(reruns, "read_map", lambda scratch, folder: None)
     monkeypatch.setattr(_runs, "signature_of", lambda bundle: f"of {bundle}")
     for _ in range(2):
-        assert runs._signature_of(result, folder) == (None if fails else "of bundle")
+        assert runs._signature_of(EndedRun(0, result, None, folder)) == (None if fails else "of bundle")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["trial"]

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given, strategies as st
 
-from crashhunt.analysis import StoppedError, _scripting, _shrink_stages as _stages, fewest, plainest
+from crashhunt.analysis import _scripting, _shrink_stages as _stages, fewest, plainest
 from crashhunt.analysis._scripting import Part
-from crashhunt.analysis._shrink_runs import OutOfTimeError
 from crashhunt.analysis._shrink_stages import Minimizer
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.reruns import OutOfTimeError, StoppedError
 from crashhunt.trial import ALL_AGENTS, Disturbance, Escape, TrialSpec
 from crashhunt.world import Actor, Roster, Scene
 

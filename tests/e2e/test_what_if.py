@@ -13,11 +13,11 @@ from conftest import mostly_nightly
 
 import crashhunt
 from crashhunt.analysis import Reseed, WhatIfOptions, _whatif_runs as _engine, what_if
-from crashhunt.analysis._reruns import Reruns
 from crashhunt.base.errors import UsageError
 from crashhunt.crashes import find_bundle
 from crashhunt.recording import first_divergence
-from crashhunt.replays import ReplayOptions, prepare, up_to
+from crashhunt.replays import ReplayOptions, _prepare, prepare, reruns_of, up_to
+from crashhunt.reruns import Reruns
 from crashhunt.trial import KILLED, Failure, Outcome, Reseeding
 
 SPEED = ("--agent", "crashhunt.agents:KeepLaneWithSpeed", "--arg")
@@ -112,7 +112,7 @@ def by_hand(folder, after, number):
     """Run one future as a trial of its own; return its result and how its first steps differ from the recording."""
     rerun = prepare(find_bundle(folder), ReplayOptions())
     spec = replace(rerun.spec, reseeding=Reseeding(after, _engine.future_seed(rerun.spec.seed, number)))
-    reruns = Reruns(rerun, folder.parent, parallel=1, stopped=lambda: False)
+    reruns = reruns_of(rerun, folder.parent, parallel=1, stopped=lambda: False)
     try:
         (ended,) = reruns.run([spec])
     finally:
@@ -251,7 +251,7 @@ OTHER: list = []
 def test_runs_that_are_killed_or_differ_before_the_step_do_not_count(crash, monkeypatch):
     crash.crashhunt("run", "other", "1", "20", "300", "--scenario", "toy", "--arg", "speed=13", "--seed", "7")
     OTHER[:] = [crash.folder / "other"]
-    monkeypatch.setattr(_engine, "Reruns", Tampered)
+    monkeypatch.setattr(_prepare, "Reruns", Tampered)
     bundle = find_bundle(crash.folder / "h")
     monkeypatch.chdir(crash.folder)
     found = what_if(bundle, [Reseed(from_step=20)], WhatIfOptions(times=4))

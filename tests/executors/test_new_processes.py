@@ -17,7 +17,6 @@ from crashhunt.episode import WorkerSettings, answer_file, scratch_of
 from crashhunt.executors import PoolExecutor, _fresh, _pool, _protocol
 from crashhunt.executors._fresh import FreshProcessExecutor
 from crashhunt.executors._postmortem import TrialAttempt
-from crashhunt.executors._protocol import run_trials
 from crashhunt.executors._supervisor import EndedTrial, LostTrialError, UnfitZygoteError
 from crashhunt.executors._time_limits import ImportKilledError
 from crashhunt.scenario import AgentSetup, Scenario
@@ -276,62 +275,6 @@ def test_new_process_writes_its_answer_at_once_and_exits(monkeypatch, tmp_path):
         _fresh.main()
 
 
-class Executor:
-    """Each call of `completed` yields the next of `ends`."""
-
-    def __init__(self, *ends):
-        self.ends, self.submitted, self.cancelled, self.timeouts = list(ends), [], [], []
-
-    def submit(self, given):
-        self.submitted.append(given.number)
-
-    def completed(self, timeout_s):
-        self.timeouts.append(timeout_s)
-        yield from map(survived, self.ends.pop(0))
-
-    def cancel(self, *, above=-1):
-        self.cancelled.append(above)
-
-
-def test_trials_of_one_caller_end_in_any_order():
-    executor = Executor([], [6, 99], [5, 7])
-    found = list(run_trials(executor, [spec(number) for number in (5, 6, 7)], check_every_s=3.0))
-    assert found == [(1, survived(6)), (0, survived(5)), (2, survived(7))]
-    assert (executor.submitted, executor.cancelled, executor.timeouts) == ([5, 6, 7], [], [3.0] * 3)
-
-
-def test_trials_that_are_not_needed_or_not_awaited_are_cancelled():
-    executor = Executor([6], [8, 7, 5])
-    needed = lambda index: index < 2  # noqa: E731
-    found = list(run_trials(executor, [spec(number) for number in (5, 6, 7, 8)], needed=needed))
-    assert [index for index, _ in found] == [1, 0]
-    assert executor.cancelled == [6]
-    executor = Executor([6], [5])
-    runs = run_trials(executor, [spec(5), spec(6)])
-    next(runs)
-    runs.close()
-    assert executor.cancelled == [-1]
-    stops = iter([False, True])
-    executor = Executor([5])
-    assert len(list(run_trials(executor, [spec(5), spec(6)], stopped=lambda: next(stops)))) == 1
-    assert executor.cancelled == [-1]
-
-
-def test_one_trial_that_is_run_alone_ends_with_its_executor(settings, monkeypatch):
-    closed, made = [], []
-
-    def make(given):
-        made.append(given)
-        executor = Executor([3])
-        executor.close = lambda: closed.append(True)
-        return executor
-
-    monkeypatch.setattr(_fresh, "FreshProcessExecutor", make)
-    assert _fresh.run_alone(settings, spec(3)) == survived(3)
-    assert _fresh.run_alone(settings, spec(3), lambda: True) is None
-    assert (closed, made) == ([True, True], [settings, settings])
-
-
 def test_code_of_a_snapshot_is_compiled_outside_of_it_and_few_are_kept(settings, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", "/mine")
@@ -353,20 +296,6 @@ def test_code_of_a_snapshot_is_compiled_outside_of_it_and_few_are_kept(settings,
         found = _protocol.snapshot_environment(other)
         assert found["PYTHONDONTWRITEBYTECODE"] == "1"
         assert found.get("PYTHONPYCACHEPREFIX") == os.environ.get("PYTHONPYCACHEPREFIX")
-
-
-def test_crashhunt_of_a_snapshot_may_have_no_fork_server(settings, monkeypatch, tmp_path):
-    old, new = tmp_path / "old", tmp_path / "new"
-    (old / "crashhunt").mkdir(parents=True)
-    (new / "crashhunt/executors").mkdir(parents=True)
-    (new / "crashhunt/executors/_fork_server.py").touch()
-    made = []
-    monkeypatch.setattr(_fresh, "PoolExecutor", lambda *given, **more: made.append(("pool", more)))
-    monkeypatch.setattr(_fresh, "FreshProcessExecutor", lambda *given, **more: made.append(("fresh", more)))
-    for code in ((), (str(tmp_path),), (str(new),), (str(tmp_path), str(old))):
-        _fresh.snapshot_executor(replace(settings, code=code), parallel=3)
-    pool = ("pool", {"parallel": 3, "snapshot": True})
-    assert made == [pool, pool, pool, ("fresh", {"parallel": 3})]
 
 
 @pytest.fixture

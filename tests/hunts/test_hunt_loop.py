@@ -503,14 +503,14 @@ def test_parts_of_a_hunt_are_closed_at_its_end(run, monkeypatch):
 
         monkeypatch.setattr(kind, "close", close)
 
-    for kind in (hunt_module.Audit, hunt_module.Confirmation, hunt_module.SharedExecutors):
+    for kind in (hunt_module.Audit, hunt_module.Confirmation, hunt_module.SharedReruns):
         note(kind, kind.__name__)
     released = []
     monkeypatch.setattr(
         hunt_module, "release_shared_memory", lambda scratch, *, of_ended: released.append((scratch, of_ended))
     )
     found = run(3)
-    assert closed == ["Audit", "Confirmation", "SharedExecutors"]
+    assert closed == ["Audit", "Confirmation", "SharedReruns"]
     assert [(scratch.name[:8], of_ended) for scratch, of_ended in released[:1]] == [(".scratch", True)]
     closed.clear()
 
@@ -519,7 +519,7 @@ def test_parts_of_a_hunt_are_closed_at_its_end(run, monkeypatch):
 
     with pytest.raises(ValueError, match="odd"):
         run(3, fails, overwrite=True)
-    assert closed == ["Audit", "Confirmation", "SharedExecutors"]
+    assert closed == ["Audit", "Confirmation", "SharedReruns"]
     assert list(found.path.glob(".scratch*")) == []
 
 

@@ -25,6 +25,7 @@ from crashhunt.hunts._reports import BranchReport, Difference, ProbeReport, Rare
 from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReruns, is_settled
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
+from crashhunt.reruns import EndedRun, StoppedError
 from crashhunt.results import _hunt_results as _results, _state
 from crashhunt.results._state import HuntDirectory, LogReader
 from crashhunt.statistics import TRIALS_PER_ROOT, RareEstimate
@@ -629,7 +630,7 @@ def test_cause_of_a_crash_is_written_unless_it_was_stopped(tmp_path, monkeypatch
 
 
 def test_trials_run_again_with_the_code_that_they_ran_with(tmp_path, monkeypatch):
-    made, removed, closed = [], [], []
+    made, removed = [], []
     again = reruns(
         tmp_path, ledger=SimpleNamespace(snapshot_of=lambda number: "0f" if number < 5 else "99"),
         phases=SimpleNamespace(tick=lambda: None),
@@ -640,28 +641,38 @@ def test_trials_run_again_with_the_code_that_they_ran_with(tmp_path, monkeypatch
     monkeypatch.setattr(_verification, "settings_again", lambda *given: given)
     monkeypatch.setattr(_verification, "remove_scratch", removed.append)
 
-    def executor(settings, *, parallel):
-        made.append((settings, parallel))
-        return SimpleNamespace(close=lambda: closed.append(True))
+    class Runs:
+        closed = 0
 
-    def run(given, specs, *, stopped, check_every_s):
-        assert not stopped()
-        assert check_every_s == _verification._STOP_CHECK_S
-        yield from ((place, result(one.number)) for place, one in enumerate(specs))
+        def __init__(self, *given, parallel, stopped):
+            made.append((given, parallel))
+            self.stopped = stopped
 
-    monkeypatch.setattr(_verification, "snapshot_executor", executor)
-    monkeypatch.setattr(_verification, "run_trials", run)
+        def run(self, specs, *, recorded):
+            assert not recorded
+            assert not self.stopped()
+            yield from (ran(place, one.number) for place, one in enumerate(specs))
+            raise StoppedError  # which is no error
+
+        def close(self):
+            Runs.closed += 1
+
+    def ran(place, number):
+        return EndedRun(place, result(number), None, tmp_path / "scratch/near" / f"trial-{number:06d}")
+
+    monkeypatch.setattr(_verification, "Reruns", Runs)
     specs = [TrialSpec(number, 1, {}, {}, 9) for number in (1, 7, 2)]
     found = list(again.run(specs, "near"))
     scratch = tmp_path / "scratch/near"
-    assert found == [Again(result=result(number), runs=again, snapshot="0f", scratch=scratch, folder="near")
-                     for number in (1, 2)]  # fmt: skip
-    assert made == [((SETTINGS, tmp_path / layout.SNAPSHOTS / "0f", scratch), 2)]
-    assert (removed, closed) == ([scratch], [True])
+    assert found == [
+        Again(ended=ran(place, number), runs=again, snapshot="0f", folder="near") for place, number in enumerate((1, 2))
+    ]
+    assert made == [(((SETTINGS, tmp_path / layout.SNAPSHOTS / "0f", scratch), "snapshot"), 2)]
+    assert (removed, Runs.closed) == ([scratch], 1)
     (note,) = again.notes
     assert note.startswith("1 trials for near did not run again: nothing proves that you took the snapshot 99 ")
     written = []
-    monkeypatch.setattr(_verification, "read_map", lambda folder, trial: (folder, trial.name))
+    monkeypatch.setattr("crashhunt.reruns.read_map", lambda folder, trial: (folder, trial.name))
     monkeypatch.setattr(_verification, "write_bundle", lambda *given, **more: written.append((given, more)) or "bundle")
     assert found[0].write(result(1), confirmed=True) == "bundle"
     (((where, what, trial), more),) = written

@@ -323,7 +323,7 @@ def test_trial_that_is_not_sampled_or_is_kept_stays_as_it_is(audit, tmp_path):
     assert (tmp_path / "audit/recorded-000002" / layout.BLACK_BOX).read_text() == "same"
 
 
-def test_audits_of_an_earlier_run_are_made_up_for(audit, again, tmp_path):
+def test_audits_of_an_earlier_run_are_made_up_for(audit, again):
     ended = [result(4), result(5)]
     ledger = SimpleNamespace(
         results_where=lambda where, since: ended if since == 7.0 else [], remarks=[],
@@ -341,7 +341,6 @@ def test_audits_of_an_earlier_run_are_made_up_for(audit, again, tmp_path):
     assert (progress.audit, progress.audits_left) == (report, [2, 3, 4, 7, 8, 9])
     runs = again(result(2), result(3, digest="f" * 32), killed(4))
     runs.ledger = ledger
-    scratch_of(tmp_path / "scratch", 2).mkdir(parents=True)
     pending.finish(runs, progress)
     assert runs.asked == [([2, 3, 4], "audits")]
     assert (progress.audit.trials, progress.audit.not_finished) == (7, 2)
@@ -351,7 +350,6 @@ def test_audits_of_an_earlier_run_are_made_up_for(audit, again, tmp_path):
     assert [one.spec.number for one in runs.failed] == [3]
     assert progress.audits_left == [4, 7]
     assert runs.phases.calls == [("auditing", 3), "one", "one"]
-    assert not scratch_of(tmp_path / "scratch", 2).exists()
     nothing = again()
     nothing.ledger = ledger
     assert _finish(nothing, [9])[1] == []

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from crashhunt import reruns
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.crashes import list_bundles
 from crashhunt.episode import answer_file
-from crashhunt.executors import _fresh
 from crashhunt.recording import Phase, read_header
 from crashhunt.replays import ReplayOptions, confirm, replay
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult
@@ -42,7 +42,7 @@ def bundle(toy, made_once):
 class Killed:
     """In place of an executor: every trial is killed."""
 
-    def __init__(self, settings):
+    def __init__(self, settings, *, parallel):
         pass
 
     def submit(self, spec):
@@ -58,7 +58,7 @@ class Killed:
 @pytest.mark.nightly  # by day, test_verdicts.py confirms with replays that are made up
 def test_replay_that_is_killed_leaves_a_crash_unconfirmed(bundle, monkeypatch, toy):
     with monkeypatch.context() as patched:
-        patched.setattr(_fresh, "FreshProcessExecutor", Killed)
+        patched.setattr(reruns, "FreshProcessExecutor", Killed)
         failed = []
         found = confirm(replace(bundle, confirmed=None), failed=failed)
         assert (found.confirmed, found.divergence, failed) == (None, None, [])

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError, UsageError
+from crashhunt.base.errors import CrashhuntError, UntrustedError, UsageError
 from crashhunt.recording import AgentChannel, Divergence, Prologue, Tag
 from crashhunt.replays import Look, ReplayOptions, ReplayReport, _debugger, _replaying as _replay
+from crashhunt.reruns import EndedRun, StoppedError
 from crashhunt.trial import KILLED, Collision, Failure, Outcome, TrialResult, TrialSpec
 
 EGO = AgentChannel("ego", "float32", (8, 7), "float64", (2,))
@@ -210,7 +210,7 @@ def test_confirmation_keeps_what_the_replay_shows(replays):
     replays.ends = [CrashhuntError("it was killed")]
     found = _replay.confirm(replace(BUNDLE, confirmed=True, divergence=THERE))
     assert found == Bundle(confirmed=None, divergence=None, why_unconfirmed="it was killed")
-    replays.ends = [_replay._StoppedError()]
+    replays.ends = [StoppedError()]
     assert _replay.confirm(BUNDLE) is None
     replays.ends = [UntrustedError("it is not yours")]
     with pytest.raises(UntrustedError):
@@ -243,37 +243,28 @@ def test_beginning_of_a_recording_ends_with_a_whole_step():
 
 @pytest.mark.parametrize("code", ["snapshot", "log"])
 @pytest.mark.parametrize("shared", [True, False])
-def test_run_of_a_replay_reads_its_recording_and_removes_it(monkeypatch, tmp_path, code, shared):
-    ends = {"result": CRASH, "error": None}
-    stopped, here = (lambda: False), tmp_path / "here"
+def test_run_of_a_replay_is_compared_with_its_recording(monkeypatch, tmp_path, code, shared):
+    ends = {"result": CRASH, "recording": records(0, 1)}
+    stopped, worker = (lambda: False), Worker()
 
-    def run(worker, spec, asked):
-        assert (worker.scratch is not None, spec, asked) == (not shared, CRASH.spec, stopped)
-        folder = here if shared else _replay.scratch_of(worker.scratch, spec.number)
-        folder.mkdir(parents=True)
-        used.append(folder)
-        return ends["result"] and ((ends["result"], here) if shared else ends["result"])
+    def run(given, spec, asked):
+        assert (given, spec, asked) == (worker, CRASH.spec, stopped)
+        if ends["result"] is None:
+            raise StoppedError
+        ended = EndedRun(0, ends["result"], ends["recording"], tmp_path)
+        return ended if shared else iter([ended])
 
-    def read(path):
-        assert path == used[-1] / "blackbox.bin"
-        if ends["error"]:
-            raise ends["error"]
-        return path
-
-    used = []
     monkeypatch.setattr(_replay, "run_alone", run)
-    monkeypatch.setattr(_replay, "read_black_box", read)
-    monkeypatch.setattr(_replay, "Recording", lambda path: records(0, 1))
     monkeypatch.setattr(_replay, "judged", lambda *compared: compared)
-    rerun = SimpleNamespace(worker=Worker(), spec=CRASH.spec, code=code, bundle=BUNDLE, recorded=records(0, 1))
+    rerun = SimpleNamespace(worker=worker, spec=CRASH.spec, code=code, bundle=BUNDLE, recorded=records(0, 1))
     executors = SimpleNamespace(run=run) if shared else None
     first, recorded, replayed, result = _replay._run(rerun, stopped, executors)
     assert (first, result) == (rerun, CRASH)
     last = 99 if code == "snapshot" else 1
     assert [found.records[-1].number for found in (recorded, replayed)] == [last, last]
 
-    def fails(result, says, error=None):
-        ends.update(result=result, error=error)
+    def fails(result, says, recording=ends["recording"]):
+        ends.update(result=result, recording=recording)
         with pytest.raises(CrashhuntError, match=says) as caught:
             _replay._run(rerun, stopped, executors)
         assert caught.value.where == BUNDLE.id
@@ -281,11 +272,9 @@ def test_run_of_a_replay_reads_its_recording_and_removes_it(monkeypatch, tmp_pat
 
     killed = replace(FINE, outcome=Outcome.INVALID, failure=Failure(KILLED, "killed 3 times", exit_code=-9))
     assert fails(killed, "collision: the replay was killed 3 times") is CrashhuntError
-    shutil.rmtree(used[-1], ignore_errors=True)
     invalid = replace(FINE, outcome=Outcome.INVALID, steps=0, failure=Failure("invalid", "the agent needs a map"))
     assert fails(invalid, "as far as the first step: the agent needs a map") is _replay._NotSetUpError
-    assert fails(CRASH, "it left no recording", BundleError("empty")) is _replay._NotSetUpError
-    assert not any(folder.exists() for folder in used)
+    assert fails(CRASH, "it left no recording", None) is _replay._NotSetUpError
     ends.update(result=None)
-    with pytest.raises(_replay._StoppedError):
+    with pytest.raises(StoppedError):
         _replay._run(rerun, stopped, executors)

@@ -39,10 +39,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.analysis import Reruns, divide_by_cause
+from crashhunt.analysis import divide_by_cause
 from crashhunt.base import layout
 from crashhunt.crashes import group_crashes, join_causes, list_bundles
-from crashhunt.replays import ReplayOptions, prepare
+from crashhunt.replays import ReplayOptions, prepare, reruns_of
 from crashhunt.trial import Handover, Outcome
 
 if TYPE_CHECKING:
@@ -182,7 +182,7 @@ def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, dict[st
     reruns = [prepare(bundle, ReplayOptions(trusted=True)) for bundle in bundles]
     asked = [(rerun, what, spec) for rerun in reruns for what, spec in _label_runs(rerun, bugs)]
     with TemporaryDirectory(prefix="crashhunt-causes-") as scratch:
-        runs = Reruns(reruns[0], Path(scratch), parallel=2, stopped=lambda: False)
+        runs = reruns_of(reruns[0], Path(scratch), parallel=2, stopped=lambda: False)
         for ended in runs.run([spec for *_, spec in asked], recorded=False):
             rerun, words, _ = asked[ended.place]
             bundle = rerun.bundle

@@ -28,15 +28,15 @@ from typing import TYPE_CHECKING, Any
 from towns import TOWNS, make_town
 
 from crashhunt.analysis._cause_runs import _Search
-from crashhunt.analysis._reruns import Reruns
 from crashhunt.crashes import ending_of, fault_of, list_bundles, overruled_trial
-from crashhunt.replays import ReplayOptions, Rerun, prepare
+from crashhunt.replays import ReplayOptions, Rerun, prepare, reruns_of
 from crashhunt.trial import KINDS, Disturbance, Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from crashhunt.crashes import Bundle
+    from crashhunt.reruns import Reruns
     from crashhunt.trial import TrialResult
 
 _SCENARIOS = (
@@ -118,7 +118,7 @@ def _put(bundles: list[Bundle]) -> Iterator[dict[str, Any]]:
         return
     reruns = [prepare(bundle, ReplayOptions(force=True)) for bundle in bundles]
     with tempfile.TemporaryDirectory(prefix="crashhunt-judged-") as scratch:
-        runs = Reruns(reruns[0], Path(scratch), parallel=len(os.sched_getaffinity(0)), stopped=lambda: False)
+        runs = reruns_of(reruns[0], Path(scratch), parallel=len(os.sched_getaffinity(0)), stopped=lambda: False)
         try:
             for bundle, rerun in zip(bundles, reruns, strict=True):
                 first = _overruled(rerun, runs, 0, ("brake",))
@@ -134,7 +134,7 @@ def _judged(bundle: Bundle) -> dict[str, Any]:
     assert hit is not None
     told: dict[str, Any] = {"crash": bundle.id, "step": bundle.result.steps, "role": hit.role}
     with tempfile.TemporaryDirectory(prefix="crashhunt-judged-") as scratch:
-        runs = Reruns(rerun, Path(scratch), parallel=len(os.sched_getaffinity(0)), stopped=lambda: False)
+        runs = reruns_of(rerun, Path(scratch), parallel=len(os.sched_getaffinity(0)), stopped=lambda: False)
         try:
             fault = fault_of(bundle, rerun.recorded)
             told |= {"verdict": fault.verdict, "rules": [one.rule for one in fault.findings]}

@@ -19,11 +19,10 @@ from xml.etree import ElementTree as ET
 from heap_orders import build_allocator
 
 from crashhunt.base import layout
-from crashhunt.episode import scratch_of
-from crashhunt.executors import SharedExecutors, run_alone
 from crashhunt.hunts._next_trials import settings_again
 from crashhunt.ledger import Ledger
-from crashhunt.recording import Recording, first_divergence, read_black_box
+from crashhunt.recording import first_divergence
+from crashhunt.reruns import SharedReruns, run_alone
 from crashhunt.snapshots import Snapshot
 
 
@@ -94,16 +93,17 @@ def _run_again(hunt: Path, *, permute: bool) -> tuple[Counter[str], int, list[st
             settings = settings_again(snapshot.settings(), snapshot, Path(folder))
             if permute:  # the new process loads the allocator, this one does not
                 os.environ |= {"LD_PRELOAD": str(build_allocator(Path(folder))), "HEAP_ORDER": str(number + 1)}
-            now = run_alone(settings, was.spec)
-            assert now is not None  # as nothing stops it
+            (alone,) = run_alone(settings, was.spec)
+            now = alone.result
             os.environ.pop("LD_PRELOAD", None)
             if (now.outcome, now.steps, now.digest) == (was.outcome, was.steps, was.digest):
                 continue
-            with closing(SharedExecutors(Path(folder), parallel=1)) as executors:
-                forked, place = executors.run(settings, was.spec) or (now, Path())
-            boxes = (place / layout.BLACK_BOX, scratch_of(settings.scratch, number) / layout.BLACK_BOX)
-            found = first_divergence(*(Recording(read_black_box(box)) for box in boxes))
-            runs = ", ".join(f"{run.outcome} at step {run.steps} ({run.digest})" for run in (was, now, forked))
+            with closing(SharedReruns(Path(folder), parallel=1)) as shared:
+                forked = shared.run(settings, was.spec)
+            assert forked.recording is not None
+            assert alone.recording is not None
+            found = first_divergence(forked.recording, alone.recording)
+            runs = ", ".join(f"{run.outcome} at step {run.steps} ({run.digest})" for run in (was, now, forked.result))
             different.append(
                 f"trial {number} of {hunt}: hunt, new process, fork again: {runs}; {found or 'the last two are equal'}"
             )
