@@ -359,6 +359,7 @@ def call_in_threads(
     *,
     ended: Callable[[R], None] = lambda _: None,
     tick: Callable[[], None] = lambda: None,
+    over: threading.Event | None = None,
 ) -> list[R]:
     """Call a function for each item in threads that wait for processes; return the results in item order.
 
@@ -368,14 +369,20 @@ def call_in_threads(
         parallel: number of threads.
         ended: function called with each result, in the thread of the caller.
         tick: function called about ten times a second, in the thread of the caller.
+        over: event that tells the functions to return; it is set if an exception, such as Ctrl-C, ends the wait.
     """
     with ThreadPoolExecutor(parallel) as threads:
         futures = [threads.submit(function, item) for item in items]
         pending = dict.fromkeys(futures)
-        while pending:
-            first = list(islice(pending, 8 * parallel))  # a wait for 10,000 futures takes longer than a tick
-            for future in wait(first, timeout=_STOP_CHECK_INTERVAL_S, return_when=FIRST_COMPLETED).done:
-                del pending[future]
-                ended(future.result())
-            tick()
+        try:
+            while pending:
+                first = list(islice(pending, 8 * parallel))  # a wait for 10,000 futures takes longer than a tick
+                for future in wait(first, timeout=_STOP_CHECK_INTERVAL_S, return_when=FIRST_COMPLETED).done:
+                    del pending[future]
+                    ended(future.result())
+                tick()
+        except BaseException:
+            if over is not None:
+                over.set()
+            raise
         return [future.result() for future in futures]

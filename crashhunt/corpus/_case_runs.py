@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections import deque
-from contextlib import ExitStack
+import threading
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING, Literal
 from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError
-from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.base.text import command_line, in_lines, one_line
 from crashhunt.corpus._cases import Case, Expectation, cases_of_type, read_case, signature_today
 from crashhunt.crashes import Bundle, is_bundle_trusted, refuse_untrusted, signature_of, snapshot_of, write_bundle
-from crashhunt.episode import WorkerSettings, scratch_of
-from crashhunt.executors import FreshProcessExecutor, read_map
+from crashhunt.episode import WorkerSettings
 from crashhunt.plans import (
     load_order_change,
     read_settings,
@@ -25,6 +23,7 @@ from crashhunt.plans import (
     with_settings,
     write_settings,
 )
+from crashhunt.reruns import StoppedError, call_in_threads, run_alone
 from crashhunt.snapshots import Snapshot, environment_changes, take_snapshot
 from crashhunt.trial import Outcome
 
@@ -32,13 +31,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from crashhunt.base.progress import Watch
+    from crashhunt.crashes import Signature
     from crashhunt.plans import HuntSettings
-    from crashhunt.trial import TrialResult
+    from crashhunt.reruns import EndedRun
+    from crashhunt.scenario import Scenario
 
 __all__ = ["CaseReport", "Got", "run_cases", "untrusted_case"]
 
 Got = Literal["still", "fixed", "changed", "cannot_run"]
-_LOOK_EVERY_S = 0.01  # wait for a result of each running case
 _HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)
 
 
@@ -139,27 +139,26 @@ def run_cases(
     """
     if not trusted:
         _refuse_untrusted_cases(cases)
-    reports: dict[Path, CaseReport] = {}
     kept = {} if keep is None else _folders_of_kept(cases, keep)
-    waiting, running = deque(cases), dict[Path, _Running]()
-    with ExitStack() as stack:
-        while (waiting or running) and not stopped():
-            while waiting and len(running) < (parallel or os.cpu_count() or 1):
-                path = waiting.popleft()
-                began = _begin(path, stack)
-                if isinstance(began, CaseReport):
-                    reports[path] = began
-                else:
-                    running[path] = began
-            for path, run in list(running.items()):
-                report = run.look(kept.get(path))
-                if report is not None:
-                    reports[path] = report
-                    del running[path]
-                    run.close()
-            if watch is not None:
-                watch(len(reports), len(cases))
-    return [reports[path] for path in cases if path in reports]
+    reports: list[CaseReport] = []
+    over = threading.Event()
+
+    def tick() -> None:
+        if stopped():
+            over.set()
+        if watch is not None:
+            watch(len(reports), len(cases))
+
+    def run(path: Path) -> CaseReport | None:
+        with suppress(StoppedError):
+            return None if over.is_set() else _run_case(path, kept.get(path), over.is_set)
+        return None
+
+    def ended(report: CaseReport | None) -> None:
+        reports.extend([] if report is None else [report])
+
+    found = call_in_threads(run, cases, parallel or os.cpu_count() or 1, ended=ended, tick=tick, over=over)
+    return [report for report in found if report is not None]
 
 
 def _folders_of_kept(cases: Sequence[Path], keep: Path) -> dict[Path, Path]:
@@ -196,110 +195,80 @@ def untrusted_case(path: Path) -> Bundle | None:
     return None if is_bundle_trusted(bundle, faults=()) else bundle
 
 
-class _Running:
-    """A case that is running."""
-
-    def __init__(self, case: Case, bundle: Bundle, settings: HuntSettings, snapshot: Snapshot) -> None:
-        self._case, self._bundle, self._settings = case, bundle, settings
-        self._warnings = _warnings(snapshot)
-        self._folder = TemporaryFolder("corpus")
-        self._scratch = self._folder.path
-        order = snapshot.environment().get("load_order")
-        self._scenario = with_recorded_load_order(with_settings(snapshot.scenario(), settings), order)
-        self._executor = FreshProcessExecutor(
-            WorkerSettings(
-                scenario=self._scenario,
-                oracles=settings.oracles,
-                crash_on=settings.crash_on,
-                scratch=self._scratch,
-                timeout_s=settings.run.timeout_s,
-                keep_trials=True,
-            )
-        )
-        self._executor.submit(bundle.result.spec)
-
-    def look(self, keep: Path | None) -> CaseReport | None:
-        """Return the report of the case; None while the case is running."""
-        case = self._case
-        try:
-            result = next(iter(self._executor.completed(_LOOK_EVERY_S)), None)
-            return None if result is None else self._report(result, keep)
-        except BundleError as error:  # the process died before it recorded anything
-            return CaseReport(
-                path=case.path,
-                expected=case.expect,
-                got="cannot_run",
-                was=case.crash,
-                now=str(error),
-                note=case.note,
-                warnings=self._warnings,
-            )
-        except CrashhuntError as error:
-            why = f"{error.message} ({error.fix})" if error.fix else error.message
-            return CaseReport(
-                path=case.path,
-                expected=case.expect,
-                got="cannot_run",
-                was=case.crash,
-                now=why,
-                note=case.note,
-                warnings=self._warnings,
-            )
-
-    def close(self) -> None:
-        """End the process and remove its files; a second call does nothing."""
-        self._executor.close()
-        self._folder.remove()
-
-    def _report(self, result: TrialResult, keep: Path | None) -> CaseReport:
-        case = self._case
-        got: Got = "fixed" if result.outcome in _HARMLESS_OUTCOMES else "cannot_run"
-        kept = None
-        if result.outcome not in (*_HARMLESS_OUTCOMES, Outcome.INVALID):
-            kept = self._keep(result, keep or self._scratch / "kept", whole=keep is not None)
-            now = signature_of(kept)
-            is_same = bool(cases_of_type(now, [replace(case, expect="still")])) or not case.signature
-            got = "still" if is_same or now == signature_today(case.path) else "changed"
-        found = CaseReport(
-            path=case.path,
-            expected=case.expect,
-            got=got,
-            was=case.crash,
-            now=result.summary,
-            note=case.note,
-            warnings=self._warnings,
-        )
-        return replace(found, kept=kept.path if kept is not None and keep is not None else None)
-
-    def _keep(self, result: TrialResult, directory: Path, *, whole: bool) -> Bundle:
-        """Write a bundle of the present crash; if ``whole``, also the other files of a hunt's directory."""
-        digest = self._bundle.snapshot
-        if whole:
-            directory.mkdir(parents=True, exist_ok=True)
-            write_settings(
-                directory / layout.HUNT, self._settings, ["crashhunt", "corpus", "run", str(self._case.path)]
-            )
-            digest = take_snapshot(directory / layout.SNAPSHOTS, self._scenario, self._settings).digest
-        trial = scratch_of(self._scratch, result.spec.number)
-        return write_bundle(
-            directory, result, trial, hunt_seed=self._bundle.hunt_seed, snapshot=digest,
-            lanes=read_map(self._scratch, trial),
-        )  # fmt: skip
+_lock = threading.Lock()  # of all work but the trials: a snapshot lists the modules that are imported
 
 
-def _begin(path: Path, stack: ExitStack) -> _Running | CaseReport:
-    expected: Expectation = "fixed"  # an unreadable case never meets its expectation
-    was = note = ""
+def _run_case(path: Path, keep: Path | None, stopped: Callable[[], bool]) -> CaseReport:
+    """Run a case; return its report.
+
+    Args:
+        path: The folder of the case.
+        keep: The directory for the crash; None to keep no crash.
+        stopped: Function that returns whether to stop; called repeatedly.
+
+    Raises:
+        StoppedError: A stop was requested before the end of the case.
+    """
+    report = CaseReport(path=path, expected="fixed", got="cannot_run")  # an unreadable case never meets its expectation
     try:
-        case = read_case(path)
-        expected, was, note = case.expect, case.crash, case.note
-        bundle = case.bundle()
-        snapshot = _verified_snapshot(Snapshot(path / layout.SNAPSHOTS / bundle.snapshot))
-        running = _Running(case, bundle, read_settings(path / layout.HUNT), snapshot)
+        with _lock:
+            case = read_case(path)
+            report = replace(report, expected=case.expect, was=case.crash, note=case.note)
+            bundle = case.bundle()
+            snapshot = _verified_snapshot(Snapshot(path / layout.SNAPSHOTS / bundle.snapshot))
+            settings = read_settings(path / layout.HUNT)
+            report, scenario = replace(report, warnings=_warnings(snapshot)), _scenario(snapshot, settings)
     except CrashhuntError as error:
-        return CaseReport(path=path, expected=expected, got="cannot_run", was=was, now=str(error), note=note)
-    stack.callback(running.close)
-    return running
+        return replace(report, now=str(error))
+    worker = WorkerSettings(
+        scenario=scenario,
+        oracles=settings.oracles,
+        crash_on=settings.crash_on,
+        scratch=Path(),
+        timeout_s=settings.run.timeout_s,
+        keep_trials=True,
+    )
+    try:
+        for ended in run_alone(worker, bundle.result.spec, stopped):
+            report = replace(report, now=ended.result.summary)
+            if ended.result.outcome in _HARMLESS_OUTCOMES:
+                return replace(report, got="fixed")
+            if ended.result.outcome is not Outcome.INVALID:
+                with _lock:
+                    directory = keep or ended.folder.parent / "kept"
+                    kept = _write_crash(directory, bundle, ended, settings if keep else None, scenario, path)
+                    report = replace(report, got=_status(case, signature_of(kept)))
+                    return replace(report, kept=kept.path if keep else None)
+    except BundleError as error:  # the process died before it recorded anything
+        return replace(report, now=str(error))
+    except CrashhuntError as error:
+        return replace(report, now=f"{error.message} ({error.fix})" if error.fix else error.message)
+    return report
+
+
+def _status(case: Case, now: Signature) -> Got:
+    """Return whether a crash has the type of a case, also if earlier rules determined the stored signature."""
+    is_same = bool(cases_of_type(now, [replace(case, expect="still")])) or not case.signature
+    return "still" if is_same or now == signature_today(case.path) else "changed"
+
+
+def _write_crash(
+    directory: Path, was: Bundle, ended: EndedRun, settings: HuntSettings | None, scenario: Scenario, case: Path
+) -> Bundle:
+    """Write a bundle of the present crash; with settings, also the other files of a hunt's directory."""
+    digest = was.snapshot
+    if settings is not None:
+        directory.mkdir(parents=True, exist_ok=True)
+        write_settings(directory / layout.HUNT, settings, ["crashhunt", "corpus", "run", str(case)])
+        digest = take_snapshot(directory / layout.SNAPSHOTS, scenario, settings).digest
+    return write_bundle(
+        directory, ended.result, ended.folder, hunt_seed=was.hunt_seed, snapshot=digest, lanes=ended.lanes
+    )
+
+
+def _scenario(snapshot: Snapshot, settings: HuntSettings) -> Scenario:
+    order = snapshot.environment().get("load_order")
+    return with_recorded_load_order(with_settings(snapshot.scenario(), settings), order)
 
 
 def _verified_snapshot(snapshot: Snapshot) -> Snapshot:

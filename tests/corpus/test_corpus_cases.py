@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +24,7 @@ from crashhunt.corpus import (
     run_cases,
 )
 from crashhunt.crashes import Cause, Judgement, Signature, judgement_of, with_judgement
+from crashhunt.reruns import EndedRun, StoppedError
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "case"
@@ -49,7 +52,7 @@ def test_case_names_its_crash_and_what_is_expected(case):
     assert (case.kind_of_log(), case.to_json()["log"]) == ("", False)
 
 
-def test_case_without_log_names_the_command_that_records_it(case, tmp_path, run, monkeypatch):
+def test_case_without_log_names_the_command_that_records_it(case, tmp_path, run, trials):
     """As of an earlier version."""
     (log,) = case.path.rglob("log.mcap")
     log.unlink()
@@ -59,7 +62,7 @@ def test_case_without_log_names_the_command_that_records_it(case, tmp_path, run,
     added = add_case(case.bundle(), tmp_path / "other").case  # as bisect adds it
     assert (added.kind_of_log(), added.crash) == ("", case.crash)
     run()  # which replaces what runs trials
-    monkeypatch.setattr(Executor, "results", [Outcome.COLLISION])
+    trials.results[:] = [Outcome.COLLISION]
     (found,) = run_cases([added.path], trusted=True)
     assert (found.got, found.was) == ("still", case.crash)
 
@@ -338,39 +341,45 @@ def test_report_describes_the_crash_and_how_to_look_at_it():
     assert "kept" not in report().to_json()
 
 
-class Executor:
-    """Runs the trial of a case at its second look, with the results that a list has."""
+class Trials:
+    """In place of runs in new processes: the trials end with the results of a list, several at a time."""
 
-    results = made = ()
+    def __init__(self):
+        self.results, self.workers, self.running, self.most, self.lock = [], [], 0, 0, threading.Lock()
+        self.begun = lambda stopped: None
 
-    def __init__(self, settings):
-        self.settings, self.looks, self.closed = settings, 0, 0
-        self.made.append(self)
-
-    def submit(self, spec):
-        self.spec = spec
-
-    def completed(self, wait_s):
-        self.looks += 1
-        if self.looks == 2:
+    def run(self, worker, spec, stopped):
+        with self.lock:
+            self.workers.append(worker)
             result = self.results.pop(0)
+            self.running += 1
+            self.most = max(self.most, self.running)
+        try:
+            self.begun(stopped)
+            if stopped():
+                raise StoppedError
             if isinstance(result, Exception):
                 raise result
-            yield TrialResult(self.spec, result, 9)
-
-    def close(self):
-        self.closed += 1
+            yield EndedRun(0, TrialResult(spec, result, 9), None, Path("scratch/trial"))
+        finally:
+            with self.lock:
+                self.running -= 1
 
 
 @pytest.fixture
-def run(monkeypatch, tmp_path):
+def trials(monkeypatch):
+    made = Trials()
+    monkeypatch.setattr(_run, "run_alone", made.run)
+    return made
+
+
+@pytest.fixture
+def run(trials, monkeypatch, tmp_path):
     """Runs cases whose trials end as given."""
-    monkeypatch.setattr(_run, "FreshProcessExecutor", Executor)
-    monkeypatch.setattr(Executor, "made", [])
     monkeypatch.setattr(_run, "write_bundle", lambda folder, result, *more, **options: SimpleNamespace(path=folder))
 
     def run_them(*results, manner="rear end", **options):
-        monkeypatch.setattr(Executor, "results", [*results])
+        trials.results[:] = results
         parts = {**read_case(FROZEN).signature, "manner": manner, "later": True}
         monkeypatch.setattr(_run, "signature_of", lambda bundle: SimpleNamespace(to_json=lambda: parts))
         paths = [tmp_path / str(number) for number in range(len(results))]
@@ -381,7 +390,7 @@ def run(monkeypatch, tmp_path):
     return run_them
 
 
-def test_status_of_a_case_is_that_of_its_trial(run):
+def test_status_of_a_case_is_that_of_its_trial(run, trials):
     outcomes = (Outcome.COLLISION, Outcome.SURVIVED, Outcome.FINISHED, Outcome.INVALID)
     watched = []
     found = run(*outcomes, watch=lambda done, count: watched.append((done, count)))
@@ -390,25 +399,51 @@ def test_status_of_a_case_is_that_of_its_trial(run):
     assert {(one.expected, one.was, one.note, one.kept) for one in found} == {
         ("still", "ego drove into leader at step 52", "frozen: never made anew", None)
     }
-    assert watched == [(0, 4), (1, 4), (1, 4), (2, 4), (2, 4), (3, 4), (3, 4), (4, 4)]
-    assert [executor.closed for executor in Executor.made] == [2] * 4  # after the trial, and at the end
-    assert {executor.settings.keep_trials for executor in Executor.made} == {True}
+    assert watched == sorted(watched)
+    assert watched[-1] == (4, 4)
+    assert {worker.keep_trials for worker in trials.workers} == {True}
     (other,) = run(Outcome.COLLISION, manner="side swipe")
     assert other.got == "changed"
 
 
-def test_as_many_cases_run_at_a_time_as_are_asked_for(run, monkeypatch):
-    watched = []
-    run(*[Outcome.SURVIVED] * 3, parallel=2, watch=lambda done, count: watched.append(done))
-    assert watched == [0, 2, 2, 3]
-    for cores, expected in ((3, [0, 3]), (None, [0, 1, 1, 2, 2, 3])):
+def test_as_many_cases_run_at_a_time_as_are_asked_for(run, trials, monkeypatch):
+    for parallel, cores, most in ((1, 3, 1), (2, 1, 2), (0, 3, 3), (0, None, 1)):
+        trials.most = 0
         monkeypatch.setattr(_run.os, "cpu_count", lambda cores=cores: cores)
-        watched.clear()
-        run(*[Outcome.SURVIVED] * 3, parallel=0, watch=lambda done, count: watched.append(done))
-        assert watched == expected
-    asked = []
-    found = run(*[Outcome.SURVIVED] * 3, stopped=lambda: asked.append(1) or len(asked) > 3)
-    assert [one.path.name for one in found] == ["0"]
+        barrier = threading.Barrier(most)
+        trials.begun = lambda stopped, barrier=barrier: barrier.wait(20)
+        assert len(run(*[Outcome.SURVIVED] * 6, parallel=parallel)) == 6
+        assert trials.most == most
+
+
+def wait_for(stopped):
+    until = time.monotonic() + 20
+    while not stopped() and time.monotonic() < until:
+        time.sleep(0.01)
+
+
+def test_stop_keeps_the_reports_of_the_cases_that_ended(run, trials):
+    stop, begun = threading.Event(), []
+
+    def begin(stopped):
+        begun.append(1)
+        if len(begun) == 2:
+            stop.set()
+            wait_for(stopped)
+
+    trials.begun = begin
+    found = run(*[Outcome.SURVIVED] * 3, stopped=stop.is_set)
+    assert ([one.path.name for one in found], len(begun)) == (["0"], 2)
+
+
+def test_ctrl_c_ends_the_running_cases(run, trials):
+    def interrupt(done, count):
+        raise KeyboardInterrupt
+
+    trials.begun = wait_for
+    with pytest.raises(KeyboardInterrupt):
+        run(*[Outcome.SURVIVED] * 9, watch=interrupt)
+    assert len(trials.workers) == 1
 
 
 def test_what_keeps_a_case_from_running_is_its_result(run, tmp_path):
@@ -438,9 +473,9 @@ def test_crash_is_kept_only_where_a_folder_is_given(run, tmp_path):
     assert found.kept is None
 
 
-def test_kept_crashes_of_cases_with_the_same_name_have_their_own_folders(run, tmp_path, monkeypatch):
+def test_kept_crashes_of_cases_with_the_same_name_have_their_own_folders(run, trials, tmp_path):
     run()
-    monkeypatch.setattr(Executor, "results", [Outcome.COLLISION] * 3)
+    trials.results[:] = [Outcome.COLLISION] * 3
     names = ("a/case", "b/case", "b/case-2")
     cases = [Path(shutil.copytree(FROZEN, tmp_path / name)) for name in names]
     found = run_cases(cases, trusted=True, parallel=1, keep=tmp_path / "out")
@@ -449,13 +484,13 @@ def test_kept_crashes_of_cases_with_the_same_name_have_their_own_folders(run, tm
     ]  # fmt: skip
 
 
-def test_case_that_is_not_trusted_runs_nothing(run, tmp_path, monkeypatch):
+def test_case_that_is_not_trusted_runs_nothing(run, trials, tmp_path, monkeypatch):
     run()
     shutil.copytree(FROZEN, tmp_path / "0")
     monkeypatch.setattr(_run, "is_bundle_trusted", lambda bundle, faults: False)
     with pytest.raises(UntrustedError, match=str(tmp_path / "0")):
         run_cases([tmp_path / "0"])
-    assert Executor.made == []
+    assert trials.workers == []
     assert _run.untrusted_case(tmp_path / "0").id == "000000-collision"
     assert _run.untrusted_case(tmp_path) is None  # it cannot run anyway
     monkeypatch.setattr(_run, "is_bundle_trusted", lambda bundle, faults: True)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from conftest import add_toy, rewritten
 
 from crashhunt.base.version import __version__
-from crashhunt.corpus._case_runs import _begin
+from crashhunt.corpus._case_runs import _run_case
 from crashhunt.crashes import find_bundle
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.replays._replaying import judged
@@ -305,19 +303,15 @@ def test_a_case_keeps_the_order_of_links_that_it_was_recorded_with(crash_on_sumo
     (snapshot,) = (path / "snapshots").iterdir()
     environment = json.loads((snapshot / "environment.json").read_text())
     asked = []
-    submitted = SimpleNamespace(submit=lambda _: None, close=lambda: None)
-    monkeypatch.setattr(
-        "crashhunt.corpus._case_runs.FreshProcessExecutor", lambda settings: asked.append(settings) or submitted
-    )
+    monkeypatch.setattr("crashhunt.corpus._case_runs.run_alone", lambda worker, *given: asked.append(worker) or ())
     monkeypatch.setattr("crashhunt.native._link_order._load_library", lambda: None)
     missing = "the order of SUMO's links was fixed and is not fixed: the library is not built, which may be why"
     for recorded, kept, warnings in (({}, False, ()), ({"load_order": "fixed"}, None, (missing,))):
         environment.pop("load_order", None)
         rewritten(snapshot, "environment.json", json.dumps({**environment, **recorded}))
-        with ExitStack() as stack:
-            running = _begin(path, stack)
+        report = _run_case(path, None, lambda: False)
         assert asked.pop().scenario.table(SumoSetup).fix_link_order is kept
-        assert running._warnings == warnings
+        assert report.warnings == warnings
 
 
 def test_a_fixed_order_of_links_that_is_missing_is_the_first_suspect(crash_on_sumo, monkeypatch):
