@@ -16,8 +16,10 @@ from crashhunt.crashes import (
     Attempt,
     Judgement,
     LaneMap,
+    StepBisection,
     changes_of,
     ending_of,
+    last_avoiding,
     last_escape,
     overruled_trial,
     slowing,
@@ -87,7 +89,7 @@ class _Tries:
     @property
     def last(self) -> int | None:
         """The last step from which the manoeuvre avoids the crash."""
-        return max((step for step, ending in self.endings.items() if ending == "avoided"), default=None)
+        return last_avoiding(self.endings)
 
 
 class AvoidanceSearch:
@@ -163,22 +165,8 @@ class AvoidanceSearch:
 
     def _find(self, tries: _Tries, start: int, first: int) -> None:
         """Bisect between a step that avoids the crash and a step that does not."""
-        self._run_after_steps(tries, {start, self._end - 1} if self._parallel > 1 else {start})
-        stride = 1
-        while True:
-            helps = tries.last
-            above = -1 if helps is None else helps
-            late = min((step for step in tries.endings if step > above), default=self._end)
-            if helps is None:
-                if late <= first:
-                    return
-                steps = {max(first, late - stride * 2**more) for more in range(self._parallel)}
-                stride *= 2**self._parallel
-            elif late - helps <= 1:
-                return
-            else:
-                parts = min(self._parallel, late - helps - 1) + 1
-                steps = {helps + (late - helps) * part // parts for part in range(1, parts)}
+        bisection = StepBisection(first, start, self._end, parallel=self._parallel)
+        while steps := bisection.next_steps(tries.endings):
             self._run_after_steps(tries, steps)
 
     def _run_later_steps(self, tries: _Tries, first: int) -> None:

@@ -72,9 +72,11 @@ from ._judgement import (
 from ._lanes import Borders as Borders, LaneMap as LaneMap
 from ._last_avoidable_step import (
     Ending as Ending,
+    StepBisection as StepBisection,
     changes_of as changes_of,
     ending_of as ending_of,
     find_escape as find_escape,
+    last_avoiding as last_avoiding,
     overruled_trial as overruled_trial,
     partner as partner,
     slowing as slowing,

@@ -15,14 +15,17 @@ from crashhunt.recording import has_same_scenes
 from crashhunt.trial import Escape, Outcome, Overruled
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from crashhunt.crashes._lanes import Borders
     from crashhunt.recording import Recording
     from crashhunt.simulators import FullBraking
     from crashhunt.trial import Collision, TrialResult, TrialSpec
 
-__all__ = ["Ending", "changes_of", "ending_of", "find_escape", "overruled_trial", "partner", "slowing"]
+__all__ = [
+    "Ending", "StepBisection", "changes_of", "ending_of", "find_escape", "last_avoiding", "overruled_trial", "partner",
+    "slowing",
+]  # fmt: skip
 
 _MAX_RUNS = 12  # enough to bisect a thousand steps
 _BEFORE_S = 10.0  # earlier braking is not examined
@@ -44,6 +47,54 @@ Ending = Literal["avoided", "hit", "other", "unclear", "diverged", "impossible"]
 
 In order: no crash, a crash of the same two actors, another crash, an unclear end, a run that deviated before the
 override. The last is no crash, but the simulator stopped the vehicle harder than any vehicle can."""
+
+
+class StepBisection:
+    """Chooses the steps after which a manoeuvre runs next, to find the last step from which it avoids a crash.
+
+    As long as no run avoids the crash, the search goes back with strides that double. It then bisects between the last
+    step that avoids the crash and the next step that does not.
+
+    Args:
+        first: the first step to examine.
+        start: the step at which the search begins.
+        end: the step of the crash, at which it is too late.
+        parallel: number of runs at a time.
+        is_near: whether the last step is assumed to be near the start. Then strides also double towards the crash.
+    """
+
+    def __init__(self, first: int, start: int, end: int, *, parallel: int = 1, is_near: bool = False) -> None:
+        self._first, self._start, self._end = first, start, end
+        self._parallel, self._is_near, self._stride = parallel, is_near, 1
+
+    def next_steps(self, endings: Mapping[int, Ending]) -> set[int]:
+        """Return the steps to run next; empty if the last step that avoids the crash is known, or if there is none.
+
+        Args:
+            endings: what happened to the crash in the runs so far, by step.
+        """
+        if not endings:
+            return {self._start, self._end - 1} if self._parallel > 1 else {self._start}
+        helps = last_avoiding(endings)
+        late = min((step for step in endings if helps is None or step > helps), default=self._end)
+        if helps is None:
+            if late <= self._first:
+                return set()
+            found = {max(self._first, late - self._stride * 2**more) for more in range(self._parallel)}
+            self._stride *= 2**self._parallel
+            return found
+        if late - helps <= 1:
+            return set()
+        if self._is_near and late == self._end:
+            self._stride *= 2
+            return {min(self._end - 1, helps + self._stride // 2)}
+        parts = min(self._parallel, late - helps - 1) + 1
+        return {helps + (late - helps) * part // parts for part in range(1, parts)}
+
+
+def last_avoiding(endings: Mapping[int, Ending]) -> int | None:
+    """Return the last step from which a run avoids the crash; None if no run does."""
+    return max((step for step, ending in endings.items() if ending == "avoided"), default=None)
 
 
 def partner(result: TrialResult) -> str:
@@ -127,29 +178,17 @@ class _Search:
         agent, guess = self.result.collision.agent, self.braking.deceleration or _ASSUMED_DECELERATION_MPS2
         start = last_escape(self.recording, agent, self._other, braking=guess)
         start = min(max(first, end - 2 if start is None else start), end - 1)
-        helps, late = -1, end  # after the step of the crash it is too late by itself
-        step, stride = start, 1
-        while first <= step < end:
+        bisection = StepBisection(first, start, end, is_near=True)
+        while steps := bisection.next_steps(self.endings):
+            (step,) = steps
             ending = self._ending(step)
             if ending not in ("avoided", "hit"):
                 self.why_not = self.why_not or f"when it brakes after step {step}, {_UNCLEAR_REASONS[ending]}"
                 return None
-            if ending == "avoided":
-                helps = step
-            else:
-                late = step
-            if helps >= 0 and late - helps == 1:
-                return helps, late if late < end else None
-            if helps < 0:
-                if step == first:
-                    return None, first
-                step, stride = max(first, step - stride), 2 * stride
-            elif late == end:
-                step, stride = min(end - 1, step + stride), 2 * stride
-            else:
-                step = (helps + late) // 2
-        self.why_not = "no step was examined"
-        return None
+        helps = last_avoiding(self.endings)
+        if helps is None:
+            return None, first
+        return helps, helps + 1 if helps + 1 < end else None
 
     def how(self, deceleration: float) -> str:
         """Return a description of the braking; it contains only decelerations that the vehicle reached in a run."""
@@ -180,8 +219,6 @@ class _Search:
 
     def _ending(self, after: int) -> Ending:
         """Run the trial with the agent overruled after a step, and return what happened to the crash."""
-        if after in self.endings:
-            return self.endings[after]
         if len(self.endings) >= _MAX_RUNS:
             self.why_not = f"{_MAX_RUNS} runs did not find it"
         elif time.monotonic() - self.began > _WALL_S:

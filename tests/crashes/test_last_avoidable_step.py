@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from crashhunt.crashes import find_escape, partner
+from crashhunt.crashes import StepBisection, find_escape, last_avoiding, partner
 from crashhunt.crashes._last_avoidable_step import overruled_trial, slowing
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.simulators import FullBraking
@@ -296,3 +296,23 @@ def test_how_long_it_is_run_and_how_hard_it_braked_by_hand():
         spec = overruled_trial(crashed, recording, after, 4.0)
         assert spec.max_steps == 4 + math.ceil((5.0 + speed / 4.0) / DT)
         assert (spec.overruled.agent, spec.overruled.after, spec.overruled.manoeuvre) == ("ego", after, "brake")
+
+
+@pytest.mark.parametrize(
+    ("last", "given", "order"),
+    [
+        (12, {}, [[20], [19], [17], [13], [5], [9], [11], [12]]),
+        (33, {}, [[20], [30], [35], [32], [33], [34]]),
+        (33, {"is_near": True}, [[20], [21], [23], [27], [35], [31], [33], [34]]),
+        (12, {"parallel": 3}, [[20, 39], [16, 18, 19], [2, 8], [10, 12, 14], [13]]),
+        (-1, {}, [[20], [19], [17], [13], [5], [2]]),
+        (39, {"is_near": True}, [[20], [21], [23], [27], [35], [39]]),
+    ],
+)
+def test_bisection_examines_few_steps(last, given, order):
+    bisection, endings, found = StepBisection(2, 20, 40, **given), {}, []
+    while steps := bisection.next_steps(endings):
+        found.append(sorted(steps))
+        endings |= {step: "avoided" if step <= last else "hit" for step in steps}
+    assert found == order
+    assert last_avoiding(endings) == (None if last < 2 else last)
