@@ -171,49 +171,29 @@ def shrink(
             raise BundleError(message, fix=_DISK_FIX, where=str(bundle.path.parent)) from None
         if small is None:
             why = "what was left did not do the same in a fresh process"
-    if not search.reproduced:
-        verdict: Verdict = "not_reproduced" if ended == "done" else "unchanged"
-        return Shrunk(
-            bundle=bundle,
-            verdict=verdict,
-            ended=ended,
-            small=None,
-            why=why,
-            actors=search.actors(None),
-            agents=search.agents,
-            trials=runs.count,
-            steps=runs.steps,
-            notes=(*rerun.warnings, *search.notes),
-        )
-    if small is None:
-        return Shrunk(
-            bundle=bundle,
-            verdict="unchanged",
-            ended=ended,
-            small=None,
-            why=why,
-            actors=search.actors(None),
-            agents=search.agents,
-            trials=runs.count,
-            steps=runs.steps,
-            notes=(*rerun.warnings, *search.notes),
-        )
-    if ended == "done":
-        memory.unlink(missing_ok=True)
-    return Shrunk(
+    found = Shrunk(
         bundle=bundle,
-        verdict="shrunk",
+        verdict="unchanged" if search.reproduced or ended != "done" else "not_reproduced",
         ended=ended,
-        small=small,
         why=why,
-        actors=search.actors(small.recording()),
+        actors=search.actors(None),
         agents=search.agents,
         trials=runs.count,
         steps=runs.steps,
+        notes=(*rerun.warnings, *search.notes),
+    )
+    if small is None:
+        return found
+    if ended == "done":
+        memory.unlink(missing_ok=True)
+    return replace(
+        found,
+        verdict="shrunk",
+        small=small,
+        actors=search.actors(small.recording()),
         removed=search.removed(),
         changed=search.changed(),
         steps_cut=search.steps_cut,
-        notes=(*rerun.warnings, *search.notes),
     )
 
 

@@ -20,7 +20,7 @@ from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.hunts._next_trials import settings_again
 from crashhunt.hunts._reports import AuditReport, Difference
-from crashhunt.recording import Recording, first_divergence, read_black_box
+from crashhunt.recording import Divergence, Recording, first_divergence, read_black_box
 from crashhunt.replays import ReplayOptions, confirm
 from crashhunt.reruns import Reruns, StoppedError
 from crashhunt.results import Judged
@@ -549,25 +549,20 @@ class Audit:
             found = None
         finally:
             self._clean_up(number)
-        if found is not None:
-            return Difference(
-                trial=number,
-                step=found.step,
-                agent=found.agent,
-                field=found.field,
-                recorded=found.recorded,
-                replayed=found.replayed,
+        if found is None and was.is_identical_run(now):
+            return None
+        if found is None:
+            found = Divergence(
+                step=now.steps, agent="", field="the outcome", recorded=str(was.outcome), replayed=str(now.outcome)
             )
-        if not was.is_identical_run(now):
-            return Difference(
-                trial=number,
-                step=now.steps,
-                agent="",
-                field="the outcome",
-                recorded=str(was.outcome),
-                replayed=str(now.outcome),
-            )
-        return None
+        return Difference(
+            trial=number,
+            step=found.step,
+            agent=found.agent,
+            field=found.field,
+            recorded=found.recorded,
+            replayed=found.replayed,
+        )
 
     def _folders(self, number: int) -> tuple[Path, Path]:
         """Return the paths of a trial's two recordings: from the hunt, and from the new process."""

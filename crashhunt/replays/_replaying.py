@@ -97,16 +97,15 @@ def judged(
         result: the result of the replay.
         whole: whether the replay was expected to end where the crash did.
     """
+    divergence = None
     if rerun.elsewhere:
-        if result.outcome in rerun.worker.crash_on:
-            return ReplayReport(rerun=rerun, verdict="changed", replayed=result, recording=replayed)
-        return ReplayReport(
-            rerun=rerun, verdict="not_comparable", replayed=result, recording=replayed, reason=_no_fix(rerun)
-        )
-    divergence = first_divergence(recorded, replayed)
-    if divergence is None and whole:
-        divergence = _end_divergence(rerun.bundle.result, result, rerun.code)
-    verdict, reason = _judge(rerun, replayed, result, divergence, whole=whole)
+        verdict: Verdict = "changed" if result.outcome in rerun.worker.crash_on else "not_comparable"
+        reason = "" if verdict == "changed" else _no_fix(rerun)
+    else:
+        divergence = first_divergence(recorded, replayed)
+        if divergence is None and whole:
+            divergence = _end_divergence(rerun.bundle.result, result, rerun.code)
+        verdict, reason = _judge(rerun, replayed, result, divergence, whole=whole)
     around = tuple(values_around(recorded, replayed, divergence)) if divergence is not None else ()
     return ReplayReport(
         rerun=rerun,

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base.capabilities import supports
-from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes import partner
-from crashhunt.executors import FreshProcessExecutor
 from crashhunt.recording import read_log
 from crashhunt.replays import ReplayOptions, prepare
+from crashhunt.reruns import run_alone
 from crashhunt.simulators import NamesMetaActions
 
 if TYPE_CHECKING:
@@ -101,15 +100,8 @@ def _avoids(rerun: Rerun, after: int, afterwards_s: float) -> bool:
         for agent, given in rerun.spec.arguments.items()
     }
     steps = rerun.recorded.steps + round(afterwards_s / rerun.recorded.prologue.step_length_s)
-    with temporary_folder("escape") as scratch:
-        worker = replace(
-            rerun.worker, scenario=scenario.with_agents(dict.fromkeys(scenario.agents, name)), scratch=scratch
-        )
-        executor = FreshProcessExecutor(worker)
-        try:
-            executor.submit(replace(rerun.spec, arguments=arguments, max_steps=steps))
-            result = next(result for _ in iter(int, 1) for result in executor.completed(1.0))
-        finally:
-            executor.close()
+    worker = replace(rerun.worker, scenario=scenario.with_agents(dict.fromkeys(scenario.agents, name)))
+    (ended,) = run_alone(worker, replace(rerun.spec, arguments=arguments, max_steps=steps))
+    result = ended.result
     other = partner(rerun.bundle.result)
     return partner(result) != other or result.collision is None or result.collision.agent != rerun.bundle.driver
