@@ -94,12 +94,12 @@ def exhibit(scenario: str, folder: Path) -> Exhibit:
 
 def page(exhibits: list[Exhibit]) -> str:
     """Return the page of the guide."""
-    rows = [
-        f"| ![{shown.scenario}](../../.github/images/gallery/{shown.scenario}.gif) | **{shown.title}.** {shown.verdict} "
-        f"`{shown.command}` |\n"
+    parts = [
+        f"## {shown.title}\n\n![{shown.scenario}](../../.github/images/gallery/{shown.scenario}.gif)\n\n"
+        f"{shown.verdict} `{shown.command}`\n"
         for shown in exhibits
     ]
-    return f"{INTRODUCTION}\n| film | crash, command |\n| --- | --- |\n{''.join(rows)}"
+    return "\n".join([INTRODUCTION, *parts])
 
 
 def main(names: list[str]) -> None:
