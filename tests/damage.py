@@ -5,11 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import shutil
-import sqlite3
 import traceback
 import zipfile
-from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.integrity import digest_of_data
@@ -78,44 +75,6 @@ def damage_bytes(path: Path, generator: random.Random) -> str:
     return f"{kind} at {place} of {path.name}"
 
 
-def damage_ledger(path: Path, generator: random.Random) -> str:
-    """Damage a ledger through SQLite: other values, types, rows, columns, tables, versions."""
-    with closing(sqlite3.connect(path)) as database:
-        table = generator.choice(("trials", "trials", "trials", "hunt", "events"))
-        columns = [name for _, name, *_ in database.execute(f"PRAGMA table_info({table})")]
-        column = generator.choice(columns)
-        rows = database.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
-        key = "key" if table == "hunt" else "rowid"
-        keys = [row[0] for row in database.execute(f"SELECT {key} FROM {table}")]
-        chosen = generator.choice(keys)
-        value = generator.choice((-1, 0, 7, 1e9, "x", "", "null", "[]", "{}", '{"spec": 1}', None, b"\xff"))
-        kind = generator.choice(
-            ("value", "value", "value", "loose", "row", "column", "table", "version", "index", "add")
-        )
-        statements: list[tuple[str, tuple[Any, ...]]] = {
-            "value": [(f"UPDATE {table} SET {column} = ? WHERE {key} = ?", (value, chosen))],
-            "loose": [
-                (f"CREATE TABLE loose AS SELECT * FROM {table}", ()), (f"DROP TABLE {table}", ()),
-                (f"ALTER TABLE loose RENAME TO {table}", ()),
-                (f"UPDATE {table} SET {column} = ? WHERE {'key' if table == 'hunt' else 'rowid'} = ?", (value, chosen)),
-            ],
-            "row": [(f"DELETE FROM {table} WHERE {key} = ?", (chosen,))],
-            "column": [(f"ALTER TABLE {table} DROP COLUMN {column}", ())],
-            "table": [(f"DROP TABLE {table}", ())],
-            "version": [(f"PRAGMA user_version = {generator.choice((0, 1, 2, 99))}", ())],
-            "index": [("DROP INDEX trials_by_outcome", ())],
-            "add": [(f"INSERT INTO {table} SELECT * FROM {table} LIMIT 1", ())],
-        }[kind]  # fmt: skip
-        try:
-            for statement, values in statements:
-                database.execute(statement, values)
-            database.commit()
-        except sqlite3.Error:
-            database.rollback()
-            return ""
-    return f"{kind} {table}.{column} {value!r} of {rows} rows"
-
-
 def damage_json(data: Any, generator: random.Random) -> str:
     """Put something else into a JSON object, somewhere."""
     here, path = data, ""
@@ -136,17 +95,6 @@ def damage_json(data: Any, generator: random.Random) -> str:
         else:
             here[key] = generator.choice(JUNK)
         return f"{kind} in {path}: {str(here[key])[:20] if kind == 'junk' else ''}"
-
-
-def damage_json_file(path: Path, generator: random.Random, *, signed: bool) -> str:
-    """The same in a file; signed again where somebody means it."""
-    data = json.loads(path.read_text(encoding="utf-8"))
-    said = data.pop("integrity", None)
-    what = damage_json(data, generator)
-    if said is not None:
-        data["integrity"] = digest_of_data(data) if signed else said
-    path.write_text(json.dumps(data), encoding="utf-8")
-    return f"{path.name}: {what}"
 
 
 def damage_lines(path: Path, generator: random.Random) -> str:
@@ -243,15 +191,3 @@ def _quiet() -> Any:
     stack = contextlib.ExitStack()
     stack.callback(quiet.__exit__, None, None, None)
     return stack
-
-
-def copied(source: Path, target: Path, *, but: str = "") -> Path:
-    """A fresh copy of a folder; folders of one name stay as they are, or are left out."""
-    target.mkdir(exist_ok=True)
-    for path in sorted(target.rglob("*"), reverse=True):
-        inside = path.relative_to(target).parts
-        if but and (but in inside or any(path.rglob(but))):
-            continue
-        (path.rmdir if path.is_dir() and not path.is_symlink() else path.unlink)()
-    shutil.copytree(source, target, dirs_exist_ok=True, ignore=shutil.ignore_patterns(but) if but else None)
-    return target

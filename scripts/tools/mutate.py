@@ -93,10 +93,7 @@ _TESTS_ELSEWHERE = {
     ),
     "cli/_report.py": ("report/test_page.py",),
     "cli/_run.py": ("e2e/test_run_help.py", "e2e/test_commands.py", "e2e/test_stops.py"),
-    "cli/_show.py": (
-        "cli/test_answers_on_crashes.py",
-        "e2e/test_show.py",
-    ),
+    "cli/_show.py": ("cli/test_answers_on_crashes.py",),
     "cli/_shrink.py": (
         "cli/test_answers_on_crashes.py",
         "e2e/test_shrink.py",

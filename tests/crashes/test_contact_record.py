@@ -106,17 +106,6 @@ def test_agent_that_starts_off_is_not_driven_into(phase, angle, speed):
 
 
 @settings(max_examples=10, deadline=None)
-@given(step_s=STEPS, phase=PHASES, angle=ANGLES)
-def test_vehicle_that_stands_is_driven_into(step_s, phase, angle):
-    case = record(drives(10.0), drives(0.0, x=5.0), step_s=step_s, phase=phase)
-    found = same_in_every_view(case, angle)
-    assert found[:2] == ("rear end", "ego")
-    assert {finding.rule for finding in found[5]} == {"rear end", "standing"}
-    assert case.stood_s("other") == pytest.approx((8.0 / step_s - 1) * step_s + phase * step_s)
-    assert case.stood_s("ego") == 0.0
-
-
-@settings(max_examples=10, deadline=None)
 @given(step_s=STEPS, phase=PHASES)
 def test_time_of_standing_is_that_of_the_stop_between_scenes(step_s, phase):
     """It brakes by 4 m/s² and stops 5.3 s before the contact."""

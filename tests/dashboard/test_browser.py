@@ -141,30 +141,6 @@ def test_the_table_of_hunts_is_reached_by_keyboard(hunts, page):
     assert page.faults() == []
 
 
-@pytest.mark.nightly  # by day, report/test_page.py drives the view of a crash with the same keys
-def test_a_hunt_and_its_crash_are_reached_by_keyboard(hunts, page):
-    with served(hunts) as dashboard:
-        page.open(dashboard.url)
-        page.wait("document.querySelector('tbody tr')")
-        page.tab_to("at.tagName === 'A' && at.innerText === 'one'")
-        page.keys("\ue007")
-        page.wait("document.querySelector('h1').innerText === 'one' && document.body.dataset.complete")
-        page.tab_to("at.id === 'over'")
-        page.keys("s")  # of "simulated steps"
-        assert "over=1" in page.browser.current_url
-        page.tab_to("at.id === 'trial-number'")
-        number = page.run("return document.querySelector('#crashes a').innerText")
-        page.keys(str(int(number.partition("-")[0])), "\ue007")
-        page.wait("location.pathname.includes('/crashes/') && window.crashhuntView?.crash")
-        body = page.browser.find_element("tag name", "body")
-        body.send_keys("\ue011")  # home
-        assert page.run("return crashhuntView.step") == 0
-        body.send_keys("\ue014")
-        assert page.run("return crashhuntView.step") == 1
-        body.send_keys("f")
-        assert page.run("return document.getElementById('follow').getAttribute('aria-pressed')") == "false"
-
-
 @pytest.mark.nightly  # by day, on the pages with texts of strangers, axe on the first of them alone
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_nothing_serious_and_nothing_is_cut_off(hunts, page, scheme):

@@ -6,7 +6,6 @@ import json
 import os
 import pty
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -47,33 +46,6 @@ def test_it_prints_its_address_and_runs_until_it_is_stopped(shell, number):
     assert err.splitlines() == [address["url"], "Ctrl-C ends the dashboard."]
 
 
-@pytest.mark.nightly  # by day, test_dashboard_parts.py and test_security.py
-def test_an_address_that_others_reach_has_a_random_token(shell):
-    tokens = set()
-    for _ in range(2):
-        process, address = begun(shell, "--host", "0.0.0.0")
-        try:
-            assert f"?token={address['token']}" in address["url"]
-            assert len(address["token"]) >= 24
-            with pytest.raises(urllib.error.HTTPError, match="401"):
-                fetched(f"http://127.0.0.1:{address['port']}/")
-            tokens.add(address["token"])
-        finally:
-            process.send_signal(signal.SIGINT)
-            process.communicate(timeout=60)
-    assert len(tokens) == 2
-
-
-def test_a_taken_port_is_one_line_with_the_next_free_one(shell):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        done = shell.crashhunt("dashboard", "--port", str(port), "--no-browser", expect=2)
-    (line,) = done.err.splitlines()
-    assert f"port {port} of 127.0.0.1 is taken" in line
-    free = int(line.partition("--port ")[2].partition(",")[0])
-    assert port < free <= port + 100  # not bound again here: another test may take it at any time
-
-
 NIGHTLY = pytest.mark.nightly  # by day, test_dashboard_folders.py, and cli/test_common.py has words for numbers
 
 
@@ -97,25 +69,6 @@ def test_bad_input_is_one_line(shell, words, said):
     (line,) = done.err.splitlines()
     assert said in line
     assert done.out == ""
-
-
-def test_a_missing_extra_names_the_command_that_installs_it(shell):
-    script = (
-        "import importlib.util as util, sys; real = util.find_spec\n"
-        "util.find_spec = lambda name, *more: None if name == 'plotly' else real(name, *more)\n"
-        "sys.argv = ['crashhunt', 'dashboard', '--no-browser']\n"
-        "from crashhunt.__main__ import main; main()"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=shell.folder,
-        env=shell.environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 2
-    assert done.stderr == ("crashhunt: the dashboard needs plotly; run: pip install 'crashhunt[dashboard]'\n")
 
 
 @pytest.mark.parametrize("terminal", [True, pytest.param(False, marks=pytest.mark.nightly)])
@@ -162,16 +115,6 @@ def exported(shell, made_once):
 def test_an_exported_crash_is_shown(exported):
     with served(exported) as dashboard:
         check_exported(dashboard.get)
-
-
-@pytest.mark.nightly  # by day, the same as the command serves it
-def test_an_exported_crash_is_shown_by_the_command(shell, exported):
-    process, address = begun(shell, exported.name)
-    try:
-        check_exported(lambda target: json.loads(fetched(address["url"].rstrip("/") + target)))
-    finally:
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60)
 
 
 def check_exported(get) -> None:

@@ -214,25 +214,6 @@ def test_dashboard_on_other_hosts_gets_a_token(monkeypatch, tmp_path):
         _server.serve([tmp_path / "nothing"], announce=found.append)
 
 
-def test_next_free_port_is_named(monkeypatch):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(UsageError, match=rf"port {port} of 127.0.0.1 is taken; give --port \d+, which is free"):
-            _server._listen("127.0.0.1", port)
-    tried = []
-
-    def bound(family, target):
-        tried.append(target[1])
-        if len(tried) < 3:
-            raise OSError
-        return SimpleNamespace(close=lambda: None)
-
-    monkeypatch.setattr(_server, "_bound", bound)
-    assert _server._next_free(socket.AF_INET, ("127.0.0.1", 8642)) == 8645
-    assert tried == [8643, 8644, 8645]
-    assert _server._next_free(socket.AF_INET, ("127.0.0.1", 65535)) == 0
-
-
 @pytest.fixture
 def view(tmp_path, monkeypatch):
     """A view of a hunt whose trials take 2 s to read, on a clock of the test."""

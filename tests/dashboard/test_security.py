@@ -7,8 +7,7 @@ import os
 import shutil
 import socket
 import sqlite3
-import threading
-from contextlib import ExitStack, closing, suppress
+from contextlib import closing, suppress
 
 import pytest
 from conftest import mostly_nightly
@@ -24,18 +23,6 @@ TOKEN = "a-token-of-a-test-1234"
 def hunt(shell, made_once):
     """A real hunt of the toy simulator with crashes, in ``runs/one``."""
     return made_once(hunted, shell).folder / "runs"
-
-
-@pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:8642", "127.0.0.1.evil.example", "localhost.evil.example", "", "a b", "[::1"]
-)
-def test_a_name_that_is_not_ours_is_refused(hunt, host):
-    with served(hunt) as dashboard:
-        for target in ("/", "/api/hunts", "/static/common.js"):
-            reply = dashboard.ask(target, {"Host": host})
-            assert reply.status in (400, 421), reply.body
-            assert b"one" not in reply.body
-        assert dashboard.ask("/", {"Host": "localhost:9999"}).status == 200  # through a tunnel
 
 
 def test_two_host_headers_or_none_are_refused(hunt):
@@ -69,25 +56,6 @@ def test_pages_have_no_inline_script_and_no_foreign_address(hunt):
             assert " onclick=" not in text
 
 
-def test_requests_of_other_sites_are_refused(hunt):
-    with served(hunt) as dashboard:
-        host = {"Host": "localhost"}
-        assert dashboard.ask("/api/hunts", {**host, "Sec-Fetch-Site": "same-origin"}).status == 200
-        assert dashboard.ask("/api/hunts", {**host, "Sec-Fetch-Site": "cross-site"}).status == 403
-        assert dashboard.ask("/static/common.js", {**host, "Sec-Fetch-Site": "same-site"}).status == 403
-        assert dashboard.ask("/api/hunts", {**host, "Origin": "http://evil.example"}).status == 403
-        assert dashboard.ask("/api/hunts", {**host, "Origin": "null"}).status == 403
-        assert dashboard.ask("/api/hunts", {**host, "Origin": "http://localhost"}).status == 200
-        link = {**host, "Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}
-        assert dashboard.ask("/", link).status == 200
-
-
-def test_the_dashboard_only_reads(hunt):
-    with served(hunt) as dashboard:
-        for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE"):
-            assert dashboard.ask("/api/hunts", method=method).status == 405
-
-
 def test_without_the_token_nothing_is_shown(hunt):
     with served(hunt, host="0.0.0.0", token=TOKEN) as dashboard:
         for target in ("/", "/api", "/api/hunts", "/static/common.js", "/nothing"):
@@ -98,18 +66,6 @@ def test_without_the_token_nothing_is_shown(hunt):
             assert dashboard.ask(f"{target}?token=wrong").status == 401
         assert dashboard.ask("/api/hunts", {"Authorization": f"Bearer {TOKEN}"}).status == 200
         assert dashboard.ask("/api/hunts", {"Cookie": "crashhunt-token=\xff\xfe"}).status == 401
-
-
-def test_the_token_moves_from_the_link_to_a_cookie_that_scripts_cannot_read(hunt):
-    with served(hunt, host="0.0.0.0", token=TOKEN) as dashboard:
-        reply = dashboard.ask(f"/?q=x&token={TOKEN}")
-        assert (reply.status, reply.headers["location"]) == (303, "/?q=x")
-        cookie = reply.headers["set-cookie"]
-        assert "HttpOnly" in cookie
-        assert "samesite=strict" in cookie.lower()
-        assert dashboard.ask("/api/hunts", {"Cookie": cookie.partition(";")[0]}).status == 200
-        # Two slashes would lead to another machine.
-        assert dashboard.ask(f"//evil.example/?token={TOKEN}").headers["location"] == "/evil.example/"
 
 
 def test_no_path_leads_out_of_the_folders(hunt, tmp_path):
@@ -199,51 +155,6 @@ def test_a_request_that_does_not_end_loses_its_connection(hunt, monkeypatch):
                 while part := connection.recv(65536):  # it ends, although this side goes on
                     received += part
                 assert received.count(b"HTTP/1.1 200") == (b"\r\n\r\n" in begun)
-
-
-def test_requests_that_are_too_large_are_refused(hunt):
-    with served(hunt) as dashboard:
-        assert dashboard.ask("/api/hunts?since=" + "9" * 5_000).status == 414
-        assert dashboard.ask("/api/hunts?since=" + "9" * 3_000).status == 200
-        assert dashboard.ask("/api/hunts", {"Content-Length": "99999999"}).status in (413, 400)
-        assert dashboard.ask("/api/hunts", {"X-Long": "a" * 15_000}).status == 200
-        # The server closes a connection on which it did not read everything: the client may see a reset before the
-        # answer.
-        with suppress(ConnectionError):
-            assert dashboard.ask("/api/hunts", {"X-Long": "a" * 100_000}).status in (400, 431)
-        body = b"GET /api/hunts HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
-        body += b"8000\r\n" + b"a" * 0x8000 + b"\r\n0\r\n\r\n"
-        with suppress(ConnectionError):
-            assert not (reply := dashboard.raw(body)) or reply.split()[1] in (b"200", b"413", b"400")
-        assert dashboard.get("/api/hunts")["hunts"]
-
-
-def test_requests_at_a_time_are_bounded(hunt, monkeypatch):
-    from crashhunt.dashboard import _application, _security
-
-    monkeypatch.setattr(_security, "MAX_REQUESTS", 4)
-    goes, inside = threading.Event(), threading.Semaphore(0)
-
-    def waits(view):
-        inside.release()
-        assert goes.wait(60)
-        return {}
-
-    monkeypatch.setattr(_application, "detail_of", waits)
-    with served(hunt) as dashboard, ExitStack() as waiting:
-        identifier = dashboard.hunts()["one"]["id"]
-        replies = []
-        for _ in range(4):
-            thread = threading.Thread(target=lambda: replies.append(dashboard.ask(f"/api/hunts/{identifier}").status))
-            thread.start()
-            waiting.callback(thread.join, 60)
-        for _ in range(4):
-            assert inside.acquire(timeout=60)
-        busy = dashboard.ask("/api")
-        goes.set()
-        assert busy.status == 503
-        assert "requests at a time" in busy.json["error"]["message"]
-    assert replies == [200] * 4
 
 
 @pytest.mark.parametrize(  # by day, ledger/test_ledger_damage.py finds each kind

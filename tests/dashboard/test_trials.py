@@ -105,17 +105,6 @@ def test_counts_are_those_of_the_ledger_in_any_order(tmp_path_factory, count, rn
         _trials.PARTS, _trials._TAIL = before
 
 
-def test_a_curve_has_no_more_points_than_asked_and_both_ends(tmp_path):
-    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
-        record(ledger, (trial(number, Outcome.SURVIVED) for number in range(300)))
-        counts = TrialCounts(CRASH_ON)
-        counts.refresh(ledger)
-    for most in (2, 7, 48):
-        curve = counts.curve(most)
-        assert len(curve) == most
-        assert (curve[0], curve[-1][0]) == ([0, 0, 0], 300)
-
-
 @pytest.mark.parametrize("at_once", [True, False])
 def test_the_sample_keeps_all_crashes_and_an_even_share(tmp_path, monkeypatch, at_once):
     monkeypatch.setattr(_trials, "MAX_POINTS", 100)
@@ -141,53 +130,6 @@ def test_the_sample_keeps_all_crashes_and_an_even_share(tmp_path, monkeypatch, a
     tenths = Counter(number // 300 for number in others)  # evenly over the hunt
     assert all(abs(tenths[tenth] - len(others) / 10) <= 3 for tenth in range(10))
     assert sample.points[0]["values"].keys() == {"speed", "cars"}
-
-
-def test_the_sample_of_a_hunt_that_grows_is_that_of_one_read_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(_trials, "MAX_POINTS", 64)
-    monkeypatch.setattr(_trials, "MAX_CRASHES", 32)
-    found = []
-    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
-        grown, counts = Sample(CRASH_ON), TrialCounts(CRASH_ON)
-        for number in range(1_000):
-            record(ledger, [trial(number, Outcome.COLLISION if number % 5 == 0 else Outcome.SURVIVED)])
-            if number % 50 == 49:
-                first = counts.last < 0
-                new = counts.refresh(ledger)
-                if first:
-                    grown.begin(ledger, counts.last, counts.crashes)
-                else:
-                    grown.add(ledger, new)
-        whole = Sample(CRASH_ON)
-        whole.begin(ledger, counts.last, counts.crashes)
-    for sample in (grown, whole):
-        assert sum(point["crash"] for point in sample.points) <= 32
-        found.append({point["number"] for point in sample.points})
-    # The shares are powers of a half, so one contains the other.
-    assert found[0] <= found[1] or found[1] <= found[0]
-
-
-def test_a_cursor_returns_what_came_since_and_all_after_thinning(tmp_path, monkeypatch):
-    monkeypatch.setattr(_trials, "MAX_POINTS", 50)
-    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
-        sample, counts = Sample(CRASH_ON), TrialCounts(CRASH_ON)
-        record(ledger, (trial(number, Outcome.SURVIVED) for number in range(20)))
-        counts.refresh(ledger)
-        sample.begin(ledger, counts.last, 0)
-        points, cursor, is_all = sample.since("")
-        assert (len(points), is_all) == (20, True)
-        record(ledger, (trial(number, Outcome.SURVIVED) for number in range(20, 30)))
-        sample.add(ledger, counts.refresh(ledger))
-        points, cursor, is_all = sample.since(cursor)
-        assert ([point["number"] for point in points], is_all) == (list(range(20, 30)), False)
-        assert sample.since(cursor)[0] == []
-        record(ledger, (trial(number, Outcome.SURVIVED) for number in range(30, 90)))
-        sample.add(ledger, counts.refresh(ledger))
-        points, _, is_all = sample.since(cursor)
-        assert is_all
-        assert {point["number"] for point in points} & set(range(20))
-        for strange in ("x", "0.-1", "0.9999999999999", "\u0663.1", "1e9.2"):
-            assert sample.since(strange)[2]
 
 
 def test_the_rate_from_counts_is_the_rate_that_crashhunt_rate_reports(shell, made_once):

@@ -3,19 +3,6 @@
 from crashhunt.agents import CarFollowing
 
 
-class NeverBrakes:
-    """Holds its speed, whatever is ahead."""
-
-    def __init__(self, speed: float = 20.0):
-        self.speed = speed
-
-    def reset(self, seed):
-        pass
-
-    def act(self, observation):
-        return (self.speed, 0)
-
-
 class NeverLooksAside(CarFollowing):
     """Follows well, and changes lanes every five seconds without looking."""
 

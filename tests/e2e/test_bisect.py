@@ -55,15 +55,6 @@ def test_the_first_of_them_is_reported(repository):
     assert "the crash is still, and not fixed" in refused.err
 
 
-@pytest.mark.nightly  # by day, base/test_git.py and corpus/test_bisection.py
-def test_what_is_no_revision_is_reported(toy, made_once):
-    toy.crashhunt("run", "h", "1", "1", "80", "--scenario", "toy", "--arg", "speed=14", "--seed", "1")
-    assert "run the command in the repository" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err
-    git(toy.folder, "init", "-q")
-    git(toy.folder, "commit", "-qm", "empty", "--allow-empty")
-    assert "'v1' is not a commit" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err
-
-
 @pytest.mark.nightly
 def test_a_revision_on_another_branch_that_mended_it_is_reported(tmp_path, monkeypatch):
     """Git says so again and again, and goes on to no other revision."""

@@ -6,7 +6,6 @@ import json
 import os
 import py_compile
 import random
-import re
 import shutil
 import sqlite3
 from contextlib import closing
@@ -14,12 +13,7 @@ from contextlib import closing
 import pytest
 from damage import (
     command,
-    copied,
     damage_archive,
-    damage_bytes,
-    damage_json_file,
-    damage_ledger,
-    damage_lines,
 )
 
 import crashhunt
@@ -62,57 +56,6 @@ def edited(path, change, *, schema: int = 2):
     path.write_text(json.dumps(data))
 
 
-CLOCK = re.compile(r'"newest_kind_s": [\d.e-]+')  # how long ago
-ASKED = {
-    "trials": ("trials", "h", "--format", "json"),
-    "status": ("status", "h", "--json"),
-    "compare": ("compare", "h", "h", "--json"),
-    "logs": ("logs", "h"),
-    "show": ("show", "h"),
-    "report": ("report", "h", "--output", "report.html"),
-    "export": ("export", "h", "other.zip"),
-    "check": ("check", "h", "--json"),
-}
-
-
-@pytest.mark.nightly  # by day, damaged archives, ledgers and files, each by a test of its own
-@pytest.mark.parametrize(("seed", "times"), [(10, 2), (11, 60)])
-def test_damage_is_one_line_or_makes_no_difference(hunt, seed, times):
-    """Whatever becomes of whichever file: no traceback, and nobody exits with 0 and other numbers."""
-    generator = random.Random(seed)
-    whole = copied(hunt, hunt.with_name("whole"), but="code")
-    right = {name: command(*words) for name, words in ASKED.items()}
-    assert {code for code, _, _ in right.values()} == {0}
-    refused = 0
-    for number in range(times):
-        copied(whole, hunt, but="code")
-        signed = False
-        files = sorted(path for path in hunt.rglob("*.*") if path.is_file() and "code" not in path.parts)
-        jsons = [path for path in files if path.name in ("crash.json", "manifest.json", "environment.json")]
-        kind = number % 4
-        if kind == 0:
-            what = damage_ledger(hunt / "ledger.sqlite", generator)
-        elif kind == 1:
-            what = damage_bytes(generator.choice([path for path in files if path.stat().st_size]), generator)
-        elif kind == 2:
-            signed = generator.random() < 0.6
-            what = damage_json_file(generator.choice(jsons), generator, signed=signed)
-        else:
-            signed = True  # nobody has signed what people may edit
-            what = damage_lines(hunt / "hunt.toml", generator)
-        for name in generator.sample(sorted(ASKED), 4):
-            words = ASKED[name]
-            code, out, err = command(*words)
-            assert code != -1, (what, words, err)
-            refused += code != 0
-            said = [line for line in err.splitlines() if line.startswith("crashhunt:")]
-            assert len(said) <= 1, (what, words, err)
-            assert "\x1b" not in err, (what, words)
-            if code == 0 and not signed and name != "check":
-                assert CLOCK.sub("", out) == CLOCK.sub("", right[name][1]), (what, words)
-    assert refused > 0.8 * times
-
-
 @pytest.mark.parametrize(("seed", "times"), [(5, 4), pytest.param(6, 60, marks=pytest.mark.nightly)])
 def test_damaged_archives_are_one_line(hunt, seed, times):
     generator = random.Random(seed)
@@ -151,25 +94,6 @@ def test_a_crash_json_that_was_edited_is_refused(hunt, crash):
         edited(file, lambda data, name=name: data.update(snapshot=name), schema=1)
         assert "is not the name of a snapshot" in command("replay", crash)[2]
         file.write_text(before)
-
-
-@pytest.mark.nightly  # by day, replays/test_verdicts.py and test_replay.py
-def test_a_replay_is_the_same_only_if_the_same_things_collided(hunt, crash):
-    file = crash / "crash.json"
-    before = file.read_text()
-    edited(file, lambda data: None, schema=1)
-    assert crashhunt.replay(crash).verdict == "reproduced"
-    for change, field in (
-        (lambda data: data["collision"].update(role="victim", collider="leader", victim="ego"), "collision.role"),
-        (lambda data: data["collision"].update(victim="ego"), "collision.victim"),
-        (lambda data: data["collision"].update(x=1.5), "collision.x"),
-        (lambda data: data.update(step=data["step"] - 1), "steps"),
-    ):
-        file.write_text(before)
-        edited(file, change, schema=1)
-        report = crashhunt.replay(crash)
-        assert (report.verdict, report.divergence.field) == ("diverged", field)
-    assert crashhunt.replay(crash, code="log").verdict == "diverged"  # the last of them
 
 
 def test_a_log_belongs_to_its_crash(hunt, crash):
@@ -284,25 +208,6 @@ def test_check_states_what_is_lost_and_saves_the_rest(hunt, crash, toy):
     assert second.name
 
 
-@pytest.mark.nightly  # by day, hunts/test_check_parts.py and results/test_results.py
-def test_check_finds_what_does_not_belong_together(hunt, crash, toy):
-    shutil.rmtree(crash)
-    code, out, _ = command("check", "h")
-    assert (code, f"trial {int(crash.name[:6])} crashed, and its bundle is missing" in out) == (1, True)
-    code, out, _ = command("check", "crash.zip", "--json")
-    assert (code, json.loads(out)["hunts"][0]["kind"]) == (0, "file")
-    (other,) = (path for path in [max((hunt / "crashes").iterdir())])
-    assert command("check", other)[0] == 0
-    toy.crashhunt("run", "g", "2", "3", *HUNT[2:-1], "5", "--keep-going")
-    shutil.copytree(other, hunt.with_name("g") / "crashes" / other.name)
-    code, out, _ = command("check", "g")
-    assert (code, "it is of a hunt with seed 4" in out) == (1, True)
-    shutil.copy(hunt / "hunt.toml", hunt.with_name("g") / "hunt.toml")
-    assert "the trials have seed 5" in command("trials", "g")[2]
-    code, _, err = command("check", "toy")
-    assert (code, "there is no hunt" in err) == (2, True)
-
-
 def test_no_crash_in_other_traffic_is_no_fix(hunt, crash):
     """One draw of other traffic shows nothing."""
     found = in_other_traffic(crash, "--scenario", "toy", "--set", "gap_m=500")
@@ -316,25 +221,6 @@ def in_other_traffic(crash, *words):
     found = json.loads(out)
     assert "does not show a fix" in found["reason"]
     return code, found["verdict"]
-
-
-@pytest.mark.nightly  # by day, replays/test_edits.py and replays/test_verdicts.py
-def test_no_crash_in_other_traffic_is_no_fix_whichever_way_it_became_another(hunt, crash, toy):
-    assert in_other_traffic(crash, "--set", "gap_m=500") == (1, "not_comparable")
-    settings = hunt / "hunt.toml"
-    text = settings.read_text()
-    for before, after in (
-        (f"max_steps = {HUNT[2]}", "max_steps = 9"),
-        ('"collision"', '"hang"'),
-        ('"overlap"', '"off-road"'),
-    ):
-        assert before in text
-        settings.write_text(text.replace(before, after).replace('"reported-collision"', '"off-road"'))
-        assert crashhunt.replay(crash).verdict in ("not_comparable", "diverged"), after
-    settings.write_text(text.replace("seed = 4", "seed = 5"))
-    report = crashhunt.replay(crash)
-    assert (report.verdict, len(report.rerun.warnings)) == ("reproduced", 1)
-    assert "seed was 4 and is 5" in report.rerun.warnings[0]
 
 
 def test_hunts_are_not_compared_where_one_has_a_damaged_ledger(hunt):

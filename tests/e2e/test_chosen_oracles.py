@@ -63,15 +63,6 @@ def test_a_hunt_stops_on_what_an_oracle_of_ones_own_sees(own):
     assert own.crashhunt("check", "h").code == 0
 
 
-@pytest.mark.nightly  # by day, episode/test_episode_cases.py and plans/test_crash_on.py
-def test_crash_on_decides_where_it_states_something(own):
-    words = ["--oracle", "own:Fast:above=8", "--keep-going"]
-    assert "too_fast" not in run(own, *words, "--crash-on", "collision", name="only", trials="2")["outcomes"]
-    assert set(run(own, *words, "--crash-on", "too_fast", name="both", trials="2")["outcomes"]) >= {"too_fast"}
-    done = own.crashhunt("run", "h", "1", "1", "9", "--scenario", "toy", "--crash-on", "too_fast", expect=2)
-    assert "--crash-on 'too_fast' is not an outcome that can count as a crash" in done.err
-
-
 @pytest.mark.nightly  # by day, oracles/test_choice.py, and a chosen oracle above
 def test_near_misses_are_found_in_sumo(shell):
     words = ["loop", "2", "30", "300", "--oracle", "too-close:gap_m=1.5", "--seed", "1", "--json"]

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 import tomllib
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
@@ -126,39 +125,6 @@ def test_todays_code_is_judged(kept):
     assert done.out.count("to be warned if it crashes again") == 2
 
 
-@pytest.mark.nightly  # by day, the test above, corpus/test_corpus_cases.py, cli/test_answers.py and report/test_ci.py
-def test_todays_code_is_judged_each_time(kept):
-    found = kept.crashhunt("corpus", "run", "kept crashes", "--json").json["cases"]
-    assert all((kept.folder / case["path"]).is_dir() for case in found)
-    assert [(case["expected"], case["got"], case["ok"]) for case in found] == [("still", "still", True)] * 2
-    assert "2 cases: 2 still" in kept.crashhunt("corpus", "run", "kept crashes").out
-
-    drive(kept, MENDED)
-    done = kept.crashhunt("corpus", "run", "kept crashes")
-    assert done.out.count("to be warned if it crashes again") == 2
-    expect(kept, 0, "fixed")
-    found = kept.crashhunt("corpus", "run", "kept crashes", "--json").json["cases"]
-    assert [(case["got"], case["may_be_tightened"]) for case in found] == [("fixed", False), ("fixed", True)]
-
-    drive(kept, BROKEN)
-    done = kept.crashhunt("corpus", "run", "kept crashes", "--keep", "out", "--json", "--annotate", expect=1)
-    assert [case["got"] for case in done.json["cases"]] == ["changed"] * 2
-    assert done.err.count("::error file=kept crashes/") == 2
-    assert "crashes in another way, and fixed was expected" in done.err
-    assert "ValueError: no" in kept.crashhunt("show", done.json["cases"][0]["kept"]).out
-    assert kept.crashhunt("replay", done.json["cases"][0]["kept"], "--json").json["verdict"] == "reproduced"
-
-    drive(kept, DRIVER)
-    done = kept.crashhunt("corpus", "run", "kept crashes", expect=1)
-    assert "crashes still, and fixed was expected" in done.out
-    assert "2 cases: 2 still; 1 not as expected" in done.out
-
-    (kept.folder / "driver.py").unlink()
-    done = kept.crashhunt("corpus", "run", "kept crashes", "--json", expect=1)
-    assert [(case["got"], case["ok"]) for case in done.json["cases"]] == [("cannot_run", False)] * 2
-    assert "driver" in done.json["cases"][0]["now"]
-
-
 def test_what_is_damaged_or_no_case_is_reported_and_does_not_keep_the_others(kept):
     first, second = find_cases([kept.folder / "kept crashes"])
     (next(first.glob("snapshots/*")) / "scenario" / "scenario.toml").write_text("schema = 1")
@@ -177,71 +143,6 @@ def test_what_is_damaged_or_no_case_is_reported_and_does_not_keep_the_others(kep
     with pytest.raises(BundleError, match="no case of a corpus"):
         find_cases([kept.folder / "h"])
     assert "did you mean 'kept crashes'" in kept.crashhunt("corpus", "run", "kept crashs", expect=2).err
-
-
-@pytest.mark.nightly  # by day, test_foreign_hunts.py adds what a stranger made
-def test_a_strangers_crash_is_added_only_with_trust(kept):
-    kept.crashhunt("export", "h", "crash.zip", "--crash", "0")
-    kept.crashhunt("corpus", "add", "crash.zip", "--to", "mine")
-    kept.environment["XDG_STATE_HOME"] = str(kept.folder / "other")
-    done = kept.crashhunt("corpus", "add", "crash.zip", "--to", "theirs", expect=2)
-    assert "--trust" in done.err
-    assert not (kept.folder / "theirs").exists()
-    kept.crashhunt("corpus", "add", "crash.zip", "--to", "theirs", "--trust")
-    names = [[path.name for path in find_cases([kept.folder / folder])] for folder in ("mine", "theirs")]
-    assert names[0] == names[1]
-
-
-def small_case(shell, monkeypatch, number="0"):
-    """Return the folder of a case with a compact log, as of a crash with a large one."""
-    monkeypatch.setattr("crashhunt.corpus._cases._MAX_BYTES_WITH_LOG", 1000)
-    added = add_case(find_bundle(shell.folder / "h", number), shell.folder / "small")
-    assert added.case.kind_of_log() == "compact"
-    return added.case.path.relative_to(shell.folder)
-
-
-@pytest.mark.nightly  # by day, recording/test_compact.py
-def test_every_documented_command_reads_a_case_with_a_compact_log(kept, monkeypatch):
-    case = small_case(kept, monkeypatch)
-    (report,) = run_cases([kept.folder / case])
-    assert report.got == "still"
-    whole = kept.crashhunt("show", "h", "--crash", "0", "--json").json
-    shown = kept.crashhunt("show", str(case), "--json").json
-    assert (shown["summary"], shown["fault"], shown["danger"]) == (whole["summary"], whole["fault"], None)
-    for name in ("speed", "other_speed", "gap_to_other_m"):
-        assert [one[name] for one in shown["moments"]] == [one[name] for one in whole["moments"]]
-    assert "The log is compact" in kept.crashhunt("show", str(case)).out
-    for words in (("--code", "current"), ("--from-log",), ()):
-        assert kept.crashhunt("replay", str(case), *words, "--json").json["verdict"] == "reproduced"
-    assert kept.crashhunt("check", str(case), "--json").json["fine"]
-    assert kept.crashhunt("report", str(case), "-o", "r.html", "--json").json["crashes_found"] == 1
-    kept.crashhunt("export", str(case), "case.zip")
-    assert kept.crashhunt("replay", "case.zip", "--json").json["verdict"] == "reproduced"
-    again = kept.crashhunt("corpus", "add", str(case), "--to", "other", "--note", "moved")
-    assert "with a compact log" in again.out
-    moved = kept.folder / "other" / case.name
-    assert (read_case(moved).note, read_case(moved).kind_of_log()) == ("moved", "compact")
-    assert kept.crashhunt("replay", str(moved), "--json").json["verdict"] == "reproduced"
-    drive(kept, MENDED)
-    found = kept.crashhunt("replay", str(case), "--code", "current", "--json", "--expect", "fixed").json
-    assert (found["verdict"], found["divergence"]["field"]) == ("fixed", "action[target_speed]")
-
-
-@pytest.mark.nightly  # by day, corpus/test_corpus_cases.py
-def test_case_without_log_names_the_command_that_records_it(kept, monkeypatch):
-    """As of an earlier version."""
-    case = small_case(kept, monkeypatch)
-    (log,) = (kept.folder / case).rglob("log.mcap")
-    log.unlink()
-    for command in (("show", str(case)), ("replay", str(case))):
-        (line,) = kept.crashhunt(*command, expect=2).err.splitlines()
-        assert "the case has no log" in line
-        assert f"crashhunt corpus run {case} --keep out" in line
-    kept.crashhunt("corpus", "run", str(case), "--keep", "out")
-    assert kept.crashhunt("replay", f"out/{case.name}", "--json").json["verdict"] == "reproduced"
-    assert "without a log" in kept.crashhunt("corpus", "add", str(case), "--to", "other").out  # as bisect adds it
-    (report,) = run_cases([kept.folder / "other" / case.name])
-    assert report.got == "still"
 
 
 def test_a_full_disk_leaves_nothing_half_done(kept, monkeypatch):
@@ -295,24 +196,6 @@ def pytest_run(kept, *words, plugins=("crashhunt.corpus.pytest_plugin",)):
         [sys.executable, "-m", "pytest", "-q", "-W", "error", *names, *words], cwd=kept.folder, capture_output=True,
         text=True, env={**kept.environment, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}, check=False, timeout=120,
     )  # fmt: skip
-
-
-@pytest.mark.nightly  # by day, corpus/test_pytest_cases.py
-def test_pytest_runs_each_case_and_reports_it_readably(kept):
-    expect(kept, 0, "fixed")
-    done = pytest_run(kept, "kept crashes", "--junit-xml", "junit.xml", "-rx")
-    assert done.returncode == 1, done.stdout + done.stderr
-    assert "1 failed, 1 xfailed" in done.stdout
-    assert "crashes still, and fixed was expected" in done.stdout
-    assert "now:    ego drove into leader at step" in done.stdout
-    (hint,) = [line for line in done.stdout.splitlines() if "look at it: " in line]
-    assert "crashhunt corpus run 'kept crashes/000000-collision-" in hint
-    assert "\x1b" not in done.stdout
-    assert "Traceback" not in done.stdout
-    (suite,) = ET.parse(kept.folder / "junit.xml").getroot()
-    assert [suite.attrib[key] for key in ("tests", "failures", "skipped")] == ["2", "1", "1"]
-    found = {entry.attrib["value"] for entry in suite.iter("property") if entry.attrib["name"] == "crashhunt_got"}
-    assert found == {"still"}
 
 
 @pytest.mark.nightly

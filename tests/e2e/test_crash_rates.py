@@ -83,15 +83,6 @@ def test_bar_decides_the_exit_code(hunt):
     assert rates(hunt, "h", "--bar", f"{close['estimate']}/trial", expect=3)[0]["verdict"] == "undecided"
 
 
-@pytest.mark.nightly  # by day, statistics/test_rates_by_part.py
-def test_hunt_that_stops_at_its_first_crash_has_an_interval_and_no_estimate(toy):
-    toy.crashhunt("run", "h", "1", "40", *HUNT)
-    (rate,) = rates(toy, "h", "--per", "trial")
-    assert rate["estimate"] is None
-    assert "stops at its first crash" in rate["why_not"]
-    assert 0 < rate["certain"]["low"] < rate["certain"]["high"] <= 1
-
-
 @pytest.mark.nightly
 def test_workers_change_no_rate(toy):
     found = []
@@ -119,16 +110,6 @@ def test_bad_input_is_one_line(hunt):
     assert "pipe: is a device or a pipe" in toy.crashhunt("rate", "h", "--html", "pipe", expect=2).err
 
 
-@pytest.mark.nightly  # by day, statistics/test_rates_by_part.py
-def test_sampler_that_does_not_draw_independently_has_no_rate(toy):
-    toy.crashhunt("run", "h", "1", "2", *HUNT, "--keep-going", "--keep", "1", "--sampler", "grid")
-    (rate,) = rates(toy, "h", "--per", "trial")
-    assert rate["certain"] is None
-    assert "the sampler grid does not draw trials independently" in rate["why_not"]
-    done = toy.crashhunt("rate", "h", "--bar", "0.1/trial", expect=3)
-    assert "undecided about the bar of 0.10 per trial: there is no rate" in done.out
-
-
 @pytest.mark.nightly
 def test_disturbed_and_undisturbed_crashes_are_reported_apart(toy):
     toy.crashhunt("run", "h", "2", "30", *HUNT, "--keep-going", "--disturb", "brake=0.5")
@@ -150,19 +131,6 @@ def until(toy, folder, workers, trials, rate, *words, expect):
     return toy.crashhunt("run", folder, workers, trials, *HUNT, *options, expect=expect).json
 
 
-@pytest.mark.nightly  # by day, hunts/test_hunt_loop.py and statistics/test_rates_by_part.py
-def test_hunt_ends_once_the_rate_is_certainly_below_or_above(toy):
-    calm = ("--arg", "speed=2", "--set", "gap_m=40")
-    done = toy.crashhunt("run", "calm", "2", "0", "20", "--scenario", "toy", *calm, "--until-rate", "0.3/trial")
-    assert "certainly below the bar of 0.30 per trial" in done.out
-    (rate,) = rates(toy, "calm", "--bar", "0.3/trial")
-    assert (rate["crashes"], rate["estimate"], rate["verdict"]) == (0, 0.0, "below")
-    assert rate["units"] * 0.3 < 3.6
-    found = until(toy, "wild", "2", "0", "0.001/trial", *FEW, expect=1)
-    assert (found["stopped_because"], found["rate"]["verdict"]) == ("rate", "above")
-    assert found["rate"]["certain"]["low"] >= 0.001
-
-
 def test_hunt_that_cannot_decide_ends_at_most_and_exits_with_3(toy):
     found = until(toy, "h", "2", "0", "0.3/trial", *FEW, "--most", "6", expect=3)
     assert (found["stopped_because"], found["trials_run"], found["rate"]["verdict"]) == ("all_trials", 6, "undecided")
@@ -176,17 +144,6 @@ def test_workers_decide_at_the_same_trial(toy):
         found.append([{**rate, "dir": ""} for rate in rates(toy, workers, "--per", "hour")])
     assert found[0] == found[1]
     assert found[0][0]["crashes"] > 0
-
-
-@pytest.mark.nightly  # by day, test_gate.py resumes to a verdict, and rates/ decide in any order
-def test_resumed_hunt_decides_as_one_that_was_never_interrupted(toy):
-    whole = until(toy, "whole", "2", "0", "0.005/trial", *FEW, expect=1)["rate"]
-    first = until(toy, "parts", "2", "0", "0.005/trial", *FEW, "--most", "1", expect=3)["rate"]
-    assert first["units"] == 1 < whole["units"]
-    assert until(toy, "parts", "1", "0", "0.005/trial", *FEW, expect=1)["rate"] == {**whole, "dir": "parts"}
-    trials = len(results(toy.folder / "parts"))
-    assert until(toy, "parts", "1", "0", "0.005/trial", *FEW, expect=1)["rate"] == {**whole, "dir": "parts"}
-    assert len(results(toy.folder / "parts")) == trials  # decided before, so nothing runs
 
 
 @pytest.mark.nightly
@@ -237,49 +194,6 @@ def test_option_that_contradicts_a_bar_is_refused(toy, words, says):
 RARE = ("60", "--scenario", "toy", "--agent", "crashhunt.agents:CarFollowing", "--disturb", "stop=0.1", "--rare")
 
 
-@pytest.mark.nightly  # by day, hunts/test_rare_hunts.py
-def test_hunt_in_rare_mode_has_no_plain_rate_and_status_reports_its_own(toy):
-    report = toy.crashhunt("run", "h", "2", "10", *RARE, "--seed", "3", "--json").json
-    assert (report["rare"]["units"], report["rare"]["trials"]) == (2, 8)
-    (state,) = toy.crashhunt("status", "h", "--json").json["hunts"]
-    assert (state["rate"]["method"], state["rate"]["units"]) == ("rare", 2)
-    assert state["rate"]["certain"] == report["rare"]["certain"]
-    (per_trial,) = rates(toy, "h", "--per", "trial")
-    assert (per_trial["estimate"], per_trial["certain"]) == (None, None)
-    assert (
-        per_trial["why_not"]
-        == "in rare mode, one of five trials runs without disturbances; crashhunt status reports the rate"
-    )
-
-
-@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py
-def test_status_reports_the_certain_interval_of_any_hunt_that_has_one(hunt):
-    toy = hunt
-    (state,) = toy.crashhunt("status", "h", "--json").json["hunts"]
-    (rate,) = rates(toy, "h", "--per", "trial")
-    assert state["rate"]["certain"] == rate["certain"]
-    assert (state["rate"]["trials"], state["rate"]["crashes"]) == (24, rate["crashes"])
-    # A resumed hunt counts the trials of earlier runs.
-    toy.crashhunt("run", "h", "2", "28", *HUNT, "--keep-going", "--keep", "1")
-    (state,) = toy.crashhunt("status", "h", "--json").json["hunts"]
-    assert state["rate"]["certain"] == rates(toy, "h", "--per", "trial")[0]["certain"]
-    assert state["rate"]["trials"] == 28
-
-
 def test_rare_mode_and_a_bar_exclude_each_other(toy):
     done = toy.crashhunt("run", "h", "2", "4", *RARE, "--until-rate", "1e-3/trial", expect=2)
     assert done.err == "crashhunt: --rare and --until-rate exclude each other; omit --until-rate\n"
-
-
-@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py and the texts of both
-def test_hunt_resumed_with_fewer_trials_than_have_ended_shows_no_share(toy):
-    first = (*HUNT, "--keep-going", "--keep", "1")
-    toy.crashhunt("run", "h", "1", "6", *first)
-    done = toy.crashhunt("run", "h", "1", "2", *first)
-    assert "\n6 trials, " in f"\n{done.out}"
-    assert "of 2" not in done.out + done.err
-    toy.crashhunt("report", "h")
-    said = toy.crashhunt("status", "h")
-    assert "6/2" not in said.out
-    assert " 6 " in said.out
-    assert toy.crashhunt("status", "h", "--json").json["hunts"][0]["trials_planned"] == 2

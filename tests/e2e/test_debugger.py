@@ -38,23 +38,6 @@ def typed(shell, text: str, *words: str, fork: bool = False, expect: int | None 
     return done.out
 
 
-@pytest.mark.nightly  # starts Python; by day, the same in a fork below
-@pytest.mark.long
-def test_the_debugger_is_in_the_agents_act_at_the_step_before_the_crash(crash):
-    out = typed(crash, "p 'at', step, self.step, observation.shape, len(scene.points) > 3\nc\n", "--pdb")
-    assert "('at', 30, 29, (8, 7), True)" in out  # its own counter has not moved yet
-    first = (crash.folder / "faulty.py").read_text().splitlines().index("        self.step += 1") + 1
-    assert f"code/faulty.py({first})act()" in out
-    assert "reproduced: 29 of 29 steps" in out
-
-
-@pytest.mark.nightly  # by day, `back` goes to any step
-def test_it_stops_as_many_steps_before_the_crash_as_asked(crash):
-    out = typed(crash, "p 'at', step\nc\n", "--pdb", "--before", "10", fork=True)
-    assert "('at', 19)" in out
-    assert "reproduced: 19 of 29 steps" in out
-
-
 def test_backwards_and_on_from_there_to_the_same_bits(crash):
     asked = "p 'at', step, self.step, scene.time_s\n"
     out = typed(crash, f"{asked}back 5\n{asked}back\n{asked}back 99\nc\n", "--pdb", fork=True)

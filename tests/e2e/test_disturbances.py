@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 
 import crashhunt
@@ -13,50 +11,6 @@ WORDS = ("--scenario", "toy", "--seed", "4", "--arg", "speed=10", "--no-snapshot
 
 def hunt(shell, *more, trials="6"):
     return shell.crashhunt("run", "h", "1", trials, "100", *WORDS, *more, "--json")
-
-
-@pytest.mark.nightly  # by day, the other tests of this file
-def test_crashes_with_disturbances_from_the_hunt_to_the_report(toy):
-    """The leader of the toy brakes now and then by itself; who drives as fast as it does crashes when it stops."""
-    done = hunt(toy, "--disturb", "stop=0.05,brake=0.02", "--set", "gap_m=5")
-    crashes = done.json["crashes"]
-    assert crashes
-    assert all(crash["confirmed"] for crash in crashes)
-    saved = [json.loads((toy.folder / crash["path"] / "crash.json").read_text()) for crash in crashes]
-    disturbed = [data for data in saved if data["disturbed"]]
-    for crash, data in zip(crashes, saved, strict=True):
-        assert (crash["disturbed"], crash["log_likelihood"]) == (data["disturbed"], data["log_likelihood"])
-    assert disturbed
-    assert all(bool(data["disturbances"]) == data["disturbed"] for data in saved)
-    assert all(one["vehicle"] == "leader" for data in saved for one in data["disturbances"])
-    assert f"{len(disturbed)} with disturbances." in done.err
-    likeliest = max(disturbed, key=lambda data: data["log_likelihood"])
-    assert f"Likeliest crash with disturbances: {likeliest['id']} (log-likelihood " in done.err
-    state = toy.crashhunt("status", "h", "--json").json["hunts"][0]
-    assert (state["crashes"], state["disturbed"]) == (len(crashes), len(disturbed))
-    assert f"{len(crashes)} crashes: {len(disturbed)} disturbed, " in toy.crashhunt("status", "h").out
-    assert toy.crashhunt("check", "h").code == 0
-    compared = toy.crashhunt("compare", "h", "h", "--json").json["hunts"][0]
-    assert (compared["crashes"], compared["disturbed"]) == (len(crashes), len(disturbed))
-
-    crash = likeliest["id"]
-    first = likeliest["disturbances"][0]
-    assert "leader" in toy.crashhunt("show", "h", "--crash", crash).out
-    assert f"from step {first['step']} on: leader" in toy.crashhunt("show", "h", "--crash", crash).out
-    assert toy.crashhunt("replay", "h", "--crash", crash, "--json").json["verdict"] == "reproduced"
-    toy.crashhunt("export", "h", "crash.zip", "--crash", crash)
-    assert toy.crashhunt("replay", "crash.zip", "--json").json["verdict"] == "reproduced"
-    without = toy.crashhunt("replay", "h", "--crash", crash, "--set", "disturbances=none", expect=None)
-    assert "disturbances were" in without.out
-
-    toy.crashhunt("report", "h", "--out", "report.html")
-    page = (toy.folder / "report.html").read_text()
-    assert f"[{first['step']}, " in page
-    assert '"disturb": "brake=0.02,stop=0.05"' in page
-
-    table = crashhunt.load(toy.folder / "h").trials()
-    assert set(table["log_likelihood"] < 0) == {True}
-    assert (table["disturbances"] > 0).sum() >= len(disturbed)
 
 
 def test_they_are_listed(toy):
@@ -81,37 +35,6 @@ def test_trials_in_which_nothing_is_drawn_are_those_of_an_undisturbed_hunt(toy):
     hunt(toy, "--disturb", "stop=0.000001", "--overwrite", trials="4")
     assert [trial.digest for trial in crashhunt.load(toy.folder / "h").results()] == digests
     assert 'disturb = [\n    "stop=1e-06",\n]' in (toy.folder / "h" / "hunt.toml").read_text()
-
-
-@pytest.mark.nightly  # by day, plans/test_what_is_resolved.py
-def test_a_scenario_states_it_and_none_takes_it_back(toy):
-    file = toy.folder / "toy" / "scenario.toml"
-    before = file.read_text()
-    file.write_text(f"{before}\n[disturbances]\nbrake = 0.5\n")
-    hunt(toy, trials="2")
-    assert 'disturb = [\n    "brake=0.5",\n]' in (toy.folder / "h" / "hunt.toml").read_text()
-    hunt(toy, "--disturb", "none", "--overwrite", trials="2")
-    assert "\ndisturb" not in (toy.folder / "h" / "hunt.toml").read_text()
-    file.write_text(f"{before}\n[disturbances]\nbraek = 0.5\n")
-    said = hunt_refused(toy)
-    assert "[disturbances]: there is no disturbance 'braek'; did you mean 'brake'" in said
-    assert "scenario.toml" in said
-    file.write_text(f"{before}\n[disturbances]\nbrake = -1\n")
-    assert "[disturbances] brake=-1.0: '-1.0' is not a rate" in hunt_refused(toy)
-
-
-@pytest.mark.nightly  # by day, hunts/test_hunt_parts.py refuses other settings
-def test_another_rate_is_another_hunt_and_a_rerun_keeps_its_own(toy):
-    file = toy.folder / "toy" / "scenario.toml"
-    hunt(toy, "--disturb", "brake=0.5", trials="1")
-    done = toy.crashhunt("run", "h", "1", "2", "100", *WORDS, expect=2)
-    assert "the directory contains another hunt: disturb was brake=0.5 and is now none" in done.err
-    toy.crashhunt("rerun", "h", "--to", "again")
-    assert crashhunt.load(toy.folder / "again").settings.disturb == ("brake=0.5",)
-    hunt(toy, "--overwrite", trials="1")
-    file.write_text(f"{file.read_text()}\n[disturbances]\nbrake = 0.5\n")  # which is said later
-    toy.crashhunt("rerun", "h", "--to", "once_more")
-    assert crashhunt.load(toy.folder / "once_more").settings.disturb == ()
 
 
 def hunt_refused(shell, *more):

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from crashhunt.crashes import list_bundles
-from crashhunt.scenario import shipped_folder
 from crashhunt.testing import check_escape
 
 KEEP = ("--keep-going", "--deterministic", "--seed", "1")
@@ -19,19 +17,6 @@ KEEP = ("--keep-going", "--deterministic", "--seed", "1")
 
 def told(folder: Path) -> Counter[str]:
     return Counter(check_escape(bundle).verdict for bundle in list_bundles(folder))
-
-
-@pytest.mark.nightly  # by day, test_judging.py compares both ways to find it
-@pytest.mark.long
-def test_a_rear_end_collision_could_be_avoided_until_the_step_that_is_reported(toy):
-    toy.crashhunt("run", "h", "2", "2", "300", "--scenario", "toy", "--arg", "speed=12:14", *KEEP)
-    assert told(toy.folder / "h")["wrong"] == 0
-    bundles = list_bundles(toy.folder / "h")
-    assert sum(bundle.result.escape is not None for bundle in bundles) == 2
-    for bundle in bundles:
-        escape = bundle.result.escape
-        assert escape is None or escape.step is None or escape.step < bundle.result.steps
-        assert escape is None or escape.why_not or escape.how == "at 8 m/s², the maximum of the vehicle,"
 
 
 @pytest.mark.nightly
@@ -45,19 +30,6 @@ def test_on_sumo_it_brakes_as_hard_as_its_type(shell):
     assert facts["full_braking"] == pytest.approx(8.0, abs=0.01)
     found = shell.crashhunt("show", "h").out
     assert "Braking at 8 m/s², the maximum of its vehicle type, could have avoided it" in found
-
-
-@pytest.mark.nightly  # by day, crashes/test_encounter.py computes escapes at any length
-@pytest.mark.parametrize("length", [pytest.param("0.5", marks=pytest.mark.nightly), "1.0"])
-def test_long_steps(shell, length):
-    folder = shell.folder / "slow"
-    shutil.copytree(shipped_folder() / "loop", folder)
-    text = (folder / "scenario.toml").read_text()
-    assert "step_length_s = 0.1" in text
-    (folder / "scenario.toml").write_text(text.replace("step_length_s = 0.1", f"step_length_s = {length}"))
-    words = ("--arg", "speed=15:25", "--set", "vehicles=35", *KEEP)
-    shell.crashhunt("run", "h", "2", "2", "200", "--scenario", "slow", *words)
-    assert told(shell.folder / "h")["wrong"] == 0
 
 
 def test_a_crash_from_before_states_nothing(toy):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import re
 import tomllib
 
 import pytest
@@ -113,28 +111,6 @@ def test_an_executor_of_somebodys_own_runs_the_trials(mine):
         for hunt in "hg"
     ]
     assert digests[0] == digests[1]
-
-
-@pytest.mark.nightly  # by day, plans/test_what_is_resolved.py makes each by its name
-def test_ours_are_chosen_by_name(mine):
-    done = mine.crashhunt(*WORDS[:2], "1", "2", *WORDS[4:], "--executor", "fresh", "--json")
-    assert done.json["outcomes"] == {"survived": 2}
-    # A hunt that goes on may do so elsewhere: what a trial is does not change.
-    mine.crashhunt(*WORDS[:2], "1", "3", *WORDS[4:], "--executor", "mine:Logged")
-    assert calls(mine)[:2] == ["made 1 ", "submit 2"]
-
-
-@pytest.mark.nightly  # by day, plans/test_what_is_resolved.py and cli/test_status.py
-def test_it_may_know_better_than_this_machine_what_0_represents(mine):
-    mine.crashhunt(*WORDS[:2], "0", *WORDS[3:], "--executor", "mine:Everywhere")
-    assert calls(mine)[0] == "made 2 asked 0"
-    assert tomllib.loads((mine.folder / "h" / "hunt.toml").read_text())["run"]["parallel"] == 0
-    (state,) = mine.crashhunt("status", "h", "--json").json["hunts"]
-    assert state["nodes"] == [{"name": "there", "parallel": 2, "trials": 3, "rate_per_s": 1.5}]
-    assert re.search(r"^ +there \(2 at a time\) +3 +1\.5/s *$", mine.crashhunt("status", "h").out, re.MULTILINE)
-    mine.crashhunt("run", "g", "0", *WORDS[3:], "--executor", "mine:Logged")
-    assert "nodes" not in mine.crashhunt("status", "g", "--json").json["hunts"][0]
-    assert calls(mine)[0] == f"made {min(4, len(os.sched_getaffinity(0)))} 1000 "
 
 
 @pytest.mark.nightly

@@ -6,14 +6,17 @@ import json
 import os
 import resource
 from contextlib import redirect_stdout
+from typing import TYPE_CHECKING
 
 import av
-import numpy as np
 import pytest
 from conftest import add_toy
 from PIL import Image
 
 from crashhunt.cli import main
+
+if TYPE_CHECKING:
+    import numpy as np
 
 SHOWY = """
 from crashhunt import render
@@ -43,7 +46,6 @@ class Showy:
         with render.scope("mind"):
             return {"seen": render.Heatmap(self.seen), "step": [render.Text(str(self.step), title="count")]}
 """
-BUILTIN = 4
 WORDS = ("--arg", "speed=8", "--scenario", "toy", "--seed", "1", "--crash-on", "agent_error")
 
 
@@ -68,25 +70,6 @@ def size(path) -> tuple[int, int]:
         return image.size
 
 
-@pytest.mark.nightly  # by day, the README does
-def test_a_replay_is_filmed_with_the_agents_own_panels(crash):
-    words = ("--video", "out.mp4", "--gif", "out.gif", "--frames", "f", "--size", "480x320", "--last-step-repeats", "2")
-    done = crash.crashhunt("replay", "h", *words, "--json").json
-    assert done["verdict"] == "reproduced"
-    assert done["written"] == {"out.mp4": 42, "out.gif": 40, "f": 42}  # equal pictures are one in a GIF
-    # In the hunt, in its confirmation, and in the film.
-    assert (crash.folder / "closed").read_text() == "xxx"
-    video = pictures(crash.folder / "out.mp4")
-    assert len(video) == 42
-    # Four built-in panels and two of its own, in the step before the crash; there are none before the first step.
-    assert video[0].shape == video[-1].shape
-    last, first = (np.asarray(Image.open(crash.folder / f"f/{n:06d}.png")) for n in (38, 0))
-    assert last.shape == video[0].shape
-    viridis = ((last == (68, 1, 84)).all(axis=2).sum(), (first == (68, 1, 84)).all(axis=2).sum())
-    assert viridis[0] > 500 > viridis[1]
-    assert size(crash.folder / "out.gif") == (last.shape[1], last.shape[0])
-
-
 def test_a_film_from_the_log_runs_no_code_at_all(crash):
     (crash.folder / "showy.py").unlink()
     for found in crash.folder.glob("h/snapshots/*/code/showy.py"):
@@ -94,16 +77,6 @@ def test_a_film_from_the_log_runs_no_code_at_all(crash):
     done = crash.crashhunt("replay", "h", "--from-log", "--video", "log.mp4", "--size", "320x200", "--json")
     assert done.json["written"] == {"log.mp4": 39 + 1 + 10}
     assert "run" not in done.err.replace("crashhunt", "")
-
-
-@pytest.mark.nightly  # by day, render/test_panels.py
-def test_panels_that_fail_are_reported_in_the_film_and_do_not_change_the_verdict(crash):
-    crash.crashhunt("run", "b", "1", "1", "60", "--agent", "showy:Showy", "--arg", "broken=true", *WORDS)
-    done = crash.crashhunt("replay", "b", "--frames", "f", "--size", "240x160", "--json").json
-    assert done["verdict"] == "reproduced"
-    good, bad = (np.asarray(Image.open(crash.folder / f"f/{n:06d}.png")) for n in (20, 21))
-    assert good.shape == bad.shape
-    assert (good != bad).any()
 
 
 def test_what_the_agent_prints_is_not_shown_while_a_film_is_made(crash):
@@ -149,23 +122,6 @@ def test_a_crash_that_kills_the_process_is_filmed_up_to_it(toy, agent, where):
     done = toy.crashhunt("replay", "h", "--frames", "f", "--size", "128x128", "--json").json
     assert (done["verdict"], done["steps_replayed"]) == ("reproduced", 14)
     assert done["written"] == {"f": 14 + 1 + 10}
-
-
-@pytest.mark.nightly  # by day, replays/test_debugged_process.py runs what was killed again
-@pytest.mark.parametrize("number", ["SIGINT", "SIGKILL"])
-def test_film_of_a_replay_that_is_killed_once_is_made(toy, number):
-    (toy.folder / "killed.py").write_text(
-        "import os, signal\nfrom pathlib import Path\nfrom faulty import Raises\nclass Killed(Raises):\n    def "
-        "act(self, observation):\n        if (place := os.environ.get('KILLED')) and not "
-        "Path(place).exists():\n            Path(place).touch()\n            os.kill(os.getpid(), "
-        f"signal.{number})\n        return super().act(observation)\n"
-    )
-    toy.crashhunt("run", "h", "1", "1", "40", "--scenario", "toy", "--agent", "killed:Killed", "--arg", "at=5",
-                  "--seed", "1")  # fmt: skip
-    toy.environment["KILLED"] = str(toy.folder / "was killed")
-    done = toy.crashhunt("replay", "h", "--frames", "f", "--size", "128x128", "--json")
-    assert done.json["verdict"] == "reproduced"
-    assert done.err.count("crashhunt runs it again") == 1
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pty
-import shutil
-import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -191,56 +188,6 @@ def test_hunt_that_continues_runs_no_code_of_another_user(theirs):
     theirs.crashhunt("trust", "h")
     theirs.crashhunt(*HUNT)
     assert find_bundle(theirs.folder / "h", "0").confirmed is True
-
-
-@pytest.mark.nightly  # by day, cli/test_common.py
-def test_at_the_terminal_it_is_asked_once(theirs):
-    def answered(answer, *words):
-        mine, their_end = pty.openpty()
-        try:
-            os.write(mine, f"{answer}\n".encode())
-            done = theirs.crashhunt(*words, expect=None, terminal=their_end, streams=(0, 2))
-            os.close(their_end)
-            said = b""
-            while True:
-                try:
-                    said += os.read(mine, 65536)
-                except OSError:
-                    break
-        finally:
-            os.close(mine)
-        return done.code, said.decode()
-
-    code, said = answered("", "replay", "h")
-    assert (code, "[y/N]" in said, "theirs:Agent and crashhunt" in said) == (2, True, True)
-    assert not ran(theirs)
-    assert answered("y", "replay", "h")[0] == 0
-    assert ran(theirs)
-    theirs.crashhunt("replay", "h", "--crash", "1")
-    theirs.crashhunt("trust", "--remove", "h")
-    assert answered("y", "replay", "h", "--json")[0] == 2  # --json is for programs
-
-
-@pytest.mark.nightly  # by day, crashes/test_origins.py
-def test_corpus_of_ones_own_repository_needs_no_question(theirs, tmp_path):
-    """As a CI has it that checks the repository out, on a machine that has made none of it."""
-    theirs.crashhunt("corpus", "run", "corpus", expect=2)
-    for words in (("init", "--quiet"), ("add", "corpus", "theirs.py", "toy")):
-        subprocess.run(["git", *words], cwd=theirs.folder, check=True)
-    done = theirs.crashhunt("corpus", "run", "corpus", "--json")
-    assert {case["got"] for case in done.json["cases"]} == {"still"}
-    shutil.copytree(theirs.folder / "corpus", theirs.folder / "unpacked")
-    theirs.crashhunt("corpus", "run", "unpacked", expect=2)
-    theirs.crashhunt("corpus", "run", "unpacked", "--trust")
-
-
-@pytest.mark.nightly  # by day, corpus/test_pytest_cases.py
-def test_pytest_runs_a_corpus_as_it_runs_the_tests_next_to_it(theirs):
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:randomly", "corpus"],
-        cwd=theirs.folder, env=theirs.environment, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
-    assert "2 xfailed" in done.stdout, done.stdout
 
 
 def test_what_is_added_to_a_corpus_is_ones_own(theirs):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import subprocess
 import sys
@@ -92,19 +91,6 @@ def test_a_foreign_module_is_imported_once_to_describe_it_and_once_for_trials(to
     toy.crashhunt("run", "h", "1", "2", "5", *words)
     assert len((toy.folder / "imports").read_text().split()) == 2
     assert '"too_near"' in (toy.folder / "h" / "hunt.toml").read_text()
-
-
-@pytest.mark.nightly  # by day, plans/test_what_is_resolved.py sees that a hunt does not draw them itself
-def test_foreign_disturbances_are_drawn_in_their_own_process(toy):
-    (toy.folder / "plugins.py").write_text(PLUGINS)
-    toy.crashhunt("run", "h", "1", "3", "60", "--scenario", "loop", "--disturb", "plugins:Brake=1", "--keep-going")
-    imports, draws = ((toy.folder / name).read_text().split() for name in ("imports", "draws"))
-    assert len(set(draws)) == 1
-    assert draws[0] in imports
-    assert len(imports) == 2  # the first process has described the model
-    rows = list(csv.DictReader(toy.crashhunt("trials", "h", "--format", "csv").out.splitlines()))
-    assert len(rows) == 3
-    assert all(row["log_likelihood"] for row in rows)
 
 
 def test_a_module_of_an_agent_changes_nothing_in_the_process_of_the_command(toy):

@@ -90,56 +90,10 @@ def test_worse_agent_fails_the_gate_and_the_hunts_stay_for_compare(drivers):
     assert "--set" in refused.err  # given twice
 
 
-@pytest.mark.nightly  # by day, statistics/test_paired_test.py
-def test_agent_that_does_not_start_in_some_trials_is_worse(drivers):
-    done = drivers.crashhunt("gate", CALM, "drivers:Shy", *TOY, *SEED, "--keep", "kept", "--json", expect=1)
-    found = done.json
-    assert (found["verdict"], found["only_head"], found["invalid"]) == ("worse", 8, 0)
-    assert found["not_started"] == {"base": 0, "head": 8}
-    assert "ValueError: no weights" in done.err
-    assert found["difference"]["low"] > 0
-    (pair,) = drivers.crashhunt("compare", "kept", "--json").json["pairs"]
-    assert (pair["answer"], pair["not_started"][0]) == ("first", 0)
-    assert pair["not_started"][1] >= 8
-    assert drivers.crashhunt("gate", "drivers:Shy", CALM, *TOY, *SEED, "--json").json["verdict"] == "better"
-
-
 @pytest.mark.nightly
 def test_better_agent_passes_the_gate(drivers):
     found = gate(drivers, WILD, CALM, expect=0)
     assert (found["verdict"], found["only_base"], found["only_head"], found["dir"]) == ("better", 8, 0, None)
-
-
-@pytest.mark.nightly  # by day, the verdict within a margin is tested in tests/statistics/test_paired_test.py
-def test_equal_agents_pass_the_gate_once_the_difference_is_within_the_margin(drivers):
-    found = gate(drivers, CALM, TWIN, "--margin", "40%", *SEED, "--keep", "kept", "--most", "200", expect=0)
-    assert (found["verdict"], found["margin"]) == ("no_difference", 0.4)
-    low, high = found["difference"]["low"], found["difference"]["high"]
-    assert -0.4 < low < 0 < high < 0.4
-    assert found["pairs"] < 20
-
-
-@pytest.mark.nightly  # by day, a gate that was interrupted resumes
-def test_undecided_gate_gives_the_reason_and_resumes_with_more_pairs(drivers):
-    done = drivers.crashhunt("gate", CALM, WILD, *TOY, *SEED, "--most", "3", "--keep", "kept", expect=3)
-    assert done.out.startswith("undecided: HEAD drivers:Wild, BASE drivers:Calm\n  all 3 pairs have ended; give more")
-    found = gate(drivers, CALM, WILD, *SEED, "--keep", "kept", expect=1)
-    assert (found["verdict"], found["pairs"]) == ("worse", 8)
-
-
-@pytest.mark.nightly  # by day, suites/test_gate_of_hunts.py
-def test_both_versions_drive_in_the_same_traffic_with_the_same_disturbances(drivers):
-    """What is drawn for a trial follows from its number, whatever the agent has done before."""
-    words = ("--disturb", "brake=0.5,stop=0.2,late_action=0.1", "--most", "3", "--margin", "0")
-    gate(drivers, CALM, WILD, *words, *SEED, "--keep", "kept", expect=3)
-    base, head = (specs(drivers.folder / "kept" / side) for side in ("base", "head"))
-    assert base.keys() == head.keys() == set(range(3))
-    for number, spec in base.items():
-        same = {name: value for name, value in spec.items() if name != "arguments"}
-        assert same == {name: value for name, value in head[number].items() if name != "arguments"}
-        assert spec["disturbances"]
-    assert len({spec["seed"] for spec in base.values()}) == 3
-    assert [spec["arguments"]["ego"] for spec in head.values()] == [{}] * 3
 
 
 @pytest.fixture
@@ -159,42 +113,6 @@ def repository(drivers):
 
 
 IN_REPOSITORY = ("--scenario", "../toy", "--set", "gap_m=20:30", "--max-steps", "99", "--agent", CALM, *SEED)
-
-
-@pytest.mark.nightly  # by day, suites/test_gate_parts.py and base/test_git.py
-def test_commits_are_compared_in_work_trees_of_their_own(repository):
-    done = repository.crashhunt("gate", "calm", "HEAD", *IN_REPOSITORY, "--keep", "../kept", "--json", expect=1)
-    found = done.json
-    assert "the work tree has changes that are not committed; the gate does not compare them" in done.err
-    assert (found["verdict"], found["only_base"], found["only_head"]) == ("worse", 0, 8)
-    commit = git(repository.folder, "rev-parse", "wild")[:10]
-    assert found["compared"]["head"] == f"HEAD ({commit})"
-    assert (repository.folder / "drivers.py").read_text().endswith("# not committed\n")
-    assert len(git(repository.folder, "worktree", "list").splitlines()) == 1
-    again = repository.crashhunt("gate", "calm", "wild", *IN_REPOSITORY, "--keep", "../kept", "--json", expect=1).json
-    assert again["pairs"] == found["pairs"]  # the same commits, by another name
-
-
-@pytest.mark.nightly  # by day, suites/test_gate_parts.py and base/test_builds.py
-def test_commits_are_built_and_their_snapshots_contain_what_git_ignores(repository):
-    project, speed = repository.folder, "float((Path(__file__).parent / 'out' / 'speed').read_text())"
-    code = DRIVERS.replace("(self.speed, 0)", f"({speed}, 0)").replace(
-        "\nclass Calm", "\nfrom pathlib import Path\nclass Calm"
-    )
-    for name, metres in (("slow", 3), ("fast", 14)):
-        for file, text in (("drivers.py", code), ("speed.txt", f"{metres}"), (".gitignore", "out/\n")):
-            (project / file).write_text(text)
-        git(project, "add", ".")
-        git(project, "commit", "-qm", name)
-        git(project, "tag", name)
-    build = ("--build", "mkdir -p out && cp speed.txt out/speed")
-    words = (*IN_REPOSITORY, "--keep", "../kept", "--json")
-    found = repository.crashhunt("gate", "slow", "fast", *words, *build, expect=1).json
-    assert (found["verdict"], found["only_base"], found["only_head"]) == ("worse", 0, 8)
-    kept = repository.folder.parent / "kept"
-    assert [path.read_text() for path in sorted(kept.glob("*/snapshots/*/code/@*/out/speed"))] == ["3", "14"]
-    again = repository.crashhunt("gate", "slow", "fast", *words, *build, expect=1).json
-    assert again["pairs"] == found["pairs"]
 
 
 @pytest.mark.nightly
@@ -262,20 +180,6 @@ def test_gate_whose_time_is_up_is_undecided(drivers):
     found = gate(drivers, CALM, TWIN, *words, expect=3)
     assert (found["verdict"], found["interrupted"]) == ("undecided", False)
     assert found["why"].startswith("the time is up; give --for more")
-
-
-@pytest.mark.nightly  # by day, test_foreign_modules.py
-def test_agent_whose_module_ends_its_process_is_refused(drivers):
-    (drivers.folder / "gone.py").write_text("import os\n\nos._exit(7)\n")
-    done = drivers.crashhunt("gate", CALM, "gone:Driver", *TOY, "--most", "3", expect=2)
-    assert "HEAD (gone:Driver): the hunt cannot run: 'gone:Driver' cannot be imported" in done.err
-
-
-@pytest.mark.nightly  # by day, suites/test_gate_of_hunts.py
-def test_no_valid_trial_exits_with_3(drivers):
-    words = ("--set", "fail_reset=true", "--most", "40")
-    done = drivers.crashhunt("gate", CALM, TWIN, *TOY, *words, expect=3)
-    assert "no trial can be set up" in done.err
 
 
 SUITE = """
@@ -362,15 +266,3 @@ def test_killed_gate_leaves_nothing_running_and_resumes_to_the_same_verdict(repo
     verdict = ("verdict", "pairs", "only_base", "only_head", "both", "evidence", "difference")
     assert {name: found[name] for name in verdict} == {name: whole[name] for name in verdict}
     assert len(git(repository.folder, "worktree", "list").splitlines()) == 1
-
-
-@pytest.mark.nightly  # by day, suites/test_gate_parts.py locks the folder
-def test_two_gates_in_one_folder_exclude_each_other(drivers):
-    process = begun(drivers, "--most", "5000")
-    try:
-        words = ("--set", "step_wall_s=0.002", "--keep", "kept")
-        refused = drivers.crashhunt("gate", CALM, TWIN, *TOY, *words, expect=2)
-        assert "another gate is running in this folder" in refused.err
-    finally:
-        process.send_signal(signal.SIGTERM)
-        process.communicate(300)

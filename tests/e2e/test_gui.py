@@ -126,11 +126,3 @@ def test_a_closed_window_is_no_divergence(crash, screen):
     assert process.returncode == 130, err
     assert "the window was closed" in err
     assert "diverged" not in out
-
-
-@pytest.mark.nightly  # by day, cli/test_answers_on_crashes.py and replays/test_debugged_process.py
-def test_what_cannot_be_shown_is_said(crash, shell):
-    shell.environment.pop("DISPLAY", None)
-    assert "DISPLAY is not set" in crash.crashhunt("replay", "h", "--gui", expect=2).err
-    assert "--sleep is 3" in crash.crashhunt("replay", "h", "--sleep", "3", expect=2).err
-    assert "--sleep is -1" in crash.crashhunt("replay", "h", "--gui", "--sleep", "-1", expect=2).err

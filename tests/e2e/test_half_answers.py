@@ -144,25 +144,6 @@ def test_margin_of_a_trial_whose_copies_are_killed_is_open_until_they_are_asked_
     assert shell.crashhunt("check", "h").code == 0
 
 
-@pytest.mark.nightly  # by day, tests/episode has branches that are killed, and the hunt above runs trials again
-@pytest.mark.parametrize("gap_m", [30, 15])
-def test_branches_that_are_killed_are_counted_and_asked_again(shell, folder, gap_m):
-    branched = (*HUNT, "--set", f"gap_m={gap_m}", "--disturb", "brake=0.05,stop=0.05", "--branch")
-    undisturbed = shell.crashhunt("run", "u", *branched).json
-    report, err = hunt_and_kill(shell, branched)
-    assert (report["branches"]["not_fully_asked"], report["unanswered"]) == (1, 1), str(
-        (table(shell, "h")[1], report["notes"])
-    )
-    assert "1 trial was not fully probed: a copy was killed by SIGKILL" in err
-    rows, _ = table(shell, "h")
-    asked, of = map(int, rows[0]["branches_asked"].removeprefix("asked ").split(" of "))
-    assert asked < of
-    again = shell.crashhunt("run", "h", *branched).json
-    assert again["unanswered"] == 0
-    assert again["branches"] | {"crashes": []} == undisturbed["branches"] | {"crashes": []}
-    assert table(shell, "h") == table(shell, "u")
-
-
 @pytest.mark.nightly
 def test_trial_that_is_killed_at_different_steps_is_invalid_until_it_is_run_again(shell, folder):
     words = ("run", "h", *HUNT, "--agent", "faulty:Waits")

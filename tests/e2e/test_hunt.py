@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import sqlite3
-import subprocess
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -25,10 +24,6 @@ def ledger(folder: Path) -> dict[int, str]:
         return dict(database.execute("SELECT number, result FROM trials"))
     finally:
         database.close()
-
-
-def digests(folder: Path) -> dict[int, str]:
-    return {number: json.loads(result)["digest"] for number, result in ledger(folder).items()}
 
 
 def wait_for(condition, timeout_s=300.0):
@@ -69,15 +64,6 @@ def test_exactly_so_many_trials_run(toy, parallel, trials):
     assert report["steps_total"] == 30 * trials
     assert sorted(ledger(toy.folder / "h")) == list(range(trials))
     assert not [*(toy.folder / "h").glob(".scratch*")]
-
-
-@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py
-def test_trials_do_not_depend_on_how_many_run_at_once(shell):
-    for parallel in ("1", "3"):
-        words = ("run", parallel, parallel, "4", "120", "--seed", "11", "--keep-going")
-        shell.crashhunt(*words)
-    assert digests(shell.folder / "1") == digests(shell.folder / "3")
-    assert len(set(digests(shell.folder / "1").values())) == 4
 
 
 @pytest.mark.nightly  # by day, hunts/test_whole_hunts.py shows it on the toy
@@ -170,108 +156,9 @@ def test_a_killed_hunt_leaves_no_process_and_continues(toy):
     assert {key: after[key] for key in before} == before
 
 
-@pytest.mark.nightly  # by day, executors/test_killed_trials.py kills processes of trials
-def test_a_killed_worker_costs_its_own_trial_only(toy):
-    words = ("run", "h", "2", "30", *LONG, "--crash-on", "hang", "--json")
-    process = toy.begin(*words, start_new_session=True)
-    wait_for(lambda: count(toy.folder / "h") >= 3)
-    os.kill(running_worker(toy.folder / "h"), signal.SIGKILL)
-    out, err = process.communicate(timeout=300)
-    assert process.returncode == 0, err
-    report = json.loads(out)
-    assert report["trials_run"] == 30
-    outcomes = report["outcomes"]
-    assert outcomes.get("process_died", 0) + outcomes.get("invalid", 0) <= 1
-    assert outcomes["survived"] >= 29
-
-
-def running_worker(folder: Path) -> int:
-    from crashhunt.recording import Phase, read_header
-
-    found: list[int] = []
-
-    def look() -> bool:
-        headers = [read_header(path) for path in folder.glob(".scratch-*/trial-*/blackbox.bin")]
-        found[:] = [header.pid for header in headers if header is not None and header.phase != Phase.DONE]
-        return bool(found)
-
-    wait_for(look)
-    return found[0]
-
-
-@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py and hunts/test_hunt_parts.py
-def test_other_settings_are_refused_and_overwrite_begins_again(toy):
-    toy.crashhunt("run", "h", "1", "2", "30", *FINE)
-    done = toy.crashhunt("run", "h", "1", "2", "40", *FINE, "--json", expect=2)
-    assert "max_steps was 30 and is now 40" in done.json["error"]["message"]
-    assert len(done.err.strip().splitlines()) == 1
-    assert len(ledger(toy.folder / "h")) == 2
-    # How it is run is nobody's business but the user's, and more trials go on from there.
-    assert toy.crashhunt("run", "h", "2", "3", "30", *FINE, "--timeout", "9", "--json").json["trials_run"] == 3
-    assert toy.crashhunt("run", "h", "1", "1", "40", *FINE, "--overwrite", "--json").json["trials_run"] == 1
-
-
-@pytest.mark.nightly  # by day, hunts/test_hunt_parts.py locks the directory
-def test_a_second_hunt_on_one_directory_is_refused(toy):
-    process = toy.begin("run", "h", "1", "500", "300", *FINE)
-    try:
-        wait_for(lambda: count(toy.folder / "h") >= 1)
-        done = toy.crashhunt("run", "h", "1", "500", "300", *FINE, expect=2)
-        assert f"process {process.pid}" in done.err
-        assert process.poll() is None
-    finally:
-        process.terminate()
-        process.communicate()
-
-
-@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py and cli/test_answers_on_crashes.py
-def test_a_finished_hunt_states_again_what_it_found(toy):
-    words = ("run", "h", "1", "5", "60", "--agent", "faulty:Raises", "--scenario", "toy", "--json")
-    first, second = toy.crashhunt(*words).json, toy.crashhunt(*words).json
-    assert first["crashes"] == second["crashes"]
-    assert first["trials_run"] == second["trials_run"] == 1
-    assert toy.crashhunt(*words, "--fail-on-crash", expect=1).json["crashes"] == first["crashes"]
-
-
-@pytest.mark.nightly  # by day, hunts/test_whole_hunts.py and results/test_tally.py
-def test_keep_going_collects_all_crashes(toy):
-    words = ("run", "h", "2", "5", "60", "--agent", "faulty:Raises", "--scenario", "toy", "--keep-going", "--json")
-    report = toy.crashhunt(*words).json
-    assert report["stopped_because"] == "all_trials"
-    assert [crash["trial"] for crash in report["crashes"]] == list(range(5))
-    assert all(crash["confirmed"] for crash in report["crashes"])
-    assert toy.crashhunt("replay", "h", "--crash", "3", "--json").json["crash"] == "000003-agent_error"
-
-
 def test_the_smallest_time_limit_that_fits_is_no_hang(toy):
     report = toy.crashhunt("run", "h", "2", "4", "30", *FINE, "--timeout", "5", "--json").json
     assert report["outcomes"] == {"survived": 4}
-
-
-@pytest.mark.nightly  # by day, ledger/test_ledger_reads.py and hunts/test_whole_hunts.py
-def test_a_full_disk_is_one_clear_line_and_nothing_is_lost(shell):
-    small = shell.folder / "small"
-    small.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", str(small)], capture_output=True, check=False
-    )
-    if mounted.returncode != 0:
-        pytest.skip(f"a small file system cannot be mounted here: {mounted.stderr.decode().strip()}")
-    try:
-        words = ("run", str(small / "h"), "2", "40", "3000", "--set", "vehicles=30", "--arg", "speed=6", "--seed", "1")
-        done = shell.crashhunt(*words, "--crash-on", "hang", expect=2)
-        assert "No space left" in done.err or "disk is full" in done.err
-        assert "free some space" in done.err
-        assert len(done.err.strip().splitlines()) == 1
-        finished = ledger(small / "h")
-        subprocess.run(["mount", "-o", "remount,size=200m", str(small)], check=True)
-        words = ("run", str(small / "h"), "2", str(len(finished) + 2), *words[4:])
-        shell.crashhunt(*words, "--crash-on", "hang")
-        after = ledger(small / "h")
-        assert {key: after[key] for key in finished} == finished
-        assert len(after) == len(finished) + 2
-    finally:
-        subprocess.run(["umount", "-l", str(small)], check=False)
 
 
 @pytest.mark.parametrize(

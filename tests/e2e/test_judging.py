@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -10,67 +9,10 @@ import pytest
 from crashhunt.analysis import judge
 from crashhunt.analysis._avoidability import AvoidanceSearch
 from crashhunt.analysis._cause_runs import _Search
-from crashhunt.crashes import INTERRUPTED, find_bundle, judgement_of, with_judgement
+from crashhunt.crashes import find_bundle, judgement_of
 from crashhunt.errors import UsageError
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Outcome
-
-HUNT = ("--scenario", "toy", "--arg", "speed=14", "--seed", "1")
-
-
-@pytest.mark.nightly  # by day, what a failure hangs on is run and reported
-def test_what_is_found_is_kept_and_reported(toy):
-    found = toy.crashhunt("run", "h", "1", "2", "300", *HUNT, "--only-at-fault", "--json").json
-    assert (found["stopped_because"], found["trials_run"], found["at_fault"]) == ("crash", 1, [0])
-    (group,) = toy.crashhunt("crashes", "h", "--json").json["groups"]
-    assert (group["fault"], group["avoidable"]) == ("ego", True)  # the hunt has run the brakes
-    before = json.loads(next((toy.folder / "h").glob("crashes/*/crash.json")).read_text())
-    found = toy.crashhunt("judge", "h", "--runs", "9", "--why", "12", "--parallel", "2", "--json")
-    (judged,) = found.json["judged"]
-    brake = judged["attempts"][0]
-    assert judged["avoidable"] is True
-    assert judged["runs"] <= 9
-    assert brake["manoeuvre"] == "brake"
-    assert brake["deceleration"] == pytest.approx(8.0)
-    assert "by braking (at up to 8.0 m/s²): a run from this step avoids it" in found.err
-    why = {(factor["kind"], factor["name"], factor["what"]): factor for factor in judged["why"]["factors"]}
-    assert (judged["why"]["runs"], judged["why"]["why_not"]) == (12, "")
-    sped_up = why["agent", "ego", "sped up"]
-    assert (sped_up["step"], sped_up["same"], sped_up["needed"]) == (0, 0, True)  # it holds 14 m/s, behind 10
-    seeds = why["seed", "seed", "drawn"]
-    assert seeds["was"] == before["seed"]
-    assert seeds["clear"] == len({run["given"] for run in seeds["runs"]} - {before["seed"]}) >= 3
-    assert seeds["interval"][0] < seeds["crashed"] / seeds["clear"] <= seeds["interval"][1]
-    assert why["other", "leader", "there"]["clear"] == 0  # the toy cannot take it away, and so it is silent
-    assert "ego sped up at 0.0 s; without that (it keeps its speed): no crash" in found.err
-    after = json.loads(next((toy.folder / "h").glob("crashes/*/crash.json")).read_text())
-    assert {name: value for name, value in after.items() if name not in ("judged", "integrity")} == {
-        name: value for name, value in before.items() if name != "integrity"
-    }
-    assert "by braking (at up to 8.0 m/s²): a run from this step avoids it" in toy.crashhunt("show", "h").out
-    assert "At fault: ego, by the rule 'rear end': ego drove into the back of leader" in toy.crashhunt("show", "h").out
-    assert toy.crashhunt("show", "h", "--json").json["judged"] == {
-        name: value for name, value in judged.items() if name != "crash"
-    }
-    # The hunt itself had looked for the same, by its own way.
-    escape = before["escape"]
-    assert escape["step"] == brake["last_step"]
-    assert toy.crashhunt("judge", "h", "--all", "--json").json == {"judged": []}  # it has been judged
-    # Asked for less, it keeps what it knows; and what was broken off is taken up again.
-    (less,) = toy.crashhunt("judge", "h", "--runs", "9", "--why", "0", "--json").json["judged"]
-    assert less["why"] == judged["why"]
-    bundle = find_bundle(toy.folder / "h")
-    known = judgement_of(bundle)
-    assert known.why is not None
-    assert not known.is_interrupted
-    for broken in (
-        replace(known, why_not=INTERRUPTED),
-        replace(known, why=replace(known.why, why_not=INTERRUPTED)),
-    ):
-        with_judgement(bundle, broken).write()
-        words = ("judge", "h", "--all", "--runs", "1", "--why", "1", "--json")
-        assert [one["crash"] for one in toy.crashhunt(*words).json["judged"]] == [bundle.id]
-    assert toy.crashhunt("check", "h").out.endswith("are intact\n")
 
 
 @pytest.mark.parametrize(

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-import random
 import shutil
 import sqlite3
-import time
 from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
-
-from crashhunt.ledger import Ledger
 
 HERE = Path(__file__).parent
 HUNT = ("2", "60", "20", "--scenario", "toy", "--seed", "3", "--keep-going", "--crash-on", "hang", "--json")
@@ -51,49 +47,6 @@ def trials(hunt):
     return {}
 
 
-@pytest.mark.nightly  # by day, hunts/test_next_trials.py kills hunts that learn, without processes
-@pytest.mark.parametrize("sampler", ["climber:Climber", "optuna:tpe"])
-def test_a_hunt_that_learns_and_is_killed_runs_the_same_trials(own, sampler):
-    words = (*HUNT, "--sampler", sampler, "--deterministic")
-    own.crashhunt("run", "whole", *words)
-    whole = trials(own.folder / "whole")
-    assert sorted(whole) == list(range(60))
-    assert sum("parent" in spec or spec["origin"] == "optuna" for spec, _ in whole.values()) > 5
-    chance = random.Random(5)
-    for ends in (chance.randrange(2, 30), chance.randrange(30, 50)):
-        process = own.begin("run", "killed", *words, "--set", "step_wall_s=0.002")
-        deadline = time.monotonic() + 300
-        while len(trials(own.folder / "killed")) < ends:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        process.kill()
-        process.communicate()
-    own.crashhunt("run", "killed", *words, "--set", "step_wall_s=0.002")
-    killed = trials(own.folder / "killed")
-    for spec, _ in killed.values():
-        assert spec["scenario_arguments"].pop("step_wall_s") == 0.002
-    for spec, _ in whole.values():
-        assert spec["scenario_arguments"].pop("step_wall_s") == 0.0
-    assert killed == whole
-    own.crashhunt("check", "killed")
-
-
-@pytest.mark.nightly  # by day, report/test_page_search.py reads parents and origins
-def test_where_trials_come_from_is_in_the_table(own):
-    own.crashhunt("run", "h", *HUNT, "--sampler", "climber:Climber")
-    head, *lines = own.crashhunt("trials", "h", "--format", "csv").out.splitlines()
-    assert head.split(",")[-2:] == ["parent", "origin"]
-    assert lines[0].split(",")[-2:] == ["", "draw 0"]
-    assert any(line.split(",")[-1].startswith("climb ") and line.split(",")[-2].isdigit() for line in lines)
-    own.crashhunt("run", "random", "1", "2", *HUNT[2:])
-    assert "parent" not in own.crashhunt("trials", "random", "--format", "csv").out
-    own.crashhunt("trials", "h", "--format", "parquet", "--out", "h.parquet")
-    import polars as pl
-
-    table = pl.read_parquet(own.folder / "h.parquet")
-    assert (table.schema["parent"], table.schema["origin"]) == (pl.Int64, pl.String)
-
-
 @pytest.mark.nightly
 def test_a_damaged_proposal_is_found_and_the_others_are_saved(own):
     words = (*HUNT, "--sampler", "climber:Climber", "--deterministic")
@@ -130,15 +83,3 @@ def test_what_is_wrong_with_a_sampler_is_one_line(own):
     done = own.crashhunt("run", "h", *HUNT[:-1], "--sampler", "climber:Bad", expect=2)
     assert "the sampler 'climber:Bad' fails when it is asked for trial 0: KeyError" in done.err
     assert "climber.py, line" in done.err
-
-
-@pytest.mark.nightly  # by day, hunts/test_hunt_loop.py writes a missing row
-def test_a_crash_without_a_row_gets_one_that_states_where_it_is_from(own):
-    words = ("1", "3", "20", "--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=5", "--keep-going")
-    own.crashhunt("run", "h", *words, "--sampler", "climber:Climber")
-    before = trials(own.folder / "h")
-    assert before[1][0]["origin"] == "draw 0"
-    with closing(Ledger(own.folder / "h" / "ledger.sqlite", writable=True)) as ledger:
-        assert ledger.replace([1]) == 1
-    own.crashhunt("run", "h", *words, "--sampler", "climber:Climber")
-    assert trials(own.folder / "h") == before

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
 import signal
 import sqlite3
@@ -15,7 +14,6 @@ from contextlib import closing
 import pytest
 from conftest import CRASHHUNT, keeps_going
 
-from crashhunt.ledger import Ledger
 from crashhunt.statistics import RateTest
 
 KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
@@ -33,62 +31,6 @@ def started(shell, *words: str):
         assert time.monotonic() < deadline
         time.sleep(0.05)
     return process
-
-
-@pytest.mark.nightly  # by day, hunts/test_states_and_reports.py, and test_hunt.py kills a hunt
-def test_a_hunt_is_running_until_its_process_is_gone(toy):
-    process = started(toy)
-    found = state(toy)
-    assert (found["state"], found["owner_alive"], found["trials_planned"]) == ("running", True, 50000)
-    assert found["rate_per_s"] > 0
-    assert 0 < found["seconds_left"] < 50000 * 10  # s: of a trial each, on a loaded machine too
-    # Nobody else's business: the workers are stopped first, so that nothing is left to end by itself.
-    os.kill(process.pid, signal.SIGKILL)
-    process.communicate()
-    found = state(toy)
-    assert (found["state"], found["owner_alive"], found["seconds_left"]) == ("killed", False, None)
-    toy.crashhunt("run", "h", "2", str(found["trials_run"]), "50", *KEEP, "--set", "step_wall_s=0.001")
-    assert state(toy)["state"] in ("finished", "crashed")
-
-
-@pytest.mark.nightly  # by day, hunts/test_states_and_reports.py
-def test_a_process_id_that_another_process_has_now_is_not_the_owner(toy):
-    process = started(toy)
-    os.kill(process.pid, signal.SIGKILL)
-    process.communicate()
-    with closing(Ledger(toy.folder / "h/ledger.sqlite", writable=True)) as ledger:
-        owner = ledger.facts()["owner"]
-        assert owner["pid"] == process.pid
-        ledger.note(owner=owner | {"pid": os.getpid()})
-        assert state(toy)["state"] == "killed"
-        # On another machine, only its heartbeat tells.
-        ledger.note(owner=owner | {"host": "elsewhere"}, heartbeat=time.time())
-        assert state(toy)["state"] == "running"
-        ledger.note(heartbeat=time.time() - 3600)
-        assert state(toy)["state"] == "killed"
-
-
-@pytest.mark.nightly  # by day, hunts/test_states_and_reports.py and hunts/test_whole_hunts.py
-def test_every_end_has_its_state(toy):
-    toy.crashhunt("run", "fine", "1", "5", "50", "--scenario", "toy", "--arg", "speed=4", "--seed", "1")
-    toy.crashhunt("run", "crash", "1", "50", "99", "--scenario", "toy", "--arg", "speed=14", "--seed", "1")
-    toy.crashhunt("run", "none", "1", "5", "50", "--scenario", "toy", "--set", "fail_reset=true", expect=3)
-    found = {hunt["dir"]: hunt for hunt in toy.crashhunt("status", "fine", "crash", "none", "--json").json["hunts"]}
-    assert {name: hunt["state"] for name, hunt in found.items()} == {
-        "fine": "finished", "crash": "crashed", "none": "error",
-    }  # fmt: skip
-    assert (found["crash"]["crashes"], found["none"]["errors"]) == (1, 5)
-    assert "fails as its scenario arguments demand" in found["none"]["detail"]
-    (lost,) = (toy.folder / "crash/crashes").glob("*/crash.json")
-    lost.unlink()
-    (found,) = toy.crashhunt("status", "crash", "--json").json["hunts"]
-    assert (found["state"], found["crashes"]) == ("crashed", 1)
-    # All below a folder, and one that nobody can read hides no other.
-    (toy.folder / "fine/ledger.sqlite").write_bytes(b"nonsense" * 1000)
-    found = {hunt["dir"]: hunt["state"] for hunt in toy.crashhunt("status", ".", "--json", expect=2).json["hunts"]}
-    assert found == {"fine": "error", "crash": "crashed", "none": "error"}
-    assert "there is no hunt in 'toy'" in toy.crashhunt("status", "toy", expect=2).err
-    assert "does not exist" in toy.crashhunt("status", "nowhere", expect=2).err
 
 
 @pytest.mark.nightly
@@ -128,26 +70,6 @@ def test_logs_are_found_wherever_they_are(shell):
     assert "contradict" in shell.crashhunt("logs", "h", "--errors-only", "--type", "run", expect=2).err
 
 
-@pytest.mark.nightly  # by day, hunts/test_logs.py and cli/test_answers_on_crashes.py
-def test_logs_follow_what_runs(toy):
-    process = started(toy)
-    following = subprocess.Popen(
-        [str(CRASHHUNT), "logs", "h", "--follow", "--type", "state"], cwd=toy.folder, env=toy.environment,
-        stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert following.stdout is not None
-    out = ""
-    while "running" not in out:
-        line = following.stdout.readline()
-        assert line, out
-        out += line
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=300)
-    out += following.communicate(timeout=300)[0]
-    assert out.count("running") == 1
-    assert "interrupted" in out
-
-
 def test_trials_that_could_not_be_set_up_run_again(toy):
     (toy.folder / "moody.py").write_text(
         "import pathlib\nclass Agent:\n    def __init__(self, number: int = 0):\n"
@@ -167,23 +89,6 @@ def test_trials_that_could_not_be_set_up_run_again(toy):
     with closing(sqlite3.connect(toy.folder / "h/ledger.sqlite")) as database:
         assert {number for (number,) in database.execute("SELECT number FROM replaced")} == failed
     assert toy.crashhunt("rerun", "h", "--json").json["hunts"][0]["trials_run"] == 20
-
-
-@pytest.mark.nightly  # by day, the README does
-def test_another_version_of_a_hunt_runs_elsewhere(toy):
-    toy.crashhunt("run", "h", "2", "4", "99", *KEEP, "--arg", "speed=14", "--set", "gap_m=20:30")
-    done = toy.crashhunt("rerun", "h", "--to", "slower", "--set", "speed=4", "--set", "trials=3", "--json").json
-    assert [(hunt["dir"], hunt["outcomes"]) for hunt in done["hunts"]] == [("slower", {"survived": 3})]
-    # The same seeds, and the same traffic.
-    for old, new in zip(rows(toy, "h"), rows(toy, "slower"), strict=False):
-        assert (old["seed"], old["scenario.gap_m"]) == (new["seed"], new["scenario.gap_m"])
-    assert state(toy)["state"] == "crashed"
-    assert "exists already" in toy.crashhunt("rerun", "h", "--to", "slower", expect=2).err
-    assert "a hunt cannot change its settings" in toy.crashhunt("rerun", "h", "--set", "speed=4", expect=2).err
-    assert "trials=many" in toy.crashhunt("rerun", "h", "--to", "x", "--set", "trials=many", expect=2).err
-    wrong = toy.crashhunt("rerun", "h", "--to", "x", "--set", "sped=4", expect=2)
-    assert "--set: the hunt has no argument 'sped'; did you mean 'ego.speed'?" in wrong.err
-    assert not (toy.folder / "x").exists()
 
 
 @pytest.mark.nightly
@@ -301,17 +206,3 @@ def test_which_of_two_agents_crashes_less(toy):
     (head, *lines) = toy.crashhunt("compare", "fast", "slow", "--csv").out.splitlines()
     assert head.startswith("dir,state,trials,crashes,crash_rate,rate_low,rate_high")
     assert len(lines) == 2
-
-
-@pytest.mark.nightly  # by day, statistics/test_comparison.py
-def test_an_interval_only_where_trials_are_independent(toy):
-    toy.crashhunt("run", "first", "1", "40", "99", "--scenario", "toy", "--seed", "4", "--arg", "speed=14")
-    words = ("--scenario", "toy", "--seed", "4", "--sampler", "grid", "--arg", "speed=4:14", "--points", "5")
-    toy.crashhunt("run", "grid", "1", "5", "99", *words, "--keep-going", "--keep", "1")
-    toy.crashhunt("run", "other", "1", "2", "99", "--scenario", "toy", "--seed", "99", "--keep-going")
-    found = toy.crashhunt("compare", "first", "grid", "other")
-    assert "first: no crash rate: the hunt stops at its first crash" in found.out
-    assert "grid: no interval: the sampler grid does not draw" in found.out
-    assert "first and other have no seed in common" in found.out
-    assert "a single hunt cannot be compared" in toy.crashhunt("compare", "first", expect=2).err
-    assert "does not exist" in toy.crashhunt("compare", "first", "nowhere", expect=2).err

@@ -127,33 +127,3 @@ def test_one_that_is_damaged_is_found_and_made_again(hunt):
     hunt.crashhunt(*WORDS, "--near-misses", "2")
     assert hunt.crashhunt("check", "h", "--json").json["fine"]
     assert log.exists()
-
-
-@pytest.mark.nightly  # by day, crashes/test_bundle.py
-def test_of_a_hunt_without_a_crash_the_most_dangerous_is_meant(toy):
-    words = ("run", "h", "2", "3", "20", "--scenario", "toy", "--seed", "4", "--arg", "speed=11:13")
-    done = toy.crashhunt(*words, "--near-misses", "3")
-    first = done.out.split("--crash ")[1].split()[0]
-    assert toy.crashhunt("replay", "h", "--json").json["crash"] == first
-
-
-REMEMBERS = """
-from faulty import Remembers
-
-
-class Fast(Remembers):
-    def act(self, observation):
-        speed, change = super().act(observation)
-        return speed + 12, change
-"""
-
-
-@pytest.mark.nightly  # by day, hunts/test_from_the_start.py
-def test_one_that_is_another_trial_in_a_fresh_process_is_not_kept(toy):
-    (toy.folder / "fast.py").write_text(REMEMBERS)
-    words = ("run", "h", "1", "3", "30", "--scenario", "toy", "--seed", "4", "--agent", "fast:Fast")
-    words += ("--set", "gap_m=25", "--crash-on", "hang")
-    done = toy.crashhunt(*words, "--near-misses", "3", "--json").json
-    assert all("a near miss, is another one in a fresh process" in note for note in done["notes"])
-    assert len(done["near_misses"]) + len(done["notes"]) == 3
-    assert done["notes"]

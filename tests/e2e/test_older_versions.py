@@ -48,22 +48,6 @@ def test_a_hunt_is_listed_read_and_checked(shell, place):
     assert "leader" in (shell.folder / "page.html").read_text()
 
 
-@pytest.mark.nightly  # by day, hunts/test_next_trials.py draws them, and crashes are replayed below
-@hunts
-def test_a_hunt_continues_with_the_trials_that_it_would_have_had(shell, place):
-    shutil.copytree(place / "hunt", shell.folder / "hunt")
-    shutil.copytree(FROZEN / "toy", shell.folder / "toy")
-    options = ("--scenario", "toy", "--seed", "1", "--keep-going", "--no-snapshot")
-    shell.crashhunt("run", "hunt", "1", "6", "60", *options)
-    shell.crashhunt("run", "anew", "1", "6", "60", *options)
-    tables = [shell.crashhunt("trials", name, "--format", "jsonl").out.splitlines() for name in ("hunt", "anew")]
-    old, new = ([{**json.loads(line), "wall_s": 0} for line in table] for table in tables)
-    for before, after in zip(old, new, strict=True):  # versions that did not measure the danger do not say it
-        after["danger"] = before["danger"] if before["danger"] is None else after["danger"]
-    assert old == new
-    assert len(old) == 6
-
-
 @hunts
 @pytest.mark.parametrize("name", ["hunt", "fault.zip", "highway.zip"])
 def test_crashes_are_replayed_by_the_code_of_today(shell, place, name):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.analysis import Overrule, WhatIfOptions, judge, what_if
-from crashhunt.crashes import find_bundle, judgement_of, list_bundles, with_judgement
+from crashhunt.analysis import judge
+from crashhunt.crashes import find_bundle, list_bundles
 from crashhunt.replays import ReplayOptions
 
 OMITTING = Path(__file__).with_name("omitting.py")
@@ -18,37 +18,6 @@ def hunt(shell, *words):
     shutil.copy(OMITTING, shell.folder)
     shell.crashhunt("run", "h", "2", "8", "400", *words)
     return find_bundle(shell.folder / "h")
-
-
-def without_crash(bundle, step, manoeuvre):
-    """How many of two runs end without a crash, by `what_if`, which knows nothing of `judge`."""
-    found = what_if(bundle, [Overrule(from_step=step, manoeuvre=manoeuvre)], WhatIfOptions(trusted=True, times=2))
-    return sum(not run.crashed and not run.excluded for run in found.each)
-
-
-@pytest.fixture
-def rear_end(shell):
-    return hunt(shell, "--scenario", "loop", "--agent", "omitting:NeverBrakes", "--arg", "speed=20:25", "--seed", "1")
-
-
-@pytest.mark.nightly  # by day, episode/test_reference_driver.py and report/test_omission_words.py
-def test_judge_names_the_vehicle_for_which_the_agent_did_not_brake(rear_end, shell):
-    judgement = judge(rear_end, ReplayOptions(), runs=1, reference=20, parallel=2)
-    found = judgement.reference
-    omission, hit = found.omission, rear_end.result.collision
-    assert (omission.faculty, omission.kind, omission.actor) == ("longitudinal", "vehicle", hit.other)
-    assert omission.instead == "kept its speed"
-    assert omission.speed_mps > omission.safe
-    assert [run.ending for run in found.deciding] == ["none"] * len(found.deciding)
-    assert omission.step < rear_end.result.steps - 5  # not the last possible rescue
-    assert omission.visible_step is not None
-    assert without_crash(rear_end, omission.step, "reference_speed") == 2
-    assert without_crash(rear_end, omission.step, "reference_lanes") == 0
-    with_judgement(rear_end, judgement).write()
-    said = shell.crashhunt("show", "h", "--crash", rear_end.id).out
-    assert f"Cause: ego did not brake for {hit.other}" in said
-    assert said.index("Cause: ") < said.index("It could be avoided") if "It could be avoided" in said else True
-    assert judgement_of(find_bundle(shell.folder / "h", rear_end.id)) == judgement
 
 
 @pytest.mark.nightly

@@ -133,23 +133,3 @@ def test_crash_on_decides_what_counts(toy):
     assert report["crashes"] == []
     assert sorted(path.name for path in (toy.folder / "h" / "trials").iterdir()) == [f"{n:06d}" for n in range(4)]
     assert "no plan" in (toy.folder / "h" / "trials" / "000002" / "error.log").read_text()
-
-
-@pytest.mark.nightly  # by day, test_replay.py has an agent that is not deterministic
-def test_a_crash_that_does_not_come_again_is_called_flaky(toy):
-    report = toy.crashhunt("run", "h", "1", "1", "100", "--agent", "faulty:SlowsDown", *TOY, "--json").json
-    (found,) = report["crashes"]
-    assert found["confirmed"] is False
-    again = toy.crashhunt("replay", "h", "--json", expect=1).json["steps_replayed"]
-    assert report["steps_total"] == found["step"] + again  # what was simulated to confirm it is in vain
-    assert (
-        toy.crashhunt("run", "h", "1", "1", "100", "--agent", "faulty:SlowsDown", *TOY, "--json").json["steps_total"]
-        == report["steps_total"]
-    )  # the same command, which finds it there
-    crash = crash_of(toy.folder / "h")
-    assert crash["divergence"]["step"] == 1
-    assert crash["divergence"]["field"] == "action[target_speed]"
-    verdict = toy.crashhunt("replay", "h", "--json", expect=1).json
-    assert verdict["verdict"] == "diverged"
-    # What was recorded can still be driven again, to the bit.
-    assert toy.crashhunt("replay", "h", "--from-log", "--json").json["verdict"] == "reproduced"

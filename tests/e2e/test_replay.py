@@ -69,20 +69,6 @@ def crash_on_sumo(shell, made_once):
     return made_once(hunted_on_sumo, shell)
 
 
-@pytest.mark.nightly  # by day, test_snapshot.py removes the project, and the hunt is moved
-def test_the_originals_may_be_gone(crash_on_sumo):
-    crash = crash_on_sumo
-    for name in ("my_pkg", "own"):
-        shutil.rmtree(crash.folder / name)
-    (crash.folder / "helper.py").write_text("WORDS = 'something else'\nGAIN = 5.0\n")
-    moved = crash.folder / "elsewhere"
-    (crash.folder / "h").rename(moved)
-    verdict = crash.crashhunt("replay", "elsewhere", "--json").json
-    assert (verdict["verdict"], verdict["code"], verdict["steps_replayed"]) == ("reproduced", "snapshot", 29)
-    (bundle,) = (moved / "crashes").iterdir()
-    assert crash.crashhunt("replay", str(bundle), "--json").json == verdict
-
-
 def test_the_actions_of_the_log_lead_to_the_same_scenes(crash):
     verdict = crash.crashhunt("replay", "h", "--from-log", "--json").json
     assert (verdict["verdict"], verdict["code"], verdict["divergence"]) == ("reproduced", "log", None)
@@ -152,79 +138,10 @@ def _flip(data: bytes) -> bytes:
     return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
 
 
-@pytest.mark.nightly  # by day, hunts/test_hunt_loop.py, crashes/test_bundle.py and base/test_names.py
-def test_replay_takes_the_crash_with_the_fewest_steps(toy):
-    words = ("run", "h", "2", "2", "200", "--agent", "faulty:Raises", "--arg", "at=5:60", "--scenario", "toy")
-    report = toy.crashhunt(*words, "--keep-going", "--json").json
-    steps = [crash["step"] for crash in report["crashes"]]
-    assert steps == sorted(steps)
-    assert toy.crashhunt("replay", "h", "--json").json["crash"] == report["crashes"][0]["id"]
-    done = toy.crashhunt("replay", "h", "--crash", "77", expect=2)
-    assert report["crashes"][0]["id"] in done.err
-
-
 def edit(path: Path, before: str, after: str) -> None:
     text = path.read_text()
     assert before in text
     path.write_text(text.replace(before, after))
-
-
-@pytest.mark.nightly  # by day, test_scenarios.py, test_corpus.py and replays/test_verdicts.py
-def test_todays_code_is_judged_against_the_recorded_crash(crash):
-    agents = crash.folder / "my_pkg" / "agents.py"
-    same = crash.crashhunt("replay", "h", "--code", "current", "--json").json
-    assert (same["verdict"], same["code"]) == ("reproduced", "current")
-
-    edit(agents, "if self.step == 30:", "if self.step == 40:")
-    other = crash.crashhunt("replay", "h", "--code", "current", "--json", expect=1)
-    assert other.json["verdict"] == "changed"
-    assert (other.json["steps_recorded"], other.json["steps_replayed"]) == (29, 39)
-    assert "it was: ego: ValueError: out of ideas" in other.err
-
-    edit(agents, "if self.step == 40:", "if self.step == 4000:")
-    assert crash.crashhunt("replay", "h", "--code", "current", expect=1).out.count("fixed: no crash") == 1
-    fixed = crash.crashhunt("replay", "h", "--code", "current", "--expect", "fixed", "--json").json
-    assert (fixed["verdict"], fixed["outcome_replayed"], fixed["steps_replayed"]) == ("fixed", "survived", 100)
-    crash.crashhunt("replay", "h", "--expect", "fixed", expect=1)  # the snapshot still crashes
-
-    edit(agents, "import helper", "import helper_that_is_gone")
-    broken = crash.crashhunt("replay", "h", "--code", "current", expect=2)
-    assert "helper_that_is_gone" in broken.err
-
-
-@pytest.mark.nightly  # by day, replays/test_edits.py, replays/test_verdicts.py and report/test_result_texts.py
-def test_another_value_is_no_longer_the_recorded_trial(crash):
-    done = crash.crashhunt("replay", "h", "--set", "speed=9", "--json", expect=1)
-    assert done.json["verdict"] == "changed"  # it raises all the same
-    assert done.json["edits"] == ["ego.speed was 8.0 and is 9.0"]
-    assert "no longer the recorded trial" in done.err
-    assert (
-        crash.crashhunt("replay", "h", "--set", "ego.speed=9", "--json", expect=1).json["edits"] == done.json["edits"]
-    )
-    for words, says in (
-        (("--set", "sped=9"), "did you mean 'ego.speed'"),
-        (("--set", "speed=9:10"), "not a single value"),
-        (("--set", "speed=fast"), "fast"),
-        (("--set", "speed=9", "--from-log"), "--code snapshot"),
-        (("--times", "0"), "--times"),
-    ):
-        refused = crash.crashhunt("replay", "h", *words, expect=2)
-        assert says in refused.err
-        assert len(refused.err.strip().splitlines()) == 1
-
-
-@pytest.mark.nightly  # by day, replays/test_edits.py and replays/test_verdicts.py
-def test_hunt_toml_is_what_a_replay_uses(crash):
-    settings = crash.folder / "h" / "hunt.toml"
-    edit(settings, "max_steps = 100", "max_steps = 12")
-    done = crash.crashhunt("replay", "h", "--json", expect=1).json
-    assert done["edits"] == ["max_steps was 100 and is 12"]
-    # Whoever stops before the crash has mended nothing.
-    assert (done["verdict"], done["steps_replayed"]) == ("not_comparable", 12)
-    assert "max_steps was 100 and is 12" in done["reason"]
-    edit(settings, "max_steps = 12", "max_steps = 100")
-    edit(settings, 'spec = "8.0"', 'spec = "5.5"')
-    assert crash.crashhunt("replay", "h", "--json", expect=1).json["edits"] == ["ego.speed was 8.0 and is 5.5"]
 
 
 def test_an_agent_that_is_not_deterministic_is_found_out(toy):
@@ -244,31 +161,6 @@ def test_an_agent_that_is_not_deterministic_is_found_out(toy):
     assert done["divergence"]["step"] == 10
     assert done["divergence"]["field"] == "action[target_speed]"
     assert done["agreed"] < 3
-
-
-@pytest.mark.nightly  # by day, replays/test_verdicts.py and replays/test_prepare.py
-def test_what_cannot_be_compared_states_which(crash_on_sumo):
-    crash = crash_on_sumo
-    (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
-    scenario = snapshot / "scenario" / "scenario.toml"
-    edit(scenario, "vehicles = 8", "vehicles = 4")
-    done = crash.crashhunt("replay", "h", "--force", "--trust", "--json", expect=1).json
-    assert done["verdict"] == "not_comparable"
-    assert "(8, 7)" in done["reason"]
-    assert "(4, 7)" in done["reason"]
-    # Another version of the simulator: a warning as long as it makes no difference.
-    edit(scenario, "vehicles = 4", "vehicles = 8")
-    data = json.loads((snapshot / "environment.json").read_text())
-    now = data["distributions"]["libsumo"]
-    data["distributions"]["libsumo"] = "1.2.3"
-    rewritten(snapshot, "environment.json", json.dumps(data))
-    same = crash.crashhunt("replay", "h", "--json").json
-    assert same["warnings"] == [f"libsumo was 1.2.3 and is {now}"]
-    change_snapshot(crash, "self.step * helper.GAIN", "self.step * helper.GAIN * 2")
-    other = crash.crashhunt("replay", "h", "--force", "--trust", "--json", expect=1).json
-    assert (other["verdict"], other["reason"]) == (
-        "not_comparable", f"the simulator differs: libsumo was 1.2.3 and is {now}"
-    )  # fmt: skip
 
 
 def test_a_crash_keeps_the_order_of_links_that_it_was_recorded_with(crash_on_sumo, monkeypatch):
@@ -354,16 +246,3 @@ def test_the_recorded_actions_run_no_code_of_the_bundle(crash):
         (snapshot / "code" / module).write_text(f"open('evil', 'a').write({module!r})\n")
     crash.crashhunt("replay", "h", "--from-log", "--force")
     assert not (crash.folder / "evil").exists()
-
-
-@pytest.mark.nightly  # by day, episode/test_parts.py
-def test_code_comes_from_the_snapshot_or_the_replay_is_refused(crash):
-    # Somebody's start-up file imports a module before anything else can.
-    site = crash.folder / "site"
-    site.mkdir()
-    (site / "sitecustomize.py").write_text(
-        f"import sys; sys.path.insert(0, {str(crash.folder)!r}); import my_pkg.agents\n"
-    )
-    crash.environment["PYTHONPATH"] = str(site)
-    done = crash.crashhunt("replay", "h", expect=2)
-    assert "not from the snapshot" in done.err

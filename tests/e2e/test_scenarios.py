@@ -11,12 +11,10 @@ import json
 import tomllib
 from pathlib import Path
 
-import numpy as np
 import pytest
 from conftest import mostly_nightly, rewritten
 
 import crashhunt
-from crashhunt.recording import read_lanes
 from crashhunt.scenario import shipped_scenarios
 
 SEEDS = {  # with which a crash comes soon
@@ -60,16 +58,6 @@ def test_a_crash_of_it_is_found_replayed_and_filmed(shell, scenario):
     assert crash["id"] in (shell.folder / "h/report.html").read_text(encoding="utf-8")
 
 
-POLE = """
-schema = 1
-title = "A pole on a cart, which falls"
-simulator = "gym"
-[gym]
-id = "CartPole-v1"
-crash = { termination = true }
-[agents.cart]
-agent = "random"
-"""
 PENDULUM = """
 import gymnasium
 
@@ -117,20 +105,6 @@ agent = "shaky:Swing"
 """
 
 
-@pytest.mark.nightly  # by day, an environment of ones own, and on_gym/test_gym.py has the words
-def test_a_crash_of_a_gymnasium_environment_without_a_scene(shell):
-    (shell.folder / "scenario.toml").write_text(POLE)
-    (crash,) = shell.crashhunt("run", "h", "2", "20", "400", "--scenario", ".", "--seed", "1", "--json").json["crashes"]
-    assert crash["confirmed"]
-    assert "cart crashed (terminated) at step" in shell.crashhunt("show", "h").out
-    for who in ((), ("--code", "current"), ("--from-log",)):
-        assert shell.crashhunt("replay", "h", *who, "--json").json["verdict"] == "reproduced"
-    shell.crashhunt("replay", "h", "--frames", "f", "--size", "160x120")
-    shell.crashhunt("report", "h")
-    shell.crashhunt("export", "h", "crash.zip")
-    assert shell.crashhunt("replay", "crash.zip", "--json").json["digest_replayed"] == crash["digest"]
-
-
 def test_an_environment_of_ones_own_is_part_of_the_snapshot(shell):
     """Its factory, its crash rule and its structured observations; edits of it are seen as such."""
     (shell.folder / "scenario.toml").write_text(SWING)
@@ -165,25 +139,6 @@ def test_a_mistake_in_a_highway_scenario_is_one_line(shell, table, says):
     assert says in done.err
     assert len(done.err.strip().splitlines()) == 1
     assert "snapshots" not in done.err  # the file to mend is the one that was given
-
-
-@pytest.mark.nightly  # by day, test_accelerator.py compares every bit, and test_golden.py the digests
-def test_the_accelerator_changes_nothing_but_the_time(shell):
-    words = ("2", "2", "30", "--scenario", "highway", "--seed", "1", "--keep-going")
-    shell.crashhunt("run", "fast", *words)
-    shell.crashhunt("run", "slow", *words, "--no-accelerate")
-    fast, slow = (
-        [
-            (row["seed"], row["outcome"], row["digest"])
-            for row in shell.crashhunt("trials", name, "--format", "json").json
-        ]
-        for name in ("fast", "slow")
-    )
-    assert fast == slow
-    assert len({digest for _, _, digest in fast}) == 2
-    assert "accelerate = false" in (shell.folder / "slow/hunt.toml").read_text()
-    if any(outcome == "collision" for _, outcome, _ in fast):
-        assert shell.crashhunt("replay", "fast", "--no-accelerate", "--json").json["verdict"] == "reproduced"
 
 
 @pytest.mark.nightly  # by day, replays/test_prepare.py and replays/test_verdicts.py
@@ -232,34 +187,3 @@ def test_what_a_stranger_made_imports_nothing_even_from_its_log(table, says):
     assert isinstance(scenario, Scenario)
     with pytest.raises(UsageError, match=says):
         refuse_side_effects(scenario, settings, {})
-
-
-WIDER = """
-schema = 1
-simulator = "highway"
-[highway]
-id = "roundabout-generic-v1"
-config = { policy_frequency = 5 }
-[observation]
-vehicles = 6
-[arguments.radius]
-default = 20.0
-range = "16:40"
-option = "roundabout_radius"
-[agents.ego]
-agent = "keep-lane"
-"""
-
-
-@pytest.mark.nightly  # by day, executors/test_maps_of_trials.py
-def test_every_crash_has_the_map_of_its_own_trial(shell):
-    """An argument may change the road; what is drawn is the road that was driven."""
-    (shell.folder / "scenario.toml").write_text(WIDER)
-    words = ("--scenario", ".", "--seed", "1", "--keep-going")
-    found = shell.crashhunt("run", "h", "2", "4", "60", *words, "--json").json["crashes"]
-    assert len(found) >= 2
-    for crash in found:
-        lanes = read_lanes(shell.folder / crash["path"] / "log.mcap")
-        rings = [np.hypot(*np.concatenate(borders).T) for borders in lanes]
-        inner = min(distances.max() for distances in rings if np.ptp(distances) < 5)
-        assert inner == pytest.approx(crash["scenario_arguments"]["radius"] + 2, abs=0.5)

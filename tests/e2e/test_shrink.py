@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from crashhunt.analysis import shrink
-from crashhunt.crashes import find_bundle, list_bundles, read_bundle, signature_of, write_bundle
-from crashhunt.errors import BundleError, UsageError
+from crashhunt.crashes import find_bundle, read_bundle, write_bundle
+from crashhunt.errors import BundleError
 
 
 def hunted(shell):
@@ -37,62 +37,6 @@ def test_a_crash_becomes_smaller_and_replays(shell):
     assert "ego.speed" in told["changed"]
     replayed = shell.crashhunt("replay", told["path"], "--trust", "--json").json
     assert (replayed["verdict"], replayed["steps_replayed"]) == ("reproduced", told["steps_after"])
-
-
-@pytest.mark.nightly  # by day, analysis/test_shrink_bundle.py
-def test_arguments_become_plain_and_the_rest_stays(hunt):
-    was = find_bundle(hunt.folder / "h")
-    told = hunt.crashhunt("shrink", "h", "--json").json
-    assert (told["verdict"], told["ended"], told["signature_kept"], told["confirmed"]) == ("shrunk", "done", True, True)
-    assert told["steps_after"] <= told["steps_before"] == was.result.steps
-    small = find_bundle(hunt.folder / "h", f"{was.id}.small")
-    assert str(small.path) == str(hunt.folder / told["path"])
-    assert signature_of(small) == signature_of(was)
-    assert (
-        len(str(small.result.spec.arguments["ego"]["speed"])) <= 4 < len(str(was.result.spec.arguments["ego"]["speed"]))
-    )
-    assert small.added["shrunk"]["changed"] == told["changed"] != {}
-    assert any("cannot exclude actors" in note for note in told["notes"])
-    assert hunt.crashhunt("replay", "h", "--crash", small.id, "--json").json["verdict"] == "reproduced"
-    assert f"minimized from {was.id}: " in hunt.crashhunt("show", "h", "--crash", small.id).out
-
-    # To the hunt, it is none of its crashes.
-    assert small.id not in [bundle.id for bundle in list_bundles(hunt.folder / "h")]
-    assert find_bundle(hunt.folder / "h", str(was.result.spec.number)).id == was.id
-    assert hunt.crashhunt("status", "h", "--json").json["hunts"][0]["crashes"] == len(list_bundles(hunt.folder / "h"))
-    assert hunt.crashhunt("check", "h", "--json").json["fine"]
-    with pytest.raises(UsageError, match="is already minimized"):
-        shrink(small)
-    hunt.crashhunt("corpus", "add", told["path"], "--to", "kept")
-    assert hunt.crashhunt("corpus", "run", "kept", "--json").json["cases"][0]["got"] == "still"
-
-
-@pytest.mark.nightly  # by day, analysis/test_shrink_bundle.py resumes
-def test_a_budget_that_is_too_small_leaves_the_best_and_is_gone_on_from(hunt):
-    bundle = find_bundle(hunt.folder / "h")
-    part = shrink(bundle, budget=2, parallel=1)
-    assert part.ended == "budget"
-    assert part.trials <= 2
-    assert "larger --budget" in part.why
-    assert "000000-collision.small.jsonl: shrink resumes from it" in hunt.crashhunt("check", "h").out
-    whole = shrink(bundle, parallel=1)
-    assert whole.ended == "done"
-    shutil.rmtree(whole.small.path)
-    again = shrink(bundle, parallel=2)
-    assert (again.small.result.spec, again.small.result.digest) == (whole.small.result.spec, whole.small.result.digest)
-    assert not list(bundle.path.parent.glob(".*"))
-
-
-@pytest.mark.nightly  # by day, analysis/test_shrink_bundle.py
-def test_a_crash_that_does_not_come_again_is_reported(hunt, monkeypatch):
-    bundle = find_bundle(hunt.folder / "h")
-    monkeypatch.setattr("crashhunt.analysis._shrink_runs.signature_of", lambda _: None)
-    found = shrink(bundle, parallel=1)
-    assert (found.verdict, found.small) == ("not_reproduced", None)
-    assert "did not come again" in found.why
-    (bundle.path / "log.mcap").unlink()
-    with pytest.raises(BundleError):
-        shrink(bundle)
 
 
 @pytest.mark.nightly
@@ -196,13 +140,6 @@ def test_ctrl_c_leaves_the_best(hunt):
     _, err = running.communicate(timeout=300)
     assert running.returncode in (0, 130), err
     assert "Traceback" not in err
-
-
-@pytest.mark.nightly  # by day, cli/test_answers_on_crashes.py
-def test_what_is_asked_for_must_make_sense(hunt):
-    assert "--budget is 0" in hunt.crashhunt("shrink", "h", "--budget", "0", expect=2).err
-    hunt.crashhunt("export", "h", "crash.zip")
-    assert "unpack this zip file into a new folder" in hunt.crashhunt("shrink", "crash.zip", expect=2).err
 
 
 @pytest.mark.nightly

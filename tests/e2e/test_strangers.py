@@ -15,7 +15,7 @@ from test_replay import hunted_on_sumo
 from crashhunt.base.sandbox import landlock_version
 from crashhunt.crashes import find_bundle, open_archive
 from crashhunt.errors import CrashhuntError, UsageError
-from crashhunt.replays import ReplayOptions, prepare, replay
+from crashhunt.replays import ReplayOptions, replay
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -68,10 +68,6 @@ def option(name: str, value: object) -> tuple[str, str, str]:
     return OPTIONS, "[sumo.options]", f"[sumo.options]\n{json.dumps(name)} = {json.dumps(value)}"
 
 
-def routes(text: str) -> tuple[str, str, str]:
-    return ROUTES, "</routes>", f"{text}</routes>"
-
-
 def detector(victim: Path) -> tuple[str, str, str]:
     """An additional file, which stands in a comment of the scenario."""
     loop = f'<inductionLoop id="d" lane="south_0" pos="5" period="1" file="{victim}"/>'
@@ -80,47 +76,9 @@ def detector(victim: Path) -> tuple[str, str, str]:
 
 
 ADDITIONAL = (OPTIONS, "additional = []\n", "")
-SSM = '<vType id="z"><param key="has.ssm.device" value="true"/><param key="device.ssm.file" value="{}"/></vType>'
 # Of the issue, and what else came to mind.
 NAMES = ["netstate-dump", "ndump", "tripinfo", "summary", "vehroutes", "C", "l", "log-file", "save-state.prefix"]
 NAMES += ["device.ssm.file", "device.toc.file", "fcd-output", "made-up", "remote-port", "configuration-file", "weights"]
-ATTACKS = {
-    **{name: option(name, "VICTIM") for name in NAMES},
-    "a name that is two": option("scale=1 --summary", "VICTIM"),
-    "an argument": (OPTIONS, "[arguments.", '[arguments.x]\ndefault = "VICTIM"\noption = "summary"\n[arguments.'),
-    "a parameter": routes(SSM.format("VICTIM")),
-    "a spelled out parameter": routes('<vType id="z"><param key="&#100;evice.ssm.file" value="VICTIM"/></vType>'),
-    "a document type": (ROUTES, "<routes>", '<!DOCTYPE r SYSTEM "VICTIM"><routes>'),
-    "an element": routes('<event commandPosix="rm VICTIM"/>'),
-    "an attribute": routes('<vType id="z" imgFile="VICTIM"/>'),
-    "an include": routes('<include href="VICTIM"/>'),
-}  # fmt: skip
-
-
-@pytest.mark.nightly  # by day, crashes/test_trust.py has each of them
-@pytest.mark.parametrize("attack", ATTACKS)
-def test_what_is_not_known_to_be_harmless_asks_for_trust(crash, tmp_path, attack):
-    victim = tmp_path / "victim"
-    victim.write_text("mine")
-    file, before, after = ATTACKS[attack]
-    bad = changed(crash, tmp_path / "bad.zip", (file, before, after.replace("VICTIM", str(victim))))
-    with open_archive(bad) as archive, pytest.raises(CrashhuntError) as caught:
-        prepare(find_bundle(archive.directory, ""), STRANGER)
-    assert isinstance(caught.value, UsageError) == ("--trust" in caught.value.fix)
-    assert "\n" not in str(caught.value)
-    if attack != "configuration-file":  # no scenario may say that
-        assert isinstance(caught.value, UsageError) or attack in ("an include", "weights")
-    assert victim.read_text() == "mine"
-
-
-@pytest.mark.nightly  # by day, crashes/test_trust.py, and on_sumo/test_sumo_files.py discards output
-def test_detectors_are_no_reason_to_distrust_and_write_nowhere(crash, tmp_path):
-    victim = tmp_path / "victim"
-    victim.write_text("mine")
-    with open_archive(changed(crash, tmp_path / "d.zip", ADDITIONAL, detector(victim))) as archive:
-        report = replay(find_bundle(archive.directory, ""), STRANGER)
-    assert report.verdict == "reproduced"
-    assert victim.read_text() == "mine"
 
 
 DOORS_OPEN = """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import time
 import tomllib
@@ -98,44 +97,6 @@ def test_every_hunt_stops_at_its_own_first_crash(toy):
     assert (toy.folder / "out/slow/0/ledger.sqlite").stat().st_mtime_ns == before
 
 
-@pytest.mark.nightly  # by day, suites/test_processes.py, cli/test_answers.py and cli/test_status.py
-def test_what_cannot_run_leaves_the_others_untouched_and_is_reported(toy):
-    written(toy, SUITE + BROKEN)
-    (toy.folder / "explodes.py").write_text("raise OSError('no such luck')")
-    done = toy.crashhunt("suite", "run", "suite.toml", "out", "2", expect=1)
-    assert "4 hunts could not run" in done.out
-    found = states(toy)
-    assert {name for name, state in found.items() if state == "error"} == {
-        "unimportable/0", "a-word/0", "raises/0", "no-scenario/0",
-    }  # fmt: skip
-    assert found["fast/0"] == "crashed"
-    assert found["slow/0"] == "finished"
-    logs = toy.crashhunt("logs", "out", "--errors-only").out
-    for words in ("No module named 'nothing'", "'fast' is not a number", "no such luck", "nowhere"):
-        assert words in logs
-    assert "unimportable/0: error" in logs
-    compared = toy.crashhunt("compare", "out", "--json")
-    assert [hunt["dir"] for hunt in compared.json["hunts"]] == ["out/fast/0", "out/fast/1", "out/slow/0"]
-    assert "out/unimportable/0 has not begun, and is excluded" in compared.err
-    table = toy.crashhunt("status", "out").out
-    assert "out/a-word/0: --arg speed: 'fast' is not a number" in " ".join(table.split())
-
-
-@pytest.mark.long
-@pytest.mark.nightly  # by day, suites/test_processes.py
-def test_what_failed_runs_again_and_nothing_else(toy):
-    written(toy, SUITE.replace("runs = 2\n", "") + BROKEN.partition('[[hunts]]\nid = "raises"')[0])
-    toy.crashhunt("suite", "run", "suite.toml", "out", "2", expect=1)
-    (toy.folder / "nothing.py").write_text("from crashhunt.agents import KeepLaneWithSpeed as There")
-    finished = (toy.folder / "out/slow/0/ledger.sqlite").read_bytes()
-    again = toy.crashhunt("rerun", "out", "--run", "unimportable", "--json").json
-    assert [hunt["state"] for hunt in again["hunts"]] == ["crashed"]
-    assert again["replaced"] == ["out/unimportable/0.replaced-0"]
-    assert "No module named" in (toy.folder / again["replaced"][0] / "error.log").read_text()
-    assert (toy.folder / "out/slow/0/ledger.sqlite").read_bytes() == finished
-    assert states(toy)["a-word/0"] == "error"
-
-
 @pytest.mark.nightly
 def test_all_runs_again_with_the_same_seeds_and_crashes(toy):
     written(toy, SUITE.replace("runs = 2\n", "") + BROKEN.partition('[[hunts]]\nid = "raises"')[0])
@@ -145,30 +106,6 @@ def test_all_runs_again_with_the_same_seeds_and_crashes(toy):
     assert len(everything["replaced"]) == len(everything["hunts"]) == 4
     assert {path.name for path in (toy.folder / "out/fast/0/crashes").iterdir()} == crash
     assert toy.crashhunt("replay", "out/fast/0.replaced-0", "--json").json["verdict"] == "reproduced"
-
-
-@pytest.mark.nightly  # by day, test_hunt.py kills a hunt, and Ctrl-C stops a suite
-@pytest.mark.long
-def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
-    written(toy, SLOW.replace("80", "16"))
-    process = toy.begin("suite", "run", "suite.toml", "out", "2")
-    wait_for(lambda: (toy.folder / "out/a/0/ledger.sqlite").exists() and len(numbers(toy, "out/a/0")) > 3)
-    os.kill(process.pid, signal.SIGKILL)
-    process.communicate()
-    wait_for(lambda: "running" not in states(toy).values())
-    killed = states(toy)
-    begun = [name for name in "abc" if killed[f"{name}/0"] != "queued"]
-    before = {name: dict(digests(toy, f"out/{name}/0")) for name in begun}
-    assert any(before.values())
-    toy.crashhunt("suite", "run", "suite.toml", "out", "2")
-    assert set(states(toy).values()) == {"finished"}
-    for name in "abc":
-        assert numbers(toy, f"out/{name}/0") == list(range(16))
-    for name, rows in before.items():
-        after = digests(toy, f"out/{name}/0")
-        assert {number: after[number] for number in rows} == rows
-    log = toy.crashhunt("logs", "out", "--run", "a/0", "--type", "state").out
-    assert log.count("running") == (1 if killed["a/0"] == "finished" else 2)  # as on a machine that is busy
 
 
 @pytest.mark.nightly
@@ -183,26 +120,6 @@ def test_a_damaged_plan_leaves_the_others_untouched(toy):
     assert "no request.json" in toy.crashhunt("logs", "out", "--errors-only").out
 
 
-@pytest.mark.nightly  # by day, results/test_directory.py has several claim a directory
-@pytest.mark.long
-def test_two_at_once_do_not_disturb_each_other(toy):
-    written(toy, SLOW.replace("80", "10").replace('[[hunts]]\nid = "c"\n', ""))
-    first = toy.begin("suite", "run", "suite.toml", "out", "2", "--json")
-    second = toy.begin("suite", "run", "suite.toml", "out", "2", "--json")
-    for process in (first, second):
-        _, err = process.communicate(timeout=300)
-        assert process.returncode == 0, err
-    assert set(states(toy).values()) == {"finished"}
-    for name in "ab":
-        assert numbers(toy, f"out/{name}/0") == list(range(10))
-        assert "error" not in toy.crashhunt("logs", "out", "--run", name, "--type", "state").out
-
-
-def digests(shell, hunt: str) -> dict[int, tuple[str, str]]:
-    lines = shell.crashhunt("trials", hunt, "--format", "jsonl").out.splitlines()
-    return {row["number"]: (row["digest"], row["wall_s"]) for row in map(json.loads, lines)}
-
-
 def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
     written(toy, SLOW.replace("80", "5000"))  # so that none ends before it is looked at, on no machine
     process = toy.begin("suite", "run", "suite.toml", "out", "2", "--json")
@@ -214,22 +131,6 @@ def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
     assert "Run the same command to resume" in err
     found = states(toy)
     assert (found["a/0"], found["b/0"], found["c/0"]) == ("interrupted", "interrupted", "queued")
-
-
-@pytest.mark.nightly  # by day, suites/test_processes.py
-def test_the_last_hunts_share_all_slots(toy):
-    written(toy, SLOW.replace('[[hunts]]\nid = "b"\n[[hunts]]\nid = "c"\n', "").replace("80", "20"))
-    toy.crashhunt("suite", "run", "suite.toml", "out", "2")
-    workers = {row["worker"] for row in _results(toy, "out/a/0")}
-    assert len(workers) == 2
-
-
-def _results(shell, hunt: str) -> list[dict]:
-    import sqlite3
-    from contextlib import closing
-
-    with closing(sqlite3.connect(shell.folder / hunt / "ledger.sqlite")) as database:
-        return [json.loads(text) for (text,) in database.execute("SELECT result FROM trials")]
 
 
 @pytest.mark.parametrize(

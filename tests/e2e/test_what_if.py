@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import signal
 import time
-from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from conftest import mostly_nightly
 
 import crashhunt
-from crashhunt.analysis import Reseed, WhatIfOptions, _whatif_runs as _engine, what_if
+from crashhunt.analysis import _whatif_runs as _engine
 from crashhunt.base.errors import UsageError
 from crashhunt.crashes import find_bundle
 from crashhunt.recording import first_divergence
-from crashhunt.replays import ReplayOptions, _prepare, prepare, reruns_of, up_to
-from crashhunt.reruns import Reruns
-from crashhunt.trial import KILLED, Failure, Outcome, Reseeding
+from crashhunt.replays import ReplayOptions, prepare, reruns_of, up_to
+from crashhunt.trial import Reseeding
 
 SPEED = ("--agent", "crashhunt.agents:KeepLaneWithSpeed", "--arg")
 
@@ -56,17 +53,6 @@ def test_same_agent_from_any_step_on_crashes_as_it_was_recorded(crash, step):
     assert (found["from_step"], found["excluded"]) == (step, {})
 
 
-@pytest.mark.nightly  # by day, the same agent crashes as it was recorded
-def test_other_argument_counts_the_same_as_a_replay_with_it(crash):
-    for speed in ("8", "14"):
-        words = ("--set", f"speed={speed}", "--json")
-        replayed = [crash.crashhunt("replay", "h", *words, expect=None).json for _ in range(2)]
-        found = crash.crashhunt("whatif", "h", *words, "--times", "2").json
-        assert [each["digest"] for each in found["each"]] == [one["digest_replayed"] for one in replayed]
-        assert found["outcomes"] == dict(Counter(one["outcome_replayed"] for one in replayed))
-        assert found["from_step"] is None
-
-
 def test_another_agent_takes_over_after_the_recorded_actions(crash):
     slow = crash.crashhunt("whatif", "h", "--before", "2", *SPEED, "speed=8", "--json").json
     late = crash.crashhunt("whatif", "h", "--before", "0.1", *SPEED, "speed=8", "--json").json
@@ -95,17 +81,6 @@ def test_agent_of_today_is_found_in_the_working_directory(crash):
     err = crash.crashhunt("whatif", "h", "--agent", "newcomer:Late", "--arg", "sped=1", expect=2).err
     assert "--arg: newcomer:Late has no argument 'sped'" in err
     assert "speed" in err
-
-
-@pytest.mark.nightly  # by day, Python and the command run the same futures
-def test_futures_are_the_same_in_every_call_and_share_the_recorded_steps(crash):
-    words = ("whatif", "h", "--from-step", "20", "--futures", "--times", "12", "--json")
-    one, two = (crash.crashhunt(*words, "--parallel", parallel).json for parallel in ("1", "2"))
-    assert one == two
-    assert (one["runs"], one["from_step"]) == (12, 20)
-    assert one["different"] > 6
-    assert [each["number"] for each in one["each"]] == list(range(12))
-    assert one["interval"][0] <= one["share"] <= one["interval"][1]
 
 
 def by_hand(folder, after, number):
@@ -224,55 +199,6 @@ def test_python_counts_as_the_command_does(crash):
     assert crashhunt.what_if(folder, changes={"speed": 8.0}).survived == 1
     with pytest.raises(UsageError, match="recorded actions cannot react"):
         crashhunt.what_if(folder, code="log")
-
-
-class Tampered(Reruns):
-    """Runs of which some are changed on the way."""
-
-    def run(self, specs, **options):
-        for ended in super().run(specs, **options):
-            if ended.place == 1:
-                failure = Failure(KILLED, "killed from outside 3 times", exit_code=-9)
-                killed = replace(ended.result, outcome=Outcome.INVALID, failure=failure)
-                yield replace(ended, result=killed, recording=None)
-            elif ended.place == 2:
-                yield replace(ended, recording=None)
-            elif ended.place == 3:
-                bundle = find_bundle(OTHER[0])
-                yield replace(ended, recording=bundle.recording())
-            else:
-                yield ended
-
-
-OTHER: list = []
-
-
-@pytest.mark.nightly  # by day, analysis/test_what_is_counted.py
-def test_runs_that_are_killed_or_differ_before_the_step_do_not_count(crash, monkeypatch):
-    crash.crashhunt("run", "other", "1", "20", "300", "--scenario", "toy", "--arg", "speed=13", "--seed", "7")
-    OTHER[:] = [crash.folder / "other"]
-    monkeypatch.setattr(_prepare, "Reruns", Tampered)
-    bundle = find_bundle(crash.folder / "h")
-    monkeypatch.chdir(crash.folder)
-    found = what_if(bundle, [Reseed(from_step=20)], WhatIfOptions(times=4))
-    assert found.runs == 1
-    killed, silent, strange = (run.excluded for run in found.each[1:])
-    assert killed == "its process was killed from outside: killed from outside 3 times"
-    assert silent == "it left no recording"
-    assert strange.startswith("it differs from the recording: step 0")
-    assert sum(found.excluded.values()) == 3
-
-
-@pytest.mark.nightly  # by day, analysis/test_reruns.py
-@pytest.mark.parametrize("name", ["crashhunt-0.1.0", "crashhunt-0.1.0-packages"])
-def test_crash_of_an_earlier_version_takes_changes_and_names_what_needs_todays_code(toy, name):
-    bundle = str(Path(__file__).with_name("bundles") / f"{name}.zip")
-    done = toy.crashhunt("whatif", bundle, "--trust", "--from-step", "3", "--futures", "--times", "2", expect=2)
-    assert "the crashhunt in the snapshot of this crash is too old for this change" in done.err
-    assert done.err.endswith("add --code current\n")
-    assert done.err.count("\n") == 1
-    found = toy.crashhunt("whatif", bundle, "--trust", "--from-step", "3", *SPEED, "speed=5", "--json").json
-    assert (found["runs"], found["crashed"], found["from_step"], found["code"]) == (1, 0, 3, "current")
 
 
 @pytest.mark.nightly

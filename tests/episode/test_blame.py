@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import re
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.boundaries import ForeignError
-from crashhunt.episode import Episode, Nearness, Observer, Parts, Recorder, WorkerSettings, _failures, run_episode
+from crashhunt.episode import Episode, Nearness, Parts, Recorder, WorkerSettings, _failures, run_episode
 from crashhunt.episode._blame import guarded_check, guarded_step
 from crashhunt.episode._fast_path import FastPath
 from crashhunt.errors import InternalError, RecorderError, ScenarioError, UnusableValueError
@@ -514,16 +512,6 @@ def test_agent_that_closes_our_files_is_the_agents_fault_and_a_full_disk_nobodys
     assert label(run(tmp_path, gym(tmp_path)))[0] == "agent_error"
 
 
-class Full(Observer):
-    def scene(self, step, scene, rewards):
-        raise RecorderError("full")
-
-
-def test_full_disk_is_no_fault_of_anybody(modules, tmp_path):
-    with pytest.raises(RecorderError, match="full"):
-        run(tmp_path, gym(tmp_path), observers=[Full()])
-
-
 # Hunts.
 
 SCENARIO = """
@@ -541,26 +529,6 @@ def prepare(shell, environment="", agent=""):
     (shell.folder / "place_environment.py").write_text(ENVIRONMENT.replace('fails = ""', f"fails = {environment!r}"))
     (shell.folder / "place_agent.py").write_text(AGENT.replace('fails = ""', f"fails = {agent!r}"))
     (shell.folder / "s.toml").write_text(SCENARIO)
-
-
-@pytest.mark.parametrize(
-    ("environment", "agent", "outcome", "party", "says"),
-    [
-        pytest.param("", "", "survived", "", "", marks=pytest.mark.nightly),  # by day, every hunt that finds nothing
-        ("step", "", "simulator_error", "environment", "environment (step): KeyError: 'of the environment'"),
-        ("", "act", "agent_error", "agent", "ego: ValueError: of the agent"),
-    ],
-)
-def test_hunt_names_the_party_that_failed(shell, environment, agent, outcome, party, says):
-    prepare(shell, environment, agent)
-    done = shell.crashhunt("run", "h", "1", "1", "4", "--scenario", "s.toml", "--seed", "1", "--json")
-    assert done.json["outcomes"] == {outcome: 1}
-    if party:
-        (crash,) = done.json["crashes"]
-        data = json.loads(Path(shell.folder, crash["path"], "crash.json").read_text())
-        assert data["failure"]["party"] == party
-        assert crash["confirmed"]
-        assert says in shell.crashhunt("show", "h").out
 
 
 FAULT = f"""

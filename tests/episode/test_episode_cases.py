@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from crashhunt.base.errors import InvalidEpisodeError, RecorderError, SimulatorError
+from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
 from crashhunt.episode import Braking, message_of_error, overruled_agent, run_episode
 from crashhunt.oracles import Finding, OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Phase, Recording, Tag, digest_of, read_black_box, read_header
@@ -392,46 +392,6 @@ def test_what_a_simulator_raises_is_no_agents_fault(run, at, error, outcome, kin
     assert ("Traceback" in result.failure.traceback) == (kind != "invalid")
     assert result.steps == max(0, at - 1)
     assert result.sim_time_s == result.steps / 2
-
-
-def test_a_full_disk_is_nobodys_fault(run):
-    for script in ({0: {"raises": RecorderError("full")}}, {2: {"raises": RecorderError("full")}}):
-        log = []
-        with pytest.raises(RecorderError):
-            run(Scripted(script), {"ego": Driver(log=log)})
-        assert log[-1:] == (["closed"] if 2 in script else [])
-
-
-class Failing:
-    name = "failing"
-
-    def __init__(self, error):
-        self.error, self.left = error, 2
-
-    def check(self, scene, agents):
-        assert agents == ("ego", "second")
-        self.left -= 1
-        if not self.left:
-            raise self.error
-        return []
-
-
-@pytest.mark.parametrize(
-    ("error", "outcome"),
-    [
-        (ZeroDivisionError("oracle"), Outcome.SIMULATOR_ERROR),
-        (OSError("a file of the oracle's"), Outcome.SIMULATOR_ERROR),
-        (MemoryError("all gone"), Outcome.SIMULATOR_ERROR),
-    ],
-)
-def test_failure_of_an_oracle_of_a_users_ends_it(run, error, outcome):
-    log = []
-    result = run(drivers={"ego": Driver(log=log)}, oracles=(Failing(error),))
-    assert (result.outcome, result.steps) == (outcome, 1)
-    assert result.failure.message.startswith(str(error))  # a limit on memory is named with it
-    assert (result.failure.party, result.failure.place) == ("oracle", "check")
-    assert result.digest == run.recording().digest
-    assert log[-1] == "closed"
 
 
 def test_an_oracle_of_an_actor_elses_is_asked_with_the_others(run):

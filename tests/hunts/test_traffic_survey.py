@@ -73,12 +73,6 @@ def test_trials_replace_vehicles_that_enter_only(town):
     assert {**hunted(town.folder), "trials": 4} == before
 
 
-@pytest.mark.nightly  # by day, a survey that was killed finds the same when it is run again
-def test_two_hunts_draw_from_the_same_vehicles(town):
-    one, other = (surveyed(town.folder, hunt=hunt, seed=1)[1] for hunt in "ab")
-    assert one == other
-
-
 def test_a_hunt_of_before_continues_with_the_vehicles_that_its_files_promised(town):
     _, before = surveyed(town.folder, survey=False)
     promised = before.scenario_arguments["vehicle"].spec
@@ -146,14 +140,6 @@ def test_vehicles_that_stand_for_ever_are_a_gridlock(shell):
     assert "gridlocked from" in note
     assert "9 of 9 vehicles stand still" in note
     assert "in 2 of 2 runs" in note
-
-
-@pytest.mark.nightly  # by day, the survey alone, and test_whole_hunts.py has no valid trial
-def test_where_sumo_refuses_its_input_the_hunt_states_so(town):
-    (town.folder / "r.rou.xml").write_text(f'<routes>{WAY}<vehicle id="a" route="gone" depart="1"/></routes>')
-    done = town.crashhunt("run", "h", "1", "2", "20", *WORDS, expect=3)
-    assert "the simulation of the traffic without agents failed" in done.err
-    assert done.json["stopped_because"] == "no_valid_trial"
 
 
 def test_a_survey_that_takes_too_long_is_given_up(town, monkeypatch):
@@ -284,22 +270,3 @@ def test_ctrl_c_ends_the_survey_and_leaves_nothing_behind(shell):
     assert json.loads(out)["error"]["message"] == "interrupted before the hunt began"
     assert not list(temporary.iterdir())
     assert not (shell.folder / "h").exists()
-
-
-@pytest.mark.nightly  # by day, base/test_temporary.py kills what has such a folder
-def test_next_command_removes_what_a_killed_survey_left(shell):
-    write(shell.folder, '<trip id="a" depart="99999999" from="south" to="east"/>')
-    temporary = shell.folder / "tmp"
-    temporary.mkdir()
-    shell.environment["TMPDIR"] = str(temporary)
-    process = shell.start("run", "h", "1", "4", "20", *WORDS)
-    deadline = time.monotonic() + 300
-    while not list(temporary.rglob("stage")):
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    process.kill()
-    process.communicate(timeout=300)
-    assert list(temporary.rglob("stage"))
-    shell.crashhunt("oracles")
-    assert not list(temporary.iterdir())

@@ -84,16 +84,6 @@ def test_another_vehicle_is_driven_in_each_trial(town):
     assert len({spec["scenario_arguments"]["vehicle"] for spec in specs}) > 1
 
 
-@pytest.mark.nightly  # by day, without a hunt below, and plans/ has arguments of scenarios
-def test_a_vehicle_that_is_asked_for_is_driven_or_reported_of(town):
-    words = ("--scenario", "town.sumocfg", "--arg", "speed=5:9", "--keep-going", "--keep-trials", "--seed", "3")
-    town.crashhunt("run", "one", "1", "1", "20", *words, "--set", "vehicle=odd.name#1.2", "--json")
-    (params,) = (town.folder / "one" / "trials").glob("*/params.json")
-    assert json.loads(params.read_text())["spec"]["scenario_arguments"]["vehicle"] == "odd.name#1.2"
-    nobody = town.crashhunt("run", "none", "1", "1", "20", *words, "--set", "vehicle=nobody", "--json", expect=3)
-    assert "the vehicle 'nobody' was not on the road" in nobody.err
-
-
 def test_who_takes_the_place_of_another_drives_on_from_there(town, tmp_path):
     """The same traffic as with the other, whose way goes on, one step later, where it was."""
     scenes = {}

@@ -13,12 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt import reruns
-from crashhunt.base.errors import CrashhuntError
 from crashhunt.crashes import list_bundles
 from crashhunt.episode import answer_file
 from crashhunt.recording import Phase, read_header
-from crashhunt.replays import ReplayOptions, confirm, replay
+from crashhunt.replays import confirm
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult
 
 WHY = "killed from outside 3 times, each time at another step (SIGKILL after step 2, …)"
@@ -53,29 +51,6 @@ class Killed:
 
     def close(self):
         pass
-
-
-@pytest.mark.nightly  # by day, test_verdicts.py confirms with replays that are made up
-def test_replay_that_is_killed_leaves_a_crash_unconfirmed(bundle, monkeypatch, toy):
-    with monkeypatch.context() as patched:
-        patched.setattr(reruns, "FreshProcessExecutor", Killed)
-        failed = []
-        found = confirm(replace(bundle, confirmed=None), failed=failed)
-        assert (found.confirmed, found.divergence, failed) == (None, None, [])
-        assert found.why_unconfirmed == f"the replay was {WHY}"
-        assert found.summary()["confirmed"] is None
-        with pytest.raises(CrashhuntError, match="the replay was killed from outside 3 times"):
-            replay(bundle, ReplayOptions())
-    found.write()
-    (read,) = list_bundles(toy.folder / "h")
-    assert (read.confirmed, read.why_unconfirmed) == (None, found.why_unconfirmed)
-    words = ("run", "h", "1", "1", "300", "--scenario", "toy", "--arg", "speed=14", "--set", "step_wall_s=0.01")
-    done = toy.crashhunt(*words, "--seed", "1", "--json")
-    (crash,) = done.json["crashes"]
-    assert crash["confirmed"] is True
-    assert "why_unconfirmed" not in crash
-    (read,) = list_bundles(toy.folder / "h")
-    assert (read.confirmed, read.why_unconfirmed) == (True, "")
 
 
 @pytest.mark.nightly

@@ -139,39 +139,6 @@ def test_it_is_driven_by_keyboard_and_plays(hunt, browser):
     check_contrast(browser, "dark")
 
 
-@pytest.mark.nightly  # by day, keys work without one
-def test_keys_work_after_a_click(hunt, browser):
-    hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
-    opened(browser, hunt.folder / "report.html")
-    wait_until(lambda: step(browser) > 0 or browser.execute_script("return crashhuntView.crash.steps") < 50)
-
-    def press(*keys):
-        webdriver.ActionChains(browser).send_keys(*keys).perform()  # to whatever has the focus
-
-    for name in ("back", "forth", "in", "out", "follow"):
-        browser.find_element(By.ID, name).click()
-        press(Keys.HOME)
-        assert step(browser) == 0, name
-        press(Keys.ARROW_RIGHT)
-        assert step(browser) == 1, name
-        press(" ")  # plays, and does not press the button again
-        assert browser.execute_script("return crashhuntView.playing"), name
-        press(" ")
-        assert not browser.execute_script("return crashhuntView.playing"), name
-    listed = browser.find_elements(By.CSS_SELECTOR, "#list button")
-    listed[1].click()
-    wait_until(lambda: text(browser, "summary").startswith(listed[1].text.split("\n")[0]))
-    press(Keys.HOME, Keys.ARROW_RIGHT)
-    assert step(browser) == 1
-
-    # With the keyboard, a button that has the focus is pressed by space, and the other keys work all the same.
-    browser.execute_script("document.getElementById('forth').focus()")
-    press(" ")
-    assert step(browser) == 2
-    press(Keys.ARROW_LEFT)
-    assert step(browser) == 1
-
-
 @pytest.mark.nightly
 def test_dots_say_which_trial_they_are_and_lead_to_it(hunt, browser):
     hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
@@ -230,16 +197,6 @@ def test_nothing_is_wider_than_a_telephone(hunt, telephone):
 
 
 DARK = {"name": "prefers-color-scheme", "value": "dark"}
-
-
-@pytest.mark.nightly  # by day, the test of keys changes to dark on the page that it has
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_light_and_dark_differ_and_can_be_read(hunt, browser, scheme):
-    hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
-    media = {"features": [{**DARK, "value": scheme}]}
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
-    opened(browser, hunt.folder / "report.html")
-    check_contrast(browser, scheme)
 
 
 def check_contrast(browser, scheme) -> None:

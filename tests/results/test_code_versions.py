@@ -107,7 +107,6 @@ def test_hunt_without_results_may_change_its_code(agent, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.long
 def test_versions_are_kept_apart_in_every_figure(agent, tmp_path, capsys):
     hunt = tmp_path / "h"
     first = run(20, keep=1)

@@ -1121,21 +1121,9 @@ class Instances(Steady):
         self.speed = 5.0 + self.made
 
 
-class NoSpace(Steady):
-    def act(self, observation):
-        return (5.0, 0, 0)
-
-
 class Shows(Steady):
     def panels(self):
         return {"speed": Text("5 m/s"), "plan": Text("ahead")}
-
-
-class Same(Steady):
-    """Two panels have one label."""
-
-    def panels(self):
-        return {"a": {"b": Text("5 m/s")}, "a / b": Text("ahead"), "a b": Text("x"), "a/b": Text("y"), "a.b": Text("z")}
 
 
 class CannotClose(Steady):

@@ -336,14 +336,6 @@ def test_crashes_of_other_scenarios_and_spaces_are_refused(crashes, tmp_path, mo
         assert said in refused([crashes, other], test=0.0)
 
 
-@pytest.mark.nightly  # by day, of copies of one hunt, above
-def test_crashes_of_hunts_with_other_scenarios_and_spaces_are_refused(crashes, tmp_path):
-    other = hunt(tmp_path, "other", scenario="another", trials=2)
-    assert "the crashes belong to two scenarios: 'toy.toml' and 'another.toml'" in refused([crashes, other], test=0.0)
-    continuous = hunt(tmp_path, "continuous", action="continuous", trials=2)
-    assert "the action spaces differ: Discrete(5) and " in refused([crashes, continuous], test=0.0)
-
-
 def test_a_crash_without_its_snapshot_is_refused(crashes, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(crashes, copy)

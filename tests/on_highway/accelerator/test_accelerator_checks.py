@@ -140,17 +140,6 @@ def test_left_alone_names_members_of_moving_classes_only(caplog, monkeypatch):
     ]
 
 
-class Changing:
-    value = 1
-
-    def method(self):
-        """Is watched."""
-
-
-class Heir(Changing):
-    """Inherits a method, which a value may hide."""
-
-
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
