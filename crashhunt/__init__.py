@@ -17,46 +17,22 @@ an environment to train an agent on crashes.
 'reproduced'
 """
 
-import importlib
 import sys
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.doors import offer_lazily
+from crashhunt.base.version import __version__ as __version__
+
 if TYPE_CHECKING:
-    from crashhunt.api import prepare, replay, run, what_if
-    from crashhunt.highway.accelerator import accelerate
-    from crashhunt.hunts import Hunt
-    from crashhunt.results import load
-    from crashhunt.statistics import compare
-    from crashhunt.suites import Suite
-    from crashhunt.training import make_training_env
+    from crashhunt.api import prepare as prepare, replay as replay, run as run, what_if as what_if
+    from crashhunt.highway.accelerator import accelerate as accelerate
+    from crashhunt.hunts import Hunt as Hunt
+    from crashhunt.results import load as load
+    from crashhunt.statistics import compare as compare
+    from crashhunt.suites import Suite as Suite
+    from crashhunt.training import make_training_env as make_training_env
 
-from crashhunt.base.version import __version__
-
-__all__ = [
-    "Hunt", "Suite", "__version__", "accelerate", "compare", "load", "make_training_env", "prepare", "replay", "run",
-    "what_if",
-]  # fmt: skip
-
-_HOMES = {
-    "Hunt": "crashhunt.hunts",
-    "Suite": "crashhunt.suites",
-    "accelerate": "crashhunt.highway.accelerator",
-    "compare": "crashhunt.statistics",
-    "load": "crashhunt.results",
-    "make_training_env": "crashhunt.training",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import a function of the package at its first use; workers need none of them."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES.get(name, "crashhunt.api")), name)
-
-
-def __dir__() -> list[str]:
-    return __all__
-
+offer_lazily(__name__)
 
 _ENVIRONMENTS = {
     "crashhunt/SUMO-v0": "crashhunt.envs:SumoEnv",

@@ -5,8 +5,6 @@ from typing import NoReturn
 
 from crashhunt.base.signals import is_interrupt, remember_interrupts
 
-__all__ = ["main"]
-
 
 def main() -> NoReturn:
     """Run the command line and exit."""

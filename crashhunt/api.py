@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.snapshots import SnapshotOptions
 
-__all__ = ["HuntCall", "RunCall", "prepare", "replay", "run", "what_if"]
-
 
 @dataclass(frozen=True)
 class HuntCall(HuntOptions):

@@ -1,6 +1,26 @@
 """The errors of crashhunt, which users may catch or raise."""
 
-from crashhunt.base import errors as _errors
-from crashhunt.base.errors import *  # noqa: F403 - every one of them
-
-__all__ = [name for name in _errors.__all__ if not name.isupper()]  # but no sets of error numbers
+from crashhunt.base.errors import (
+    ActionError as ActionError,
+    ArgumentError as ArgumentError,
+    BundleError as BundleError,
+    BusyError as BusyError,
+    CallError as CallError,
+    CrashhuntError as CrashhuntError,
+    EpisodeError as EpisodeError,
+    HostError as HostError,
+    HuntDirectoryError as HuntDirectoryError,
+    InternalError as InternalError,
+    InvalidEpisodeError as InvalidEpisodeError,
+    NoValidTrialError as NoValidTrialError,
+    PluginError as PluginError,
+    RecorderError as RecorderError,
+    ScenarioError as ScenarioError,
+    SimulatorError as SimulatorError,
+    SnapshotError as SnapshotError,
+    UntrustedError as UntrustedError,
+    UnusableValueError as UnusableValueError,
+    UsageError as UsageError,
+    WorkerError as WorkerError,
+    remedy as remedy,
+)

@@ -52,19 +52,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult, TrialSpec
     from crashhunt.world import Lane
 
-__all__ = [
-    "Budget",
-    "EndedRun",
-    "NotUnderstoodError",
-    "OutOfTimeError",
-    "Reruns",
-    "SharedReruns",
-    "StoppedError",
-    "Where",
-    "call_in_threads",
-    "run_alone",
-]
-
 T = TypeVar("T")
 R = TypeVar("R")
 

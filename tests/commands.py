@@ -332,7 +332,7 @@ if __name__ == "__main__":
 
     for package in IMPORTED:
         module = importlib.import_module(f"crashhunt.{package}")
-        for name in module.__all__:
+        for name in getattr(module, "__all__", ()):
             getattr(module, name)  # which imports what it lies in
     for name in _WHILE_RUNNING:
         importlib.import_module(name)

@@ -115,7 +115,7 @@ def simulators_named(file: Path) -> list[str]:
 
 def test_simulators_are_named_in_their_own_homes_only():
     named: dict[str, list[str]] = {}
-    for file in sorted([*ROOT.rglob("*.py"), *ROOT.rglob("*.pyi")]):
+    for file in sorted(ROOT.rglob("*.py")):
         name = file.relative_to(ROOT).as_posix()
         if not name.startswith(HOMES) and (found := simulators_named(file)):
             named[name] = found
@@ -197,15 +197,14 @@ def files_of_crashhunt() -> list[Path]:
 
 
 def names_behind_doors() -> dict[tuple[str, str], tuple[str, str]]:
-    """For each name that a package offers, the module that it comes from: doors import lazily, by their stubs."""
+    """For each name that a package offers, the module that it comes from: doors import lazily."""
     found = {}
-    for stub in ROOT.rglob("__init__.pyi"):
-        package = ".".join(("crashhunt", *stub.parent.relative_to(ROOT).parts))
-        for node in ast.parse(stub.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ImportFrom):
-                base = package.rsplit(".", node.level - 1)[0] if node.level > 1 else package
+    for door in ROOT.rglob("__init__.py"):
+        package = ".".join(("crashhunt", *door.parent.relative_to(ROOT).parts))
+        for node in nodes_of(door):
+            if isinstance(node, ast.ImportFrom) and node.level:
                 for alias in node.names:
-                    found[package, alias.name] = (f"{base}.{node.module}" if node.module else base, alias.name)
+                    found[package, alias.name] = (f"{package}.{node.module}", alias.name)
     return found
 
 

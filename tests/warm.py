@@ -368,8 +368,7 @@ def _import_ours(simulator: str = "") -> None:
             code, text = _made[name]
             files = {".py": text}
             if hasattr(module, "__path__"):
-                stub = Path(module.__path__[0], "__init__.pyi")
-                files = {"/__init__.py": text, **({"/__init__.pyi": stub.read_bytes()} if stub.exists() else {})}
+                files = {"/__init__.py": text}
             found[name] = module, code, files
         del found[begins_with]  # which knows its process, as no other does
         _given.clear()

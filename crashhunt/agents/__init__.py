@@ -1,5 +1,24 @@
 """Agents: the protocol of a driver, and the agents that crashhunt includes."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._car_following import CarFollowing as CarFollowing
+    from ._lane_changing import IntelligentDriver as IntelligentDriver, LaneChanger as LaneChanger
+    from ._policies import (
+        NumpyPolicy as NumpyPolicy,
+        OnnxPolicy as OnnxPolicy,
+        StableBaselines3 as StableBaselines3,
+        TorchPolicy as TorchPolicy,
+    )
+    from ._protocol import (
+        Agent as Agent,
+        Closes as Closes,
+        DrawsPanels as DrawsPanels,
+        NeedsLibraries as NeedsLibraries,
+    )
+    from ._simple import KeepLaneWithSpeed as KeepLaneWithSpeed, RandomAgent as RandomAgent, Recorded as Recorded
+
+offer_lazily(__name__)

@@ -17,19 +17,6 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-__all__ = [
-    "CAR_LENGTH_M",
-    "CarFollowing",
-    "Leader",
-    "PathCurvature",
-    "X",
-    "actors",
-    "check_layout",
-    "find_leader",
-    "idm_acceleration",
-    "off_path",
-]
-
 CAR_LENGTH_M = 5.0  # highway-env's, and SUMO's default; the observation does not say how long others are
 # The default layout: presence, x, y, vx, vy, cos_h, sin_h; x ahead and y to the right of the vehicle.
 PRESENCE, X, Y, VX, VY, COS_H, SIN_H = range(7)

@@ -29,9 +29,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-__all__ = ["IntelligentDriver", "LaneChanger"]
-
-
 LANE_WIDTH_M = 3.2  # SUMO's default; an observation has no lanes to count
 LEFT, RIGHT = 1, -1  # as in the action
 MIN_GAP_M = 5.0  # a truck's half is up to 2.5 m longer than a car's

@@ -26,9 +26,6 @@ if TYPE_CHECKING:
 
     ActionMasks = Callable[[], NDArray[np.bool_] | None]
 
-__all__ = ["NumpyPolicy", "OnnxPolicy", "StableBaselines3", "TorchPolicy"]
-
-
 _ALGORITHMS = ("PPO", "DQN", "A2C", "SAC", "TD3", "DDPG")
 _USUAL_CLIP = 10.0  # of VecNormalize
 _MASK = "action_mask"  # Gymnasium's and PettingZoo's key

@@ -13,9 +13,6 @@ if TYPE_CHECKING:
     from gymnasium import Space
 
 
-__all__ = ["Agent", "Closes", "DrawsPanels", "NeedsLibraries", "meta_actions", "wanted_meta_action"]
-
-
 @runtime_checkable
 class Agent(Protocol):
     """The protocol of an agent, which drives one vehicle.

@@ -12,9 +12,6 @@ if TYPE_CHECKING:
     from gymnasium import Space
 
 
-__all__ = ["KeepLaneWithSpeed", "RandomAgent", "Recorded"]
-
-
 class KeepLaneWithSpeed:
     """Keeps its lane at a constant speed, and ignores other vehicles.
 

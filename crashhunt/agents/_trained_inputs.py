@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-__all__ = ["NOT_NORMALIZED", "Statistics", "TrainedInputs", "is_equal", "read_statistics"]
-
 NOT_NORMALIZED: Final = "none"
 """The value of ``normalize`` for a model whose observations were not normalised."""
 _VEC_NORMALIZE: Final = ("stable_baselines3.common.vec_env.vec_normalize", "VecNormalize")

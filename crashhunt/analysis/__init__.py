@@ -1,5 +1,35 @@
 """Trials run again with a change: what-if runs, avoidability, causes, and minimization."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._avoidability import judge as judge
+    from ._delta_debugging import Tried as Tried, fewest as fewest, plainest as plainest
+    from ._interventions import (
+        Disturb as Disturb,
+        HandOver as HandOver,
+        Intervention as Intervention,
+        LeaveOut as LeaveOut,
+        Overrule as Overrule,
+        Reseed as Reseed,
+        SetArguments as SetArguments,
+        interventions_of as interventions_of,
+        step_before as step_before,
+    )
+    from ._minimization import Shrunk as Shrunk, shrink as shrink, shrunk_name as shrunk_name
+    from ._types_by_cause import (
+        REPRESENTATIVES as REPRESENTATIVES,
+        divide_by_cause as divide_by_cause,
+        find_cause as find_cause,
+    )
+    from ._whatif_runs import (
+        FUTURES as FUTURES,
+        Counts as Counts,
+        Run as Run,
+        WhatIfOptions as WhatIfOptions,
+        what_if as what_if,
+    )
+
+offer_lazily(__name__)

@@ -41,9 +41,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["AvoidanceSearch", "CannotError", "Tried", "judge"]
-
-
 # The search for the last step from which a manoeuvre avoids a collision: which runs it asks for, and in what order.
 
 _BRAKING_SHARE_OF_RUNS = 0.6  # of the runs; the rest is for changing lanes

@@ -35,9 +35,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 
-__all__ = ["Maneuver", "find_why", "maneuvers_of", "relevant_actors"]
-
-
 # What agent and others did before a collision that it may hang on: braking, speeding up, changing lanes.
 
 _BEFORE_S = 10.0  # manoeuvres longer before the collision are not examined

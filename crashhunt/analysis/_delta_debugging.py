@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import Value
 
-__all__ = ["Tried", "as_type_of", "fewest", "plainest"]
-
 T = TypeVar("T")
 Tried = Callable[[Sequence[T]], int | None]
 """Tries candidates; returns the place of the first that still crashes in the same manner, None if none does."""

@@ -25,19 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance, Value
 
 
-__all__ = [
-    "Disturb",
-    "HandOver",
-    "Intervention",
-    "LeaveOut",
-    "Overrule",
-    "Reseed",
-    "SetArguments",
-    "interventions_of",
-    "step_before",
-]
-
-
 _FACULTIES = {"reference_speed": "longitudinal", "reference_lanes": "lateral", "reference": "both"}
 
 

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialSpec
 
-__all__ = ["Shrunk", "shrink", "shrunk_name"]
-
 Verdict = Literal["shrunk", "unchanged", "not_reproduced"]
 _MAX_CONFIRMATIONS = 3  # of what is left of a flaky crash
 _DISK_FIX = "free some space and run the same command again, which reuses the results of finished trials"

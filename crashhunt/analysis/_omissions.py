@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from crashhunt.reruns import EndedRun, Reruns
     from crashhunt.trial import TrialResult, TrialSpec
 
-__all__ = ["find_omission"]
-
 _BEFORE_S = 10.0  # a period that ended longer before the crash has not led to it
 _EARLIER_S = (0.0, 0.5, 1.0)  # the reference driver takes over from these times before the period
 _LONGER_S = 5.0  # simulation time past the crash: a reference driver may only postpone it

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialSpec
 
-__all__ = ["Part", "Scripting", "can_be_scripted"]
-
 _BEFORE_S = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0)
 """How long before the crash it may begin, in s: tried in this order. A lane change is looked for 3 s back."""
 

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from crashhunt.reruns import EndedRun
     from crashhunt.trial import TrialSpec
 
-__all__ = ["Ran", "Runs", "is_same"]
-
 
 @dataclass(frozen=True, slots=True)
 class Ran:

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from crashhunt.replays import Rerun
     from crashhunt.trial import Disturbance, TrialSpec, Value
 
-__all__ = ["Ended", "Form", "Minimizer"]
-
 Ended = Literal["done", "budget", "time", "interrupted", "error"]
 Form = Literal["either", "traffic", "scripted"]
 _MAX_RUNS = 3  # of a crash that does not come again at once

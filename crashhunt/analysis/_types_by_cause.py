@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle, Group
 
-__all__ = ["REPRESENTATIVES", "divide_by_cause", "find_cause"]
-
 REPRESENTATIVES = 8
 """How many crashes of each type are judged; six bugs in one type have been seen."""
 

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialSpec
 
 
-__all__ = ["FUTURES", "Counts", "Run", "WhatIfOptions", "future_seed", "what_if"]
-
 FUTURES = 50
 """How many futures are run where the user gives no number: their interval is at most 0.27 wide."""
 _SELF_TEST_RUNS = 4  # futures to begin with, of which one is run twice

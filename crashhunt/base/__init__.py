@@ -3,5 +3,3 @@
 Its modules are independent, so import each module by its own name. Every other package exports its names in its
 ``__init__``.
 """
-
-__all__: list[str] = []

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from types import TracebackType
 
-__all__ = ["Boundary", "ForeignError", "Party", "is_at_boundary", "is_ours"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 

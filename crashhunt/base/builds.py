@@ -24,8 +24,6 @@ from crashhunt.base.signals import describe_death
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-__all__ = ["BuildError", "clean_tree", "copy_built", "files_outside", "run_build", "track_built"]
-
 _QUIET_S = 3.0  # before a note on what takes so long
 _MAX_LINES, _MAX_CHARACTERS = 3, 300  # of the output in an error
 

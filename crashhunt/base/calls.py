@@ -14,8 +14,6 @@ from crashhunt.base.text import one_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-__all__ = ["Documented", "called_with", "clear_calls", "clear_constructor"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")

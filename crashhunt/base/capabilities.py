@@ -11,9 +11,6 @@ if TYPE_CHECKING:
     from typing_extensions import TypeIs
 
 
-__all__ = ["members", "supports"]
-
-
 T = TypeVar("T")
 
 

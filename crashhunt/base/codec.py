@@ -49,30 +49,6 @@ if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain
 
 
-__all__ = [
-    "ESSENTIAL",
-    "OMIT_DEFAULT",
-    "JsonObject",
-    "Serializable",
-    "essentials",
-    "from_plain",
-    "known_part",
-    "known_values",
-    "merged",
-    "not_understood",
-    "null_is",
-    "plain",
-    "plain_types",
-    "prepare",
-    "required_in",
-    "required_of",
-    "slip",
-    "to_plain",
-    "typed_where_there",
-    "written_if",
-    "written_keys",
-]
-
 JsonObject: TypeAlias = dict[str, Any]
 """The JSON object of a `Serializable`: its keys are the fields."""
 
@@ -223,7 +199,7 @@ def _write_function(kind: Any) -> _Convert:
     return cast(_Convert, names["write"])
 
 
-def _default(item: Field[Any]) -> object:
+def _default(item: Field[object]) -> object:
     return item.default_factory() if item.default_factory is not MISSING else item.default
 
 
@@ -237,10 +213,16 @@ def written_keys(kind: Any) -> list[tuple[str, str, bool]]:
     return found
 
 
+def names_of_tuple(kind: type) -> tuple[str, ...]:
+    """Return the names in a class of named tuples; empty for other classes."""
+    return vars(kind).get("_fields", ()) if issubclass(kind, tuple) else ()
+
+
 def _plain_at(path: list[str]) -> _Convert:
-    def get(value: Any) -> Any:
+    def get(value: object) -> object:
         for name in path:
-            value = None if value is None else value[int(name)] if name.isdigit() else getattr(value, name)
+            if value is not None:
+                value = cast(Sequence[object], value)[int(name)] if name.isdigit() else getattr(value, name)
         return plain(value)
 
     return get
@@ -257,8 +239,8 @@ def plain(value: object) -> Any:
         return str(value)
     if isinstance(value, float):
         return _finite(value)
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return plain(value._asdict())
+    if isinstance(value, tuple) and (names := names_of_tuple(type(value))):
+        return plain(dict(zip(names, value, strict=True)))
     if isinstance(value, Mapping):
         return {str(key): plain(held) for key, held in value.items()}
     if isinstance(value, AbstractSet):
@@ -270,10 +252,10 @@ def _finite(value: float) -> float | None:
     return value if isfinite(value) else None
 
 
-def _writer(hint: Any) -> _Convert | None:
+def _writer(hint: object) -> _Convert | None:
     """Return the function that converts values of a type to JSON data; None if they need no conversion."""
     kind, inner = _kind_of(hint)
-    if issubclass(kind, tuple) and hasattr(kind, "_fields"):
+    if names_of_tuple(kind):
         return plain
     of_item = _writer(inner[-1 if issubclass(kind, Mapping) else 0]) if inner else None
     if issubclass(kind, Mapping):
@@ -316,7 +298,7 @@ def _optional(convert: _Convert, *, falsy: bool) -> _Convert:
     return lambda held: None if held is None or (falsy and not held) else convert(held)
 
 
-def _reader(hint: Any) -> _Convert | None:
+def _reader(hint: object) -> _Convert | None:
     """Return the function that converts JSON data to values of a type; None if they need no conversion."""
     kind, inner = _kind_of(hint)
     if issubclass(kind, Serializable):
@@ -331,7 +313,7 @@ def _reader(hint: Any) -> _Convert | None:
     return _of_values(of_item) if issubclass(kind, Mapping) else _of_items(of_item, list)
 
 
-def _kind_of(hint: Any) -> tuple[type, tuple[Any, ...]]:
+def _kind_of(hint: object) -> tuple[type, tuple[object, ...]]:
     """Return the class of a type hint and the types in its brackets; `object` if several classes are possible."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):

@@ -9,8 +9,6 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-__all__ = ["one_of"]
-
 T = TypeVar("T")
 
 

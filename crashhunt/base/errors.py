@@ -37,33 +37,6 @@ if TYPE_CHECKING:
 
     from crashhunt.base.json_types import ErrorData
 
-__all__ = [
-    "DISK",
-    "FULL",
-    "ActionError",
-    "ArgumentError",
-    "BundleError",
-    "BusyError",
-    "CallError",
-    "CrashhuntError",
-    "EpisodeError",
-    "HostError",
-    "HuntDirectoryError",
-    "InternalError",
-    "InvalidEpisodeError",
-    "NoValidTrialError",
-    "PluginError",
-    "RecorderError",
-    "ScenarioError",
-    "SimulatorError",
-    "SnapshotError",
-    "UntrustedError",
-    "UnusableValueError",
-    "UsageError",
-    "WorkerError",
-    "remedy",
-]
-
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 """Error numbers of an `OSError` where a disk, or the user's quota on it, is full."""
 

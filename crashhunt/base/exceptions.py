@@ -15,20 +15,6 @@ if TYPE_CHECKING:
     from typing import Final
 
 
-__all__ = [
-    "MAX_MESSAGE_CHARACTERS",
-    "MAX_TRACEBACK_CHARACTERS",
-    "blamed",
-    "class_name",
-    "format_error",
-    "in_words",
-    "is_users",
-    "message_of",
-    "place_of",
-    "shown_path",
-]
-
-
 MAX_MESSAGE_CHARACTERS: Final = 10_000
 MAX_TRACEBACK_CHARACTERS: Final = 100_000
 _MAX_NAME_CHARACTERS: Final = 200

@@ -15,8 +15,6 @@ from crashhunt.base.temporary import remove_tree, temporary_beside, temporary_na
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["cannot_write", "exchange", "is_empty_folder", "put_in_place", "sync_folder", "sync_tree", "whole_file"]
-
 _PARALLEL_SYNCS = 8  # fsync calls that overlap; more threads are not faster
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # of <fcntl.h> and <linux/fs.h>
 

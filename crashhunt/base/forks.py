@@ -51,31 +51,6 @@ if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain
 
 
-__all__ = [
-    "MEMORY",
-    "CannotForkError",
-    "Copy",
-    "Held",
-    "NoAnswer",
-    "NoProcessError",
-    "SuspendedFork",
-    "Watchdog",
-    "children_now",
-    "copying",
-    "end_orphans",
-    "ended",
-    "ends",
-    "explain_silence",
-    "fork",
-    "held",
-    "parse_answer",
-    "shared_memory",
-    "threads",
-    "took_longer",
-    "watchdog",
-]
-
-
 # Answers of forks of this process, and reasons why an answer is missing.
 
 _ENDS_S = 1.0  # wall time within which a process with a closed pipe ends

@@ -17,20 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
 
-__all__ = [
-    "checked_out",
-    "commit_of",
-    "environment_of_git",
-    "git",
-    "git_directory",
-    "import_environment",
-    "query",
-    "run_to_end",
-    "top_of",
-    "tracked_files",
-    "work_tree",
-]
-
 _TIMEOUT_S = 60
 
 # Git sets these variables for its hooks and for `rebase --exec`, and they take precedence over `-C FOLDER`. They are

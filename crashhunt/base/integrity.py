@@ -27,27 +27,6 @@ if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain
 
 
-__all__ = [
-    "FILES",
-    "FileEntry",
-    "authentication_code",
-    "changed_file",
-    "describe_files",
-    "digest_of_content",
-    "digest_of_data",
-    "digest_of_file",
-    "digest_of_row",
-    "is_authentic",
-    "parse_object",
-    "read_bounded",
-    "read_object",
-    "state_folders",
-    "too_large",
-    "typed",
-    "user_key",
-]
-
-
 T = TypeVar("T")
 _SMALL_FILE_BYTES = 1 << 20  # bytes
 

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
     Report: TypeAlias = Callable[[str], None]
 
-__all__ = ["OWN_THREAD", "ServerApart", "files_read_apart", "work_apart"]
-
 C = TypeVar("C", bound=Copy)
 
 OWN_THREAD = "crashhunt"

@@ -10,9 +10,6 @@ import math
 from collections.abc import Mapping
 from typing import NotRequired, TypeAlias, TypedDict, final
 
-__all__ = ["ErrorData", "ErrorWords", "Json", "Plain", "finite", "finite_values"]
-
-
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 """What `json.loads` returns."""
 

@@ -5,53 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-__all__ = [
-    "ANSWER",
-    "ARCHIVE_INDEX",
-    "ARCHIVE_KEY",
-    "BESIDE",
-    "BLACK_BOX",
-    "BRANCHES",
-    "BUILDING",
-    "CASE",
-    "CODE",
-    "CRASH",
-    "CRASHES",
-    "ENTERED",
-    "ENVIRONMENT",
-    "ERROR_LOG",
-    "FILES",
-    "FOXGLOVE_LAYOUT",
-    "GIT_DIFF",
-    "HUNT",
-    "JOB",
-    "LEDGER",
-    "LOG",
-    "MANIFEST",
-    "MAP",
-    "NEAR_MISSES",
-    "NOTICES",
-    "PACKAGE",
-    "PARAMS",
-    "PROBES",
-    "REPLACED",
-    "REPORT",
-    "REQUEST",
-    "RESPONSES",
-    "RUN_LOG",
-    "SCENARIO",
-    "SCENARIO_FILES",
-    "SCRATCH",
-    "SHOWN",
-    "SMALL",
-    "SNAPSHOTS",
-    "STACK",
-    "TRAINED_ON",
-    "TRIALS",
-    "crash_folder",
-    "numbered",
-]
-
 PACKAGE: Final = Path(__file__).resolve().parent.parent
 """The folder of the package `crashhunt`."""
 

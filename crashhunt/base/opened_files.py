@@ -17,8 +17,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-__all__ = ["OpenedFiles", "output_files"]
-
 
 class OpenedFiles:
     """Collects the absolute paths of files from now on, also of files that do not exist."""

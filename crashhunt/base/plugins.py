@@ -24,22 +24,6 @@ if TYPE_CHECKING:
     from importlib.machinery import ModuleSpec
     from importlib.metadata import Distribution, EntryPoint
 
-__all__ = [
-    "CurrentFolder",
-    "Group",
-    "ImportedModules",
-    "add_current_folder",
-    "describe_unused_clone",
-    "distributions",
-    "import_module",
-    "is_foreign",
-    "is_foreign_module",
-    "load_attribute",
-    "load_object",
-    "locate",
-    "registered",
-]
-
 _MAX_LINE_CHARACTERS = 1_000
 Group = Literal["agents", "backends", "disturbances", "executors", "oracles", "samplers", "simulators"]
 

@@ -19,20 +19,6 @@ from typing import TYPE_CHECKING, NoReturn
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = [
-    "adopt_orphans",
-    "children_of",
-    "descendants_of",
-    "die_with",
-    "end_descendants",
-    "exits_refused",
-    "has_child",
-    "is_alive",
-    "kill",
-    "outlive_parent",
-    "resume",
-]
-
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # of <sys/prctl.h>
 _libc = ctypes.CDLL(None) if sys.platform == "linux" else None  # looked up once, not in every fork
 _PATIENCE_S = 2.0  # for processes that do not die at once; processes of another user never do

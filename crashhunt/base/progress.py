@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, TypeVar
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-__all__ = ["Watch", "watched"]
-
 T = TypeVar("T")
 Watch = Callable[[int, int], None]
 """Called with the number of finished items and the total."""

@@ -24,8 +24,6 @@ from typing import IO, TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-__all__ = ["Kept"]
-
 _FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _LOOK_EVERY_S = 0.02  # where the kernel does not notify when a child ends
 _RESUME_EVERY_S = 1.0  # one check takes 20 µs

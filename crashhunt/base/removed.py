@@ -15,8 +15,6 @@ from crashhunt.base.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["refuse_removed_words", "removed_fix", "removed_fix_in"]
-
 _RARE = "use --rare with --disturb and rates, such as --disturb brake=0.001: crashhunt no longer splits paths"
 _REMOVED = {
     "--splitting": _RARE,

@@ -10,9 +10,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-__all__ = ["FREE", "error_of_next_files", "error_of_next_thread", "free_memory", "is_no_thread", "limit_behind"]
-
-
 _MEBIBYTE = 1 << 20
 _NO_MEMORY_MESSAGES = (
     "can't start new thread",

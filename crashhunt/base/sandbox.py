@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
 from crashhunt.base.layout import PACKAGE
 
-__all__ = ["confine", "landlock_version"]
-
 # The numbers are the same on every processor (include/uapi/linux/landlock.h).
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
 _VERSION_ONLY, _PATH_BENEATH, _PR_SET_NO_NEW_PRIVS = 1, 1, 38  # of <linux/landlock.h> and <sys/prctl.h>

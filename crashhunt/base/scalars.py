@@ -15,8 +15,6 @@ from typing import Any, Final, Protocol
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import UnusableValueError
 
-__all__ = ["describe_value", "is_masked", "number_of", "truth_of"]
-
 _ALLOWED: Final = "a bool, a number, an array with one element"
 _MAX_CHARACTERS: Final = 200  # of a value in an error message
 _MAX_NESTING: Final = 4  # an array with one element may contain another such array

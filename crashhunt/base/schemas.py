@@ -27,9 +27,7 @@ from typing import (
     is_typeddict,
 )
 
-from crashhunt.base.codec import JsonObject, Serializable, written_keys
-
-__all__ = ["describe_type", "json_schema"]
+from crashhunt.base.codec import JsonObject, Serializable, names_of_tuple, written_keys
 
 _JSON_TYPES = {bool: "boolean", int: "integer", float: "number", str: "string", NoneType: "null"}
 
@@ -84,8 +82,8 @@ def describe_type(hint: Any) -> JsonObject:
         return _of_dataclass(kind)
     if issubclass(kind, Mapping):
         return {"type": "object", "additionalProperties": describe_type(inner[-1])} if inner else {"type": "object"}
-    if issubclass(kind, tuple) and hasattr(kind, "_fields"):
-        hints = {name: _type_at(kind, name) for name in kind._fields}
+    if names := names_of_tuple(kind):
+        hints = {name: _type_at(kind, name) for name in names}
         return _of_keys({name: one | None if one is float else one for name, one in hints.items()})
     if issubclass(kind, tuple) and inner and inner[-1] is not Ellipsis:
         items = [describe_type(item) for item in inner]

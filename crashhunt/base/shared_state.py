@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection
     from typing import Final
 
-__all__ = ["SharedState"]
-
 _MAX_COPIED_BYTES: Final = 16 << 20  # of a file without a name, or of a mapping; a copy of it is made in every fork
 _MAP_FIXED: Final = 0x10
 _RESTORED_OPEN_FLAGS: Final = (

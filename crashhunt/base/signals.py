@@ -12,19 +12,6 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = [
-    "InterruptedCodeError",
-    "block_signals",
-    "blocked_signals",
-    "describe_death",
-    "ended_by_signals",
-    "interrupted_after",
-    "is_interrupt",
-    "is_sent_from_outside",
-    "remember_interrupts",
-    "stop_requests",
-]
-
 _SENT_FROM_OUTSIDE: Final = frozenset(
     {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU}
 )

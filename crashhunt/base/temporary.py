@@ -48,30 +48,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
 
-__all__ = [
-    "OwnerProcess",
-    "SharedMemoryWatch",
-    "TemporaryFolder",
-    "begin_records",
-    "end_records",
-    "folder_for_temporary_files",
-    "has_ended",
-    "new_folder",
-    "owner_in",
-    "record_shared_memory",
-    "release_shared_memory",
-    "remove_at_once",
-    "remove_ended",
-    "remove_leftovers",
-    "remove_scratch",
-    "remove_tree",
-    "start_time",
-    "temporary_beside",
-    "temporary_folder",
-    "temporary_name",
-    "this_process",
-]
-
 _WRITTEN_MEANWHILE = "another process has written there in the meantime"
 
 

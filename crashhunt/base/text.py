@@ -17,26 +17,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-__all__ = [
-    "ABSENT_WORDS",
-    "NOTICE_TOPIC",
-    "PRESENT_WORDS",
-    "any_of",
-    "command_line",
-    "count_of",
-    "did_you_mean",
-    "encodable",
-    "format_time",
-    "in_lines",
-    "listed",
-    "near_path",
-    "one_line",
-    "one_of",
-    "out_of",
-    "visible",
-]
-
-
 NOTICE_TOPIC = "\t"
 """Separates the topic of a notice of a worker from its text; of each topic, a hunt prints one notice."""
 ABSENT_WORDS, PRESENT_WORDS = " names nothing that occurred: ", " names something that occurred"

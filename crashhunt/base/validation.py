@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from crashhunt.base.errors import CrashhuntError
 
-__all__ = ["validate"]
-
 T = TypeVar("T")
 
 _UNKNOWN_KEY_ERRORS = ("unexpected_keyword_argument", "extra_forbidden")

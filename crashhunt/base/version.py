@@ -1,5 +1,3 @@
 """The version of crashhunt."""
 
-__all__ = ["__version__"]
-
 __version__ = "0.1.0"

@@ -55,8 +55,6 @@ from crashhunt.cli._whatif import add_whatif
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
 
-__all__ = ["main", "make_parser"]
-
 _DESCRIPTION = "Hunt for the crashes of a driving agent, and save each crash so that it can be replayed and fixed."
 _EPILOG = """\
 examples:

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.corpus import Got
 
-__all__ = ["add_bisect"]
-
 
 def add_bisect(commands: Commands) -> None:
     """Add the command ``bisect`` to the parser."""

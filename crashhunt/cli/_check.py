@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.hunts import Checked
 
-__all__ = ["add_check"]
-
 
 def add_check(commands: Commands) -> None:
     """Add the command ``check`` to the parser."""

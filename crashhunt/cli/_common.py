@@ -30,38 +30,6 @@ if TYPE_CHECKING:
     from crashhunt.plans import Given, HuntOption
 
 
-__all__ = [
-    "Commands",
-    "GivenOnce",
-    "Parser",
-    "WordsWithCommas",
-    "add_build",
-    "add_ci_options",
-    "add_crash",
-    "add_json",
-    "add_options",
-    "add_options_of_machine",
-    "add_trust",
-    "ask_to_trust",
-    "build_limit_s",
-    "check_trust",
-    "chosen_of_machine",
-    "chosen_options",
-    "chosen_runs",
-    "integer",
-    "make_console",
-    "number",
-    "opened_crash",
-    "opened_hunt",
-    "pairs",
-    "run_trusted",
-    "say",
-    "shown_progress",
-    "tell",
-    "unwritable_output",
-]
-
-
 T = TypeVar("T")
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 """What a command is added to; argparse has no other name for it."""

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from crashhunt.cli._common import Commands
 
-__all__ = ["add_compare"]
-
 
 def add_compare(commands: Commands) -> None:
     """Add the command ``compare`` to the parser."""

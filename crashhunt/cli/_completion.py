@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     Completer = Callable[..., Iterable[str]]
 
-__all__ = ["add_completion", "complete"]
-
 _OPTUNA = ("tpe", "cma-es", "gp", "nsgaii", "nsgaiii", "qmc", "random")  # to ask it itself takes most of a second
 _INSTRUCTIONS = """\
 put one of these lines where your shell starts:

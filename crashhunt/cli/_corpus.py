@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.corpus import CaseReport
 
-__all__ = ["add_corpus"]
-
 
 def add_corpus(commands: Commands) -> None:
     """Add the command ``corpus`` to the parser."""

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.corpus import Case, KnownType
     from crashhunt.crashes import CauseGroup, Group, Groups, Signature
 
-__all__ = ["add_crashes", "add_known", "checked_cases", "compare_with_corpus"]
-
 _DEFAULT_RUNS = 8  # `crashhunt.analysis.REPRESENTATIVES`, which takes longer to import than a parser to build
 
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.dashboard import Address
 
-__all__ = ["add_dashboard"]
-
 
 def add_dashboard(commands: Commands) -> None:
     """Add the command ``dashboard`` to the parser."""

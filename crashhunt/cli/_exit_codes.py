@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = ["BAD_INPUT", "DONE", "INTERRUPTED", "NO_ANSWER", "NO_VALID_TRIAL", "OUTPUT_CLOSED", "THE_ANSWER_IS_NO"]
-
 DONE: Final = 0
 THE_ANSWER_IS_NO: Final = 1
 BAD_INPUT: Final = 2

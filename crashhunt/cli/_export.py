@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from crashhunt.cli._common import Commands
 
-__all__ = ["add_export"]
-
 _FORMATS = {"commonroad": ".xml", "openscenario": ".xosc"}
 
 

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from crashhunt.statistics import GateReport
     from crashhunt.suites import GateProgress, RunRequest
 
-__all__ = ["add_gate"]
-
 _HUNT_OPTIONS = (
     "scenario", "ego", "action", "agents", "arguments", "scenario_arguments", "oracles", "seed", "crash_on", "disturb",
     "timeout_s", "accelerate", "native", "executor", "snapshot_roots", "snapshot_limit_mb",

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.guide import Page
 
-__all__ = ["add_guide"]
-
 
 def add_guide(commands: Commands) -> None:
     """Add the command ``guide`` to the parser."""

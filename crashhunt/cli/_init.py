@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.sumo.maps import MapSource, PlainTrial
 
-__all__ = ["add_init"]
-
 
 def add_init(commands: Commands) -> None:
     """Add the command ``init`` to the parser."""

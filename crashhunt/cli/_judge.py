@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.crashes import Bundle, Judgement
 
-__all__ = ["add_judge"]
-
 
 def add_judge(commands: Commands) -> None:
     """Add the command ``judge`` to the parser."""

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.report import ListingEntry
 
-__all__ = ["add_list", "with_list"]
-
-
 _KINDS: dict[str, Callable[[], list[ListingEntry]]] = {
     "agents": lambda: report.list_registered("agents"),
     "disturbances": lambda: report.list_registered("disturbances"),

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from crashhunt.cli._common import Commands
 
-__all__ = ["add_logs"]
-
 
 def add_logs(commands: Commands) -> None:
     """Add the command ``logs`` to the parser."""

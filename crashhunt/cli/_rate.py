@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.statistics import Per
 
-__all__ = ["add_rate", "exit_code_of"]
-
 
 def add_rate(commands: Commands) -> None:
     """Add the command ``rate`` to the parser."""

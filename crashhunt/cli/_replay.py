@@ -45,18 +45,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = [
-    "add_film_options",
-    "add_replay",
-    "film_options",
-    "filmed",
-    "look_at_all",
-    "recorded_shot",
-    "replayed_shot",
-    "write_films",
-]
-
-
 # The options of ``crashhunt replay`` that make films.
 
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.results import FoundCrashes
 
-__all__ = ["add_report"]
-
 
 def add_report(commands: Commands) -> None:
     """Add the command ``report`` to the parser."""

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.hunts import HuntStatus
 
-__all__ = ["add_run", "short_help"]
-
 _leave = os._exit  # which is refused to samplers, also while they are imported
 _MIN_HELP_COLUMNS = 32  # in a narrower terminal, the terminal breaks the lines
 _LONG_WAIT_S = 3.0  # after which people wonder

@@ -14,9 +14,6 @@ if TYPE_CHECKING:
 
     from crashhunt.cli._common import Commands
 
-__all__ = ["add_show"]
-
-
 _MIN_BRAKING_MPS2: Final = 0.1
 
 

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.crashes import Bundle
 
-__all__ = ["add_shrink"]
-
 _DEFAULT_TRIALS = 500
 
 

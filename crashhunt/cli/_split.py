@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
     from crashhunt.cli._common import Commands
 
-__all__ = ["add_split"]
-
 _PARTS = ("training", "test")
 
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.results import BranchSums, HuntState, ProbeSums
 
-__all__ = ["add_status", "show_states", "states_console", "states_table"]
-
 _COLUMNS_WITHOUT_TERMINAL = 120
 _NUMBERS = ("trials", "pace", "left", "crashes", "errors")  # columns
 _OMITTED_FIRST = ("pace", "errors", "left", "outcomes")  # columns that a narrow terminal does not show

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.results import HuntState
 
-__all__ = ["add_rerun", "add_suite"]
-
 T = TypeVar("T")
 
 

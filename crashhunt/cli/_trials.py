@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from crashhunt.cli._common import Commands
 
-__all__ = ["add_trials"]
-
 
 def add_trials(commands: Commands) -> None:
     """Add the command ``trials`` to the parser."""

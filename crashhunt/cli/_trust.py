@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.crashes import TrustedOrigin
 
-__all__ = ["add_trust_command"]
-
 
 def add_trust_command(commands: Commands) -> None:
     """Add the command ``trust`` to the parser."""

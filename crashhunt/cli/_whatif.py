@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from crashhunt.analysis import Counts
     from crashhunt.cli._common import Commands
 
-__all__ = ["add_whatif"]
-
 
 def add_whatif(commands: Commands) -> None:
     """Add the command ``whatif`` to the parser."""

@@ -1,5 +1,28 @@
 """A corpus: crashes that users keep in their own repository as regression tests."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._bisection import Bisected as Bisected, bisect as bisect
+    from ._case_runs import (
+        CaseReport as CaseReport,
+        Got as Got,
+        run_cases as run_cases,
+        untrusted_case as untrusted_case,
+    )
+    from ._cases import (
+        Added as Added,
+        Case as Case,
+        Expectation as Expectation,
+        KnownType as KnownType,
+        add_case as add_case,
+        cases_of_type as cases_of_type,
+        compare_types as compare_types,
+        find_cases as find_cases,
+        read_case as read_case,
+        signature_today as signature_today,
+    )
+
+offer_lazily(__name__)

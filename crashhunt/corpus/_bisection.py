@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle
 
-__all__ = ["Bisected", "bisect"]
-
 _BISECT_WORDS: dict[Got, str] = {"still": "bad", "fixed": "good", "changed": "skip", "cannot_run": "skip"}
 _FIRST_BAD_COMMIT = re.compile(r"^([0-9a-f]{7,64}) is the first \S+ commit", re.MULTILINE)
 _ORIGIN_SCRIPT = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from crashhunt.reruns import EndedRun
     from crashhunt.scenario import Scenario
 
-__all__ = ["CaseReport", "Got", "run_cases", "untrusted_case"]
-
 Got = Literal["still", "fixed", "changed", "cannot_run"]
 _HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)
 

@@ -47,12 +47,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialSpec, Value
 
 
-__all__ = [
-    "Added", "Case", "Expectation", "KnownType", "add_case", "cases_of_type", "compare_types", "find_cases",
-    "read_case", "signature_today",
-]  # fmt: skip
-
-
 Expectation = Literal["still", "fixed"]
 _CASE_COMMENT = """\
 # A crash that is kept: `crashhunt corpus run` and pytest run it again with today's code.

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-__all__ = ["pytest_collect_file"]
-
 _CASE_FILE = "crashhunt-case.toml"  # as in crashhunt.base.layout
 
 

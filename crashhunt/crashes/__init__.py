@@ -1,5 +1,107 @@
 """Crashes: bundles, archives, trust, encounters, criticality, signatures, crash types, fault and preventability."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._archive import Archive as Archive, export_crash as export_crash, open_archive as open_archive
+    from ._bundle import (
+        Bundle as Bundle,
+        CrashData as CrashData,
+        CrashSummary as CrashSummary,
+        as_stored as as_stored,
+        authenticate_bundle as authenticate_bundle,
+        crash_folders as crash_folders,
+        files_of as files_of,
+        find_bundle as find_bundle,
+        is_bundle_made_here as is_bundle_made_here,
+        list_bundles as list_bundles,
+        list_near_misses as list_near_misses,
+        read_bundle as read_bundle,
+        read_params as read_params,
+        snapshot_of as snapshot_of,
+        write_bundle as write_bundle,
+        write_trial as write_trial,
+    )
+    from ._bundle_trust import (
+        TrustedOrigin as TrustedOrigin,
+        add_trusted as add_trusted,
+        describe_code as describe_code,
+        is_bundle_trusted as is_bundle_trusted,
+        is_fingerprint_trusted as is_fingerprint_trusted,
+        is_hunt_trusted as is_hunt_trusted,
+        is_snapshot_trusted as is_snapshot_trusted,
+        list_trusted as list_trusted,
+        refuse_side_effects as refuse_side_effects,
+        refuse_untrusted as refuse_untrusted,
+        remove_trusted as remove_trusted,
+        trust_repositories as trust_repositories,
+        trust_repository as trust_repository,
+        trust_snapshot as trust_snapshot,
+    )
+    from ._causes import (
+        Cause as Cause,
+        CauseGroup as CauseGroup,
+        CauseType as CauseType,
+        Division as Division,
+        cause_of as cause_of,
+        count_causes as count_causes,
+        features_of as features_of,
+        join_causes as join_causes,
+        without_chance_lengths as without_chance_lengths,
+    )
+    from ._contact_record import ContactRecord as ContactRecord, contact_record as contact_record
+    from ._encounter import (
+        DangerCourse as DangerCourse,
+        Encounter as Encounter,
+        Moment as Moment,
+        Position as Position,
+        closest_actors as closest_actors,
+        danger_course as danger_course,
+        last_escape as last_escape,
+        most_dangerous as most_dangerous,
+        visible_from as visible_from,
+    )
+    from ._fault import Fault as Fault, Verdict as Verdict, fault_of as fault_of
+    from ._judgement import (
+        INTERRUPTED as INTERRUPTED,
+        Attempt as Attempt,
+        Factor as Factor,
+        Judgement as Judgement,
+        JudgementVerdict as JudgementVerdict,
+        LeftOut as LeftOut,
+        Why as Why,
+        judgement_of as judgement_of,
+        wilson as wilson,
+        with_judgement as with_judgement,
+    )
+    from ._lanes import Borders as Borders, LaneMap as LaneMap
+    from ._last_avoidable_step import (
+        Ending as Ending,
+        StepBisection as StepBisection,
+        changes_of as changes_of,
+        ending_of as ending_of,
+        find_escape as find_escape,
+        last_avoiding as last_avoiding,
+        overruled_trial as overruled_trial,
+        partner as partner,
+        slowing as slowing,
+    )
+    from ._omission import (
+        Omission as Omission,
+        Reference as Reference,
+        ReferenceRun as ReferenceRun,
+        Without as Without,
+    )
+    from ._signature import (
+        SIGNATURE_VERSION as SIGNATURE_VERSION,
+        Signature as Signature,
+        StackFrame as StackFrame,
+        own_frames as own_frames,
+        signature_of as signature_of,
+        signature_of_fault as signature_of_fault,
+    )
+    from ._types import Group as Group, Groups as Groups, group_crashes as group_crashes, groups_of as groups_of
+
+offer_lazily(__name__)

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from crashhunt.base.progress import Watch
     from crashhunt.crashes._bundle import Bundle
 
-__all__ = ["Archive", "export_crash", "open_archive"]
-
 SCHEMA = 1
 _MAX_BYTES = 4 * 10**9  # unpacked size, because a small zip file can contain terabytes
 _MAX_FILES = 100_000  # so many make a file system slow

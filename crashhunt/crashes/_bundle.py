@@ -51,31 +51,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Lane
 
 
-__all__ = [
-    "ArchiveIndex",
-    "Bundle",
-    "CrashData",
-    "CrashSummary",
-    "Protected",
-    "as_stored",
-    "authenticate_bundle",
-    "collect_output",
-    "crash_folders",
-    "describe_other_files",
-    "files_of",
-    "find_bundle",
-    "is_bundle_made_here",
-    "list_bundles",
-    "list_near_misses",
-    "read_bundle",
-    "read_params",
-    "refuse_damaged",
-    "snapshot_of",
-    "write_bundle",
-    "write_trial",
-]
-
-
 # The shapes of what a crash consists of on disk: ``crash.json``, and the index of an archive.
 #
 # What an earlier version did not write need not be there, and what a later one has added may be there as well.

@@ -37,26 +37,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Distribution, TrialSpec
 
 
-__all__ = [
-    "TrustedOrigin",
-    "add_trusted",
-    "describe_code",
-    "is_bundle_trusted",
-    "is_fingerprint_trusted",
-    "is_hunt_trusted",
-    "is_made_here",
-    "is_snapshot_trusted",
-    "list_trusted",
-    "refuse_side_effects",
-    "refuse_untrusted",
-    "remove_trusted",
-    "signature",
-    "trust_repositories",
-    "trust_repository",
-    "trust_snapshot",
-]
-
-
 # What this user trusts although it was not made here: a file for each origin in the folder of the user's state.
 
 _TRUST_FOLDER = "trusted"

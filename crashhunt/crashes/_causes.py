@@ -17,11 +17,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.world import Scene
 
-__all__ = [
-    "Cause", "CauseGroup", "CauseType", "Division", "cause_of", "count_causes", "features_of", "join_causes",
-    "without_chance_lengths",
-]  # fmt: skip
-
 _LONG_M = 7.0  # a longer actor is a truck, a bus or a trailer, which agents that assume a car's length hit
 _DEFECTS = ("omission", "decision", "disturbance", "argument")  # the kinds of causes that name what to fix
 _LOOKS_S = (0.2, 1.0, 2.0)  # before the crash

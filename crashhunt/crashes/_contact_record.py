@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Event, RightOfWay, Scene, Touch
 
 
-__all__ = ["SAME_WAY", "ApproachPath", "ContactRecord", "contact_record", "record_in"]
-
-
 _WINDOW_S = 4.0  # earlier movements have not led to the contact
 _SAMPLE_S = 0.1  # as short as the usual steps of simulators
 _EVENTS_S = 10.0  # before the contact

@@ -33,20 +33,6 @@ if TYPE_CHECKING:
     from crashhunt.world import DangerousMoment, Rectangle
 
 
-__all__ = [
-    "DangerCourse",
-    "Encounter",
-    "Manner",
-    "Moment",
-    "Position",
-    "closest_actors",
-    "danger_course",
-    "last_escape",
-    "most_dangerous",
-    "visible_from",
-]
-
-
 _LOOKS_BACK_S = 30.0  # before the end; what was longer ago has not led to it
 _PART_M, _MOST_PARTS = 0.5, 100  # within a step, outlines are compared each time both together have moved so far
 

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.world import RightOfWay
 
 
-__all__ = ["RULES", "Blame", "Fault", "FaultFinding", "Verdict", "fault_in", "fault_of", "safe_gap_m"]
-
-
 # The rules that assign the fault of a collision. A rule returns a finding only if it is certain.
 #
 # A rule reads a `ContactRecord` and returns a finding, or None where it does not apply. Names of sources: *Vienna* is

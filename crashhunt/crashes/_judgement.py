@@ -10,27 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal
 from crashhunt.base.codec import Serializable
 from crashhunt.base.integrity import typed
 from crashhunt.crashes._last_avoidable_step import Ending
-from crashhunt.crashes._omission import Reference, Without
+from crashhunt.crashes._omission import Reference, Without as Without
 from crashhunt.trial import Value
 
 if TYPE_CHECKING:
     from crashhunt.crashes._bundle import Bundle
-
-
-__all__ = [
-    "INTERRUPTED",
-    "Attempt",
-    "Factor",
-    "Judgement",
-    "JudgementVerdict",
-    "LeftOut",
-    "Why",
-    "Without",
-    "judgement_of",
-    "why_from",
-    "wilson",
-    "with_judgement",
-]
 
 
 # The causes of a collision, found by runs that each omit one candidate cause.

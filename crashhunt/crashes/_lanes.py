@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 
-__all__ = ["Borders", "LaneMap"]
-
 Borders: TypeAlias = "tuple[NDArray[np.float64], NDArray[np.float64]]"
 """The right and the left border of a lane, shape (n, 2) each, in m."""
 

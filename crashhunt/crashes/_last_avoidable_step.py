@@ -22,11 +22,6 @@ if TYPE_CHECKING:
     from crashhunt.simulators import FullBraking
     from crashhunt.trial import Collision, TrialResult, TrialSpec
 
-__all__ = [
-    "Ending", "StepBisection", "changes_of", "ending_of", "find_escape", "last_avoiding", "overruled_trial", "partner",
-    "slowing",
-]  # fmt: skip
-
 _MAX_RUNS = 12  # enough to bisect a thousand steps
 _BEFORE_S = 10.0  # earlier braking is not examined
 _WALL_S = 60.0  # the search runs while the user waits for the confirmation of a crash

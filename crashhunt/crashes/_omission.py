@@ -7,8 +7,6 @@ from typing import Literal
 
 from crashhunt.base.codec import Serializable
 
-__all__ = ["Omission", "Reference", "ReferenceRun", "Without"]
-
 Without = Literal["same", "other", "none", "unclear"]
 """What became of the collision: the same two again, another crash, none, or something that does not say it."""
 

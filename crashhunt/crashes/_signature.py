@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Collision, Failure, TrialResult
 
 
-__all__ = ["SIGNATURE_VERSION", "Signature", "StackFrame", "own_frames", "signature_of", "signature_of_fault"]
-
 SIGNATURE_VERSION = 4
 """Version of these rules. Raise it with each change by which a crash gets another type: types that an earlier version
 has noted in a ledger are then determined again."""

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes._fault import Verdict
 
 
-__all__ = ["Group", "Groups", "group_crashes", "groups_of"]
-
-
 @dataclass(frozen=True, slots=True)
 class Group:
     """Crashes with the same signature.

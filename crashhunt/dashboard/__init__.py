@@ -1,5 +1,10 @@
 """The dashboard: a live web page that shows many hunts."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._server import Address as Address, has_dashboard as has_dashboard, serve as serve
+
+offer_lazily(__name__)

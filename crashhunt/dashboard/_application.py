@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.dashboard._catalog import Catalog, FoundHunt
 
-__all__ = ["API_VERSION", "Application", "make_application"]
-
 API_VERSION: Final = 1
 """Of the shapes below ``/api``. Keys may be added; a change of a key raises it."""
 

@@ -22,8 +22,6 @@ from crashhunt.results import is_case, is_hunt
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-__all__ = ["Catalog", "FoundHunt", "is_inside", "unreadable", "unreadable_below"]
-
 _MAX_DEPTH = 4  # of hunts below a named folder: a folder of suites has DIR/SUITE/ID/RUN
 _MAX_FOLDERS = 20_000  # looked into; a home folder may have millions
 _SCAN_EVERY_S = 1.0

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.dashboard._hunt_page import HuntView
 
-__all__ = ["COMMANDS", "Jobs", "stop_hunt"]
-
 COMMANDS: Final = {"replay": "replay", "judge": "judge", "shrink": "shrink"}
 """What a job may be, and the command that it is."""
 

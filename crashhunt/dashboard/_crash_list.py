@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.dashboard._catalog import FoundHunt
 
-__all__ = ["CrashList"]
-
 _BUNDLE_FOLDERS = (layout.CRASHES, layout.NEAR_MISSES)
 _MAX_LISTED = 2_000
 _MAX_LANES = 4_000

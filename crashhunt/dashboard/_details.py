@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Value
 
 
-__all__ = ["HuntComparer", "detail_of", "importance_of_points"]
-
 _MAX_WORKERS = 256
 _MAX_EVENTS = 50
 _PHASES = {

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from crashhunt.statistics import CrashRate
     from crashhunt.training import HeldOutTraffics
 
-__all__ = ["HuntView", "read_tail"]
-
 _SPARKLINE_POINTS = 48  # points of the curve in the list
 _MAX_SHARE_OF_TIME = 0.05  # that figures may take which read all trials
 _MAX_TRIALS_READ = 200_000  # for such a figure

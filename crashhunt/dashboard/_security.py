@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-__all__ = ["MAX_BODY", "MAX_HEADERS", "MAX_REQUESTS", "MIN_TOKEN", "Guard", "is_loopback", "names_of"]
-
 MAX_TARGET: Final = 4_096
 """Characters of path and query, at most."""
 MAX_BODY: Final = 16_384

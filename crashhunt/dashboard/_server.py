@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-__all__ = ["Address", "has_dashboard", "serve"]
-
 _EXTRA_LIBRARIES = ("starlette", "uvicorn", "plotly")
 _MAX_TRIED_PORTS = 100
 

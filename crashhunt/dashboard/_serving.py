@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
     from starlette.types import ASGIApp
 
-__all__ = ["make_server", "run_server"]
-
 _MAX_CONNECTIONS = 200
 _MAX_HEADERS = 16_384  # bytes of a request's first line and headers
 _KEEP_ALIVE_S = 15

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.ledger import Ledger
 
-__all__ = ["MAX_CRASHES", "MAX_POINTS", "PARTS", "Point", "Prefix", "Sample", "TrialCounts"]
-
 PARTS = 256
 """Parts that the trials of a hunt are counted in, at most."""
 MAX_POINTS = 4_000

@@ -26,21 +26,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = [
-    "FORM",
-    "NONE",
-    "DisturbanceSampler",
-    "disturber_of",
-    "draw_checked",
-    "is_fixed",
-    "locate_model",
-    "modules_of_models",
-    "parse_fixed",
-    "parse_rates",
-    "word_of",
-]
-
-
 # ``brake@124=ahead:4:2``: a disturbance that every trial has, in a given step.
 
 FORM = "KIND@STEP=WHO:HOW_STRONG:HOW_LONG"

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain
     from crashhunt.disturbances._protocol import DisturbanceModel
 
-__all__ = ["ModelApart", "described_model"]
-
 
 def described_model(name: str) -> str:
     """Create a model in this process, and return its kind.

@@ -15,22 +15,6 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-__all__ = [
-    "Choices",
-    "brake",
-    "cut_in",
-    "dawdle",
-    "ignore_priority",
-    "late_action",
-    "late_merge",
-    "late_observation",
-    "noisy_observation",
-    "speed",
-    "step_out",
-    "stop",
-    "unseen",
-]
-
 T = TypeVar("T")
 
 _WEIGHT_BY_PLACE = {"left": 1.0, "right": 1.0, "left ahead": 2.0, "right ahead": 2.0}

@@ -58,17 +58,6 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances._disturbance_rates import DisturbanceSampler
 
-__all__ = [
-    "COPIES_PER_ROOT",
-    "FIRST_STEP",
-    "SECONDS_PER_COPY",
-    "FirstOnsets",
-    "HasTarget",
-    "Onset",
-    "cell_of",
-    "first_forcing",
-]
-
 HasTarget = Callable[[Disturbance], bool]
 """Whether a disturbance that begins in the next step finds a vehicle."""
 

@@ -10,8 +10,6 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-__all__ = ["Closes", "DisturbanceModel", "Drawn", "Enumerates"]
-
 
 @dataclass(frozen=True, slots=True)
 class Drawn:

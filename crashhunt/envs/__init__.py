@@ -1,5 +1,11 @@
 """Gymnasium environments on SUMO: ``crashhunt/SUMO-v0``."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._process import RemoteEpisodes as RemoteEpisodes
+    from ._sumo_env import SumoEnv as SumoEnv
+
+offer_lazily(__name__)

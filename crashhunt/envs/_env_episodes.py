@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance, Kind, Value
     from crashhunt.world import Scene
 
-__all__ = ["Episodes"]
-
 _PICTURE_PIXELS = (960, 540)  # width and height of the picture, in pixels
 _TRAIL_S = 4.0  # how long the picture shows the agent's past path, in s
 _ASSUMED_SPEED_MPS = 10.0  # m/s

@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from crashhunt.envs._env_episodes import Episodes
     from crashhunt.trial import Value
 
-__all__ = ["RemoteEpisodes"]
-
 Ours: TypeAlias = "Connection[Any, Any]"
 """A pipe between the two processes, which carries the arguments and results of the methods of `Episodes`."""
 

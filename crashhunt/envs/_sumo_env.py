@@ -20,8 +20,6 @@ from crashhunt.envs._process import RemoteEpisodes
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["SumoEnv"]
-
 # The environment that owns this process's simulation, and the id of this process: a fork owns no simulation. The
 # reference is weak, so that an environment without `close` is still collected.
 _here: weakref.WeakSet[Episodes] = weakref.WeakSet()

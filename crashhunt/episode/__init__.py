@@ -1,5 +1,53 @@
 """The episode: the only place where agent, simulator, oracle and recorder interact."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._action_override import (
+        Braking as Braking,
+        HandedOver as HandedOver,
+        Keeping as Keeping,
+        ReferenceDriver as ReferenceDriver,
+        overruled_agent as overruled_agent,
+    )
+    from ._blame import has_users_code as has_users_code, internal_error as internal_error
+    from ._branches import Brancher as Brancher
+    from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
+    from ._failures import (
+        are_functions_replaced as are_functions_replaced,
+        failure_of as failure_of,
+        message_of_error as message_of_error,
+    )
+    from ._fast_path import FastEpisode as FastEpisode
+    from ._forced_onsets import OnsetForcer as OnsetForcer
+    from ._forks import FirstCopy as FirstCopy, ForkRunner as ForkRunner
+    from ._observers import (
+        Nearness as Nearness,
+        Observer as Observer,
+        Recorder as Recorder,
+        observation_restorers as observation_restorers,
+        options_of as options_of,
+        ready_recorder as ready_recorder,
+    )
+    from ._probes import (
+        BUDGET as BUDGET,
+        BUDGET_BESIDE as BUDGET_BESIDE,
+        PROBED as PROBED,
+        Probed as Probed,
+        Prober as Prober,
+    )
+    from ._run_episode import (
+        Parts as Parts,
+        generators as generators,
+        require_origin as require_origin,
+        run_episode as run_episode,
+        seal as seal,
+        seed_everything as seed_everything,
+        set_generators as set_generators,
+        stage_of as stage_of,
+    )
+    from ._worker_settings import WorkerSettings as WorkerSettings, answer_file as answer_file, scratch_of as scratch_of
+
+offer_lazily(__name__)

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Crossing, Side, Surroundings
 
 
-__all__ = ["Braking", "HandedOver", "Keeping", "ReferenceDriver", "overruled_agent"]
-
 _LANE_ACTIONS = ("LANE_LEFT", "LANE_RIGHT")
 _SPEED_ACTIONS = ("FASTER", "SLOWER")
 

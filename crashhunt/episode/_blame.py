@@ -30,18 +30,6 @@ if TYPE_CHECKING:
 
     from crashhunt.simulators import Simulator
 
-__all__ = [
-    "Blame",
-    "blame",
-    "guarded_check",
-    "guarded_reset",
-    "guarded_scene",
-    "guarded_step",
-    "has_users_code",
-    "internal_error",
-    "party_of_simulator",
-]
-
 _RESOURCE_ERRORS: Final = (OSError, MemoryError)
 _MAX_CAUSES: Final = 16
 _MAX_FRAMES: Final = 2_000

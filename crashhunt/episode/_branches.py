@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
     from crashhunt.world import Frame, Scene
 
-__all__ = ["BRANCHED", "Brancher"]
-
 BRANCHED: Final = 4
 """Steps that branches may take for each step of their trial."""
 _DRAWN_SHARE_OF_STEPS = 1  # of these steps, the part for branches with drawn disturbances

@@ -29,9 +29,6 @@ if TYPE_CHECKING:
     Array = NDArray[Any]
 
 
-__all__ = ["DisturbanceInjector"]
-
-
 _NOISE_STREAM = 0x6E6F6973  # apart from what else is drawn of a trial's seed
 _NOISELESS_COLUMNS = (
     "presence",

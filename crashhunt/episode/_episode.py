@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 
-__all__ = ["ASK_ALL", "Episode", "MakeAgent", "Reset"]
-
-
 # Forks of a running episode, which are forks of its process.
 
 C = TypeVar("C")

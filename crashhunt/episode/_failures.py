@@ -41,19 +41,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 
-__all__ = [
-    "Attribution",
-    "Ending",
-    "are_functions_replaced",
-    "attribute_error",
-    "close_agent",
-    "failure_of",
-    "is_emptied",
-    "message_of_error",
-    "record_originals",
-]
-
-
 # The text of an exception. An agent's exception may be of any class and any size.
 
 _MIN_RECURSION_LIMIT: Final = 1000

@@ -49,9 +49,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 
-__all__ = ["FastEpisode", "FastPath", "make_fast_path"]
-
-
 _EVENT_ORACLES = (ReportedCollision, OffRoad, TrafficEvents, RedLight, WrongWay, OffRoute, Teleport)
 """Oracles that find nothing in steps without a simulator event; subclasses of these do not count."""
 

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from crashhunt.episode._episode import Episode
     from crashhunt.trial import TrialResult
 
-__all__ = ["OnsetForcer"]
-
 _WAIT_FACTOR_WITH_SECONDS: Final = 2 + SECONDS_PER_COPY  # such a copy waits for as many others, on average
 
 

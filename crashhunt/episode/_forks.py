@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["FirstCopy", "ForkRunner"]
-
-
 _MAX_ATTEMPTS: Final = 3  # copies per fork that is asked for, as long as something outside ends them
 _PAUSES_S: Final = (0.05, 0.5)  # wall time before the second and the third, in which memory may become free
 _MAX_CONSECUTIVE_FAILURES: Final = 3  # forks in turn without a result

@@ -56,19 +56,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Actor, ClosestApproach, Frame, Roster, Scene
 
 
-__all__ = [
-    "Nearness",
-    "Observer",
-    "Recorder",
-    "agent_seed",
-    "callbacks_for",
-    "observation_restorers",
-    "options_of",
-    "overrides_hook",
-    "ready_recorder",
-]
-
-
 # Observers of a running episode, which never change it.
 
 

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from crashhunt.episode._episode import Episode
     from crashhunt.trial import TrialResult
 
-__all__ = ["BUDGET", "BUDGET_BESIDE", "PROBED", "Probed", "Prober"]
-
 BUDGET: Final = 4
 """Steps that copies may take for each step of their trial."""
 BUDGET_BESIDE: Final = 1

@@ -47,20 +47,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Outcome, TrialResult, TrialSpec, Value
 
 
-__all__ = [
-    "MAX_RECURSION_LIMIT",
-    "Parts",
-    "bound_recursion",
-    "generators",
-    "require_origin",
-    "run_episode",
-    "seal",
-    "seed_everything",
-    "set_generators",
-    "stage_of",
-]
-
-
 def run_episode(
     spec: TrialSpec,
     *,

@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.trial import TrialResult
 
-__all__ = ["WorkerSettings", "answer_file", "scratch_of"]
-
-
 _TIMEOUT_S = 60.0  # what leaving it out means, whatever the default of the option is some day
 _AUDIT_STREAM = 1  # apart from what draws the trial itself
 

@@ -1,5 +1,27 @@
 """Executors: run trials in processes of this machine or on other machines."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._fork_server import fork_zygote as fork_zygote
+    from ._fresh import FreshProcessExecutor as FreshProcessExecutor
+    from ._host_conditions import HostConditions as HostConditions
+    from ._pool import PoolExecutor as PoolExecutor
+    from ._postmortem import read_map as read_map
+    from ._protocol import (
+        ChoosesParallelism as ChoosesParallelism,
+        Executor as Executor,
+        ExecutorFactory as ExecutorFactory,
+        HasNodes as HasNodes,
+        NodeFigures as NodeFigures,
+        has_fork_server as has_fork_server,
+        make_executor as make_executor,
+        snapshot_environment as snapshot_environment,
+        worker_environment as worker_environment,
+    )
+    from ._supervisor import Supervisor as Supervisor
+    from ._trial_process import EXCLUDED_WORDS as EXCLUDED_WORDS
+
+offer_lazily(__name__)

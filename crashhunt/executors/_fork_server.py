@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from crashhunt.base.json_types import ErrorData
     from crashhunt.executors._protocol import ForkServerJob, FromForkServer, ToForkServer
 
-__all__ = ["fork_zygote", "main"]
-
 _MAX_MESSAGE_BYTES = 1 << 16  # bytes; an order to start a supervisor is some hundred
 _ORPHANS_EVERY_S = 0.5  # looking for what dead trials left behind walks all of /proc
 _LOOK_EVERY_S = 0.02  # where the kernel does not report when a process ends

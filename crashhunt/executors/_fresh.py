@@ -36,9 +36,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import BlackBoxHeader
 
 
-__all__ = ["FreshProcessExecutor"]
-
-
 _LOOK_EVERY_S = 0.01  # starting one takes thirty times as long
 _DAMAGED_EXIT_CODE = 79  # the exit code of a process of crashhunt 0.2 and before whose trial damaged it
 _FULL_BYTES = 1 << 20  # with less free space, a recording cannot be made

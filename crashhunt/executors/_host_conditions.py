@@ -24,8 +24,6 @@ from crashhunt.base.text import command_line
 if TYPE_CHECKING:
     from crashhunt.episode import WorkerSettings
 
-__all__ = ["HostConditions"]
-
 _MIN_FREE_BYTES: Final = 1 << 20
 """With less free space on a disk, it counts as full: no recording of a trial fits."""
 _AGAIN: Final = "and run the same command again: the trials that failed because of it run again"

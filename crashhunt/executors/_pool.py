@@ -33,9 +33,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialSpec
 
 
-__all__ = ["ForkServerLink", "PoolExecutor"]
-
-
 # The pool's end of its fork server: how it is started, asked for supervisors, and listened to.
 
 _MAX_MESSAGE_BYTES = 1 << 16  # bytes, as in _fork_server

@@ -31,25 +31,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialSpec
 
 
-__all__ = [
-    "FaultReport",
-    "Report",
-    "TrialAttempt",
-    "agent_in_stack",
-    "check_report",
-    "damaged",
-    "died",
-    "encode_report",
-    "hung",
-    "killed_from_outside",
-    "read_map",
-    "read_tail",
-    "result_of_death",
-    "signal_name",
-    "where_it_is",
-]
-
-
 _TAIL_BYTES = 4000  # bytes
 _FRAME_LINE = re.compile(r'  File "(.*)", line (\d+) in (.*)')  # of a stack that faulthandler wrote
 _MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside

@@ -15,7 +15,7 @@ from crashhunt.base.exceptions import blamed
 from crashhunt.base.json_types import ErrorData, ErrorWords
 from crashhunt.base.removed import removed_fix_in
 from crashhunt.base.text import NOTICE_TOPIC
-from crashhunt.plans import ChoosesParallelism, executor_of
+from crashhunt.plans import ChoosesParallelism as ChoosesParallelism, executor_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -24,29 +24,6 @@ if TYPE_CHECKING:
     from crashhunt.episode import WorkerSettings
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialResult, TrialSpec
-
-
-__all__ = [
-    "Answer",
-    "ChoosesParallelism",
-    "Done",
-    "Executor",
-    "ExecutorFactory",
-    "ForkServerJob",
-    "FreshJob",
-    "FromForkServer",
-    "FromZygote",
-    "HasNodes",
-    "KillTrial",
-    "Lost",
-    "NodeFigures",
-    "Notes",
-    "ToForkServer",
-    "has_fork_server",
-    "make_executor",
-    "snapshot_environment",
-    "worker_environment",
-]
 
 
 class Executor(Protocol):

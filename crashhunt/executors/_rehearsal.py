@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-__all__ = ["rehearse_trial"]
-
 _REHEARSALS = 10  # Python specializes a function at its 8th call
 _STEPS = 2
 _AGENT = "crashhunt.agents:KeepLaneWithSpeed"

@@ -44,9 +44,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["EndedTrial", "LostTrialError", "Supervisor", "UnfitZygoteError", "be_supervisor", "with_escape"]
-
-
 _LOOK_EVERY_S = 0.1  # whether a trial hangs
 _CHUNK_BYTES = 1 << 16  # bytes at a time
 _MAX_RESTORED_OUTPUT_BYTES = 64 << 20  # bytes of a run.log that are written again where an agent has removed the file

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import BlackBoxHeader
 
 
-__all__ = ["START_UP_S", "ImportKilledError", "ImportWatch", "PauseMeter", "await_imports", "has_hung", "import_died"]
-
-
 START_UP_S = 60.0  # for Python and the agent to be imported and the simulator to be made, before a trial's time runs
 _PAUSE_S = 2.0  # without a look, after which a process was suspended; a busy machine delays it less
 _LAST_WORDS_S = 0.2  # after its time limit, for a hung process to write down where it is stuck

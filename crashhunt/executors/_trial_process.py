@@ -66,8 +66,6 @@ if TYPE_CHECKING:
     from crashhunt.simulators import Simulator
     from crashhunt.trial import TrialResult, Value
 
-__all__ = ["EXCLUDED_WORDS", "Job", "TrialProcess", "loaded"]
-
 EXCLUDED_WORDS = " are left out: "
 """Text of a notice between "probes" or "branches" and the reason why they are disabled."""
 _EXCLUDED_FROM_HERE_WORDS = " are left out from here on: "

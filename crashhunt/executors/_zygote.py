@@ -44,9 +44,6 @@ if TYPE_CHECKING:
     Wait = Callable[[int | None, Callable[[], None]], None]
 
 
-__all__ = ["Imported", "WarmTraffics", "be_zygote", "import_nothing", "import_parts"]
-
-
 # Warming up once: forks of a zygote that have reset the simulator, for trials that begin in the same traffic.
 #
 # The zygote of a slot keeps some such processes suspended. A trial with the same seed and scenario arguments runs in a

@@ -4,6 +4,13 @@ The files are written as plain XML with Python's standard library. ``scripts/too
 libraries read back the recorded values. These libraries are not needed for writing.
 """
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._commonroad import write_commonroad as write_commonroad
+    from ._openscenario import write_openscenario as write_openscenario
+    from ._recorded import RecordedCrash as RecordedCrash, RecordedPath as RecordedPath, recorded_of as recorded_of
+
+offer_lazily(__name__)

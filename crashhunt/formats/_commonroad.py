@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.formats._recorded import Pose, RecordedCrash, RecordedPath, Road
 
-__all__ = ["write_commonroad"]
-
 _TYPES = {
     "taxi": "taxi", "bus": "bus", "coach": "bus", "truck": "truck", "trailer": "truck", "bicycle": "bicycle",
     "motorcycle": "motorcycle", "moped": "motorcycle", "pedestrian": "pedestrian", "emergency": "priorityVehicle",

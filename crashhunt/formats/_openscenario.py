@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.formats._recorded import Pose, RecordedCrash, RecordedPath, Road
 
 
-__all__ = ["opendrive_of", "write_openscenario"]
-
-
 # The lanes of a crash as a road network in OpenDRIVE 1.6.
 
 _CONSTANT_POLYNOMIAL = {"b": "0", "c": "0", "d": "0"}  # of a polynomial that is a constant

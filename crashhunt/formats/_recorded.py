@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.world import Path
 
-__all__ = ["Pose", "RecordedCrash", "RecordedPath", "Road", "recorded_of"]
-
 _SAME_PLACE_M = 1e-3  # a lane continues where another begins: maps give such points to the centimetre, or better
 _SAME_WAY_RAD = math.pi / 3  # and in about its direction; a lane that only crosses there is another's
 

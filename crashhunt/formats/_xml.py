@@ -13,8 +13,6 @@ from crashhunt.base.text import one_line
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["add", "comment", "number", "plain_text", "write_xml"]
-
 
 def add(parent: ET.Element, tag: str, text: str = "", **attributes: str) -> ET.Element:
     """Add an element to its parent and return it."""

@@ -14,8 +14,6 @@ from crashhunt.guide._reference import describe_api, describe_commands, describe
 if TYPE_CHECKING:
     import argparse
 
-__all__ = ["SECTIONS", "Page", "completed", "find_page", "for_terminal", "list_pages", "pages_folder", "search_pages"]
-
 SECTIONS = {
     "start": "Start",
     "tutorials": "Tutorials",

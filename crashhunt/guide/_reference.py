@@ -23,12 +23,6 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
 
 
-__all__ = [
-    "as_markdown", "definition", "describe_api", "describe_commands", "describe_json", "describe_keys",
-    "describe_modules",
-]  # fmt: skip
-
-
 _PUBLIC_MODULES = {
     "crashhunt": "",
     "crashhunt.hunts": "HuntReport",
@@ -229,29 +223,18 @@ def _prose(line: str) -> str:
 
 
 def _public_names(module: str) -> dict[str, tuple[str, str]]:
-    """Return the public names of a module, each with the module and the name of its definition."""
-    stub = _file(module).with_suffix(".pyi")
-    tree = ast.parse(stub.read_text(encoding="utf-8")) if stub.is_file() else _parsed(module)
+    """Return the public names of a module, each with the module and the name of its definition.
+
+    A module offers its own names without an underscore, and each imported name that it imports *as* that name.
+    """
     found: dict[str, tuple[str, str]] = {}
-    for node in ast.walk(tree):
+    for node in ast.walk(_parsed(module)):
         if isinstance(node, ast.ImportFrom):
             origin = f"{module}.{node.module}" if node.level else str(node.module)
-            for alias in node.names:
-                if alias.name == "*":
-                    found |= _public_names(origin)
-                elif origin.startswith("crashhunt"):
-                    found[alias.asname or alias.name] = origin, alias.name
-    found |= {node.name: (module, node.name) for node in tree.body if isinstance(node, _Definition)}
-    listed = _listed(tree)
-    return {name: place for name, place in found.items() if name[0] != "_" and (listed is None or name in listed)}
-
-
-def _listed(tree: ast.Module) -> list[str] | None:
-    """Return the names in ``__all__``; None if ``__all__`` is computed at import."""
-    for node in tree.body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
-            return ast.literal_eval(node.value) if isinstance(node.value, ast.List) else None
-    return None
+            found |= {alias.name: (origin, alias.name) for alias in node.names if alias.asname == alias.name}
+        elif isinstance(node, _Definition) and node in _parsed(module).body:
+            found[node.name] = module, node.name
+    return {name: place for name, place in found.items() if not name.startswith("_")}
 
 
 def definition(module: str, name: str) -> _Definition | None:

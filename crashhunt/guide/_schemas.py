@@ -24,8 +24,6 @@ from crashhunt.statistics import Comparison, CrashRate, Interval, PairVerdict
 from crashhunt.sumo.maps import PlainRun
 from crashhunt.training import Split
 
-__all__ = ["SCHEMAS", "describe_schemas"]
-
 
 class EventCount(TypedDict):
     """The number of traffic events of a type, and of trials with such an event."""

@@ -1,5 +1,11 @@
 """Gymnasium and PettingZoo environments as a simulator, and the description of their table in a scenario."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._backend import CrashRule as CrashRule, GymSetup as GymSetup
+    from ._simulator import GymSimulator as GymSimulator
+
+offer_lazily(__name__)

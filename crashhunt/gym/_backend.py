@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Value
 
-__all__ = ["BACKEND", "CrashRule", "GymSetup"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class CrashRule:
@@ -107,7 +105,7 @@ def _side_effect(scenario: Scenario, values: Mapping[str, Value], _specification
     return "it gives its environment arguments" if given else ""
 
 
-BACKEND = Backend(
+BACKEND: Backend = Backend(
     title="Gymnasium",
     table=GymSetup,
     example="the id of the environment",

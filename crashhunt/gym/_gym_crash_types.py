@@ -17,8 +17,6 @@ from crashhunt.base.text import encodable
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["crash_cell"]
-
 _MAX_TEXT_CHARACTERS, _MAX_WORDS = 20, 8  # of the info
 
 

@@ -14,8 +14,6 @@ from crashhunt.base.scalars import truth_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-__all__ = ["OneLearner", "is_parallel", "takes_turns"]
-
 _STEP_PARTS = ("observations", "rewards", "terminations", "truncations", "infos")
 _FIX = "return a bool for each agent"
 

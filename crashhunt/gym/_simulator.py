@@ -60,8 +60,6 @@ if TYPE_CHECKING:
     from crashhunt.simulators import ActionForm, Info, Observations, Options, StepResult
     from crashhunt.trial import Value
 
-__all__ = ["GymSimulator"]
-
 _RESET_OPTIONS = "reset_options"  # the key of the table [gym], and the first part of an argument's option
 _NO_ACTORS = Roster(())
 _RESET_PARTS = ("observation", "info")

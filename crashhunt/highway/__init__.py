@@ -1,5 +1,11 @@
 """highway-env: the simulator, the description of its table in a scenario, and its accelerator."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._config import restore_classes as restore_classes
+    from ._simulator import HighwaySimulator as HighwaySimulator
+
+offer_lazily(__name__)

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Value
 
-__all__ = ["BACKEND", "HighwaySetup"]
-
 _KERNEL = "_crashhunt_highway"  # the compiled module of the accelerator
 
 
@@ -93,7 +91,7 @@ def _texts(value: object) -> Iterator[str]:
             yield from _texts(inner)
 
 
-BACKEND = Backend(
+BACKEND: Backend = Backend(
     title="highway-env",
     table=HighwaySetup,
     example="the id of the environment",

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Value
 
-__all__ = ["configured", "mistake", "restore_classes"]
-
 Config: TypeAlias = dict[str, Any]
 """The configuration of a highway-env environment; highway-env's classes define its entries."""
 

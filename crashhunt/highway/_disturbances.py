@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance
 
 
-__all__ = ["HighwayDisturbances", "crosses", "lanes_ahead", "place_of"]
-
-
 # Paths of vehicles through a junction: which paths cross the agent's path.
 
 _REACH_M = 80.0  # length of a path ahead of its vehicle

@@ -11,8 +11,6 @@ import os
 import sys
 from types import ModuleType
 
-__all__ = ["highway_env"]
-
 _DEFERRED_MODULES = ("matplotlib", "matplotlib.pyplot", "pandas")
 
 

@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Actor
 
 
-__all__ = ["Hidden", "HighwayEvents", "VehicleFilter", "contact_of", "gap", "lanes_of"]
-
-
 _LANE_STEP_M = 2.0  # distance between the points of a curved lane
 
 

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from crashhunt.world import Actor, Path, Paths
 
-__all__ = ["Puppet", "Puppets"]
-
 
 class Puppet(Vehicle):  # type: ignore[misc]
     """A vehicle that follows a recorded path.

@@ -70,8 +70,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Contact, Event, Motion, Paths, Surroundings
 
-__all__ = ["HighwaySimulator"]
-
 _PACKAGES = frozenset(("highway_env", "gymnasium", "typing", "builtins"))
 _REPLACED_WRAPPERS = (OrderEnforcing, TimeLimit)  # whose work this simulator does itself
 _STEP_FIX = "return one number or bool for each agent from step()"

@@ -18,8 +18,6 @@ from crashhunt.world import Motion
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["OVER_M", "action_with", "is_steered", "lane_change_of", "motion_of"]
-
 OVER_M = 1.0
 """A vehicle that is so far over the side of its lane is in the way of the next lane, in m: as highway-env has it."""
 

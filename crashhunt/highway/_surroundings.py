@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     _LaneIndex = tuple[str, str, int]
 
-__all__ = ["surroundings_of"]
-
 _MIN_LOOK_M, _LOOK_S = 60.0, 6.0  # further away, no safe distance of a road vehicle reaches
 _OTHERS_MPS2 = 6.0  # IDMVehicle.ACC_MAX: the limit of the other vehicles in both directions
 _SPEED_STEP_MPS = 5.0  # ControlledVehicle.DELTA_SPEED, where a vehicle has no list of target speeds

@@ -1,5 +1,25 @@
 """Hunts: the main loop, the directory, and results that can be read afterwards."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._disk_check import Checked as Checked, CheckFinding as CheckFinding, check as check, salvage as salvage
+    from ._hunt import Hunt as Hunt
+    from ._next_trials import (
+        GREATEST_LAG as GREATEST_LAG,
+        Trials as Trials,
+        growing_lag as growing_lag,
+        spec_of as spec_of,
+    )
+    from ._preflight import Preflight as Preflight, TrafficSurveyor as TrafficSurveyor
+    from ._progress import (
+        HuntStatus as HuntStatus,
+        PhaseStatus as PhaseStatus,
+        SearchStatus as SearchStatus,
+        StrategyStatus as StrategyStatus,
+    )
+    from ._reports import AuditReport as AuditReport, HuntReport as HuntReport, StoppedBecause as StoppedBecause
+
+offer_lazily(__name__)

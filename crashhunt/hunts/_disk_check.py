@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Noted, Row
 
 
-__all__ = ["CheckFinding", "Checked", "check", "intact_snapshots", "salvage"]
-
-
 _MAX_SHOWN = 5
 _MAX_OPEN_FILES = 4  # at a time: a folder, and the ledger with its write-ahead log and shared memory
 

@@ -31,18 +31,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Branch, Disturbance, ForcedCopy, TrialResult
 
 
-__all__ = [
-    "ForkCrashes",
-    "keep_near_misses",
-    "likeliest",
-    "mildest",
-    "verify_branches",
-    "verify_fork_results",
-    "verify_probes",
-    "verify_rare",
-]
-
-
 _MAX_VERIFIED_BRANCHES = 10  # trials; each takes two processes of its own
 
 

@@ -23,8 +23,8 @@ from crashhunt.executors import HostConditions, make_executor, read_map
 from crashhunt.hunts._fork_results import ForkCrashes, keep_near_misses, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._preflight import Preflight, WorkerNotices, is_hopeless, unusable_value, why_invalid
-from crashhunt.hunts._progress import HuntStatus, PhaseClock, PhaseStatus, Progress, RemainingTime
-from crashhunt.hunts._reports import HuntReport, StoppedBecause
+from crashhunt.hunts._progress import HuntStatus as HuntStatus, PhaseClock, PhaseStatus, Progress, RemainingTime
+from crashhunt.hunts._reports import HuntReport as HuntReport, StoppedBecause as StoppedBecause
 from crashhunt.hunts._verification import Audit, Confirmation, PendingAudits, TrialReruns, VerificationRuns, is_settled
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import core_of, disturber_apart, parallel_here, sampler_of
@@ -74,8 +74,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.scenario import Scenario
     from crashhunt.statistics import BarWatch, CrashRate
-
-__all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
 
 T = TypeVar("T")
 

@@ -37,19 +37,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance, Forcing, TrialResult, Value
 
 
-__all__ = [
-    "GREATEST_LAG",
-    "Pace",
-    "Trials",
-    "Unanswered",
-    "find_unanswered",
-    "growing_lag",
-    "settings_again",
-    "settings_of_workers",
-    "spec_of",
-]
-
-
 _TRAFFIC_STREAM = 0x74726166  # apart from what else is drawn of the hunt's seed
 GREATEST_LAG = 32
 """Greatest delay of results for a sampler in a deterministic hunt, in trials. It does not depend on the workers, so

@@ -37,9 +37,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["Preflight", "TrafficSurveyor", "WorkerNotices", "is_hopeless", "unusable_value", "why_invalid"]
-
-
 _MAX_INVALID_AT_START = 10  # trials; if none of so many could begin, the setup is wrong, not the seed
 _ENOUGH_TRIALS = 10
 """Trials after which a hunt reports that a name of the scenario has not occurred; later trials may still correct it."""

@@ -34,19 +34,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = [
-    "HuntStatus",
-    "PhaseClock",
-    "PhaseName",
-    "PhaseStatus",
-    "Progress",
-    "RemainingTime",
-    "SearchStatus",
-    "StrategyStatus",
-    "StrategyTally",
-]
-
-
 # What a hunt's sampler has tried in this run, strategy by strategy, and the result.
 
 

@@ -21,17 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.statistics import CrashRate, RareEstimate
     from crashhunt.trial import Disturbance
 
-__all__ = [
-    "AuditReport",
-    "BranchReport",
-    "Difference",
-    "HuntReport",
-    "ProbeReport",
-    "RareReport",
-    "StoppedBecause",
-    "kind_data",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class Difference(Serializable):

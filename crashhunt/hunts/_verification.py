@@ -41,18 +41,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult, TrialSpec
 
 
-__all__ = [
-    "Again",
-    "Audit",
-    "Confirmation",
-    "Found",
-    "PendingAudits",
-    "TrialReruns",
-    "VerificationRuns",
-    "is_settled",
-]
-
-
 class Confirmation:
     """Confirms crashes one at a time, in its own thread; meanwhile, the hunt runs one trial less at a time.
 

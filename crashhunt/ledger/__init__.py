@@ -1,5 +1,22 @@
 """The ledger of a hunt: facts about its trials in one SQLite file, with schema, migrations, writer and reader."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._reader import (
+        CodeVersionsData as CodeVersionsData,
+        Facts as Facts,
+        HuntOwner as HuntOwner,
+        KindData as KindData,
+        Noted as Noted,
+        RateBounds as RateBounds,
+        RunningRate as RunningRate,
+        Turn as Turn,
+        UntilRate as UntilRate,
+    )
+    from ._schema import Row as Row, damaged as damaged, leave_untouched as leave_untouched
+    from ._writer import Ledger as Ledger, has_begun as has_begun
+
+offer_lazily(__name__)

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from crashhunt.ledger._schema import PatientConnection, Shape
 
 
-__all__ = ["CodeVersionsData", "Facts", "HuntOwner", "KindData", "LedgerReader", "Noted", "Seal", "Turn", "UntilRate"]
-
-
 # The shapes of what a ledger says besides trials.
 
 

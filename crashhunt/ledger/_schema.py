@@ -26,37 +26,6 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
 
 
-__all__ = [
-    "DANGER_INDEX",
-    "EVENTS_INDEX",
-    "FIRST",
-    "MIGRATIONS",
-    "OUTCOME_INDEX",
-    "OWN_FACTS",
-    "PROPOSALS",
-    "SEAL",
-    "VERSION",
-    "WITH_EVENTS",
-    "PatientConnection",
-    "Row",
-    "Shape",
-    "checked",
-    "columns_of_trials",
-    "create",
-    "damaged",
-    "explained",
-    "has_content",
-    "is_untouched",
-    "leave_untouched",
-    "migrate",
-    "note_reader",
-    "opened",
-    "plain_trial",
-    "removed",
-    "rewrite",
-    "shape_of",
-]
-
 VERSION = 5  # of the tables, as PRAGMA user_version
 _MIN_READER_VERSION = 3  # the least version of a crashhunt that reads what this one writes
 _MAX_CELL_BYTES = 64 << 20  # of a ledger that may be a stranger's; the state of a sampler has some MB

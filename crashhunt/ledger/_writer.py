@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Unpack
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.ledger._reader import LedgerReader, Turn
+from crashhunt.ledger._reader import LedgerReader, Turn as Turn
 from crashhunt.ledger._schema import (
     SEAL,
     VERSION,
@@ -40,9 +40,6 @@ if TYPE_CHECKING:
     from crashhunt.ledger._reader import Facts, Noted
     from crashhunt.ledger._schema import Row
     from crashhunt.trial import TrialResult
-
-
-__all__ = ["Ledger", "Turn", "has_begun"]
 
 
 _COLUMNS = columns_of_trials()

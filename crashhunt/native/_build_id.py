@@ -14,8 +14,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-__all__ = ["HOW_TO_REBUILD", "build_id", "outdated_modules"]
-
 HOW_TO_REBUILD: Final = "pip install --no-deps --editable ."
 _MODULES: Final = {
     "_crashhunt_core": "native",

@@ -9,21 +9,6 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-__all__ = [
-    "ANSWERED",
-    "ASK",
-    "DONE",
-    "REFUSED",
-    "SIMULATED",
-    "Columns",
-    "Core",
-    "Part",
-    "UsualSteps",
-    "Vehicles",
-    "core_for",
-    "why_not",
-]
-
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
 _INTERFACE = 10

@@ -13,8 +13,6 @@ from functools import cache
 
 import numpy as np
 
-__all__ = ["reseed_generators", "why_no_reseeding"]
-
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo in which the generators were found as they are described here."""
 _GENERATOR_BYTES = 5048  # a SumoRNG: its name, its count, and the 624 words of a Mersenne Twister

@@ -11,8 +11,6 @@ import ctypes
 import importlib.util
 from functools import cache
 
-__all__ = ["LinkOrder", "link_order", "why_no_link_order"]
-
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _LIBRARY = "_crashhunt_link_order"
 _INTERFACE = 1

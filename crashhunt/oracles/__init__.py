@@ -1,5 +1,39 @@
 """Oracles: detectors of crashes and traffic events in the scene of a step."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._crash_oracles import (
+        MAX_BRAKING_MPS2 as MAX_BRAKING_MPS2,
+        OffRoad as OffRoad,
+        Overlap as Overlap,
+        ReportedCollision as ReportedCollision,
+    )
+    from ._protocol import (
+        DEFAULT_ORACLES as DEFAULT_ORACLES,
+        ORACLES_OF_ACTORS as ORACLES_OF_ACTORS,
+        BringsOutcomes as BringsOutcomes,
+        Finding as Finding,
+        Oracle as Oracle,
+        OracleChoice as OracleChoice,
+        SeesMap as SeesMap,
+        chosen_oracles as chosen_oracles,
+        described_oracle as described_oracle,
+        merge_findings as merge_findings,
+        modules_of as modules_of,
+        oracle_name as oracle_name,
+        outcomes_brought as outcomes_brought,
+        parse_oracle as parse_oracle,
+    )
+    from ._traffic import (
+        OffRoute as OffRoute,
+        RedLight as RedLight,
+        Teleport as Teleport,
+        TooClose as TooClose,
+        TrafficEvents as TrafficEvents,
+        WrongWay as WrongWay,
+    )
+
+offer_lazily(__name__)

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from crashhunt.world import Actor, Contact, Rectangle, Scene, Touch
 
-__all__ = ["MAX_BRAKING_MPS2", "OffRoad", "Overlap", "ReportedCollision"]
-
 MAX_BRAKING_MPS2 = 10.0
 """Upper bound of braking, in m/s²: it bounds the speed of an actor in the previous scene."""
 

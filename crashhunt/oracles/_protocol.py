@@ -20,24 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Event, Lane, Scene
 
 
-__all__ = [
-    "DEFAULT_ORACLES",
-    "ORACLES_OF_ACTORS",
-    "BringsOutcomes",
-    "Finding",
-    "Oracle",
-    "OracleChoice",
-    "SeesMap",
-    "chosen_oracles",
-    "described_oracle",
-    "merge_findings",
-    "modules_of",
-    "oracle_name",
-    "outcomes_brought",
-    "parse_oracle",
-]
-
-
 @dataclass(frozen=True, slots=True)
 class Finding:
     """A traffic crash or a traffic event that an oracle has detected.

@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 
-__all__ = ["OffRoute", "RedLight", "Teleport", "TooClose", "TrafficEvents", "WrongWay"]
-
-
 class TooClose:
     """Detects a near miss: a moving agent comes closer to another actor than a given gap, without touching it.
 

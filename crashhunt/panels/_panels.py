@@ -23,26 +23,6 @@ if TYPE_CHECKING:
     from PIL import Image, ImageFont
 
 
-__all__ = [
-    "FAINT",
-    "INK",
-    "Action",
-    "ActionDistribution",
-    "Bar",
-    "Contour",
-    "Curve",
-    "Curve3D",
-    "Heatmap",
-    "Panel",
-    "Picture",
-    "Text",
-    "as_array",
-    "font",
-    "labelled",
-    "scope",
-]
-
-
 # Names of panels: nested scopes, and the places in a nest.
 
 _scopes: ContextVar[tuple[str, ...]] = ContextVar("crashhunt_render_scopes", default=())

@@ -1,5 +1,60 @@
 """Plans: the user's request for a hunt, the settings in ``hunt.toml`` that result from it, and all options of hunts."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._code import CodeFacts as CodeFacts, describe_code as describe_code, imported_by as imported_by
+    from ._declaration import Given as Given, HuntOption as HuntOption
+    from ._durations import check_duration as check_duration, seconds_of as seconds_of
+    from ._plan import (
+        FIXED as FIXED,
+        Owners as Owners,
+        Takes as Takes,
+        agent_of as agent_of,
+        core_of as core_of,
+        disturber as disturber,
+        disturber_apart as disturber_apart,
+        load_order_change as load_order_change,
+        load_order_of as load_order_of,
+        parse_crash_on as parse_crash_on,
+        plan as plan,
+        plan_with_code as plan_with_code,
+        sampler_of as sampler_of,
+        takes_of as takes_of,
+        with_recorded_load_order as with_recorded_load_order,
+        with_settings as with_settings,
+    )
+    from ._run_options import (
+        Driver as Driver,
+        HuntOptions as HuntOptions,
+        SnapshotChoices as SnapshotChoices,
+        Spec as Spec,
+        TrialOptions as TrialOptions,
+        hunt_options as hunt_options,
+    )
+    from ._settings import (
+        AgentSettings as AgentSettings,
+        ArgumentSpec as ArgumentSpec,
+        ChoosesParallelism as ChoosesParallelism,
+        HuntSettings as HuntSettings,
+        Request as Request,
+        RunSettings as RunSettings,
+        executor_of as executor_of,
+        fields_of as fields_of,
+        parallel_here as parallel_here,
+        read_settings as read_settings,
+        request_of as request_of,
+        spec_words as spec_words,
+        write_settings as write_settings,
+    )
+    from ._shares_and_rates import (
+        RATE_PERS as RATE_PERS,
+        RatePer as RatePer,
+        check_rate as check_rate,
+        rate_of as rate_of,
+        share_of as share_of,
+    )
+
+offer_lazily(__name__)

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Category
 
 
-__all__ = ["IMPORT_S", "CodeFacts", "describe_code", "imported_by"]
-
 IMPORT_S = 60.0  # besides the time limit of a trial
 
 

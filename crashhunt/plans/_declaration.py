@@ -12,20 +12,6 @@ from typing import Any, Literal, TypeAlias, TypeVar, Union, cast, get_args, get_
 
 from crashhunt.base.errors import UsageError
 
-__all__ = [
-    "About",
-    "Form",
-    "Given",
-    "HuntOption",
-    "above_zero",
-    "at_least",
-    "declared",
-    "declared_options",
-    "option",
-    "within",
-]
-
-
 T = TypeVar("T")
 
 Form = Literal["flag", "integer", "number", "text", "list", "table"]

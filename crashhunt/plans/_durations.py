@@ -6,9 +6,6 @@ import math
 import re
 import sys
 
-__all__ = ["check_duration", "check_probe", "seconds_of"]
-
-
 _UNITS_S = (86400.0, 3600.0, 60.0, 1.0)  # days, hours, minutes, seconds
 _DURATION = re.compile(r"(?:(\d+(?:\.\d+)?)d)?(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?")
 

@@ -39,25 +39,6 @@ if TYPE_CHECKING:
     Surveyor = Callable[[Scenario, Request, HuntSettings], Scenario]
 
 
-__all__ = [
-    "FIXED",
-    "Owners",
-    "Takes",
-    "agent_of",
-    "disturber",
-    "disturber_apart",
-    "load_order_change",
-    "load_order_of",
-    "parse_crash_on",
-    "plan",
-    "plan_with_code",
-    "sampler_of",
-    "takes_of",
-    "with_recorded_load_order",
-    "with_settings",
-]
-
-
 # The order in which a simulator processes a scenario at load: whether it is fixed, and as it was for a recorded crash.
 #
 # ``environment.json`` of a snapshot holds it (``load_order``). Snapshots of earlier versions lack it: it was not fixed.

@@ -30,11 +30,6 @@ from crashhunt.plans._durations import check_duration, check_probe
 from crashhunt.plans._shares_and_rates import check_rate, check_share
 from crashhunt.trial import CRASHES
 
-__all__ = [
-    "Driver", "HuntOptions", "RunOptions", "SnapshotChoices", "Spec", "Subject", "TrialOptions",
-    "hunt_options",
-]  # fmt: skip
-
 Spec = str | int | float | bool
 Driver = str | Callable[..., object]  # a class is one, too
 

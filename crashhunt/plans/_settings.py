@@ -31,25 +31,6 @@ if TYPE_CHECKING:
     from crashhunt.samplers import Space
 
 
-__all__ = [
-    "AgentSettings",
-    "ArgumentSpec",
-    "ChoosesParallelism",
-    "HuntSettings",
-    "Request",
-    "RunSettings",
-    "executor_name",
-    "executor_of",
-    "fields_of",
-    "parallel_here",
-    "read_settings",
-    "request_of",
-    "sized",
-    "sizes_itself",
-    "spec_words",
-    "write_settings",
-]
-
 # What hunt.toml has had from the beginning, in the order in which it is written.
 _FIRST_KEYS = (
     "scenario", "scenario_digest", "trials", "max_steps", "seed", "sampler", "points", "crash_on", "oracles", "agents",

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from typing import Literal, cast, get_args
 
-__all__ = ["RATE_PERS", "RatePer", "check_rate", "check_share", "rate_of", "share_of"]
-
 
 def share_of(text: str) -> float:
     """Return the share in a text such as ``30%`` or ``0.3``, as a number from 0 to 1.

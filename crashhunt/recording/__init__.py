@@ -4,6 +4,55 @@ Writing and reading logs needs MCAP and protobuf, which a worker never does, so 
 use.
 """
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._blackbox import (
+        BlackBox as BlackBox,
+        BlackBoxFile as BlackBoxFile,
+        BlackBoxHeader as BlackBoxHeader,
+        Phase as Phase,
+        Record as Record,
+        digest_of as digest_of,
+        read_black_box as read_black_box,
+        read_header as read_header,
+    )
+    from ._first_difference import (
+        first_divergence as first_divergence,
+        has_same_scenes as has_same_scenes,
+        values_around as values_around,
+    )
+    from ._foxglove import foxglove_layout as foxglove_layout, lane_borders as lane_borders, read_lanes as read_lanes
+    from ._log import read_log as read_log, write_log as write_log
+    from ._reading import (
+        AgentChannel as AgentChannel,
+        Divergence as Divergence,
+        Prologue as Prologue,
+        StepRecord as StepRecord,
+    )
+    from ._recording import Compact as Compact, Recording as Recording
+    from ._values import (
+        OPAQUE_SHAPE as OPAQUE_SHAPE,
+        OpaqueValue as OpaqueValue,
+        decode_value as decode_value,
+        describe_value as describe_value,
+        encode_value as encode_value,
+        is_opaque as is_opaque,
+    )
+    from .records import RECORD_TYPES as RECORD_TYPES, Tag as Tag
+    from .records._event_record import (
+        encode_disturbance as encode_disturbance,
+        encode_events as encode_events,
+        encode_notes as encode_notes,
+    )
+    from .records._scene_record import (
+        encode_actors as encode_actors,
+        encode_heights as encode_heights,
+        encode_lanes as encode_lanes,
+        encode_roster as encode_roster,
+        encode_spines as encode_spines,
+    )
+
+offer_lazily(__name__)

@@ -40,32 +40,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Frame, Roster, Scene
 
 
-__all__ = [
-    "CHUNK",
-    "FIRST",
-    "FIRST_NON_EVIDENCE_TAG",
-    "HEADER",
-    "MAGIC",
-    "MAPPED",
-    "NO_ROOM",
-    "REPORT",
-    "REPORT_OFFSET",
-    "UNREPORTABLE",
-    "BlackBox",
-    "BlackBoxFile",
-    "BlackBoxHeader",
-    "Phase",
-    "Record",
-    "cannot_record",
-    "decode_header",
-    "digest_of",
-    "is_evidence",
-    "read_black_box",
-    "read_header",
-    "readable_bytes",
-]
-
-
 # The digest of a trial: what belongs to it, and how it is computed.
 
 FIRST_NON_EVIDENCE_TAG = 128

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from crashhunt.recording._recording import Recording
     from crashhunt.recording.records._type import Difference
 
-__all__ = ["first_divergence", "has_same_scenes", "values_around"]
-
 
 def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | None:
     """Return the first difference between two recordings; None if they are bit-identical.

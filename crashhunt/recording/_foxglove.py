@@ -45,18 +45,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Actor, Lane, Scene
 
 
-__all__ = [
-    "MESSAGES",
-    "NAMESPACE",
-    "LogWriter",
-    "foxglove_layout",
-    "lane_borders",
-    "messages_of",
-    "read_lanes",
-    "to_ns",
-    "write_views",
-]
-
 _MAX_CHUNK_BYTES = 256 << 20  # unpacked; crashhunt begins a new chunk after 1 MB, and the log may be a stranger's
 _MAP_REACH_M = 300.0  # around where anybody drove; a town's whole map is too much for a viewer
 _HEIGHT_M = 1.5  # of a car of unknown height

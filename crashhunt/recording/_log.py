@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
     from crashhunt.world import Lane
 
-__all__ = ["read_log", "write_log"]
-
 SCHEMA = "1"
 _COMPACT_KEY = "crashhunt_compact"  # key of the metadata that says what a compact recording lacks
 _KNOWN_BY_TOPIC = 11

@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Actor, Contact, Event, Scene, Spine
 
 
-__all__ = ["AgentChannel", "Divergence", "Prologue", "Reading", "SceneParts", "StepRecord", "first_difference"]
-
-
 @dataclass(frozen=True, slots=True)
 class AgentChannel:
     """Types and shapes of the observations and actions of one agent.

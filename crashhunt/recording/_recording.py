@@ -40,15 +40,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Actor, Scene
 
 
-__all__ = [
-    "Compact",
-    "Near",
-    "PresentActors",
-    "Recording",
-    "compact_records",
-]
-
-
 class Recording:
     """The complete recording of one episode.
 

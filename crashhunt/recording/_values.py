@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["OPAQUE_DTYPE", "OPAQUE_SHAPE", "OpaqueValue", "decode_value", "describe_value", "encode_value", "is_opaque"]
-
 OPAQUE_SHAPE: Final = (-1,)
 """The shape, in the prologue of a recording, of arrays that hold the text of a value; each has its own length."""
 OPAQUE_DTYPE: Final = "|u1"

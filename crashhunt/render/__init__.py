@@ -4,6 +4,41 @@ Drawing needs Pillow, and MP4 needs PyAV: ``pip install 'crashhunt[video]'``. Pa
 agent can create panels that are not drawn.
 """
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._film import (
+        FilmOptions as FilmOptions,
+        Layout as Layout,
+        Shot as Shot,
+        check_places as check_places,
+        frames as frames,
+        shown_steps as shown_steps,
+        write_frames as write_frames,
+        write_gif as write_gif,
+        write_video as write_video,
+    )
+    from ._panel_drawing import (
+        Action as Action,
+        ActionDistribution as ActionDistribution,
+        Bar as Bar,
+        Contour as Contour,
+        Curve as Curve,
+        Curve3D as Curve3D,
+        Heatmap as Heatmap,
+        Panel as Panel,
+        Picture as Picture,
+        Text as Text,
+        explanation as explanation,
+        labelled as labelled,
+        load_meanings as load_meanings,
+        load_panels as load_panels,
+        save_meanings as save_meanings,
+        save_panels as save_panels,
+        scope as scope,
+    )
+    from ._scene_from_above import SceneView as SceneView
+
+offer_lazily(__name__)

@@ -26,19 +26,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
 
 
-__all__ = [
-    "FilmOptions",
-    "Layout",
-    "Shot",
-    "check_places",
-    "frames",
-    "shown_steps",
-    "write_frames",
-    "write_gif",
-    "write_video",
-]
-
-
 _PANEL_PIXELS = (240, 160)
 _BACKGROUND = 255
 _AROUND_S = 10.0  # of a near miss, half of it before and half after

@@ -13,18 +13,18 @@ import numpy as np
 
 from crashhunt.crashes import Encounter
 from crashhunt.panels import (
-    Action,
-    ActionDistribution,
-    Bar,
-    Contour,
-    Curve,
-    Curve3D,
-    Heatmap,
-    Panel,
-    Picture,
-    Text,
-    labelled,
-    scope,
+    Action as Action,
+    ActionDistribution as ActionDistribution,
+    Bar as Bar,
+    Contour as Contour,
+    Curve as Curve,
+    Curve3D as Curve3D,
+    Heatmap as Heatmap,
+    Panel as Panel,
+    Picture as Picture,
+    Text as Text,
+    labelled as labelled,
+    scope as scope,
 )
 from crashhunt.recording import is_opaque
 from crashhunt.world import approaches
@@ -36,29 +36,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.recording import Recording
-
-
-__all__ = [
-    "Action",
-    "ActionDistribution",
-    "Bar",
-    "BuiltinPanels",
-    "Contour",
-    "Curve",
-    "Curve3D",
-    "Heatmap",
-    "Panel",
-    "Picture",
-    "Text",
-    "builtin_labels",
-    "explanation",
-    "labelled",
-    "load_meanings",
-    "load_panels",
-    "save_meanings",
-    "save_panels",
-    "scope",
-]
 
 
 # The panels that every film has.

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance
     from crashhunt.world import Scene
 
-__all__ = ["SceneView"]
-
 _SKY, _ROAD, _MARK = (246, 247, 249), (228, 232, 237), (170, 180, 192)
 _EGO, _CRASH, _AGENT, _OTHER = (224, 138, 0), (198, 40, 40), (46, 158, 91), (125, 139, 156)
 _DISTURBANCE_COLOR = (128, 62, 158)

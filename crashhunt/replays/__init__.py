@@ -1,5 +1,26 @@
 """Replays: run a crash again, compare the run with the recording, edit it, or examine it in a debugger or a window."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._edits import edited_disturbances as edited_disturbances, with_other_words as with_other_words
+    from ._prepare import (
+        Code as Code,
+        Look as Look,
+        ReplayOptions as ReplayOptions,
+        Rerun as Rerun,
+        is_current_code as is_current_code,
+        prepare as prepare,
+        reruns_of as reruns_of,
+    )
+    from ._replaying import (
+        ReplayReport as ReplayReport,
+        Verdict as Verdict,
+        confirm as confirm,
+        replay as replay,
+        up_to as up_to,
+    )
+
+offer_lazily(__name__)

@@ -51,9 +51,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 
-__all__ = ["Backwards", "OneLine", "debug", "main"]
-
-
 # Backwards in the debugger: before each of the last steps, a copy of the process waits for the user to go back.
 #
 # The debugger continues in a fork while the process waits for its end. If the fork ends in order to go back, the

@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance, TrialSpec
 
 
-__all__ = ["NAME", "Edits", "edited_disturbances", "edited_spec", "is_about_disturbances", "with_other_words"]
-
-
 # A crash with other disturbances: ``--set disturbances…`` of a replay, and ``disturb`` of ``hunt.toml``.
 
 NAME = "disturbances"

@@ -31,17 +31,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialSpec, Value
 
 
-__all__ = [
-    "Code",
-    "Look",
-    "ReplayOptions",
-    "Rerun",
-    "is_current_code",
-    "prepare",
-    "reruns_of",
-]
-
-
 Code = Literal["snapshot", "current", "log"]
 
 

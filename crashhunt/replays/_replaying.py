@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.reruns import SharedReruns
 
 
-__all__ = ["ReplayReport", "Verdict", "confirm", "judged", "replay", "up_to"]
-
-
 # Whether a replay is the same as what was recorded, and where it first is not.
 
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]

@@ -1,5 +1,72 @@
 """Reports: summaries, descriptions, tables and pages for people."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._comparison_text import comparison_page as comparison_page, describe_comparison as describe_comparison
+    from ._crash_text import Story as Story
+    from ._findings import (
+        corpus_annotations as corpus_annotations,
+        corpus_summary as corpus_summary,
+        crash_annotations as crash_annotations,
+        crashes_summary as crashes_summary,
+        findings_of as findings_of,
+        write_sarif as write_sarif,
+    )
+    from ._gate_report import (
+        describe_gate as describe_gate,
+        gate_annotations as gate_annotations,
+        gate_summary as gate_summary,
+        write_gate_junit as write_gate_junit,
+    )
+    from ._listing import (
+        ArgumentEntry as ArgumentEntry,
+        ListingEntry as ListingEntry,
+        describe as describe,
+        list_registered as list_registered,
+        list_scenarios as list_scenarios,
+    )
+    from ._page import (
+        UNCHOSEN as UNCHOSEN,
+        PlayerParts as PlayerParts,
+        importance_of as importance_of,
+        lineage_of as lineage_of,
+        player_data as player_data,
+        player_parts as player_parts,
+        report_data as report_data,
+        values_of as values_of,
+        write_report as write_report,
+    )
+    from ._rate_text import (
+        describe_rates as describe_rates,
+        describe_running as describe_running,
+        format_interval as format_interval,
+        format_rate as format_rate,
+        rates_page as rates_page,
+        write_rates_csv as write_rates_csv,
+    )
+    from ._status_screen import (
+        Watcher as Watcher,
+        describe_phase as describe_phase,
+        describe_types as describe_types,
+        format_arguments as format_arguments,
+        format_pace as format_pace,
+        format_seconds as format_seconds,
+    )
+    from ._summary import (
+        describe_causes as describe_causes,
+        describe_groups as describe_groups,
+        describe_hunt as describe_hunt,
+        describe_replay as describe_replay,
+    )
+    from ._table import (
+        argument_units as argument_units,
+        check_fields as check_fields,
+        format_table as format_table,
+        steps_table as steps_table,
+    )
+    from ._words import describe_types_by_version as describe_types_by_version, describe_versions as describe_versions
+
+offer_lazily(__name__)

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.statistics import Comparison, HuntFigures, Per
     from crashhunt.training import HeldOutTraffics
 
-__all__ = ["comparison_page", "describe_comparison"]
-
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5a5a5a")
 _MAX_BINS = 10  # more, and most hunts have too few crashes a bin
 _STYLE = """

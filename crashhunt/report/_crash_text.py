@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import StepRecord
     from crashhunt.report._table import TableCell
 
-__all__ = ["Story"]
-
 _MAX_ACTION_CHARACTERS = 60  # of an action that is no array of numbers
 _MAX_TABLE_ROWS = 20  # of the table; of more steps, the table shows a selection
 _WIDTH = 80  # characters of a line of the table, as on an ordinary terminal

@@ -27,17 +27,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, Group, Signature
 
 
-__all__ = [
-    "CrashFinding",
-    "corpus_annotations",
-    "corpus_summary",
-    "crash_annotations",
-    "crashes_summary",
-    "findings_of",
-    "write_sarif",
-]
-
-
 @dataclass(frozen=True, slots=True)
 class CrashFinding:
     """A crash type, and the line of code at which an annotation for it is shown.

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from crashhunt.statistics import CrashRate, GateReport, SideCounts
 
-__all__ = ["describe_gate", "gate_annotations", "gate_summary", "write_gate_junit"]
-
 _MARKDOWN_SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|~])")
 _MAX_TYPES = 3  # named of each version
 _ICONS = {"better": "✅", "no_difference": "✅", "worse": "❌", "undecided": "❔"}

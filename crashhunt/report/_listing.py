@@ -19,15 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.base.plugins import Group
     from crashhunt.trial import Argument, Kind, Value
 
-__all__ = [
-    "ArgumentEntry",
-    "ListingEntry",
-    "describe",
-    "list_registered",
-    "list_scenarios",
-]
-
-
 _IMPORT_S = 60.0
 
 

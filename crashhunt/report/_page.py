@@ -50,20 +50,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Actor
 
 
-__all__ = [
-    "UNCHOSEN",
-    "Importance",
-    "PlayerParts",
-    "importance_of",
-    "lineage_of",
-    "player_data",
-    "player_parts",
-    "report_data",
-    "values_of",
-    "write_report",
-]
-
-
 # The search on the page: the arguments that criticality depends on, and the trials that a crash was derived from.
 
 UNCHOSEN = ("", "random", "start", "halton")

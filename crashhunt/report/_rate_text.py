@@ -19,16 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.ledger import RateBounds, RunningRate
     from crashhunt.statistics import CrashRate, RatePart
 
-__all__ = [
-    "count_training_trials",
-    "describe_rates",
-    "describe_running",
-    "format_interval",
-    "format_rate",
-    "rates_page",
-    "write_rates_csv",
-]
-
 _TRAINED_ON = "trained_on"
 _MAX_DIGITS = 9  # of a rate next to a bar
 _REASONS = {

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from crashhunt.hunts import HuntStatus, PhaseStatus, SearchStatus
     from crashhunt.trial import TrialResult, Value
 
-__all__ = ["Watcher", "describe_phase", "format_arguments", "format_inputs", "format_pace", "format_seconds"]
-
 _LINE_EVERY_S = 5.0  # where lines cannot be overwritten, such as in a CI log
 _MIN_SCREEN_LINES = 16  # lines; on a lower screen, workers need the space
 _MIN_BAR_COLUMNS = 8  # columns; a shorter bar is unreadable, and the words need the space

@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["describe_groups", "describe_hunt", "describe_replay"]
-
-
 # The table of crash types. `crashhunt.crashes` decides which crashes are of one type, and in which order.
 
 

@@ -27,19 +27,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import AgentChannel, Recording, StepRecord
 
 
-__all__ = [
-    "NEAREST",
-    "TableCell",
-    "TableRow",
-    "aligned",
-    "argument_units",
-    "check_fields",
-    "format_table",
-    "stacked",
-    "steps_table",
-]
-
-
 TableCell: TypeAlias = "bool | int | float | str | None"
 TableRow: TypeAlias = dict[str, TableCell]
 _SCENE_FIELDS = ("x", "y", "heading", "speed")

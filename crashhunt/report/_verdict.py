@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.world import DangerousMoment
 
-__all__ = ["describe_contact", "verdict_of"]
-
 _CHANGE_S = 3.0  # before the contact: the rules of fault call a lane change that began earlier complete
 _MAX_STRAIGHT_TURN_RAD = math.radians(10)  # in a bend, a sideways displacement is no lane change
 _MAX_MERGE_ANGLE_RAD = math.radians(30)  # between their headings, as in the rules of fault

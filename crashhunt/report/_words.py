@@ -29,32 +29,6 @@ if TYPE_CHECKING:
     from crashhunt.world import DangerousMoment, Event
 
 
-__all__ = [
-    "COLUMNS",
-    "MAX_STANDING_SPEED_MPS",
-    "about_danger",
-    "about_disturbances",
-    "about_events",
-    "about_gap",
-    "about_judgement",
-    "about_nearest",
-    "about_place",
-    "about_reference",
-    "about_why",
-    "by_likelihood",
-    "danger_cells",
-    "danger_to_json",
-    "describe_branches",
-    "describe_disturbances",
-    "describe_probes",
-    "list_disturbances",
-    "may_be_disturbed",
-    "nearest_to_json",
-    "traffic_of",
-    "window_of",
-]
-
-
 # The positions of two actors relative to each other, in words.
 
 MAX_STANDING_SPEED_MPS = 0.05  # m/s; a lower speed is shown as 0

@@ -1,5 +1,61 @@
 """What the directory of a hunt says: its state, its trials, its crashes, and which code ran them."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._code_versions import (
+        CodeVersions as CodeVersions,
+        VersionCounts as VersionCounts,
+        count_versions as count_versions,
+        resumed_versions as resumed_versions,
+    )
+    from ._found_crashes import (
+        CrashTally as CrashTally,
+        FoundCrashes as FoundCrashes,
+        Judged as Judged,
+        Kinds as Kinds,
+        crashes_by_version as crashes_by_version,
+        dropped_crashes as dropped_crashes,
+        find_crashes as find_crashes,
+        prune_bundles as prune_bundles,
+        tally_crashes as tally_crashes,
+    )
+    from ._hunt_results import (
+        FACTS as FACTS,
+        Cell as Cell,
+        HuntResults as HuntResults,
+        IncompleteHuntWarning as IncompleteHuntWarning,
+        SuiteResults as SuiteResults,
+        TrialRow as TrialRow,
+        columns_of as columns_of,
+        load as load,
+        write_parquet as write_parquet,
+        write_text as write_text,
+    )
+    from ._state import (
+        BRANCHES as BRANCHES,
+        HEARTBEAT_S as HEARTBEAT_S,
+        PROBES as PROBES,
+        BranchSums as BranchSums,
+        HuntDirectory as HuntDirectory,
+        HuntState as HuntState,
+        LogKind as LogKind,
+        LogReader as LogReader,
+        ProbeSums as ProbeSums,
+        copies_to_come as copies_to_come,
+        draws_independently as draws_independently,
+        find_hunts as find_hunts,
+        find_searches as find_searches,
+        hunt_state as hunt_state,
+        is_case as is_case,
+        is_hunt as is_hunt,
+        ledger_owner as ledger_owner,
+        state_of_facts as state_of_facts,
+        sums_of_branches as sums_of_branches,
+        sums_of_probes as sums_of_probes,
+        trials_of_running as trials_of_running,
+    )
+
+offer_lazily(__name__)

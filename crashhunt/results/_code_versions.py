@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.ledger import CodeVersionsData, Facts, Ledger
     from crashhunt.plans import HuntSettings
 
-__all__ = ["CodeVersions", "VersionCounts", "count_versions", "resumed_versions"]
-
 _MAX_SHOWN = 4  # changed files
 _MIN_UNDER_WAY = 64  # trials, for hunts that did not record how many were under way
 

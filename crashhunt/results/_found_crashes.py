@@ -41,19 +41,6 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Facts, KindData, Noted
     from crashhunt.trial import TrialResult
 
-__all__ = [
-    "CrashTally",
-    "FoundCrashes",
-    "Judged",
-    "Kinds",
-    "crashes_by_version",
-    "dropped_crashes",
-    "find_crashes",
-    "outcomes_of_crashes",
-    "prune_bundles",
-    "tally_crashes",
-]
-
 _MAX_SHARE_OF_TIME = 0.05  # that grouping crashes for a screen may take
 _MAX_READ_LOGS = 200  # of crashes that are read for their types; a log takes 0.05 s
 

@@ -42,25 +42,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Outcome, TrialResult, Value
 
 
-__all__ = [
-    "BRANCHES",
-    "CODE_VERSION",
-    "DISTURBANCES",
-    "FACTS",
-    "ORIGINS",
-    "STRESS",
-    "Cell",
-    "HuntResults",
-    "IncompleteHuntWarning",
-    "SuiteResults",
-    "TrialRow",
-    "columns_of",
-    "load",
-    "write_parquet",
-    "write_text",
-]
-
-
 # The columns of a trial: the projection of a result that tables and pages share.
 
 FACTS = (

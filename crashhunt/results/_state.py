@@ -35,32 +35,6 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Facts, HuntOwner
 
 
-__all__ = [
-    "BRANCHES",
-    "HEARTBEAT_S",
-    "PROBES",
-    "BranchSums",
-    "HuntDirectory",
-    "HuntState",
-    "LogKind",
-    "LogReader",
-    "ProbeSums",
-    "State",
-    "copies_to_come",
-    "draws_independently",
-    "find_hunts",
-    "find_searches",
-    "hunt_state",
-    "is_case",
-    "is_hunt",
-    "ledger_owner",
-    "state_of_facts",
-    "sums_of_branches",
-    "sums_of_probes",
-    "trials_of_running",
-]
-
-
 # What has come of the copies of a hunt's trials so far, as its ledger sums it up.
 
 PROBES, BRANCHES, RARE = "probes", "branches", "rare"

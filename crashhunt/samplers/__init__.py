@@ -1,5 +1,35 @@
 """Samplers: they choose the arguments of the next trial."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._by_name import NamedSampler as NamedSampler, varies_only_asked as varies_only_asked
+    from ._learning import (
+        CmaEsSampler as CmaEsSampler,
+        CrossEntropySampler as CrossEntropySampler,
+        GuidedSampler as GuidedSampler,
+        MutationSampler as MutationSampler,
+    )
+    from ._protocol import (
+        HuntFacts as HuntFacts,
+        Independent as Independent,
+        Key as Key,
+        OnlyAsked as OnlyAsked,
+        PlainStream as PlainStream,
+        Proposal as Proposal,
+        ReceivesHuntFacts as ReceivesHuntFacts,
+        Sampler as Sampler,
+        Space as Space,
+    )
+    from ._space_filling import (
+        Cube as Cube,
+        GridSampler as GridSampler,
+        HaltonSampler as HaltonSampler,
+        RandomSampler as RandomSampler,
+        SobolSampler as SobolSampler,
+        SweepSampler as SweepSampler,
+    )
+
+offer_lazily(__name__)

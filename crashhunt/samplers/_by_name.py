@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["NamedSampler", "varies_only_asked"]
-
-
 _SEEDS = 2**31
 
 

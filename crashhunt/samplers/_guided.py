@@ -48,9 +48,6 @@ if TYPE_CHECKING:
     Seeds = NDArray[np.int64]
 
 
-__all__ = ["KnownCrashes", "Peaks", "Portfolio", "make_basins"]
-
-
 _EVEN, _MODEL = "halton", "model"
 
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from crashhunt.samplers._strategy import Strategy
     from crashhunt.trial import TrialResult
 
-__all__ = ["CmaEsSampler", "CrossEntropySampler", "GuidedSampler", "Learning", "MutationSampler"]
-
 _PLAIN, _START = "random", "start"
 
 

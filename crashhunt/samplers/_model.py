@@ -35,9 +35,6 @@ if TYPE_CHECKING:
     Excluded = Callable[[Floats, NDArray[np.int64]], NDArray[np.bool_]]
 
 
-__all__ = ["TRIALS", "Model", "Process"]
-
-
 # A Gaussian process over arguments and seeds (Rasmussen and Williams 2006, algorithm 2.1).
 
 

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.samplers._strategy import ScoredTrial, Strategy
 
 
-__all__ = ["ORIGIN", "PREFIX", "OptunaMaker", "Storage", "optuna_maker"]
-
-
 PREFIX = "optuna:"
 ORIGIN = "optuna"
 _LONGEST = 2**29  # points of a sequence that are surely there

@@ -13,19 +13,6 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import TrialResult
 
-__all__ = [
-    "HuntFacts",
-    "Independent",
-    "Key",
-    "OnlyAsked",
-    "PlainStream",
-    "Proposal",
-    "ReceivesHuntFacts",
-    "Sampler",
-    "Space",
-    "Versioned",
-]  # fmt: skip
-
 Key = tuple[str, str]
 """(agent id, argument name); the agent id is empty for an argument of the scenario."""
 

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult, TrialSpec, Value
 
 
-__all__ = ["Cube", "GridSampler", "HaltonSampler", "RandomSampler", "SobolSampler", "SweepSampler"]
-
-
 class RandomSampler:
     """Draws every argument independently in every trial.
 

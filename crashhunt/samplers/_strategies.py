@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from crashhunt.samplers._strategy import ScoredTrial
 
 
-__all__ = ["CmaEs", "CrossEntropy", "Mutation"]
-
-
 _FIRST = 10  # trials before a run begins, at the most critical of them
 _SIGMA = 0.2  # initial standard deviation, in widths of the cube: a fifth covers most of it
 

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["CRASHED", "PLAIN_EVERY", "Draft", "Elites", "ScoredTrial", "Strategy", "reflected", "scored_trial"]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Draft:
     """A proposed point.

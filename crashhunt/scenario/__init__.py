@@ -1,5 +1,44 @@
 """Scenarios: network, traffic, controlled vehicles and arguments, from ``scenario.toml`` or a SUMO configuration."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._load import (
+        copy_shipped_scenario as copy_shipped_scenario,
+        endings as endings,
+        load_scenario as load_scenario,
+        refuse as refuse,
+        scenario_from_dict as scenario_from_dict,
+        shipped_folder as shipped_folder,
+        shipped_scenarios as shipped_scenarios,
+    )
+    from ._scenario import (
+        STEP_LENGTH_S as STEP_LENGTH_S,
+        Accelerator as Accelerator,
+        AgentSetup as AgentSetup,
+        ArgumentSetup as ArgumentSetup,
+        Backend as Backend,
+        CompiledCore as CompiledCore,
+        Configuration as Configuration,
+        LoadOrder as LoadOrder,
+        ObservationSetup as ObservationSetup,
+        RunToSurvey as RunToSurvey,
+        Scenario as Scenario,
+        SurveyJob as SurveyJob,
+        TrafficSurvey as TrafficSurvey,
+        argument_values as argument_values,
+        as_in_file as as_in_file,
+        as_plain_data as as_plain_data,
+        backend_names as backend_names,
+        backend_of as backend_of,
+        configurations as configurations,
+        digest_of_described as digest_of_described,
+        installed_backends as installed_backends,
+        scenario_digest as scenario_digest,
+        titles as titles,
+        with_action as with_action,
+    )
+
+offer_lazily(__name__)

@@ -35,20 +35,6 @@ if TYPE_CHECKING:
     from crashhunt.scenario._scenario import Backend, Configuration
 
 
-__all__ = [
-    "check",
-    "check_arguments",
-    "copy_shipped_scenario",
-    "endings",
-    "load_scenario",
-    "refuse",
-    "scenario_from_dict",
-    "shipped_folder",
-    "shipped_scenarios",
-    "unregistered",
-]
-
-
 # What a scenario must be, whatever simulator it is for; what its simulator demands is in its `Backend`.
 
 

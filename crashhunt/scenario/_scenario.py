@@ -44,33 +44,6 @@ if TYPE_CHECKING:
     from crashhunt.world import RightOfWay
 
 
-__all__ = [
-    "STEP_LENGTH_S",
-    "Accelerator",
-    "AgentSetup",
-    "ArgumentSetup",
-    "Backend",
-    "CompiledCore",
-    "Configuration",
-    "ObservationSetup",
-    "RunToSurvey",
-    "Scenario",
-    "SurveyJob",
-    "TrafficSurvey",
-    "argument_values",
-    "as_in_file",
-    "as_plain_data",
-    "backend_names",
-    "backend_of",
-    "configurations",
-    "digest_of_described",
-    "installed_backends",
-    "scenario_digest",
-    "titles",
-    "with_action",
-]
-
-
 # The tables of a ``scenario.toml`` that every simulator has.
 
 DEFAULT_AGENT = "crashhunt.agents:KeepLaneWithSpeed"

@@ -1,5 +1,67 @@
 """Simulators: the world that agents drive in. Nothing here imports libsumo; `crashhunt.sumo` does."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._actions import (
+        META_ACTIONS as META_ACTIONS,
+        MetaAction as MetaAction,
+        SpaceAction as SpaceAction,
+        SpeedAndLaneChange as SpeedAndLaneChange,
+    )
+    from ._any_space import (
+        ObservationForm as ObservationForm,
+        action_form as action_form,
+        action_mask_of as action_mask_of,
+        as_tables as as_tables,
+        has_action_masks as has_action_masks,
+        has_nan as has_nan,
+        merge as merge,
+        native as native,
+        reseed_in_place as reseed_in_place,
+        time_limit_of as time_limit_of,
+    )
+    from ._kinematics_observation import Kinematics as Kinematics, Unseen as Unseen
+    from ._protocol import (
+        FACULTIES as FACULTIES,
+        ActionForm as ActionForm,
+        ActiveDisturbance as ActiveDisturbance,
+        CountsSetUp as CountsSetUp,
+        FastStepper as FastStepper,
+        FlattensObservations as FlattensObservations,
+        FullBraking as FullBraking,
+        HasMap as HasMap,
+        HasWindow as HasWindow,
+        Info as Info,
+        MasksActions as MasksActions,
+        NamesMetaActions as NamesMetaActions,
+        NamesObservations as NamesObservations,
+        Observations as Observations,
+        OfAnyLength as OfAnyLength,
+        Options as Options,
+        PreparesProcess as PreparesProcess,
+        ReportsCrashCell as ReportsCrashCell,
+        ReportsDanger as ReportsDanger,
+        ReportsEvents as ReportsEvents,
+        ReportsNotices as ReportsNotices,
+        ReportsSurroundings as ReportsSurroundings,
+        ReportsTruncation as ReportsTruncation,
+        RestoresObservations as RestoresObservations,
+        RestoresState as RestoresState,
+        RunsForeignCode as RunsForeignCode,
+        Simulator as Simulator,
+        StepResult as StepResult,
+        SupportsDisturbances as SupportsDisturbances,
+        SupportsExclusion as SupportsExclusion,
+        SupportsFastSteps as SupportsFastSteps,
+        SupportsFullBraking as SupportsFullBraking,
+        SupportsHolds as SupportsHolds,
+        SupportsReseeding as SupportsReseeding,
+        SupportsScripts as SupportsScripts,
+        TranslatesMotion as TranslatesMotion,
+    )
+    from ._standstill import Standstill as Standstill
+
+offer_lazily(__name__)

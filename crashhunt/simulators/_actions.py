@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-__all__ = ["META_ACTIONS", "MetaAction", "SpaceAction", "SpeedAndLaneChange", "cast"]
-
 MAX_TARGET_SPEED = 100.0  # m/s; a Box space needs a finite bound, and no road vehicle is faster
 _ACTION_BOUNDARY = Boundary(Party.ENVIRONMENT, "action conversion")
 META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")

@@ -28,23 +28,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Value
 
 
-__all__ = [
-    "FlatAction",
-    "ObservationForm",
-    "OpaqueAction",
-    "OpaqueSpace",
-    "action_form",
-    "action_mask_of",
-    "as_tables",
-    "has_action_masks",
-    "has_nan",
-    "merge",
-    "native",
-    "reseed_in_place",
-    "time_limit_of",
-]
-
-
 _ARRAY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _MAX_ORIGINALS: Final = 256  # objects of a user's classes that may be needed again, because an agent sees them late
 _OPAQUE_MARK: Final = b'{"opaque":'  # in the text of a value with a part that cannot be restored; texts escape quotes

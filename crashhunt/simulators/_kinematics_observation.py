@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 
-__all__ = ["Kinematics", "Unseen"]
-
-
 _FLOAT32 = np.dtype("<f4")
 _ALL_COLUMNS = ("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "kind")
 _DEFAULT_COLUMNS = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")

@@ -19,44 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Lane, Motion, Paths, Roster, Scene, Surroundings
 
-__all__ = [
-    "FACULTIES",
-    "ActionForm",
-    "ActiveDisturbance",
-    "CountsSetUp",
-    "FastStepper",
-    "FlattensObservations",
-    "FullBraking",
-    "HasMap",
-    "HasWindow",
-    "Info",
-    "MasksActions",
-    "NamesMetaActions",
-    "NamesObservations",
-    "Observations",
-    "OfAnyLength",
-    "Options",
-    "ReportsCrashCell",
-    "ReportsDanger",
-    "ReportsEvents",
-    "ReportsNotices",
-    "ReportsSurroundings",
-    "ReportsTruncation",
-    "RestoresObservations",
-    "RestoresState",
-    "RunsForeignCode",
-    "Simulator",
-    "StepResult",
-    "SupportsDisturbances",
-    "SupportsExclusion",
-    "SupportsFastSteps",
-    "SupportsFullBraking",
-    "SupportsHolds",
-    "SupportsReseeding",
-    "SupportsScripts",
-    "TranslatesMotion",
-]
-
 
 class Options(TypedDict, total=False):
     """Options of an episode.

@@ -9,8 +9,6 @@ from crashhunt.world import LIMITS
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["Standstill"]
-
 
 class Standstill:
     """Counts the steps in which vehicles stand still, one episode after another.

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from crashhunt.scenario import Backend
 
-__all__ = ["BACKEND"]
-
-BACKEND = Backend(
+BACKEND: Backend = Backend(
     title="the toy",
     reported_events=(),
     disturbances=("brake", "stop", "unseen"),

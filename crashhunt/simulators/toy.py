@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from crashhunt.simulators._protocol import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance
 
-__all__ = ["ToySimulator"]
-
 _LENGTH_M, _WIDTH_M = 5.0, 1.8
 _ACCELERATION, _BRAKING = 3.0, 8.0
 _LEADER_ID = "leader"

@@ -1,5 +1,30 @@
 """Snapshots: the code, scenario and versions that a hunt ran with, stored in its directory."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._changes import CodeChanges as CodeChanges, code_changes as code_changes
+    from ._differences import code_differences as code_differences
+    from ._environment import (
+        Environment as Environment,
+        environment as environment,
+        environment_changes as environment_changes,
+        processor as processor,
+        versions as versions,
+    )
+    from ._snapshot import (
+        Manifest as Manifest,
+        Snapshot as Snapshot,
+        latest_snapshot as latest_snapshot,
+        without_code as without_code,
+    )
+    from ._take import SnapshotOptions as SnapshotOptions, take_snapshot as take_snapshot
+    from ._unsaved import (
+        describe_missing as describe_missing,
+        describe_unsaved as describe_unsaved,
+        with_original_paths as with_original_paths,
+    )
+
+offer_lazily(__name__)

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from crashhunt.snapshots._snapshot import Snapshot
 
-__all__ = ["CodeChanges", "code_changes", "is_page"]
-
 _OWN_CODE = f"{layout.CODE}/crashhunt/"
 _PAGES = frozenset((
     "AUTHORS", "CHANGELOG", "CHANGES", "CITATION", "CODE_OF_CONDUCT", "CONTRIBUTING", "COPYING", "LICENCE", "LICENSE",

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from crashhunt.snapshots._snapshot import Snapshot
 
-__all__ = ["code_differences"]
-
 
 def code_differences(snapshot: Snapshot, locators: Iterable[str]) -> list[str] | None:
     """Return the files of today's code that differ from their copies in a snapshot; None if none can be compared.

@@ -14,16 +14,6 @@ from crashhunt.scenario import installed_backends
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = [
-    "Environment",
-    "differing_versions",
-    "environment",
-    "environment_changes",
-    "environment_of_simulation",
-    "processor",
-    "versions",
-]
-
 
 class Environment(TypedDict):
     """The contents of ``environment.json``: everything besides code on which a result depends.

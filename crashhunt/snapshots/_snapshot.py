@@ -35,18 +35,6 @@ if TYPE_CHECKING:
     from crashhunt.base.integrity import FileEntry
 
 
-__all__ = [
-    "SCHEMA_WITHOUT_CONDITIONS",
-    "Manifest",
-    "Snapshot",
-    "code_of_manifest",
-    "digest_of_manifest",
-    "latest_snapshot",
-    "may_run",
-    "without_code",
-]
-
-
 class Manifest(TypedDict):
     """The contents of ``manifest.json``: the files of a snapshot, and the folders from which modules are imported.
 

@@ -42,9 +42,6 @@ if TYPE_CHECKING:
     from crashhunt.snapshots._snapshot import Manifest
 
 
-__all__ = ["SnapshotOptions", "Sources", "find_sources", "take_snapshot"]
-
-
 # The code that a hunt runs: the agents' own projects, found through the imported modules.
 
 _GENERATED_FOLDERS = {"__pycache__", ".git", ".hg", ".venv", ".mypy_cache", ".ruff_cache", ".pytest_cache"}

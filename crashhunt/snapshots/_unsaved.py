@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from crashhunt.snapshots._snapshot import Snapshot
 
-__all__ = ["describe_missing", "describe_unsaved", "with_original_paths"]
-
 _SYSTEM = tuple(
     f"{place}/"
     for place in ("/bin", "/boot", "/etc", "/lib", "/lib32", "/lib64", "/nix", "/proc", "/run", "/sbin",

@@ -1,5 +1,87 @@
 """Crash rates: the trials that count, every interval and every test."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._anytime_interval import Bets as Bets, Interval as Interval, RateTest as RateTest
+    from ._comparison import (
+        Comparison as Comparison,
+        HuntFigures as HuntFigures,
+        compare as compare,
+        held_out_by_seed as held_out_by_seed,
+    )
+    from ._crash_rate import (
+        CrashRate as CrashRate,
+        RatePart as RatePart,
+        check_confidence as check_confidence,
+        make_rate as make_rate,
+    )
+    from ._hunt_pairs import (
+        GateCase as GateCase,
+        GateReport as GateReport,
+        PairedHunts as PairedHunts,
+        ScenarioCounts as ScenarioCounts,
+    )
+    from ._hunt_rate import (
+        counts_suffice as counts_suffice,
+        measure_rates as measure_rates,
+        rate_of_counts as rate_of_counts,
+        rate_of_trials as rate_of_trials,
+    )
+    from ._paired_rates import difference_of_rates as difference_of_rates
+    from ._paired_test import (
+        Pair as Pair,
+        PairSequence as PairSequence,
+        PairTest as PairTest,
+        PairVerdict as PairVerdict,
+        PairWatch as PairWatch,
+        SideCounts as SideCounts,
+    )
+    from ._rare import (
+        BLOCK as BLOCK,
+        TRIALS_PER_ROOT as TRIALS_PER_ROOT,
+        Estimated as Estimated,
+        RareCounter as RareCounter,
+        RareEstimate as RareEstimate,
+        Root as Root,
+        is_root as is_root,
+        learn_forcing as learn_forcing,
+        rare_estimate as rare_estimate,
+        root_of as root_of,
+        with_plain as with_plain,
+    )
+    from ._rate_of_running_hunt import (
+        Forcings as Forcings,
+        RareWatch as RareWatch,
+        bar_watch as bar_watch,
+        counting_rule as counting_rule,
+        crashed_copies as crashed_copies,
+        forcings_of as forcings_of,
+        rare_watch as rare_watch,
+        rate_watch as rate_watch,
+        refuse_training_traffic as refuse_training_traffic,
+        why_no_interval as why_no_interval,
+    )
+    from ._running import (
+        WHY_NOT_UNTIL_RATE as WHY_NOT_UNTIL_RATE,
+        BarWatch as BarWatch,
+        Paced as Paced,
+        RateWatch as RateWatch,
+    )
+    from ._units import (
+        MAX_INVALID_SHARE as MAX_INVALID_SHARE,
+        PER_WORDS as PER_WORDS,
+        PERS as PERS,
+        CountingRule as CountingRule,
+        Per as Per,
+        RateCounter as RateCounter,
+        TrialFacts as TrialFacts,
+        Unit as Unit,
+        UnitSequence as UnitSequence,
+        facts_of as facts_of,
+        facts_of_plain as facts_of_plain,
+    )
+
+offer_lazily(__name__)

@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["Bets", "Interval", "RateTest"]
-
 _WEIGHT_OF_ZERO = 0.535
 _LEAST_RATE, _GREATEST_RATE = 1e-7, 0.98  # of the grid, in events per greatest exposure
 _COMPONENTS = 162  # between them, evenly spaced in the logarithm

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from crashhunt.statistics._units import CountingRule, TrialFacts
     from crashhunt.training import TrainedOn
 
-__all__ = ["Comparison", "HuntFigures", "Pair", "compare", "held_out_by_seed", "why_unpaired"]
-
 Answer = Literal["first", "second", "undecided", ""]
 _CONFIDENCE = 0.95
 _ALPHA = 1 - _CONFIDENCE

@@ -13,8 +13,6 @@ from crashhunt.statistics._units import MAX_INVALID_SHARE, Per
 if TYPE_CHECKING:
     from crashhunt.statistics._units import RateCounter, UnitSequence
 
-__all__ = ["CrashRate", "RatePart", "check_confidence", "make_rate"]
-
 _S_PER_HOUR, _M_PER_KM = 3600.0, 1000.0
 _MIN_CONFIDENCE, _MAX_CONFIDENCE = 50.0, 99.9999  # percent; above that, six digits would show 100
 

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from crashhunt.statistics._paired_test import Pair, PairVerdict, PairWatch
     from crashhunt.statistics._units import TrialFacts
 
-__all__ = ["GateCase", "GateReport", "PairedHunts", "ScenarioCounts"]
-
 _FAILED_STATES = ("no_valid_trial", "error")
 _KILLED_SIGN = f'"kind": "{KILLED}"'
 _NEW_SQL = "number >= ? AND (ended_at >= ? OR outcome != 'invalid' OR instr(result, ?) = 0)"

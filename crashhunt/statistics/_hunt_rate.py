@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from crashhunt.training import HeldOutTraffics
     from crashhunt.trial import Distribution, Value
 
-__all__ = ["counts_suffice", "crash_types", "measure_rates", "rate_of_counts", "rate_of_trials"]
-
 _DEFAULT_BINS = 4
 _MAX_BINS = 50
 _LABEL_DIGITS, _MAX_DIGITS = 4, 17  # of the ends of a bin: as few as tell all bins apart

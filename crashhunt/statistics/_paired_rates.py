@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from crashhunt.statistics._paired_test import Pair
     from crashhunt.statistics._units import CountingRule, Per
 
-__all__ = ["difference_of_rates"]
-
 _NODES = 16  # of the shares from 0 to 1
 _SHARES: NDArray[np.float64] = np.append(np.cos(np.pi * (np.arange(_NODES) + 0.5) / (2 * _NODES)), 0.5)
 _LOG_WEIGHTS: NDArray[np.float64] = np.log(np.append(np.full(_NODES, 0.5 / _NODES), 0.5))

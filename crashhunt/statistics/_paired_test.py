@@ -57,8 +57,6 @@ if TYPE_CHECKING:
 
     from crashhunt.statistics._units import CountingRule, TrialFacts
 
-__all__ = ["Pair", "PairSequence", "PairTest", "PairVerdict", "PairWatch", "SideCounts", "failures_of"]
-
 PairVerdict = Literal["better", "worse", "no_difference", "undecided"]
 """The verdict of pairs on the second agent, compared with the first."""
 

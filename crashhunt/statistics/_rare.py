@@ -64,11 +64,6 @@ if TYPE_CHECKING:
     from crashhunt.statistics._anytime_interval import Interval
     from crashhunt.trial import Forced, TrialResult
 
-__all__ = [
-    "BLOCK", "TRIALS_PER_ROOT", "Estimated", "RareCounter", "RareEstimate", "Root", "is_root", "learn_forcing",
-    "rare_estimate", "root_of", "with_plain",
-]  # fmt: skip
-
 BLOCK: Final = 32
 """Roots with the same forcing."""
 PLAIN_PER_ROOT: Final = 4

@@ -29,21 +29,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Forced, ForcedCopy, TrialResult
 
 
-__all__ = [
-    "Forcings",
-    "RareWatch",
-    "bar_watch",
-    "counting_rule",
-    "crashed_copies",
-    "forcings_of",
-    "greatest_weight",
-    "rare_watch",
-    "rate_watch",
-    "refuse_training_traffic",
-    "why_no_interval",
-]
-
-
 def counting_rule(settings: HuntSettings, facts: Facts, held_out: HeldOutTraffics | None = None) -> CountingRule:
     """Return the rule by which the trials of a hunt count.
 

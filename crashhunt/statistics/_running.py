@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.statistics._units import CountingRule, Per, TrialFacts, Unit
     from crashhunt.trial import TrialResult
 
-__all__ = ["WHY_NOT_UNTIL_RATE", "BarWatch", "Paced", "RateWatch"]
-
 WHY_NOT_UNTIL_RATE = "--until-rate ends the hunt by its crashes, so crashes by trials would be biased"
 """Why a hunt that is compared with a threshold has no estimate."""
 

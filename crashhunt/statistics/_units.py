@@ -30,22 +30,6 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import TrialResult
 
-__all__ = [
-    "MAX_INVALID_SHARE",
-    "PERS",
-    "PER_WORDS",
-    "CountingRule",
-    "Per",
-    "RateCounter",
-    "TrialFacts",
-    "Unit",
-    "UnitSequence",
-    "exposure_of",
-    "facts_of",
-    "facts_of_plain",
-    "has_too_many_invalid",
-]
-
 Per: TypeAlias = RatePer
 """What a rate is per."""
 

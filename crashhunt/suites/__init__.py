@@ -1,5 +1,23 @@
 """Suites: many hunts, each in its own process; reruns and gates."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._gate_runs import Gate as Gate, GateProgress as GateProgress, GateVersion as GateVersion
+    from ._processes import (
+        RunRequest as RunRequest,
+        refuse_untrusted_hunt as refuse_untrusted_hunt,
+        run_all as run_all,
+        trust_hunt as trust_hunt,
+    )
+    from ._rerun import rerun as rerun
+    from ._suite_file import (
+        Suite as Suite,
+        SuiteEntry as SuiteEntry,
+        default_suite as default_suite,
+        describe_finished as describe_finished,
+    )
+
+offer_lazily(__name__)

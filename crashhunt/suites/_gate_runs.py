@@ -54,8 +54,6 @@ if TYPE_CHECKING:
     from crashhunt.plans import Given
     from crashhunt.statistics import CrashRate, PairVerdict
 
-__all__ = ["Gate", "GateProgress", "GateVersion"]
-
 GATE: Final = "gate.json"
 """What a gate compares, in the folder with its hunts."""
 _LOCK = ".lock"

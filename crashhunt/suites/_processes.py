@@ -48,20 +48,6 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
 
 
-__all__ = [
-    "PURPOSE_OF_REQUEST",
-    "REQUEST",
-    "RunRequest",
-    "check_machine",
-    "refuse_untrusted_hunt",
-    "run_all",
-    "set_aside",
-    "slots_of",
-    "trust_hunt",
-    "write_request",
-]
-
-
 REQUEST = layout.REQUEST
 PURPOSE_OF_REQUEST = "request of a suite"  # of its authentication code
 _LOOK_EVERY_S = 0.1  # at processes that may have ended

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
     from crashhunt.plans import Given
 
-__all__ = ["rerun"]
-
 _NUMBER_OPTIONS = ("trials", "max_steps", "seed")  # what --set changes besides arguments
 
 

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
     from crashhunt.plans import Given
 
-__all__ = ["Suite", "SuiteEntry", "default_suite", "describe_finished"]
-
 _ENTRY_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]*")
 
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Value
     from crashhunt.world import RightOfWay
 
-__all__ = ["BACKEND"]
-
 _VEHICLE_KEYS = (
     "existing",
     "replaces",
@@ -161,7 +159,7 @@ def _why_no_link_order(scenario: Scenario) -> str:
     return why_no_link_order(metadata.version("libsumo"))
 
 
-BACKEND = Backend(
+BACKEND: Backend = Backend(
     title="SUMO",
     table=SumoSetup,
     example="net and routes",

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
     from crashhunt.world import Actor, Spine
 
-__all__ = ["Bends", "height_at", "is_articulated"]
-
 _RAIL_CLASSES = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
 _RIGID_M = 15.0  # longest rigid bus in the EU (Directive 96/53/EC, Annex I); a longer vehicle has a joint
 _JOINT_M = 6.0  # a shorter rail vehicle or trailer is treated as rigid

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-__all__ = ["SORT_FIX", "is_searched", "unsorted_notes"]
-
 SORT_FIX = "sort the file, for example with SUMO's tools/route/sort_routes.py, or put each flow into a file of its own"
 _MAX_SEARCHED_BYTES = 20 * 2**20  # of all route files: half a second. SUMO itself reports what a trial omits
 _DEPARTING = {

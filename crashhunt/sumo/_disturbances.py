@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 
-__all__ = ["JunctionLanes", "SteppingOut", "SumoDisturbances", "can_step_out", "roadside"]
-
-
 # The disturbance `step_out`: a person steps out onto the road and back, which SUMO's own persons never do.
 #
 # SUMO 1.28 maps a moved person to the best lane nearby. If that is a crossing or a walking area that the person was not

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.simulators import ActiveDisturbance
 
 
-__all__ = ["Driving", "hold_vehicle"]
-
-
 # Calls go to libsumo's extension module, because the wrapper functions of the package cost twice as much.
 
 

@@ -21,22 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
 
 
-__all__ = [
-    "EGO_VEHICLE",
-    "NOT_GIVEN",
-    "NOT_ON_A_ROAD",
-    "Departure",
-    "Ego",
-    "SurveyedRun",
-    "choose_ego",
-    "draw_among",
-    "number",
-    "refine",
-    "restore",
-    "seconds",
-]
-
-
 _EGO = "ego"
 EGO_VEHICLE = "vehicle"
 """The scenario argument that names the vehicle that the controlled one replaces."""

@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Roster
 
 
-__all__ = ["PresentVehicles", "UsualSteps"]
-
-
 _MAX_ROSTERS = 3  # rosters to keep: of the last scene, the scene before it, and the next scene, which may not be needed
 _FLOAT32 = np.dtype("<f4")
 

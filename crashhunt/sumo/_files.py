@@ -23,21 +23,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Value
 
 
-__all__ = [
-    "READ",
-    "WRITTEN",
-    "FileReference",
-    "StagedFiles",
-    "filled_in",
-    "movable",
-    "nested_files",
-    "read_xml",
-    "references",
-    "rewritten",
-    "written_by",
-]
-
-
 # What SUMO's XML files say about other files: those that they read, and those that they write.
 
 READ = {

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Value
 
 
-__all__ = ["VehicleFilter", "enter", "replaced_by", "steps_counted"]
-
-
 def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]) -> dict[str, str]:
     """Return the vehicles of the traffic that agents replace, each with its agent.
 

@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-__all__ = ["VERSION", "Loading", "keep_xml_ready", "ready_xml"]
-
-
 # SUMO's XML library, which stays initialized between trials.
 
 # xercesc_3_2::XMLPlatformUtils::Initialize(locale, nls_home, panic_handler, memory_manager)

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
     from crashhunt.scenario import Scenario
 
-__all__ = ["load_map"]
-
 
 def load_map(path: Path, ego: str) -> Scenario:
     """Return the scenario of a map. The scenario is made once, and then kept in the user's cache.

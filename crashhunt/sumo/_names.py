@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from crashhunt.scenario import AgentSetup, Scenario
 
 
-__all__ = ["check_names", "explained", "places_of"]
-
-
 # Where one of these is, things may be defined that are not written there as `id="NAME"`.
 _GENERATED_ID = re.compile(rb"""\bid\s*=\s*["'][^"']*(?:\$\{|&#)""")
 _TAGS = {"type": b"vType|vTypeDistribution", "route": b"route|routeDistribution", "edge": b"edge"}

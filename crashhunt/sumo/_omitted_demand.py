@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from crashhunt.scenario import Scenario
 
-__all__ = ["OmittedDemand"]
-
 _STANDARD_ERROR = 2
 _MAX_OUTPUT_BYTES = 2**20  # of one episode; a scenario with more warnings has reported enough
 _MAX_SEARCHED_BYTES = 5 * 2**20  # of the files of the demand, which each trial would search

@@ -9,21 +9,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-__all__ = [
-    "DEFAULT_OPTIONS",
-    "FIXED_OPTIONS",
-    "HARMLESS",
-    "INPUTS",
-    "RESERVED",
-    "SumoSetup",
-    "canonical",
-    "is_output",
-    "is_shown",
-    "is_true",
-    "writes",
-]
-
-
 DEFAULT_OPTIONS = {"time-to-teleport": "-1"}  # otherwise a jam removes vehicles; a scenario may want just that
 """What SUMO gets where a scenario says nothing else."""
 FIXED_OPTIONS = {

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     Lists = tuple[list[tuple[float, float]], list[float], list[float]]
 
 
-__all__ = ["LOOK_AROUND_INTERVAL_STEPS", "SIGHT_M", "Sight"]
-
 SIGHT_M = 150.0
 """A scene contains the actors that were within this distance of a controlled vehicle at the last look around.
 

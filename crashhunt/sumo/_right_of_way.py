@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from crashhunt.scenario import Scenario
 
-__all__ = ["right_of_way"]
-
 _MAX_NETWORK_BYTES = 50_000_000  # a larger network is not worth the wait
 _UNREGULATED_TYPES = ("unregulated", "internal", "dead_end", "rail_signal", "rail_crossing")
 

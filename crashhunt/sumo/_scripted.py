@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     Row = tuple[Actor, ActorState, str, Spine | None]
 
-__all__ = ["ScriptedSight", "place_agents"]
-
 
 class ScriptedSight:
     """Reads the controlled vehicles from SUMO, and adds the recorded actors.

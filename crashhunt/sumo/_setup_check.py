@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from crashhunt.scenario import Scenario
 
-__all__ = ["check", "check_options"]
-
 
 def check(scenario: Scenario, where: str) -> None:
     """Refuse a scenario whose table, arguments, files and controlled vehicles are not consistent.

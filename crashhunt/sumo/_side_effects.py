@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Value
 
 
-__all__ = ["ATTRIBUTES", "ELEMENTS", "LABELS", "side_effect"]
-
-
 # The elements and attributes of SUMO's networks, routes and additional files that do no more than simulate.
 
 # From the schemas of SUMO 1.28 (data/xsd), without what names a file, which `_xml` knows.

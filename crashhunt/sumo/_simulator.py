@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Paths, Scene, Surroundings
 
-__all__ = ["SumoSimulator"]
-
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
 _WINDOW_WIDTH_M = 150.0  # width of the visible part of the network when the window follows a vehicle
 _DECELERATION_LIMIT_BIT = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type

@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-__all__ = ["changes", "is_left_out", "load_sumocfg", "read_config", "split_names"]
-
-
 # Reading a ``.sumocfg`` as SUMO does: sections, short names, environment variables.
 
 _VARIABLE = re.compile(r"\$\{(.+?)\}")

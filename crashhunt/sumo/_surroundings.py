@@ -12,8 +12,6 @@ from crashhunt.world import Crossing, Neighbor, Side, Surroundings
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-__all__ = ["surroundings_of"]
-
 _MIN_LOOK_M, _LOOK_S = 60.0, 6.0  # further away, no safe distance of a road vehicle reaches
 _LEADERS, _RIGHT = 2, 1  # bits of the mode of getNeighbors
 _RED_STATES = frozenset("ruR")

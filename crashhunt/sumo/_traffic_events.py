@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Actor, Scene
 
 
-__all__ = ["HardBraking", "SumoEvents"]
-
-
 # Vehicles that brake hard because of a controlled vehicle ahead.
 
 _MIN_CHECKED_DECELERATION_MPS2 = 2.0  # weaker braking is never an event, whatever the limit

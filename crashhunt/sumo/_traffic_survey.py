@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.scenario import SurveyJob
     from crashhunt.trial import Value
 
-__all__ = ["main"]
-
 AFTER_FIRST_ENTRY_S = 600.0
 """Simulation time after the first road vehicle has entered: candidates are drawn from the first 500 s."""
 WITHOUT_ROAD_VEHICLES_S = 3600.0

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from crashhunt.simulators import ActionForm
 
-__all__ = ["AgentContract"]
-
 Make = Callable[[], Agent]
 
 

@@ -24,8 +24,6 @@ from crashhunt.world import EVENT_WORDS
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["BackendContract"]
-
 # The name of a simulator goes in, and whether its module was imported comes out.
 _IMPORTED = """
 import sys

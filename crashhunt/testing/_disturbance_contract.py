@@ -13,8 +13,6 @@ import pytest
 from crashhunt.disturbances import DisturbanceModel, Drawn
 from crashhunt.trial import CELLS
 
-__all__ = ["DisturbanceContract"]
-
 Make = Callable[[], DisturbanceModel]
 
 _DRAWS = 2000

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import Value
 
-__all__ = ["ExecutorContract"]
-
 Make = Callable[[WorkerSettings, int], Executor]
 
 _SWITCHES = ("fail_at_step", "exit_at_step", "segfault_at_step", "hang_at_step")

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.replays import Rerun
 
-__all__ = ["EscapeCheck", "RecordedThenBrakes", "check_escape"]
-
 _NEVER = 10**9  # a step that no episode reaches
 _AFTERWARDS_S = 10.0  # longer than what is checked looks
 

@@ -13,8 +13,6 @@ from crashhunt.oracles import BringsOutcomes, Finding, Oracle, SeesMap
 from crashhunt.trial import Outcome
 from crashhunt.world import Actor, Contact, Event, Lane, Roster, Scene
 
-__all__ = ["OracleContract", "drive"]
-
 Make = Callable[[], Oracle]
 
 _AGENTS = ("ego", "second")

@@ -16,8 +16,6 @@ from crashhunt.world import ClosestApproach
 if TYPE_CHECKING:
     from crashhunt.trial import Value
 
-__all__ = ["SamplerContract"]
-
 Make = Callable[[Space], Sampler]
 
 _TRIALS, _LAG = 40, 4

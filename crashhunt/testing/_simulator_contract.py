@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from crashhunt.simulators import Observations
     from crashhunt.world import Event
 
-__all__ = ["SimulatorContract"]
-
 Make = Callable[[], Simulator]
 
 

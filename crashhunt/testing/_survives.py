@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from crashhunt.plans import Driver, Spec
     from crashhunt.trial import TrialResult, Value
 
-__all__ = ["Example", "assert_survives"]
-
 
 class Example(TypedDict, total=False):
     """One trial, in the form in which a failure of `assert_survives` prints it.

@@ -25,8 +25,6 @@ from crashhunt.training._training_episodes import CrashEpisodes
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["CrashEnv", "make_training_env"]
-
 _SEED_LIMIT = 2**31
 """Seeds of plain episodes are drawn from 0 to here, as those of trials are."""
 _MAX_INVALID = 20

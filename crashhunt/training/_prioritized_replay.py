@@ -20,8 +20,6 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["CrashReplay"]
-
 _STALENESS_SHARE = 0.1
 """rho; the value of the paper for Procgen."""
 _TEMPERATURE = 1.0

@@ -22,8 +22,6 @@ from crashhunt.plans import read_settings
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = ["SavedCrash", "Split", "check_test_share", "is_test_traffic", "split_crashes"]
-
 _HASH_BYTES = 8
 
 

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from crashhunt.plans import HuntSettings
 
-__all__ = ["HeldOutTraffics", "TrainedOn", "held_out_traffics", "read_trained_on"]
-
 _SCHEMA = 1
 
 

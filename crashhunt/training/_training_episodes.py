@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult, Value
     from crashhunt.world import Scene
 
-__all__ = ["CrashEpisodes"]
-
 _DIGEST_BYTES = 16
 
 

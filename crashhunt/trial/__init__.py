@@ -1,5 +1,68 @@
 """Trials: the spaces of their arguments, their specifications, their possible outcomes, and their results."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._data import check_disturbances as check_disturbances, check_parts as check_parts, check_plain as check_plain
+    from ._disturbance import (
+        CELLS as CELLS,
+        HOLD_KINDS as HOLD_KINDS,
+        KINDS as KINDS,
+        SENSOR_KINDS as SENSOR_KINDS,
+        Disturbance as Disturbance,
+        Manoeuvre as Manoeuvre,
+        in_turn as in_turn,
+        steps_of as steps_of,
+        why_not as why_not,
+    )
+    from ._evidence import (
+        KILLED as KILLED,
+        UNUSABLE_VALUE as UNUSABLE_VALUE,
+        Collision as Collision,
+        Escape as Escape,
+        Failure as Failure,
+    )
+    from ._outcome import (
+        CRASHES as CRASHES,
+        EVENTS as EVENTS,
+        Category as Category,
+        Outcome as Outcome,
+        in_order as in_order,
+        outcome_of as outcome_of,
+    )
+    from ._result import (
+        Branch as Branch,
+        Branches as Branches,
+        Forced as Forced,
+        ForcedCopy as ForcedCopy,
+        Stress as Stress,
+        TrialResult as TrialResult,
+        in_effect as in_effect,
+    )
+    from ._space import (
+        FILLED_BY_NAME as FILLED_BY_NAME,
+        Argument as Argument,
+        Choice as Choice,
+        Constant as Constant,
+        Distribution as Distribution,
+        Kind as Kind,
+        Range as Range,
+        Signature as Signature,
+        Value as Value,
+        kind_of as kind_of,
+        parse_spec as parse_spec,
+        signature_of as signature_of,
+        without_folder as without_folder,
+    )
+    from ._specification import (
+        ALL_AGENTS as ALL_AGENTS,
+        Forcing as Forcing,
+        Handover as Handover,
+        Overruled as Overruled,
+        Reseeding as Reseeding,
+        TrialSpec as TrialSpec,
+    )
+
+offer_lazily(__name__)

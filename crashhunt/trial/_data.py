@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
 
-__all__ = ["check_disturbances", "check_parts", "check_plain"]
-
-
 # The types of the plain data of a trial, which are checked before objects are built.
 
 _TEXT_OR_NUMBER = bool | float | str | None

@@ -12,11 +12,6 @@ from crashhunt.base.codec import OMIT_DEFAULT, Serializable
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-__all__ = [
-    "CELLS", "HOLD_KINDS", "KINDS", "SENSOR_KINDS", "Disturbance", "Kind", "Manoeuvre", "in_turn", "steps_of",
-    "why_not",
-]  # fmt: skip
-
 _DURATION_DIGITS = 9  # decimal places of a duration in s, so that three steps of 0.1 s are 0.3 s
 
 _CELL_BY_PLACE = {

@@ -12,8 +12,6 @@ from crashhunt.base.codec import OMIT_DEFAULT, Serializable, null_is
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.base.text import encodable
 
-__all__ = ["KILLED", "UNUSABLE_VALUE", "Collision", "Escape", "Failure"]
-
 KILLED: Final = "killed from outside"
 """Kind of the failure of a trial whose processes were killed from outside until no attempt was left."""
 UNUSABLE_VALUE: Final = "unusable value"

@@ -11,8 +11,6 @@ from crashhunt.world import EVENT_WORDS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-__all__ = ["CRASHES", "EVENTS", "Category", "Outcome", "in_order", "outcome_of"]
-
 Category = Literal["traffic crash", "traffic event", "software fault", "no crash"]
 """The category of an outcome in reports."""
 

@@ -14,9 +14,6 @@ from crashhunt.trial._outcome import Outcome, outcome_of
 from crashhunt.trial._specification import TrialSpec
 from crashhunt.world import ClosestApproach, Event
 
-__all__ = ["Branch", "Branches", "Forced", "ForcedCopy", "Stress", "TrialResult", "in_effect", "summarize"]
-
-
 _NOT_ALL_ANSWERED = written_if(lambda branches: branches.unanswered)
 _NOT_ALL_ASKED = written_if(lambda stress: stress.margin is None)
 

@@ -29,24 +29,6 @@ if TYPE_CHECKING:
     import numpy as np
 
 
-__all__ = [
-    "FILLED_BY_NAME",
-    "Argument",
-    "Choice",
-    "Constant",
-    "Distribution",
-    "Kind",
-    "Range",
-    "Signature",
-    "Value",
-    "describe",
-    "kind_of",
-    "parse_spec",
-    "signature_of",
-    "without_folder",
-]
-
-
 _MOST_STEPS = 2**63 - 1  # NumPy's integers have 64 bits
 Value = bool | int | float | str
 Kind = Literal["float", "int", "bool", "str", "float|str"]

@@ -22,8 +22,6 @@ from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._space import Value
 from crashhunt.world import Paths
 
-__all__ = ["ALL_AGENTS", "Forcing", "Handover", "Overruled", "Reseeding", "TrialSpec"]
-
 ALL_AGENTS = "*"
 """In `TrialSpec.only`: no actor is excluded, but the trial records which actors enter."""
 

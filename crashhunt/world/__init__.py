@@ -1,5 +1,74 @@
 """The road at one step and the distances on it: scenes, outlines, contacts, closest approach and criticality."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._approach import (
+        ApproachMeter as ApproachMeter,
+        ClosestApproach as ClosestApproach,
+        approaches as approaches,
+        closest_approach as closest_approach,
+    )
+    from ._contact import (
+        MAX_CONTACT_GAP_M as MAX_CONTACT_GAP_M,
+        STANDS_MPS as STANDS_MPS,
+        Face as Face,
+        Touch as Touch,
+        contact_at as contact_at,
+        first_contact as first_contact,
+        lane_jump as lane_jump,
+        poses_between as poses_between,
+        reachable_m as reachable_m,
+    )
+    from ._danger import (
+        DangerMeter as DangerMeter,
+        DangerousMoment as DangerousMoment,
+        dangers as dangers,
+        followers_danger as followers_danger,
+    )
+    from ._distance_driven import DrivenMeter as DrivenMeter
+    from ._events import (
+        EVENT_WORDS as EVENT_WORDS,
+        LIMITS as LIMITS,
+        Event as Event,
+        Link as Link,
+        RightOfWay as RightOfWay,
+        event_counts as event_counts,
+    )
+    from ._geometry import (
+        Rectangle as Rectangle,
+        corners as corners,
+        levels as levels,
+        on_one_level as on_one_level,
+        outlines as outlines,
+        outlines_overlap as outlines_overlap,
+        rectangle_gap as rectangle_gap,
+        time_to_contact as time_to_contact,
+    )
+    from ._safe_distances import (
+        Crossing as Crossing,
+        Motion as Motion,
+        Neighbor as Neighbor,
+        Side as Side,
+        Surroundings as Surroundings,
+        safe_distance as safe_distance,
+        safe_speed as safe_speed,
+        time_to_drive as time_to_drive,
+    )
+    from ._scene import (
+        PERSON as PERSON,
+        Actor as Actor,
+        Contact as Contact,
+        Frame as Frame,
+        Lane as Lane,
+        Roster as Roster,
+        Scene as Scene,
+        Spine as Spine,
+        is_person as is_person,
+        joined_frame as joined_frame,
+    )
+    from ._tracks import ActorState as ActorState, Path as Path, Paths as Paths, paths_of as paths_of
+
+offer_lazily(__name__)

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from crashhunt.world._scene import Frame, Scene
 
 
-__all__ = ["ApproachMeter", "ClosestApproach", "approaches", "closest_approach"]
-
-
 # The closest approach.
 
 

@@ -25,17 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.world._geometry import Level, Rectangle
     from crashhunt.world._scene import Scene
 
-__all__ = [
-    "MAX_CONTACT_GAP_M",
-    "STANDS_MPS",
-    "Face",
-    "Touch",
-    "contact_at",
-    "first_contact",
-    "lane_jump",
-    "poses_between",
-]
-
 STANDS_MPS = 0.1
 """An actor that moves more slowly than this stands, in m/s."""
 

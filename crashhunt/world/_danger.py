@@ -47,18 +47,6 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 
-__all__ = [
-    "AHEAD_M",
-    "DangerMeter",
-    "DangerousMoment",
-    "by_step",
-    "dangers",
-    "followers_danger",
-    "measured_along",
-    "summed_danger",
-]
-
-
 _HALF_S = 10.0  # integral at which a trial has criticality 0.5
 _DECAY_S = 1.2  # time gap at which the criticality falls to 1/e
 _MAX_BRAKING_MPS2 = 12.0  # m/s²: more than any vehicle can brake

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from crashhunt.world._scene import Frame
 
 
-__all__ = ["DrivenMeter"]
-
 _ROUNDING_DIGITS = 3  # mm and ms
 
 

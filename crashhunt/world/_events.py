@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-__all__ = ["EVENT_WORDS", "LIMITS", "Event", "Link", "RightOfWay", "event_counts"]
-
 EVENT_WORDS = {
     "red_light": ("red light run", "red lights run"),
     "wrong_way": ("wrong-way drive", "wrong-way drives"),

@@ -15,22 +15,6 @@ if TYPE_CHECKING:
     from crashhunt.world._scene import Scene
 
 
-__all__ = [
-    "LEVEL_M",
-    "Level",
-    "Rectangle",
-    "corners",
-    "levels",
-    "on_one_level",
-    "outlines",
-    "outlines_overlap",
-    "rectangle_gap",
-    "same_level",
-    "separation",
-    "time_to_contact",
-]
-
-
 _MIN_OVERLAP_M = 1e-9  # m; less is rounding, not overlap
 
 

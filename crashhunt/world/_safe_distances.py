@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["Crossing", "Motion", "Neighbor", "Side", "Surroundings", "safe_distance", "safe_speed", "time_to_drive"]
-
 NeighborKind = Literal["vehicle", "red light", "crossing"]
 
 

@@ -17,21 +17,6 @@ if TYPE_CHECKING:
     from crashhunt.native import Columns, Core, Part
     from crashhunt.world._events import Event
 
-__all__ = [
-    "PERSON",
-    "Actor",
-    "Contact",
-    "Frame",
-    "Lane",
-    "Roster",
-    "Scene",
-    "Spine",
-    "core_of",
-    "is_person",
-    "joined_frame",
-    "part_of",
-]
-
 PERSON = "person "
 """What an id of a person begins with: vehicles and persons may have the same name, and no name has a blank."""
 

@@ -25,21 +25,6 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 
-__all__ = [
-    "ActorState",
-    "Others",
-    "Path",
-    "Paths",
-    "Reach",
-    "Track",
-    "paths_of",
-    "sampled",
-    "spacing_s",
-    "tracks",
-    "ways",
-]
-
-
 _APART_S = 0.3  # lower bound between samples: actors move little in that time, and every sample costs time
 _AT_MOST_S = 0.3  # longer steps get samples between two scenes
 

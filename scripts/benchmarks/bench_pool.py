@@ -20,8 +20,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from multiprocessing.pool import Pool
 
-__all__ = ["scenario"]
-
 SLOWER = 4
 DURATION_S = 1_000_000  # otherwise the environment ends an episode after 30 steps
 

@@ -15,8 +15,6 @@ from xml.etree import ElementTree as ET
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["AGENT", "AGENT_HEAD", "TOWNS", "make_town", "write_traffic"]
-
 TOWNS = {
     "priority": ("--grid", "--grid.number", "4", "--grid.length", "110", "-L", "2", "-j", "priority"),
     "lights": ("--grid", "--grid.number", "4", "--grid.length", "130", "-L", "2", "-j", "traffic_light"),

@@ -16,8 +16,6 @@ from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
-__all__ = ["ROOT", "Slot", "Watcher"]
-
 ROOT = Path(__file__).resolve().parents[2]
 # What the parent has imported differently, or must not have imported at all.
 OURS = {"crashhunt", "conftest", "py", "xdist", "_hypothesis_pytestplugin", "__main__", "slips", "copies"}

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
     from ray.cluster_utils import Cluster
 
-__all__ = ["head", "nodes"]
-
 
 @contextlib.contextmanager
 def head() -> Iterator[Cluster]:

@@ -1,5 +1,10 @@
 """Trials on all machines of a Ray cluster; Ray itself is imported in a separate process."""
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._executor import RayExecutor as RayExecutor
+
+offer_lazily(__name__)

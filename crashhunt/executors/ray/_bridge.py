@@ -42,9 +42,6 @@ if TYPE_CHECKING:
     )
 
 
-__all__ = ["main"]
-
-
 _LOOK_EVERY_S = 1.0  # which nodes there are
 _WAIT_S = 0.2  # for a node to answer, before the next node is asked
 _REFILL_S = 0.005  # for the hunt to submit more, which then goes along with the next question

@@ -25,21 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
 
-__all__ = [
-    "OLDEST_RAY_VERSION",
-    "TOKEN_FIX",
-    "Cluster",
-    "Found",
-    "Lost",
-    "Meant",
-    "TokenError",
-    "UnreachableError",
-    "cluster_of",
-    "require_ray",
-    "silent",
-]
-
-
 # Find the Ray cluster, and check whether it answers, without an import of Ray.
 
 TOKEN_FIX = "put the token with which the cluster was started into RAY_AUTH_TOKEN, or into ~/.ray/auth_token"

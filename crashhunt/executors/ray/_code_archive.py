@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.episode import WorkerSettings
 
 
-__all__ = ["LIMIT_MB", "CodeArchive", "Folder", "Place", "Store", "owned", "remove_if_left", "settings_in", "unpack"]
-
-
 LIMIT_MB = 200
 """What travels well: it is in the memory of the hunt's machine once, and on the disk of every node."""
 _MEGABYTE = 10**6

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from crashhunt.executors.ray._messages import BridgeJob, Figures, FromBridge, ToBridge
     from crashhunt.trial import TrialSpec
 
-__all__ = ["RayExecutor"]
-
 _CHUNK_BYTES = 1 << 18  # bytes at a time
 _CLOSE_S = 3.0  # for the bridge to end what runs on the nodes
 _RETRY_S = 3.0  # between looks whether a cluster that was lost is back

@@ -8,8 +8,6 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.json_types import ErrorData, ErrorWords
 
-__all__ = ["BridgeJob", "EndedTrial", "Figures", "FromBridge", "Header", "News", "NodeJob", "Submitted", "ToBridge"]
-
 Submitted = tuple[int, "JsonObject"]
 """A trial, and its ticket: a number that identifies this submission of the trial."""
 Header = tuple[int, int, float, int, int, int, int]

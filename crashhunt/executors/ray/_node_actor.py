@@ -13,9 +13,6 @@ import platform
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Site", "code_digest"]
-
-
 _LINK_ORDER = "_crashhunt_link_order"  # the library that fixes the order of SUMO's links; no part of a distribution
 
 

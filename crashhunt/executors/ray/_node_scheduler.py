@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from crashhunt.executors.ray._messages import Figures, Submitted
 
 
-__all__ = ["Node", "NodeScheduler", "Trial", "shares"]
-
-
 _TRIALS_PER_CPU = 2  # trials that a node has for each of its CPUs, so that none waits for the wire
 _MAX_TRIAL_LOSSES = 2  # of a trial with its node; then it runs alone on one, in case it is what ends them
 

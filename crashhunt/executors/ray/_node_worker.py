@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-__all__ = ["Work", "unpacked"]
-
-
 _WHERE_EVERY_S = 0.5  # as often as people can read
 _GATHER_S = 0.05  # in which what ends goes back together, while there is enough to do
 _HEADER_BYTES = 64  # bytes of a black box that say what is in the rest, most of which is room for more

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from highway_env.envs.common.abstract import AbstractEnv
     from highway_env.envs.highway_env import HighwayEnv
 
-__all__ = ["choose", "rewards"]
-
 _CLIP = np.clip
 _ONE = np.float64(1)
 _SPEED_CHANGES = {"SLOWER": -1, "IDLE": 0, "FASTER": 1}

@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from crashhunt.highway.accelerator._versions import VehicleClass
 
 
-__all__ = ["TrafficFrame", "are_plain"]
-
-
 class TrafficFrame:
     """The positions of all objects at one time, with coordinates on the lanes that are computed when needed.
 

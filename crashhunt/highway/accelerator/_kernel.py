@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from highway_env.vehicle.kinematics import Vehicle
 
 
-__all__ = ["CompiledNetwork", "Contents", "Poses", "Snapshot", "Traffic", "kernel", "why_not"]
-
-
 _MODULE = "_crashhunt_highway"
 _INTERFACE = 4
 

@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     Row = tuple[object, ...]
 
 
-__all__ = ["KernelObjects"]
-
-
 _POLICY_CODES = {"": 0, "nothing": 1, "controlled": 2, "idm": 3, "linear": 4}
 _FOREIGN_POLICY_CODE = 5
 _PARAMETERS = (

@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.highway.accelerator._kernel import CompiledNetwork, Contents
 
 
-__all__ = ["Network"]
-
-
 _ON_LANE_MARGIN_M = 1  # highway-env's lateral margin for neighbours on a lane
 
 

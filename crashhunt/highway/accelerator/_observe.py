@@ -35,18 +35,6 @@ if TYPE_CHECKING:
     from crashhunt.highway.accelerator._roads import RoadState
 
 
-__all__ = [
-    "close_objects",
-    "fill_lanes",
-    "fill_times",
-    "observe",
-    "observe_exit",
-    "observe_goal",
-    "observe_grid",
-    "observe_in_kernel",
-]
-
-
 _BASIC_FEATURES = frozenset(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))
 _LANE_FEATURES = ("long_off", "lat_off", "ang_off")
 _DESTINATION_FEATURES = ("cos_d", "sin_d")

@@ -17,24 +17,6 @@ if TYPE_CHECKING:
     from crashhunt.highway.accelerator._kernel import Traffic
 
 
-__all__ = [
-    "Prepared",
-    "RoadState",
-    "cached",
-    "forget",
-    "frame_of",
-    "is_intact",
-    "is_known",
-    "look",
-    "methods_of",
-    "network_of",
-    "prepared",
-    "take",
-    "take_for_observation",
-    "watches",
-]
-
-
 _MAX_ROADS = 16  # number of cached roads: one process may run several environments
 _roads: dict[int, Prepared] = {}
 watches: dict[str, Watch] = {}

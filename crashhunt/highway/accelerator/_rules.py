@@ -13,9 +13,6 @@ if TYPE_CHECKING:
     from crashhunt.highway.accelerator._kernel import Traffic
 
 
-__all__ = ["collide_one_by_one", "enforce", "finish"]
-
-
 def finish(road: Road, dt: float) -> None:
     """Finish a sub-step with highway-env's code, because the kernel has found a number that is not finite."""
     for vehicle in road.vehicles:

@@ -35,9 +35,6 @@ if TYPE_CHECKING:
 
     from crashhunt.highway.accelerator._roads import Prepared
 
-__all__ = ["Onlooker", "SkippedObservation", "can_run_alone", "run_step", "simulate"]
-
-
 # A wrapper of a road's `step` that declares whether it changes the road.
 
 

@@ -2,7 +2,5 @@
 
 from __future__ import annotations
 
-__all__ = ["ACCELERATED"]
-
 ACCELERATED = {"1.12.1": "c2c34aaddeb8f4c7"}
 """The digest of the modules in which the accelerator replaces something, by version of highway-env."""

@@ -44,7 +44,14 @@ from crashhunt.highway.accelerator._roads import (
 )
 from crashhunt.highway.accelerator._rules import collide_one_by_one, enforce, finish
 from crashhunt.highway.accelerator._substep_loop import can_run_alone, run_step, simulate
-from crashhunt.highway.accelerator._versions import Watch, is_genuine, kind_of, left_alone, originals, reason_against
+from crashhunt.highway.accelerator._versions import (
+    Watch,
+    is_genuine,
+    kind_of,
+    left_alone as left_alone,
+    originals,
+    reason_against,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -53,9 +60,6 @@ if TYPE_CHECKING:
     from highway_env.road.lane import LaneIndex
     from highway_env.vehicle.controller import MDPVehicle
     from highway_env.vehicle.kinematics import Vehicle
-
-
-__all__ = ["Acceleration", "accelerate", "is_on", "left_alone", "switch_off", "switch_on", "why_not"]
 
 
 def switch_on() -> str:

@@ -32,23 +32,6 @@ if TYPE_CHECKING:
     Space = dict[str, Any] | type  # the dictionary of a module, or a class
 
 
-__all__ = [
-    "MODULES",
-    "NUMBERS_OF",
-    "Own",
-    "VehicleClass",
-    "Watch",
-    "are_numbers",
-    "is_genuine",
-    "is_plain",
-    "kind_of",
-    "kinds_of",
-    "left_alone",
-    "originals",
-    "reason_against",
-]
-
-
 # Detects replaced functions of highway-env, which a user's module may replace at any time.
 
 MODULES = (utils, lane, regulation, road, behavior, controller, dynamics, kinematics, objects)

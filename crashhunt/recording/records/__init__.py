@@ -16,8 +16,6 @@ from crashhunt.recording.records._scene_record import ACTORS, HEIGHTS, LANES, RO
 if TYPE_CHECKING:
     from crashhunt.recording.records._type import RecordType
 
-__all__ = ["RECORD_TYPES", "Tag"]
-
 # In the order in which those of one step are compared: what an agent saw and did, the result.
 RECORD_TYPES: dict[int, RecordType] = {
     kind.tag: kind

@@ -19,16 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.recording.records._type import Fields, Message
 
 
-__all__ = [
-    "ACTION",
-    "OBSERVATION",
-    "PROLOGUE",
-    "ArrayForm",
-    "array_difference",
-    "message_of",
-]
-
-
 # The first record: what the episode consists of, as JSON.
 
 

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 
-__all__ = ["DISTURBANCES", "EVENTS", "NOTES", "encode_disturbance", "encode_events", "encode_notes"]
-
-
 # What touched, and who left the road, as JSON; only where anything did.
 
 _EVENTS_FIELDS = len(Contact.__slots__)

@@ -22,26 +22,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Spine
 
 
-__all__ = [
-    "ACTORS",
-    "HEIGHTS",
-    "LANES",
-    "ROSTER",
-    "SPINES",
-    "STEP",
-    "encode_actors",
-    "encode_heights",
-    "encode_lanes",
-    "encode_roster",
-    "encode_spines",
-    "points_of",
-    "roster_difference",
-    "select_actors",
-    "step_of",
-    "time_of",
-]
-
-
 # Actors that were not seen before, as JSON; each is numbered in order of appearance.
 
 _ACTORS_FIELDS = len(Actor.__slots__)

@@ -14,17 +14,6 @@ if TYPE_CHECKING:
 
     Difference = Callable[[StepRecord, StepRecord, AgentChannel | None], Divergence | None]
 
-__all__ = [
-    "SCENE",
-    "BytesForm",
-    "Fields",
-    "Form",
-    "Message",
-    "RecordType",
-    "TextForm",
-    "scene_texts",
-]
-
 SCENE = "scene"
 
 Message: TypeAlias = Any

@@ -4,6 +4,27 @@ netconvert, netgenerate and randomTrips of the distribution eclipse-sumo do the 
 process. If a program refuses its input, crashhunt reports an error of one line.
 """
 
-import lazy_loader
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from crashhunt.base.doors import offer_lazily
+
+if TYPE_CHECKING:
+    from ._cache import cached_scenario as cached_scenario
+    from ._make import (
+        MadeScenario as MadeScenario,
+        MapOptions as MapOptions,
+        PlainTrial as PlainTrial,
+        describe_place as describe_place,
+        make_scenario as make_scenario,
+    )
+    from ._road_network import RoadNetwork as RoadNetwork, read_network as read_network
+    from ._source import (
+        ENDINGS as ENDINGS,
+        MapSource as MapSource,
+        check_source as check_source,
+        parse_bbox as parse_bbox,
+        parse_shape as parse_shape,
+    )
+    from ._traffic_flow import PlainRun as PlainRun
+
+offer_lazily(__name__)

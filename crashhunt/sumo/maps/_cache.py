@@ -17,8 +17,6 @@ from crashhunt.sumo.maps._make import MapOptions, make_scenario
 from crashhunt.sumo.maps._source import MapSource, check_source, kind_of_file
 from crashhunt.sumo.maps._tools import find_tools
 
-__all__ = ["cached_scenario"]
-
 _FORMAT = 1
 """Raised where the same map becomes another scenario."""
 _COMPLETION_MARK = "made.json"

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.sumo.maps._source import BBox, MapSource
     from crashhunt.sumo.maps._tools import Tools
 
-__all__ = ["NET", "ConvertOptions", "Converted", "convert"]
-
 NET = "map.net.xml"
 _RAIL = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
 _LEFT_HAND = re.compile(rb"""\brule\s*=\s*["']LHT["']""")

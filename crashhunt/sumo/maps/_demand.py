@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from crashhunt.sumo.maps._road_network import RoadNetwork
     from crashhunt.sumo.maps._tools import Tools
 
-__all__ = ["ROUTES", "Demand", "Route", "find_demand", "route_file"]
-
 ROUTES = "traffic.rou.xml"
 _SEED = "42"  # the same map gives the same traffic
 _MAX_ROUTES = 300

@@ -14,18 +14,6 @@ from crashhunt.base.version import __version__
 if TYPE_CHECKING:
     from crashhunt.sumo.maps._demand import Demand
 
-__all__ = [
-    "AGENT",
-    "WORKFLOW",
-    "MapArgument",
-    "agent_module",
-    "arguments_of",
-    "next_commands",
-    "readme",
-    "scenario_toml",
-    "workflow",
-]
-
 AGENT = "agent:Driver"
 """The agent of ``agent.py``."""
 DEFAULT_AGENT = "crashhunt.agents:CarFollowing"

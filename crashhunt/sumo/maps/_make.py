@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from crashhunt.sumo.maps._source import BBox, MapSource
     from crashhunt.sumo.maps._tools import Tools
 
-__all__ = ["DEMAND", "MadeScenario", "MapOptions", "PlainTrial", "describe_place", "make_scenario"]
-
 DEMAND = (0.2, 1.5)
 """The usual range of the argument ``demand``."""
 PICTURE, README, AGENT_FILE = "map.png", "README.md", "agent.py"

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     from crashhunt.sumo.maps._road_network import Edge, RoadNetwork
 
-__all__ = ["draw_map"]
-
 _SIZE, _MARGIN, _HEAD = 1200, 40, 70  # pixels
 _OVERSAMPLING = 2  # drawn so many times larger, for smooth edges
 _GROUND, _ROAD, _WAY = (246, 247, 249), (200, 206, 214), (222, 226, 232)

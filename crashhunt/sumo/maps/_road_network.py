@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-__all__ = ["BICYCLE", "CAR", "PERSON", "TRUCK", "Edge", "NetworkLane", "RoadNetwork", "read_network"]
-
 Point = tuple[float, float]
 CAR, TRUCK, BICYCLE, PERSON = "passenger", "truck", "bicycle", "pedestrian"
 

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import BinaryIO
 
-__all__ = ["ENDINGS", "BBox", "MapSource", "check_source", "fix_of_bbox", "kind_of_file", "parse_bbox", "parse_shape"]
-
 BBox: TypeAlias = tuple[float, float, float, float]
 """West, south, east, north, in degrees."""
 Kind: TypeAlias = Literal["osm", "opendrive", "net", "grid", "spider"]

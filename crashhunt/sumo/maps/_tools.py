@@ -21,8 +21,6 @@ from crashhunt.base.signals import blocked_signals
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["ToolResult", "Tools", "find_tools", "first_error"]
-
 _TIME_LIMIT_S = 1800.0
 """Of one program. netconvert takes 3 s for a town of 6,000 roads; a whole country is no place to hunt in."""
 

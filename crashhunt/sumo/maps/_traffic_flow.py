@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from crashhunt.sumo.maps._road_network import RoadNetwork
     from crashhunt.sumo.maps._tools import Tools
 
-__all__ = ["RUN_S", "PlainRun", "calibrate", "run_plain_traffic"]
-
 RUN_S = 600
 """Simulated time: a road that jams does so within a few cycles of its lights, and these have up to 90 s."""
 _STEP_S = 0.1  # as in trials

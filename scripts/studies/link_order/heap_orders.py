@@ -20,8 +20,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
-__all__ = ["build_allocator", "make_demand", "run_digests", "simulate"]
-
 SOURCE = Path(__file__).with_name("heap_order.c")
 VEHICLES, PERIOD_S, STEP_LENGTH_S = 500, 0.4, 0.5
 _ALWAYS = {

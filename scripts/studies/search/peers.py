@@ -25,19 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.samplers import Key, Space
     from crashhunt.trial import TrialResult, Value
 
-__all__ = [
-    "PEERS",
-    "SLOW",
-    "OptunaCmaEs",
-    "OptunaTpe",
-    "PlainMutation",
-    "Smac",
-    "Turbo",
-    "VerifaiBandit",
-    "VerifaiCrossEntropy",
-    "missing_packages",
-]
-
 PEERS = {
     "optuna-tpe": "peers:OptunaTpe",
     "optuna-cma-es": "peers:OptunaCmaEs",

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from crashhunt.plans import Given
     from crashhunt.trial import Kind
 
-__all__ = ["PROBLEMS", "REAL", "Danger", "Problem", "Real", "as_floats", "ball", "numbers", "radius_of"]
-
 Danger = Callable[[Any, int], float]
 """Of the values of the arguments and a trial's seed; 1 for a crash."""
 

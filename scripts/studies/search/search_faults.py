@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import TrialSpec
 
-__all__ = ["EVIDENCE", "FAULTS", "FaultProblem", "faults_found", "faults_table", "write_faults"]
-
 _LAG = 4
 _ROOM = 0.1  # distance between two regions, at least
 _LEVELS = 3  # of each of four numbers of a state

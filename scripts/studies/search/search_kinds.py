@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from crashhunt.plans import HuntSettings
     from crashhunt.trial import TrialResult
 
-__all__ = ["kinds_table", "write_kinds"]
-
 _LAG = 4
 
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from search import Run
 
-__all__ = ["costs", "delay_table", "interval", "one_in", "pairs_table", "rare", "table", "write_plot"]
-
 GIVE_UP = 3.0  # times what random draws need
 _LEFT, _WIDTH, _ROW, _TOP = 190, 860, 24, 92
 _LEAST, _MOST = 0.02, 5.0

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult, TrialSpec
     from crashhunt.world import Lane
 
-__all__ = ["Trials", "trials_on"]
-
 
 class Trials:
     """Trials of several hunts, which give them the same numbers, on workers that know a trial by its number.

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from crashhunt.hunts import HuntReport
 
-__all__ = ["wall_table"]
-
 
 def wall_table(names: Sequence[str], samplers: Sequence[str], seeds: Sequence[int], parallel: int) -> str:
     """Hunt as ``crashhunt run`` does, in turns, and return the mean cost by the clock and in steps as Markdown.

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import Kind
 
-__all__ = ["UNSEEN", "unseen_problem"]
-
 _DRAWS = 60_000  # from which the limit of a margin is estimated
 
 

@@ -1,2 +1,0 @@
-from ._process import RemoteEpisodes as RemoteEpisodes
-from ._sumo_env import SumoEnv as SumoEnv

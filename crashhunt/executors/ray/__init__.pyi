@@ -1,1 +1,0 @@
-from ._executor import RayExecutor as RayExecutor
