@@ -2,12 +2,12 @@
 
 Every analysis that runs a recorded trial again uses this module. The parts of a rerun are:
 
-- **What**: specifications of trials (`TrialSpec`). A change of a trial is a changed specification. A run from the start
-  has no further part; a run from a step has a part that begins after the step (`overruled`, `disturbances`,
-  `handover`, `reseeding`), and simulates the steps before it again. The caller chooses which specifications run next.
-- **Where** (`Where`): ``current`` forks processes that have imported the current crashhunt; ``snapshot`` does the same
-  with the crashhunt of a snapshot, if that crashhunt has a fork server; ``alone`` starts a new Python process for each
-  run. `SharedReruns` serves several threads.
+- **What**: specifications of trials (`TrialSpec`). A change of a trial is a changed specification. For a change from a
+  step on, the specification has a part that begins after the step: `overruled`, `disturbances`, `handover` or
+  `reseeding`. Its run simulates the earlier steps again. The caller chooses which specifications run next.
+- **Where** (`Where`): ``current`` forks processes that have imported the current crashhunt. ``snapshot`` does the same
+  with the crashhunt of a snapshot, if that has a fork server. ``alone`` starts a new Python process for each run.
+  `SharedReruns` serves several threads.
 - **Limits**: `Budget` decides about a stop of the user and the wall time. The caller limits the number of runs,
   because only the caller knows which of the runs count.
 - **Comparison**: an `EndedRun` has the result, the recording and the files of a run. Bit-identical runs have the same
@@ -356,7 +356,7 @@ def call_in_threads(
         parallel: number of threads.
         ended: function called with each result, in the thread of the caller.
         tick: function called about ten times a second, in the thread of the caller.
-        over: event that tells the functions to return; it is set if an exception, such as Ctrl-C, ends the wait.
+        over: event on which the functions return; it is set if an exception, such as Ctrl-C, ends the wait.
     """
     with ThreadPoolExecutor(parallel) as threads:
         futures = [threads.submit(function, item) for item in items]

@@ -31,6 +31,7 @@ from crashhunt.trial import Outcome
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.base.integrity import FileEntry
     from crashhunt.ledger import Facts, HuntOwner
 
@@ -379,7 +380,7 @@ def _duration_s(facts: Facts, until: float | None) -> float:
     return by_clock
 
 
-def _phase(facts: Facts) -> dict[str, Any] | None:
+def _phase(facts: Facts) -> JsonObject | None:
     """Return the phase of a running hunt after its last trial."""
     phase = facts.get("phase")
     return {name: phase[name] for name in ("name", "done", "total")} if phase else None

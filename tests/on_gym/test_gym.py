@@ -174,7 +174,7 @@ def make_cut():
     return CutEarly(Tray())
 
 
-def test_truncation_by_a_wrapper_is_reported_and_told_apart_from_a_termination(tmp_path):
+def test_truncation_by_a_wrapper_is_reported_and_is_no_termination(tmp_path):
     cut, whole = simulator_of(tmp_path, f"{__name__}:make_cut"), simulator_of(tmp_path, "Tray-v0")
     assert (fall(cut), cut.was_truncated) == (7, True)
     what = "truncates an episode itself or by a wrapper, so the trial ends as finished before MAX_STEPS"
