@@ -5,23 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError
-from crashhunt.crashes import judgement_of
+from crashhunt.crashes import Bundle, judgement_of
 from crashhunt.crashes._contact_record import contact_record
-from crashhunt.crashes._fault import fault_of
+from crashhunt.crashes._fault import Verdict, fault_of
 from crashhunt.crashes._signature import Signature, signature_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from crashhunt.base.codec import JsonObject
-    from crashhunt.crashes import Bundle
-    from crashhunt.crashes._fault import Verdict
-
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class Group(Serializable):
     """Crashes with the same signature.
 
     Args:
@@ -35,6 +32,11 @@ class Group:
     bundles: tuple[Bundle, ...]
     faults: tuple[Verdict, ...] = ()
     dropped: int = 0
+
+    json_keys = (
+        "words", "signature", "count", "saved", "outcome=signature.outcome", "manner=signature.manner", "fault",
+        "avoidable", "first=first.path", "shortest=shortest.path", "members",
+    )  # fmt: skip
 
     @property
     def count(self) -> int:
@@ -65,21 +67,20 @@ class Group:
         """The crash with the fewest steps; if several crashes have as few, the first of them."""
         return min(self.bundles, key=lambda bundle: bundle.result.steps)
 
-    def to_json(self) -> JsonObject:
-        """Return the group in the form that ``crashes --json`` prints; crashes are given by their paths."""
-        return {
-            "words": str(self.signature),
-            "signature": self.signature.to_json(),
-            "count": self.count,
-            "saved": len(self.bundles),
-            "outcome": self.signature.outcome,
-            "manner": self.signature.manner,
-            "fault": self.fault,
-            "avoidable": self.avoidable,
-            "first": str(self.first.path),
-            "shortest": str(self.shortest.path),
-            "members": [str(bundle.path) for bundle in self.bundles],
-        }
+    @property
+    def words(self) -> str:
+        """The signature as text."""
+        return str(self.signature)
+
+    @property
+    def members(self) -> list[Path]:
+        """The paths of the bundles."""
+        return [bundle.path for bundle in self.bundles]
+
+    @property
+    def saved(self) -> int:
+        """The number of crashes with a bundle."""
+        return len(self.bundles)
 
 
 @dataclass(frozen=True, slots=True)

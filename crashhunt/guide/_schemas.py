@@ -14,7 +14,7 @@ from crashhunt.base.codec import JsonObject
 from crashhunt.base.json_types import ErrorData, Plain
 from crashhunt.base.schemas import json_schema
 from crashhunt.corpus import Bisected, CaseReport
-from crashhunt.crashes import CrashSummary, Fault, Judgement, TrustedOrigin
+from crashhunt.crashes import CrashSummary, Fault, Group, Judgement, TrustedOrigin
 from crashhunt.hunts import AuditReport, Checked, StoppedBecause
 from crashhunt.ledger import KindData
 from crashhunt.replays import ReplayReport
@@ -59,17 +59,7 @@ _RUN = {
     "code_versions?": list[JsonObject],
 }
 _CRASH_GROUP = {
-    "words": str,
-    "signature": JsonObject,
-    "count": int,
-    "saved": int,
-    "outcome": str,
-    "manner": str,
-    "fault": str,
-    "avoidable": bool | None,
-    "first": str,
-    "shortest": str,
-    "members": list[str],
+    "**": Group,
     "known?": str | None,
     "known_by?": Literal["cause", "type"] | None,
     "new_causes?": list[str],

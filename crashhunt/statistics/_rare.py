@@ -51,6 +51,7 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
+from crashhunt.base.codec import Serializable, plain
 from crashhunt.disturbances import COPIES_PER_ROOT, SECONDS_PER_COPY
 from crashhunt.statistics._anytime_interval import Bets, RateTest
 from crashhunt.statistics._units import MAX_INVALID_SHARE
@@ -131,7 +132,7 @@ class Root:
 
 
 @dataclass(frozen=True, slots=True)
-class Estimated:
+class Estimated(Serializable):
     """An estimated interval, and the figures that show its reliability.
 
     Args:
@@ -208,14 +209,14 @@ class RareEstimate:
         shared = {key: value for key, value in self.running().items() if key not in _RUNNING_KEYS}
         return {
             **shared,
-            "estimated": _plain(self.estimated),
+            "estimated": plain(self.estimated),
             "more_roots": self.more_roots,
             "left_out": self.excluded,
             "parts": {
                 "undisturbed": {"estimate": self.undisturbed, "crashes": self.undisturbed_crashes},
                 "disturbed": {
                     "estimate": self.disturbed,
-                    "estimated": _plain(self.estimated_disturbed),
+                    "estimated": plain(self.estimated_disturbed),
                     "why_not": self.why_not_disturbed,
                     "by": dict(self.parts),
                 },
@@ -243,18 +244,6 @@ class RareEstimate:
             "bar": None,
             "verdict": "",
         }
-
-
-def _plain(one: Estimated | None) -> JsonObject | None:
-    if one is None:
-        return None
-    return {
-        "low": one.low,
-        "high": one.high,
-        "effective": one.effective,
-        "largest_share": one.largest_share,
-        "roots_with_crash": one.roots_with_crash,
-    }
 
 
 def is_root(number: int) -> bool:
