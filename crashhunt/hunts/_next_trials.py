@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.hunts._progress import Progress
-    from crashhunt.ledger import Ledger
-    from crashhunt.plans import HuntSettings
+    from crashhunt.ledger import Facts, Ledger
+    from crashhunt.plans import HuntSettings, RunSettings
     from crashhunt.samplers import NamedSampler
     from crashhunt.snapshots import Snapshot
     from crashhunt.statistics import Forcings
@@ -41,6 +41,7 @@ _TRAFFIC_STREAM = 0x74726166  # apart from what else is drawn of the hunt's seed
 GREATEST_LAG = 32
 """Greatest delay of results for a sampler in a deterministic hunt, in trials. It does not depend on the workers, so
 that 1 and 16 of them run the same trials."""
+_QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker waits for the hunt
 _LOOK_EVERY_S = 0.1  # at the hunt on which another hunt waits
 _FIRST_LAG, _TRIALS_PER_LAG = 4, 8  # delay of the first trials, and trials after which it is one more
 
@@ -57,6 +58,27 @@ def growing_lag(number: int, most: int) -> int:
         most: the maximum delay.
     """
     return min(most, _FIRST_LAG + number // _TRIALS_PER_LAG)
+
+
+def trials_under_way(parallel: int) -> int:
+    """Return the number of trials to submit so that ``parallel`` trials run and each worker has its next trial."""
+    return parallel * (1 + _QUEUED_PER_WORKER)
+
+
+def result_lag(before: Facts, run: RunSettings, parallel: int) -> tuple[int, bool]:
+    """Return the number of trials by which results reach the sampler late, and whether it is smaller at first.
+
+    Args:
+        before: facts from the hunt's ledger.
+        run: options that determine how the hunt runs.
+        parallel: number of trials that run at a time.
+    """
+    under_way = trials_under_way(parallel)
+    if not run.deterministic:
+        return under_way, False
+    if lag := before.get("lag"):  # a hunt of before has one lag for all trials
+        return lag, bool(before.get("lag_grows"))
+    return max(GREATEST_LAG, under_way), True
 
 
 class Trials:

@@ -18,16 +18,16 @@ from crashhunt.crashes import (
 from crashhunt.executors import HasNodes
 from crashhunt.hunts._reports import kind_data
 from crashhunt.reruns import call_in_threads
-from crashhunt.results import CrashTally, Kinds
+from crashhunt.results import CrashTally, Kinds, sums_of_branches, sums_of_probes
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from crashhunt.crashes import Bundle
     from crashhunt.executors import Executor, NodeFigures
     from crashhunt.hunts._reports import AuditReport, StoppedBecause
-    from crashhunt.ledger import Facts, Noted, RunningRate
+    from crashhunt.ledger import Facts, Ledger, Noted, RunningRate
     from crashhunt.plans import RunSettings
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.statistics import BarWatch, RareWatch, RateWatch
@@ -274,6 +274,24 @@ class Progress:
                 apart=apart,
             )
 
+    def resume_counts(self, ledger: Ledger, before: Facts, crash_on: tuple[Outcome, ...]) -> None:
+        """Add the trials of earlier runs of the hunt to the counts on the screen.
+
+        Args:
+            ledger: ledger of the hunt.
+            before: facts from the hunt's ledger.
+            crash_on: the outcomes that count as a crash.
+        """
+        self.outcomes.update(ledger.outcomes())
+        self.nearest = ledger.nearest_miss()
+        if before.get("origins"):
+            self.searching.resume(sum(self.outcomes.values()), ledger.tried_by_origin(crash_on))
+        branches, probes = sums_of_branches(ledger, before), sums_of_probes(ledger, before)
+        self.branched = branches["crashed"] if branches is not None else 0
+        self.not_fully_asked = sum(sums["not_fully_asked"] for sums in (branches, probes) if sums is not None)
+        if probes is not None and probes["crashed_trials"] and probes["trial"] is not None:
+            self.stressed = ledger.result(probes["trial"])
+
     def count(self, result: TrialResult, *, crashed: bool, planned: int) -> None:
         """Count a finished trial.
 
@@ -371,6 +389,58 @@ class Progress:
     def time_left_s(self) -> float:
         """Time until no more trials begin, in s; infinite without a limit."""
         return max(0.0, self.until - time.monotonic())
+
+    def expect_end(self, planned: int, parallel: int) -> None:
+        """Estimate the time at which the last trial ends.
+
+        Args:
+            planned: number of planned trials; 0 if only the time is limited.
+            parallel: number of trials that run at a time.
+        """
+        left = planned - sum(self.outcomes.values())
+        found = self.remaining.seconds_left(time.monotonic(), left, parallel) if left > 0 else 0.0
+        found = min(found, self.time_left_s)
+        self.parallel = parallel
+        self.ends_at = time.time() + found if planned and math.isfinite(found) else None
+
+    def status(
+        self, phase: str, planned: int, workers: Mapping[int, BlackBoxHeader] | None = None, *, has_disturbances: bool
+    ) -> HuntStatus:
+        """Return the present progress for the status screen.
+
+        Args:
+            phase: phase of the hunt, as in `HuntStatus`.
+            planned: number of planned trials; 0 if only the time is limited.
+            workers: progress of each running trial, by number.
+            has_disturbances: whether the trials have disturbances.
+        """
+        elapsed = time.monotonic() - self.began
+        kinds, newest_s, newest_trials = self.about_kinds(running=phase != "done")
+        return HuntStatus(
+            phase=phase,
+            planned=planned,
+            done=sum(self.outcomes.values()),
+            outcomes=dict(self.outcomes),
+            rate_per_s=self.ended_here / elapsed if elapsed > 0 else 0.0,
+            elapsed_s=elapsed,
+            nearest=self.nearest,
+            workers=dict(workers or {}),
+            crashes=self.crash_count,
+            nodes=self.nodes,
+            kinds=kinds,
+            newest_kind_s=newest_s,
+            newest_kind_trials=newest_trials,
+            types_by_cause=self.kinds.types_by_cause if self.kinds is not None else None,
+            time_left_s=self.time_left_s,
+            disturbed=self.disturbed if has_disturbances else None,
+            stressed=self.stressed,
+            branched=self.branched,
+            not_fully_asked=self.not_fully_asked,
+            search=self.searching.status(),
+            rate=self.running_rate(),
+            trials_left_s=None if self.ends_at is None else max(0.0, self.ends_at - time.time()),
+            progress=self.phase,
+        )
 
     def look_at(self, executor: Executor) -> None:
         """Update the progress of the running trials."""

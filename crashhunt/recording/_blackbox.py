@@ -127,7 +127,7 @@ class BlackBox:
         RecorderError: the disk is full.
     """
 
-    def __init__(self, path: Path, *, begun: int = 0) -> None:
+    def __init__(self, path: Path | str, *, begun: int = 0) -> None:
         self._path = path
         self._file = os.open(path, os.O_RDWR | (0 if begun else os.O_CREAT | os.O_TRUNC), 0o644)
         self._reserved = begun
@@ -372,7 +372,7 @@ class BlackBox:
             raise cannot_record(error, self._path) from error
 
 
-def cannot_record(error: OSError, path: Path) -> RecorderError:
+def cannot_record(error: OSError, path: Path | str) -> RecorderError:
     """Return the error that ends a trial when the disk has no room for its recording."""
     return RecorderError(
         f"the trial cannot be recorded: {error.strerror}",

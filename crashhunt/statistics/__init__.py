@@ -60,12 +60,12 @@ if TYPE_CHECKING:
         crashed_copies as crashed_copies,
         forcings_of as forcings_of,
         rare_watch as rare_watch,
+        rate_of_bar as rate_of_bar,
         rate_watch as rate_watch,
         refuse_training_traffic as refuse_training_traffic,
         why_no_interval as why_no_interval,
     )
     from ._running import (
-        WHY_NOT_UNTIL_RATE as WHY_NOT_UNTIL_RATE,
         BarWatch as BarWatch,
         Paced as Paced,
         RateWatch as RateWatch,

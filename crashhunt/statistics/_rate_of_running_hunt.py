@@ -13,17 +13,20 @@ from crashhunt.base.errors import UsageError
 from crashhunt.disturbances import first_forcing
 from crashhunt.plans import rate_of, share_of
 from crashhunt.results import CodeVersions
+from crashhunt.statistics._crash_rate import make_rate
 from crashhunt.statistics._rare import BLOCK, TRIALS_PER_ROOT, RareCounter, is_root, learn_forcing, root_of, with_plain
-from crashhunt.statistics._running import BarWatch, Paced, RateWatch
+from crashhunt.statistics._running import WHY_NOT_UNTIL_RATE, BarWatch, Paced, RateWatch
 from crashhunt.statistics._units import CountingRule, TrialFacts
 from crashhunt.trial import Forcing, Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.ledger import Facts, Ledger, RunningRate
     from crashhunt.plans import HuntSettings
+    from crashhunt.statistics._crash_rate import CrashRate
     from crashhunt.statistics._rare import RareEstimate
     from crashhunt.training import HeldOutTraffics
     from crashhunt.trial import Forced, ForcedCopy, TrialResult
@@ -90,6 +93,20 @@ def bar_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics,
     for data in ledger.plain_results():
         watch.add(data)
     return watch
+
+
+def rate_of_bar(directory: Path, watch: BarWatch | None) -> CrashRate | None:
+    """Return the final crash rate of a hunt that compares its rate with a threshold; None without a threshold."""
+    if watch is None:
+        return None
+    found = make_rate(
+        str(directory), watch.per, watch.counter, watch.sequence, confidence=100 * (1 - watch.alpha),
+        why_no_estimate=WHY_NOT_UNTIL_RATE, bar=watch.bar,
+    )  # fmt: skip
+    excluded = found.excluded
+    if watch.decided_at is not None:  # which later trials have ended depends on the workers
+        excluded = {reason: count for reason, count in excluded.items() if reason != "after_unfinished"}
+    return replace(found, excluded=excluded, verdict=watch.verdict, why_undecided=watch.why_undecided)
 
 
 def rate_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics) -> RateWatch | None:

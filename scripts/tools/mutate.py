@@ -153,6 +153,7 @@ _TESTS_ELSEWHERE = {
         "executors/test_pool_of_trials.py",
         "executors/test_what_is_left.py",
     ),
+    "executors/_rehearsal.py": ("executors/test_zygotes.py",),
     "executors/_supervisor.py": (
         "executors/test_escapes_of_trials.py",
         "executors/test_killed_trials.py",
@@ -189,8 +190,19 @@ _TESTS_ELSEWHERE = {
     "hunts/_hunt.py": (
         "hunts/test_hunt_loop.py",
         "hunts/test_hunt_parts.py",
+        "hunts/test_states_and_reports.py",
+        "e2e/test_hunt.py",
+    ),
+    "hunts/_running_hunt.py": (
+        "hunts/test_hunt_loop.py",
+        "hunts/test_hunt_parts.py",
         "hunts/test_rare_hunts.py",
         "hunts/test_states_and_reports.py",
+        "hunts/test_whole_hunts.py",
+    ),
+    "hunts/_trial_loop.py": (
+        "hunts/test_hunt_loop.py",
+        "hunts/test_hunt_parts.py",
         "hunts/test_whole_hunts.py",
         "e2e/test_hunt.py",
     ),

@@ -331,7 +331,8 @@ def test_trial_runs_in_its_folder_and_reports(process, monkeypatch, tmp_path):
            "tries_copy": True}  # fmt: skip
     assert found._run(job, None) == 0
     expected = [
-        "own session", "separate", ("redirect", tmp_path), ("box", tmp_path / layout.BLACK_BOX, 64), ("in", tmp_path),
+        "own session", "separate", ("redirect", str(tmp_path)), ("box", str(tmp_path / layout.BLACK_BOX), 64),
+        ("in", tmp_path),
         ("begin", os.getpid(), 3), ("arm", 9.0, "stack"), "block",
     ]  # fmt: skip
     assert called[:-1] == expected

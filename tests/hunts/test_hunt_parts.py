@@ -8,6 +8,7 @@ import queue
 import signal
 import threading
 import time
+from collections import Counter
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,17 +19,29 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UntrustedError
 from crashhunt.executors import PoolExecutor
-from crashhunt.hunts import HuntReport, _hunt, _preflight, _verification
+from crashhunt.hunts import (
+    HuntReport,
+    _hunt,
+    _next_trials,
+    _preflight,
+    _progress,
+    _running_hunt,
+    _trial_loop,
+    _verification,
+)
 from crashhunt.hunts._hunt import Hunt
-from crashhunt.hunts._progress import PhaseClock
+from crashhunt.hunts._next_trials import result_lag
+from crashhunt.hunts._progress import PhaseClock, Progress
 from crashhunt.hunts._reports import BranchReport, Difference, ProbeReport, RareReport, kind_data
+from crashhunt.hunts._running_hunt import RunningHunt
+from crashhunt.hunts._trial_loop import TrialLoop
 from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReruns, is_settled
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
 from crashhunt.reruns import EndedRun, StoppedError
 from crashhunt.results import _hunt_results as _results, _state
 from crashhunt.results._state import HuntDirectory, LogReader
-from crashhunt.statistics import TRIALS_PER_ROOT, RareEstimate
+from crashhunt.statistics import TRIALS_PER_ROOT, RareEstimate, _rate_of_running_hunt, rate_of_bar
 from crashhunt.statistics._rare import Estimated
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
@@ -43,57 +56,7 @@ def result(number, outcome=Outcome.SURVIVED, **more):
 
 @pytest.fixture
 def hunt(tmp_path):
-    """Makes a hunt with such options of its run."""
-
-    def make(settings=SETTINGS, **run):
-        found = Hunt(tmp_path / "h", SimpleNamespace(origin="scenario.toml"), settings)
-        found.settings = replace(settings, run=replace(settings.run, **run))
-        found._disturber = None
-        return found
-
-    return make
-
-
-def test_trials_above_a_wanted_crash_are_cancelled(hunt):
-    cancelled = []
-    executor = SimpleNamespace(cancel=lambda *, above: cancelled.append(above))
-    assert hunt(deterministic=True)._cancelled(executor, {1, 4, 5}, 4) == {1, 4}
-    assert hunt(deterministic=False)._cancelled(executor, {1, 4, 5}, 4) == set()
-    assert cancelled == [4, -1]
-
-
-def test_results_reach_the_sampler_late_enough_for_every_worker(hunt):
-    assert _hunt._under_way(3) == 6
-    assert hunt(deterministic=False)._result_lag({"lag": 7}) == (4, False)
-    assert hunt(deterministic=True)._result_lag({"lag": 7}) == (7, False)
-    assert hunt(deterministic=True)._result_lag({"lag": 7, "lag_grows": True}) == (7, True)
-    assert hunt(deterministic=True)._result_lag({}) == (max(_hunt.GREATEST_LAG, 4), True)
-    assert hunt(parallel=1000, deterministic=True)._result_lag({}) == (2000, True)
-
-
-def test_end_of_a_hunt_is_expected_by_trials_and_by_time(hunt):
-    progress = SimpleNamespace(
-        outcomes={"survived": 4}, time_left_s=math.inf,
-        remaining=SimpleNamespace(seconds_left=lambda now, left, parallel: asked.append((left, parallel)) or 60.0),
-    )  # fmt: skip
-    asked = []
-    hunt()._expect_end(progress, 3)
-    assert asked == [(5, 3)]
-    assert progress.parallel == 3
-    assert progress.ends_at == pytest.approx(time.time() + 60, abs=5)
-    progress.time_left_s = 20.0
-    hunt()._expect_end(progress, 3)
-    assert progress.ends_at == pytest.approx(time.time() + 20, abs=5)
-    progress.outcomes = {"survived": 9}
-    hunt()._expect_end(progress, 3)
-    assert len(asked) == 2
-    assert progress.ends_at == pytest.approx(time.time(), abs=5)
-    hunt(replace(SETTINGS, trials=0))._expect_end(progress, 3)
-    assert progress.ends_at is None
-    progress.outcomes, progress.time_left_s = {}, math.inf
-    progress.remaining.seconds_left = lambda *given: math.inf
-    hunt()._expect_end(progress, 3)
-    assert progress.ends_at is None
+    return Hunt(tmp_path / "h", SimpleNamespace(origin="scenario.toml"), SETTINGS)
 
 
 class Notes:
@@ -118,84 +81,165 @@ class Notes:
         return self.restored
 
 
-def test_notices_of_workers_and_differences_of_the_audit_are_noted(hunt):
-    ledger, looks, counted = Notes(), [], []
-    progress = SimpleNamespace(notes=[], look_at=looks.append)
+@pytest.fixture
+def running(tmp_path):
+    """A running hunt of which nothing has begun: `shown` are the phases that were shown."""
+    found = object.__new__(RunningHunt)
+    found.ledger, found.disturber, found.shown = Notes(), None, []
+    found.progress = SimpleNamespace(notes=[], status=lambda phase, planned, workers, **more: (phase, planned))
+    found.setup = SimpleNamespace(
+        place=HuntDirectory(tmp_path / "h"), settings=SETTINGS, stops=(), parallel_here=2,
+        conditions=SimpleNamespace(check_hunt=lambda: None),
+        snapshot=SimpleNamespace(digest="0f"),
+    )  # fmt: skip
+    found._watch = found.shown.append
+    return found
+
+
+@pytest.fixture
+def loop(running):
+    """Makes the loop of a running hunt with such options of its run."""
+
+    def make(**run):
+        found = object.__new__(TrialLoop)
+        found._hunt, found._ledger, found._in_flight = running, running.ledger, set()
+        found._run_settings = replace(SETTINGS.run, **run)
+        return found
+
+    return make
+
+
+def test_trials_above_a_wanted_crash_are_cancelled(loop):
+    cancelled = []
+    for deterministic, left in ((True, {1, 4}), (False, set())):
+        found = loop(deterministic=deterministic)
+        found._executor = SimpleNamespace(cancel=lambda *, above: cancelled.append(above))
+        found._in_flight = {1, 4, 5}
+        found._cancel_above(4)
+        assert found._in_flight == left
+    assert cancelled == [4, -1]
+
+
+def test_results_reach_the_sampler_late_enough_for_every_worker():
+    free, fixed = RunSettings(deterministic=False), RunSettings(deterministic=True)
+    assert _next_trials.trials_under_way(3) == 6
+    assert result_lag({"lag": 7}, free, 2) == (4, False)
+    assert result_lag({"lag": 7}, fixed, 2) == (7, False)
+    assert result_lag({"lag": 7, "lag_grows": True}, fixed, 2) == (7, True)
+    assert result_lag({}, fixed, 2) == (max(_next_trials.GREATEST_LAG, 4), True)
+    assert result_lag({}, fixed, 1000) == (2000, True)
+
+
+def test_end_of_a_hunt_is_expected_by_trials_and_by_time():
+    asked = []
+    progress = Progress(outcomes=Counter(survived=4))
+    progress.remaining = SimpleNamespace(
+        seconds_left=lambda now, left, parallel: asked.append((left, parallel)) or 60.0
+    )
+    progress.expect_end(9, 3)
+    assert asked == [(5, 3)]
+    assert progress.parallel == 3
+    assert progress.ends_at == pytest.approx(time.time() + 60, abs=5)
+    progress.until = time.monotonic() + 20.0
+    progress.expect_end(9, 3)
+    assert progress.ends_at == pytest.approx(time.time() + 20, abs=5)
+    progress.outcomes = Counter(survived=9)
+    progress.expect_end(9, 3)
+    assert len(asked) == 2
+    assert progress.ends_at == pytest.approx(time.time(), abs=5)
+    progress.expect_end(0, 3)
+    assert progress.ends_at is None
+    progress.outcomes, progress.until = Counter(), math.inf
+    progress.remaining = SimpleNamespace(seconds_left=lambda *given: math.inf)
+    progress.expect_end(9, 3)
+    assert progress.ends_at is None
+
+
+def test_notices_of_workers_and_differences_of_the_audit_are_noted(running, loop):
+    looks, counted = [], []
+    running.progress.look_at = looks.append
+    running.audits_left = SimpleNamespace(note=lambda *given: counted.append(given))
     for share in (0.0, 0.5):
-        found = hunt(audit=share)
-        found._heard = SimpleNamespace(
+        found = loop(audit=share)
+        found._executor = "executor"
+        found._notices = SimpleNamespace(
             take=lambda executor: ["a", "b"] if executor == "executor" else [],
             absent=lambda *, at_end: [],
             newly_occurred=lambda: (),
         )
-        found._audits_left = SimpleNamespace(note=lambda *given: counted.append(given))
-        audit = SimpleNamespace(look=lambda wait_s: ["differs"] if wait_s == 0.25 else [])
-        found._receive_results("executor", audit, ledger, progress, wait_s=0.25)
-    assert ledger.remarks == ["a", "b", "audit: differs"] * 2
-    assert progress.notes == ["a", "b"] * 2
-    assert ledger.noted == [{"notices": ["a"]}, {"notices": ["a", "b"]}]  # each once
+        found._audit = SimpleNamespace(look=lambda wait_s: ["differs"] if wait_s == 0.25 else [])
+        found._receive_notices(wait_s=0.25)
+    assert running.ledger.remarks == ["a", "b", "audit: differs"] * 2
+    assert running.progress.notes == ["a", "b"] * 2
+    assert running.ledger.noted == [{"notices": ["a"]}, {"notices": ["a", "b"]}]  # each once
     assert looks == ["executor"] * 2
-    assert counted == [(audit, progress)]
+    assert counted == [(found._audit, running.progress)]
 
 
-def test_notice_of_an_absent_name_is_kept_until_the_name_occurs(hunt):
-    ledger, occurred = Notes(), [(), ("x names",)]
-    progress = SimpleNamespace(notes=[], look_at=lambda executor: None)
-    found, audit = hunt(), SimpleNamespace(look=lambda wait_s: [])
-    found._heard = SimpleNamespace(
+def test_notice_of_an_absent_name_is_kept_until_the_name_occurs(running, loop):
+    ledger, progress, occurred = running.ledger, running.progress, [(), ("x names",)]
+    progress.look_at = lambda executor: None
+    found = loop()
+    found._executor, found._audit = None, SimpleNamespace(look=lambda wait_s: [])
+    found._notices = SimpleNamespace(
         take=lambda executor: ["a"],
         absent=lambda *, at_end: ["x names nothing"] * at_end,
         newly_occurred=lambda: occurred.pop(0),
     )
-    found._receive_results(None, audit, ledger, progress, at_end=True)
+    found._receive_notices(at_end=True)
     assert progress.notes == ledger.facts()["notices"] == ["a", "x names nothing"]
-    found._receive_results(None, audit, ledger, progress)
+    found._receive_notices()
     assert progress.notes == ["a", "a"]
     assert ledger.facts()["notices"] == ["a"]
 
 
-def test_rest_of_an_audit_is_a_phase_of_its_own(hunt):
-    found, phases = hunt(), []
-    audit = SimpleNamespace(waiting=3, parallel=0)
-    clock = SimpleNamespace(
-        begin=lambda name, total: phases.append((name, total)), advance=lambda: phases.append("one"),
-        tick=lambda: phases.append("tick"),
+def test_rest_of_an_audit_is_a_phase_of_its_own(running, loop):
+    found, phases = loop(), []
+    found._audit = audit = SimpleNamespace(waiting=3, parallel=0)
+    running.reruns = SimpleNamespace(
+        phases=SimpleNamespace(
+            begin=lambda name, total: phases.append((name, total)), advance=lambda: phases.append("one"),
+            tick=lambda: phases.append("tick"),
+        )
     )  # fmt: skip
 
-    def receive(executor, given, ledger, progress, *, wait_s):
-        assert (given, wait_s) == (audit, _hunt._TICK_S)
+    def receive(*, wait_s):
+        assert wait_s == _trial_loop._TICK_S
         audit.waiting -= 2 if audit.waiting == 3 else 1
 
-    found._receive_results = receive
-    found._finish_audit(clock, None, audit, None, None)
+    found._receive_notices = receive
+    found._finish_audit()
     assert phases == [("auditing", 3), "one", "one", "tick", "one", "tick"]
-    assert audit.parallel == found._parallel_here == 2
-    audit.waiting, found._stops = 3, (2,)
+    assert audit.parallel == 2
+    audit.waiting, running.setup.stops = 3, (2,)
     phases.clear()
-    found._finish_audit(clock, None, audit, None, None)
+    found._finish_audit()
     assert phases == []
 
 
-def test_ledger_that_was_removed_is_written_again_with_a_note(hunt):
-    ledger, progress = Notes(), SimpleNamespace(notes=[])
-    hunt()._restore_ledger(ledger, progress)
+def test_ledger_that_was_removed_is_written_again_with_a_note(running):
+    ledger, progress = running.ledger, running.progress
+    running.restore_ledger()
     assert (ledger.remarks, progress.notes) == ([], [])
     ledger.restored = True
-    hunt()._restore_ledger(ledger, progress)
+    running.restore_ledger()
     assert ledger.remarks == progress.notes
     assert "was removed while the hunt ran" in ledger.remarks[0]
 
 
 def test_hunt_that_fails_records_why(hunt, monkeypatch):
-    found, ledger, removed = hunt(), Notes(), []
-    found._place.has_begun = True
+    ledger, removed = Notes(), []
+    hunt._place.has_begun = True
     monkeypatch.setattr(_hunt, "remove_scratch", removed.append)
-    found._fail(ledger, "no disk")
+    hunt._fail(ledger, "no disk")
     assert ledger.entered == [("error", "no disk", {})]
-    assert removed == [found._place.scratch]
-    found._progress = SimpleNamespace(noted=lambda *, now: {"kinds": now})
-    found._fail(ledger, "bad \udcff")
-    state, detail, facts = ledger.entered[1]
+    assert removed == [hunt._place.scratch]
+    hunt._running = SimpleNamespace(has_begun=False, progress=SimpleNamespace(noted=lambda *, now: {"kinds": now}))
+    hunt._fail(ledger, "no disk")
+    assert ledger.entered[1] == ledger.entered[0]
+    hunt._running.has_begun = True
+    hunt._fail(ledger, "bad \udcff")
+    state, detail, facts = ledger.entered[2]
     assert (state, facts) == ("error", {"kinds": True})
     detail.encode()
 
@@ -203,7 +247,7 @@ def test_hunt_that_fails_records_why(hunt, monkeypatch):
         raise CrashhuntError("no disk", fix="x")
 
     ledger.enter = fails
-    found._fail(ledger, "no disk")
+    hunt._fail(ledger, "no disk")
 
 
 @pytest.mark.parametrize(
@@ -219,7 +263,7 @@ def test_hunt_that_fails_records_why(hunt, monkeypatch):
     ],
 )
 def test_error_of_a_hunt_is_in_its_ledger(hunt, monkeypatch, error, raised, why):
-    found, failed, noted, removed = hunt(), [], [], []
+    found, failed, noted, removed = hunt, [], [], []
 
     @contextmanager
     def locked():
@@ -253,45 +297,45 @@ def test_error_of_a_hunt_is_in_its_ledger(hunt, monkeypatch, error, raised, why)
     assert found.run() == "report"
 
 
-def test_hunt_waits_for_a_locked_ledger_and_reports_it(hunt, monkeypatch):
-    found, shown = hunt(), []
-    progress = SimpleNamespace(notes=[])
-    monkeypatch.setattr(found, "_status", lambda given, phase: phase)
+def test_hunt_waits_for_a_locked_ledger_and_reports_it(running):
     for waited_s in (1.0, 2.0, 3.5, 60.0):
-        found._wait_for_ledger(progress, shown.append, waited_s)
-    assert shown == ["waiting", "waiting"]
-    assert progress.notes == ["the hunt waited for another program that had locked ledger.sqlite; no trial was lost"]
+        running._wait_for_ledger(waited_s)
+    assert running.shown == [("waiting", 9)] * 2
+    assert running.progress.notes == [
+        "the hunt waited for another program that had locked ledger.sqlite; no trial was lost"
+    ]
     with pytest.raises(HuntDirectoryError, match="has locked the ledger for 601 s; close the program"):
-        found._wait_for_ledger(progress, shown.append, 601.0)
-    found._stops = (signal.SIGINT,)
-    found._wait_for_ledger(progress, shown.append, 1.0)
+        running._wait_for_ledger(601.0)
+    running.setup.stops = (signal.SIGINT,)
+    running._wait_for_ledger(1.0)
     with pytest.raises(HuntDirectoryError, match="has locked the ledger for 4 s"):
-        found._wait_for_ledger(progress, shown.append, 4.0)
+        running._wait_for_ledger(4.0)
 
 
-def test_trial_is_written_recorded_and_counted(hunt, monkeypatch):
+def test_trial_is_written_recorded_and_counted(running, loop, monkeypatch):
     calls = []
-    found = hunt(replace(SETTINGS, crash_on=(Outcome.COLLISION,)))
-    found._unanswered = SimpleNamespace(account=lambda given, progress: given.spec.number < 90)
-    found._copied = SimpleNamespace(add=lambda given: calls.append(("copied", given.spec.number)))
-    ledger = SimpleNamespace(record=lambda given, *, snapshot: calls.append(("row", given.spec.number, snapshot)))
-    trials = SimpleNamespace(ended=lambda given: calls.append(("ended", given.spec.number)))
-    progress = SimpleNamespace(
+    running.setup.settings = replace(SETTINGS, crash_on=(Outcome.COLLISION,))
+    running.unanswered = SimpleNamespace(account=lambda given, progress: given.spec.number < 90)
+    running.fork_crashes = SimpleNamespace(add=lambda given: calls.append(("copied", given.spec.number)))
+    running.ledger.record = lambda given, *, snapshot: calls.append(("row", given.spec.number, snapshot))
+    running.trials = SimpleNamespace(ended=lambda given: calls.append(("ended", given.spec.number)))
+    running.progress = SimpleNamespace(
         kinds=object(), count=lambda given, *, crashed, planned: calls.append(("counted", crashed, planned)),
         save=lambda bundle: calls.append(("saved", bundle)),
     )  # fmt: skip
-    monkeypatch.setattr(_hunt, "write_trial", lambda folder, given, scratch: calls.append(("files", scratch.name)))
-    monkeypatch.setattr(_hunt, "read_map", lambda scratch, trial: "lanes")
+    found = loop()
+    monkeypatch.setattr(_trial_loop, "write_trial", lambda _, given, scratch: calls.append(("files", scratch.name)))
+    monkeypatch.setattr(_trial_loop, "read_map", lambda scratch, trial: "lanes")
 
     def write(folder, given, trial, **more):
-        calls.append(("bundle", folder == found.directory, trial.name, more))
+        calls.append(("bundle", folder == running.setup.place.path, trial.name, more))
         return "bundle"
 
-    monkeypatch.setattr(_hunt, "write_bundle", write)
+    monkeypatch.setattr(_trial_loop, "write_bundle", write)
 
     def record(given):
         calls.clear()
-        found._record_trial(given, ledger, SimpleNamespace(digest="0f"), trials, progress)
+        found._record_trial(given)
         return list(calls)
 
     assert record(result(4)) == [("row", 4, "0f"), ("counted", False, 9), ("copied", 4), ("ended", 4)]
@@ -304,43 +348,43 @@ def test_trial_is_written_recorded_and_counted(hunt, monkeypatch):
         ("bundle", True, "trial-000007", more), ("saved", "bundle"), ("row", 7, "0f"), ("counted", True, 9),
         ("ended", 7),
     ]  # fmt: skip
-    progress.kinds = None  # it is saved once it is the one that ends the hunt
+    running.progress.kinds = None  # it is saved once it is the one that ends the hunt
     assert record(crash) == [("counted", True, 9), ("ended", 7)]
-    found._disturber = SimpleNamespace(log_likelihood_of=lambda given: -given.spec.number)
-    ledger.record = lambda given, *, snapshot: calls.append(given.log_likelihood)
+    running.disturber = SimpleNamespace(log_likelihood_of=lambda given: -given.spec.number)
+    running.ledger.record = lambda given, *, snapshot: calls.append(given.log_likelihood)
     assert record(result(8))[0] == -8
 
 
-def test_phases_after_the_last_trial_are_shown_and_noted_now_and_then(hunt, monkeypatch):
-    found, ledger, seen = hunt(), Notes(), []
+def test_phases_after_the_last_trial_are_shown_and_noted_now_and_then(running, monkeypatch):
     clock = SimpleNamespace(now=100.0)
-    monkeypatch.setattr(_hunt.time, "monotonic", lambda: clock.now)
-    monkeypatch.setattr(found, "_status", lambda progress, phase: (phase, progress.phase.done))
-    progress = SimpleNamespace(phase=None, ends_at=5.0, noted=lambda: {"done": progress.phase.done}, notes=[])
-    show = found._show_phase(ledger, progress, seen.append)
+    monkeypatch.setattr(_running_hunt.time, "monotonic", lambda: clock.now)
+    running.progress = progress = SimpleNamespace(
+        phase=None, ends_at=5.0, noted=lambda: {"done": progress.phase.done}, notes=[],
+        status=lambda phase, planned, workers, **more: (phase, progress.phase.done),
+    )  # fmt: skip
+    show = running._phase_display()
     for now, name, done in ((0.0, "a", 0), (0.5, "a", 1), (1.5, "a", 2), (1.6, "b", 0), (1.7, "b", 1)):
         clock.now = 100.0 + now
         show(SimpleNamespace(name=name, done=done))
-    assert seen == [("a", 0), ("a", 1), ("a", 2), ("b", 0), ("b", 1)]
-    assert ledger.noted == [{"done": 0}, {"done": 2}, {"done": 0}]
+    assert running.shown == [("a", 0), ("a", 1), ("a", 2), ("b", 0), ("b", 1)]
+    assert running.ledger.noted == [{"done": 0}, {"done": 2}, {"done": 0}]
     assert progress.ends_at is None
 
 
-def test_earlier_runs_count_on_the_screen(hunt, monkeypatch):
-    found = hunt()
+def test_earlier_runs_count_on_the_screen(monkeypatch):
     ledger = SimpleNamespace(
-        tried_by_origin=lambda crash_on: ("tried", tuple(crash_on)), result=lambda number: f"result {number}"
-    )
+        tried_by_origin=lambda crash_on: ("tried", tuple(crash_on)), result=lambda number: f"result {number}",
+        outcomes=lambda: {"a": 3, "b": 4}, nearest_miss=lambda: "nearest",
+    )  # fmt: skip
     resumed = []
 
     def counts(branches, probes, before=None):
-        monkeypatch.setattr(_hunt, "sums_of_branches", lambda given, facts: branches)
-        monkeypatch.setattr(_hunt, "sums_of_probes", lambda given, facts: probes)
-        progress = SimpleNamespace(
-            outcomes={"a": 3, "b": 4}, searching=SimpleNamespace(resume=lambda *given: resumed.append(given)),
-            stressed=None,
-        )  # fmt: skip
-        found._resume_counts(ledger, progress, before or {}, SETTINGS)
+        monkeypatch.setattr(_progress, "sums_of_branches", lambda given, facts: branches)
+        monkeypatch.setattr(_progress, "sums_of_probes", lambda given, facts: probes)
+        progress = Progress()
+        progress.searching = SimpleNamespace(resume=lambda *given: resumed.append(given))
+        progress.resume_counts(ledger, before or {}, SETTINGS.crash_on)
+        assert (progress.outcomes, progress.nearest) == ({"a": 3, "b": 4}, "nearest")
         return progress.branched, progress.not_fully_asked, progress.stressed
 
     assert counts(None, None) == (0, 0, None)
@@ -365,16 +409,16 @@ def test_rate_of_a_hunt_with_a_bar_has_no_estimate(monkeypatch, tmp_path):
         made.append((name, per, counter, sequence, more))
         return Rate({"after_unfinished": 2, "invalid": 1})
 
-    monkeypatch.setattr(_hunt, "make_rate", make)
+    monkeypatch.setattr(_rate_of_running_hunt, "make_rate", make)
     watch = SimpleNamespace(per="trial", counter="c", sequence="s", alpha=0.05, bar=0.1, decided_at=None,
                             verdict="below", why_undecided="few")  # fmt: skip
-    assert _hunt._rate_of(tmp_path, None) is None
-    found = _hunt._rate_of(tmp_path, watch)
+    assert rate_of_bar(tmp_path, None) is None
+    found = rate_of_bar(tmp_path, watch)
     assert (found.verdict, found.why_undecided, found.excluded) == (
         "below", "few", {"after_unfinished": 2, "invalid": 1},
     )  # fmt: skip
     watch.decided_at = 0
-    assert _hunt._rate_of(tmp_path, watch).excluded == {"invalid": 1}
+    assert rate_of_bar(tmp_path, watch).excluded == {"invalid": 1}
     assert [more["why_no_estimate"].partition(" ")[0] for *_, more in made] == ["--until-rate"] * 2
     assert made[0][:4] == (str(tmp_path), "trial", "c", "s")
     assert (made[0][4]["confidence"], made[0][4]["bar"]) == (pytest.approx(95.0), 0.1)
