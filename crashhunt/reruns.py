@@ -33,18 +33,18 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
-from crashhunt.base.temporary import temporary_folder
+from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor, has_fork_server, read_map
 from crashhunt.recording import Recording, read_black_box
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.episode import WorkerSettings
@@ -135,7 +135,8 @@ class Reruns:
     """Runs trials again, several at a time.
 
     Args:
-        worker: settings of the trials; the folder for the files of the runs is ``worker.scratch``.
+        worker: settings of the trials. The files of the runs are in ``worker.scratch``, or in a temporary folder if
+            this path is empty.
         where: the processes that run the trials.
         parallel: number of trials at a time.
         stopped: function called before each wait for results; it returns whether to stop, or raises an exception.
@@ -155,6 +156,9 @@ class Reruns:
         numbered: bool = False,
         shared: bool = False,
     ) -> None:
+        self._folder = TemporaryFolder("rerun") if worker.scratch == Path() else None
+        if self._folder is not None:
+            worker = replace(worker, scratch=self._folder.path)
         self._worker, self._stopped, self._shared = worker, stopped, shared
         self._executor = _executor(worker, where, parallel)
         self._numbers = itertools.count(1) if numbered else None
@@ -210,8 +214,10 @@ class Reruns:
                 self._executor.cancel()
 
     def close(self) -> None:
-        """End all processes."""
+        """End all processes, and remove the temporary folder."""
         self._executor.close()
+        if self._folder is not None:
+            self._folder.remove()
 
     def _submit(self, specs: Sequence[TrialSpec]) -> dict[int, int]:
         """Submit trials; return the index of each trial by its number."""
@@ -292,14 +298,17 @@ def run_alone(
 ) -> Iterator[EndedRun]:
     """Yield one run in a new Python process; its files exist until the iteration continues.
 
+    Args:
+        worker: settings of the trial, as for `Reruns`.
+        spec: specification of the trial.
+        stopped: function that returns whether to stop; called repeatedly.
+
     Raises:
         StoppedError: the user has stopped the run.
         CrashhuntError: the trial could not be run.
     """
-    with temporary_folder("rerun") as scratch:
-        runs = Reruns(replace(worker, scratch=scratch), "alone", stopped=stopped)
-        with closing(runs):
-            yield from runs.run([spec])
+    with closing(Reruns(worker, "alone", stopped=stopped)) as runs:
+        yield from runs.run([spec])
 
 
 class SharedReruns:
@@ -325,9 +334,8 @@ class SharedReruns:
         key = json.dumps(replace(worker, scratch=self._scratch).to_json(), sort_keys=True)
         with self._lock:
             if key not in self._runs:
-                scratch = self._scratch / f"shared-{len(self._runs)}"
-                scratch.mkdir(parents=True)
-                worker = replace(worker, scratch=scratch)
+                worker = replace(worker, scratch=self._scratch / f"shared-{len(self._runs)}")
+                worker.scratch.mkdir(parents=True)
                 self._runs[key] = Reruns(worker, "snapshot", parallel=self._parallel, numbered=True, shared=True)
             runs = self._runs[key]
         (ended,) = runs.run([spec], stopped=stopped)

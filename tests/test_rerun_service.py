@@ -6,6 +6,7 @@ import queue
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -135,12 +136,14 @@ def test_trial_that_ran_without_a_part_of_its_specification_is_refused(runs):
 def test_one_trial_that_is_run_alone_ends_with_its_process(worker, monkeypatch):
     made, executor = [], Executor()
     monkeypatch.setattr(reruns, "FreshProcessExecutor", lambda given, *, parallel: made.append(given) or executor)
-    (ended,) = run_alone(worker, spec(3))
-    assert (ended.result, executor.closed) == (survived(3), 1)
-    assert made[0].scratch != worker.scratch
+    unplaced = replace(worker, scratch=Path())
+    for ended in run_alone(unplaced, spec(3)):
+        assert (ended.result, ended.folder) == (survived(3), scratch_of(made[0].scratch, 3))
+        assert made[0].scratch.is_dir()
+    assert executor.closed == 1
     assert not made[0].scratch.exists()
     with pytest.raises(StoppedError):
-        list(run_alone(worker, spec(3), lambda: True))
+        list(run_alone(unplaced, spec(3), lambda: True))
     assert executor.closed == 2
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,6 @@ from crashhunt.analysis._cause_runs import find_why
 from crashhunt.analysis._omissions import find_omission
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
-from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.text import command_line
 from crashhunt.crashes import (
     INTERRUPTED,
@@ -239,13 +239,12 @@ def judge(
     of_two = result.outcome is Outcome.COLLISION and hit is not None and bool(hit.other)
     _require_judgeable(bundle, of_two=of_two, why=why)
     rerun = prepare(bundle, options or ReplayOptions())
-    with temporary_folder("judge") as scratch:
-        reruns = reruns_of(rerun, scratch, parallel=parallel, stopped=stopped)
 
-        def tell(done: int) -> None:
-            if watch is not None:
-                watch(done, runs + why + reference)
+    def tell(done: int) -> None:
+        if watch is not None:
+            watch(done, runs + why + reference)
 
+    with closing(reruns_of(rerun, parallel=parallel, stopped=stopped)) as reruns:
         lanes = LaneMap(read_lanes(bundle.path / layout.LOG), (hit.x, hit.y) if hit is not None else (0.0, 0.0))
         trials = _Trials(result=result, recorded=rerun.recorded, reruns=reruns, lanes=lanes, tell=tell)
         search = AvoidanceSearch(result.steps, _start(rerun) if of_two else 0, trials.run, runs=runs, parallel=parallel)
@@ -257,20 +256,12 @@ def judge(
                 found = find_why(rerun, reruns, most=why, tell=lambda done: tell(trials.done + done))
         except StoppedError:
             search.why_not = INTERRUPTED
-        finally:
-            reruns.close()
-    with temporary_folder("judge") as scratch:
-        before = trials.done + (found.runs if found is not None else 0)
-        omitted = None
-        if reference > 0 and result.outcome in (Outcome.COLLISION, Outcome.OFF_ROAD) and search.why_not != INTERRUPTED:
-            omitted = find_omission(
-                rerun,
-                scratch,
-                most=reference,
-                parallel=parallel,
-                stopped=stopped,
-                tell=lambda done: tell(before + done),
-            )
+    before = trials.done + (found.runs if found is not None else 0)
+    omitted = None
+    if reference > 0 and result.outcome in (Outcome.COLLISION, Outcome.OFF_ROAD) and search.why_not != INTERRUPTED:
+        omitted = find_omission(
+            rerun, most=reference, parallel=parallel, stopped=stopped, tell=lambda done: tell(before + done)
+        )
     visible = visible_from(rerun.recorded, hit.agent, hit.other) if of_two and hit is not None else None
     return replace(search.judgement(), why=found, visible_step=visible, reference=omitted)
 

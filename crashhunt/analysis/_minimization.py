@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -13,7 +14,7 @@ from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.base.files import put_in_place, sync_folder
-from crashhunt.base.temporary import temporary_beside, temporary_folder
+from crashhunt.base.temporary import temporary_beside
 from crashhunt.crashes import Bundle, is_bundle_made_here, signature_of, write_bundle
 from crashhunt.plans import takes_of
 from crashhunt.replays import ReplayOptions, confirm, prepare
@@ -149,17 +150,14 @@ def shrink(
     rerun = prepare(bundle, ReplayOptions(trusted=trusted))
     signature = signature_of(bundle)
     memory = bundle.path.with_name(f".{shrunk_name(bundle.id)}.jsonl")
-    with temporary_folder("shrink") as scratch:
-        runs = Runs(
-            rerun, signature, scratch, memory,
-            parallel=parallel or len(os.sched_getaffinity(0)), budget=budget, time_s=time_s,
-            stopped=stopped, watch=watch,
-        )  # fmt: skip
-        try:
-            search = Minimizer(rerun, runs, form, _constructor_defaults(rerun))
-            ended, why = search.run(stopped)
-        finally:
-            runs.close()
+    runs = Runs(
+        rerun, signature, memory,
+        parallel=parallel or len(os.sched_getaffinity(0)), budget=budget, time_s=time_s,
+        stopped=stopped, watch=watch,
+    )  # fmt: skip
+    with closing(runs):
+        search = Minimizer(rerun, runs, form, _constructor_defaults(rerun))
+        ended, why = search.run(stopped)
     small = None
     if search.reproduced and search.best != rerun.spec:
         try:

@@ -13,6 +13,7 @@ Cost: one run in which the reference driver watches, three or six for each candi
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 from itertools import takewhile
 from typing import TYPE_CHECKING
@@ -37,7 +38,6 @@ from crashhunt.trial import Outcome, Overruled
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Without
@@ -62,7 +62,6 @@ _OLD_SNAPSHOT_REASON = (
 
 def find_omission(
     rerun: Rerun,
-    scratch: Path,
     *,
     most: int,
     parallel: int,
@@ -76,7 +75,6 @@ def find_omission(
 
     Args:
         rerun: the crash to analyse.
-        scratch: folder for the files of the workers.
         most: maximum number of runs.
         parallel: number of runs at a time.
         stopped: function that returns whether to stop.
@@ -91,18 +89,16 @@ def find_omission(
         rerun = replace(
             rerun, worker=replace(rerun.worker, scenario=with_recorded_load_order(rerun.worker.scenario, order))
         )
-    runs = reruns_of(rerun, scratch, parallel=parallel, stopped=stopped, todays=True)
-    search = _Search(rerun, runs, most, tell)
-    try:
-        return search.find(_OLD_SNAPSHOT_REASON if old else _NOT_IDENTICAL_REASON)
-    except StoppedError:
-        return Reference(runs=tuple(search.runs), why_not=INTERRUPTED)
-    except RecorderError:
-        raise
-    except CrashhuntError as error:
-        return Reference(runs=tuple(search.runs), why_not=error.message)
-    finally:
-        runs.close()
+    with closing(reruns_of(rerun, parallel=parallel, stopped=stopped, todays=True)) as runs:
+        search = _Search(rerun, runs, most, tell)
+        try:
+            return search.find(_OLD_SNAPSHOT_REASON if old else _NOT_IDENTICAL_REASON)
+        except StoppedError:
+            return Reference(runs=tuple(search.runs), why_not=INTERRUPTED)
+        except RecorderError:
+            raise
+        except CrashhuntError as error:
+            return Reference(runs=tuple(search.runs), why_not=error.message)
 
 
 class _Search:

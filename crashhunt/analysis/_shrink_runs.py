@@ -6,7 +6,6 @@ import json
 import shutil
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError
@@ -17,6 +16,7 @@ from crashhunt.reruns import Budget, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from pathlib import Path
 
     from crashhunt.base.progress import Watch
     from crashhunt.crashes import Signature
@@ -46,7 +46,6 @@ class Runs:
     Args:
         rerun: the crash to minimize.
         signature: signature of the crash, which candidates must keep.
-        scratch: folder for the files of the workers.
         memory: A file with the results of candidates, for a search that resumes after an interruption.
         parallel: number of trials at a time.
         budget: maximum number of runs.
@@ -66,7 +65,6 @@ class Runs:
         self,
         rerun: Rerun,
         signature: Signature,
-        scratch: Path,
         memory: Path,
         *,
         parallel: int,
@@ -78,11 +76,11 @@ class Runs:
         self.count = self.steps = 0
         self.most_steps = self.found_steps = max(1, rerun.bundle.result.steps_begun)
         self._rerun, self._signature, self._memory_file = rerun, signature, memory
-        self._budget, self._watch, self._scratch = budget, watch, scratch
+        self._budget, self._watch = budget, watch
         self._memory = _remembered(memory)
         # The traffic of most candidates differs, so a suspended set-up would rarely serve two of them.
         self._reruns = reruns_of(
-            rerun, scratch, parallel=parallel, stopped=Budget(stopped, time_s).require, keep_all=False, warm_copies=0
+            rerun, parallel=parallel, stopped=Budget(stopped, time_s).require, keep_all=False, warm_copies=0
         )
 
     def first(self, candidates: Sequence[TrialSpec], *, again: bool = False) -> int | None:
@@ -172,16 +170,14 @@ class Runs:
         result = ended.result
         if result.collision is None and result.failure is not None:
             return signature_of(replace(self._rerun.bundle, result=result))
+        place = ended.folder.with_name("made")
         try:
-            made = self._scratch / "made"
-            copy = Path(shutil.copytree(ended.folder, self._scratch / "copy"))
-            bundle = write_bundle(made, result, copy, hunt_seed=0, snapshot="0", lanes=ended.lanes)
+            bundle = write_bundle(place, result, ended.folder, hunt_seed=0, snapshot="0", lanes=ended.lanes)
             return signature_of(bundle)
         except BundleError:  # it died before it had recorded anything
             return None
         finally:
-            for made_here in ("made", "copy"):
-                shutil.rmtree(self._scratch / made_here, ignore_errors=True)
+            shutil.rmtree(place, ignore_errors=True)
 
     def _key(self, spec: TrialSpec) -> str:
         return digest_of_data({**spec.to_json(), "number": 0, "most_steps": self.most_steps})

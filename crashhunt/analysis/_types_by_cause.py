@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from crashhunt.analysis._avoidability import judge
 from crashhunt.analysis._omissions import find_omission
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes import (
     Cause,
     CauseGroup,
@@ -63,10 +62,7 @@ def find_cause(
         found = Judgement()
     if found.reference is None and result.outcome in (Outcome.COLLISION, Outcome.OFF_ROAD):
         rerun = prepare(bundle, options or ReplayOptions())
-        with temporary_folder("causes") as scratch:
-            reference = find_omission(
-                rerun, scratch, most=_REFERENCE_RUNS, parallel=parallel, stopped=stopped, tell=lambda _: None
-            )
+        reference = find_omission(rerun, most=_REFERENCE_RUNS, parallel=parallel, stopped=stopped, tell=lambda _: None)
         found = replace(found, reference=reference)
     if found.why is None and (found.reference is None or found.reference.omission is None):
         new = judge(bundle, options, runs=1, why=_WHY_RUNS, parallel=parallel, stopped=stopped)

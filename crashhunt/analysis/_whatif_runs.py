@@ -20,6 +20,7 @@ from __future__ import annotations
 import itertools
 import statistics
 from collections import Counter
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -28,7 +29,6 @@ import numpy as np
 from crashhunt.analysis._interventions import LeaveOut, Reseed, SetArguments
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import UsageError, WorkerError
-from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes import wilson
 from crashhunt.recording import first_divergence
 from crashhunt.replays import ReplayOptions, is_current_code, prepare, reruns_of, up_to
@@ -107,8 +107,7 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
     for one in interventions:
         rerun = one.applied(rerun)
     budget = Budget(options.stopped, options.time_s)
-    with temporary_folder("whatif") as scratch:
-        reruns = reruns_of(rerun, scratch, parallel=max(1, options.parallel), stopped=budget.require)
+    with closing(reruns_of(rerun, parallel=max(1, options.parallel), stopped=budget.require)) as reruns:
         runs = _Runs(rerun, reruns, _from_step(interventions), options, times)
         try:
             if exclusions := [one for one in interventions if isinstance(one, LeaveOut)]:
@@ -125,8 +124,6 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
             if rerun.code == "snapshot" and not is_current_code(rerun):
                 raise _too_old(error.message) from error
             raise
-        finally:
-            reruns.close()
     edits = [] if not rerun.edits else [", ".join(rerun.edits)]
     return Counts(
         crash=bundle.id,

@@ -281,7 +281,6 @@ _SUSPENDED_SETUPS = 2  # suspended set-ups of each worker: most runs begin as th
 
 def reruns_of(
     rerun: Rerun,
-    scratch: Path,
     *,
     parallel: int,
     stopped: Callable[[], bool],
@@ -293,13 +292,12 @@ def reruns_of(
 
     Args:
         rerun: the crash whose trial is changed.
-        scratch: folder for the files of the workers.
         parallel: number of trials at a time.
         stopped: function that returns whether to stop, or raises an exception; called repeatedly.
         keep_all: whether trials without a crash are recorded as well.
         warm_copies: number of suspended simulators for each worker, which have already been set up.
         todays: whether trials run with the current crashhunt and not with the snapshot's; None to determine it.
     """
-    worker = replace(rerun.worker, scratch=scratch, keep_trials=keep_all, warm_copies=warm_copies)
+    worker = replace(rerun.worker, keep_trials=keep_all, warm_copies=warm_copies)
     where: Where = "current" if (is_current_code(rerun) if todays is None else todays) else "alone"
     return Reruns(worker, where, parallel=parallel, stopped=stopped, numbered=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -18,7 +19,7 @@ from crashhunt.trial import ALL_AGENTS, Collision, Failure, Outcome, TrialResult
 
 @dataclass
 class Worker:
-    scratch: object = None
+    scratch: object = field(default_factory=Path)
     keep_trials: bool = True
     warm_copies: int = 0
     code: tuple = ()
@@ -50,7 +51,7 @@ def test_an_older_crashhunt_that_refuses_to_leave_others_out_has_no_one_excluded
     monkeypatch.setattr(reruns, "PoolExecutor", Refuses)
     rerun = SimpleNamespace(worker=Worker(), bundle=SimpleNamespace(result=SimpleNamespace(steps_begun=9)))
     words = {"parallel": 1, "budget": 9, "time_s": None, "stopped": lambda: False, "watch": None}
-    runs = _runs.Runs(rerun, None, tmp_path, tmp_path / "memory", **words)
+    runs = _runs.Runs(rerun, None, tmp_path / "memory", **words)
     spec = TrialSpec(0, 1, {}, {}, 9, only=(ALL_AGENTS,))
     assert runs.entered(spec) == ()
     monkeypatch.setattr(Refuses, "error", RecorderError)
@@ -118,7 +119,7 @@ def make_runs(tmp_path, monkeypatch):
 
     def make(**options):
         words = {"parallel": 2, "budget": 9, "time_s": None, "stopped": lambda: False, "watch": None, **options}
-        return _runs.Runs(rerun, signature_of(bundle), tmp_path, tmp_path / "memory", **words)
+        return _runs.Runs(rerun, signature_of(bundle), tmp_path / "memory", **words)
 
     return make
 
@@ -251,15 +252,15 @@ def test_of_a_collision_the_signature_is_made_only_where_it_may_be_the_same(
 
 
 @pytest.mark.parametrize("fails", [True, False])
-def test_a_bundle_that_is_made_for_its_signature_is_removed(make_runs, tmp_path, monkeypatch, fails):
+def test_bundle_that_is_made_for_its_signature_is_removed(make_runs, tmp_path, monkeypatch, fails):
     runs = make_runs()
     folder = tmp_path / "trial"
     folder.mkdir()
     (folder / "blackbox.bin").touch()
     result = TrialResult(candidate("yes"), Outcome.COLLISION, steps=7, collision=HIT)
 
-    def write_bundle(place, result, copy, **words):
-        assert (copy / "blackbox.bin").exists()
+    def write_bundle(place, result, trial, **words):
+        assert (place.parent, trial) == (tmp_path, folder)
         place.mkdir()
         if fails:
             raise BundleError("it died before it had recorded anything")
@@ -268,6 +269,5 @@ def test_a_bundle_that_is_made_for_its_signature_is_removed(make_runs, tmp_path,
     monkeypatch.setattr(_runs, "write_bundle", write_bundle)
     monkeypatch.setattr(reruns, "read_map", lambda scratch, folder: None)
     monkeypatch.setattr(_runs, "signature_of", lambda bundle: f"of {bundle}")
-    for _ in range(2):
-        assert runs._signature_of(EndedRun(0, result, None, folder)) == (None if fails else "of bundle")
+    assert runs._signature_of(EndedRun(0, result, None, folder)) == (None if fails else "of bundle")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["trial"]

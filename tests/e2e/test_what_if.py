@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from contextlib import closing
 from dataclasses import replace
 
 import pytest
@@ -87,11 +88,8 @@ def by_hand(folder, after, number):
     """Run one future as a trial of its own; return its result and how its first steps differ from the recording."""
     rerun = prepare(find_bundle(folder), ReplayOptions())
     spec = replace(rerun.spec, reseeding=Reseeding(after, _engine.future_seed(rerun.spec.seed, number)))
-    reruns = reruns_of(rerun, folder.parent, parallel=1, stopped=lambda: False)
-    try:
+    with closing(reruns_of(rerun, parallel=1, stopped=lambda: False)) as reruns:
         (ended,) = reruns.run([spec])
-    finally:
-        reruns.close()
     return ended.result, first_divergence(up_to(rerun.recorded, after), up_to(ended.recording, after))
 
 

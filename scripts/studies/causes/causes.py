@@ -33,10 +33,10 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
+from contextlib import closing
 from dataclasses import replace
 from math import comb
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.analysis import divide_by_cause
@@ -181,8 +181,7 @@ def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, dict[st
         return found
     reruns = [prepare(bundle, ReplayOptions(trusted=True)) for bundle in bundles]
     asked = [(rerun, what, spec) for rerun in reruns for what, spec in _label_runs(rerun, bugs)]
-    with TemporaryDirectory(prefix="crashhunt-causes-") as scratch:
-        runs = reruns_of(reruns[0], Path(scratch), parallel=2, stopped=lambda: False)
+    with closing(reruns_of(reruns[0], parallel=2, stopped=lambda: False)) as runs:
         for ended in runs.run([spec for *_, spec in asked], recorded=False):
             rerun, words, _ = asked[ended.place]
             bundle = rerun.bundle
@@ -197,7 +196,6 @@ def _labels(bundles: Sequence[Bundle], bugs: Sequence[str]) -> dict[str, dict[st
                 label["alone"] += [bug] if away_s <= _REPRODUCED_S else []
             elif what == "without" and not same:
                 label["needs"].append(bug)
-        runs.close()
     return found
 
 

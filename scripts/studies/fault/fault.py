@@ -21,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -117,15 +118,11 @@ def _put(bundles: list[Bundle]) -> Iterator[dict[str, Any]]:
     if not bundles:
         return
     reruns = [prepare(bundle, ReplayOptions(force=True)) for bundle in bundles]
-    with tempfile.TemporaryDirectory(prefix="crashhunt-judged-") as scratch:
-        runs = reruns_of(reruns[0], Path(scratch), parallel=len(os.sched_getaffinity(0)), stopped=lambda: False)
-        try:
-            for bundle, rerun in zip(bundles, reruns, strict=True):
-                first = _overruled(rerun, runs, 0, ("brake",))
-                more = _overruled(rerun, runs, 0, ("left", "right")) if first == ["hit"] else []
-                yield {"crash": bundle.id, "step": bundle.result.steps, "first": [*first, *more]}
-        finally:
-            runs.close()
+    with closing(reruns_of(reruns[0], parallel=len(os.sched_getaffinity(0)), stopped=lambda: False)) as runs:
+        for bundle, rerun in zip(bundles, reruns, strict=True):
+            first = _overruled(rerun, runs, 0, ("brake",))
+            more = _overruled(rerun, runs, 0, ("left", "right")) if first == ["hit"] else []
+            yield {"crash": bundle.id, "step": bundle.result.steps, "first": [*first, *more]}
 
 
 def _judged(bundle: Bundle) -> dict[str, Any]:
@@ -133,17 +130,13 @@ def _judged(bundle: Bundle) -> dict[str, Any]:
     hit = bundle.result.collision
     assert hit is not None
     told: dict[str, Any] = {"crash": bundle.id, "step": bundle.result.steps, "role": hit.role}
-    with tempfile.TemporaryDirectory(prefix="crashhunt-judged-") as scratch:
-        runs = reruns_of(rerun, Path(scratch), parallel=len(os.sched_getaffinity(0)), stopped=lambda: False)
-        try:
-            fault = fault_of(bundle, rerun.recorded)
-            told |= {"verdict": fault.verdict, "rules": [one.rule for one in fault.findings]}
-            told["first"] = _overruled(rerun, runs, 0)
-            told["braked"] = [_overruled(rerun, runs, _before(rerun, each), ("brake",))[0] for each in _BEFORE_S]
-            told["without"] = _without(rerun, runs)
-            told["other_braked"] = [_stopped_behind(rerun, runs, each) for each in _BEFORE_S]
-        finally:
-            runs.close()
+    with closing(reruns_of(rerun, parallel=len(os.sched_getaffinity(0)), stopped=lambda: False)) as runs:
+        fault = fault_of(bundle, rerun.recorded)
+        told |= {"verdict": fault.verdict, "rules": [one.rule for one in fault.findings]}
+        told["first"] = _overruled(rerun, runs, 0)
+        told["braked"] = [_overruled(rerun, runs, _before(rerun, each), ("brake",))[0] for each in _BEFORE_S]
+        told["without"] = _without(rerun, runs)
+        told["other_braked"] = [_stopped_behind(rerun, runs, each) for each in _BEFORE_S]
     return told
 
 
