@@ -2,15 +2,15 @@
 
 Every analysis that runs a recorded trial again uses this module. The parts of a rerun are:
 
-- **What**: specifications of trials (`TrialSpec`). A change of a trial is a changed specification. For a change from a
-  step on, the specification has a part that begins after the step: `overruled`, `disturbances`, `handover` or
-  `reseeding`. Its run simulates the earlier steps again. The caller chooses which specifications run next.
+- **What**: specifications of trials (`TrialSpec`). A change of a trial is a changed specification. A change that begins
+  at a step (`overruled`, `disturbances`, `handover`, `reseeding`) leaves the steps before as recorded. They are
+  simulated again. The caller chooses which specifications run next.
 - **Where** (`Where`): ``current`` forks processes that have imported the current crashhunt. ``snapshot`` does the same
-  with the crashhunt of a snapshot, if that has a fork server. ``alone`` starts a new Python process for each run.
-  `SharedReruns` serves several threads.
+  with the crashhunt of a snapshot, if that crashhunt has a fork server. ``alone`` starts a new Python process for each
+  run. `SharedReruns` serves several threads.
 - **Limits**: `Budget` decides about a stop of the user and the wall time. The caller limits the number of runs,
   because only the caller knows which of the runs count.
-- **Comparison**: an `EndedRun` has the result, the recording and the files of a run. Bit-identical runs have the same
+- **Comparison**: an `EndedRun` has the outcome, the recording and the files of a run. Bit-identical runs have the same
   digest (`TrialResult.is_identical_run`), and `first_divergence` finds where two recordings differ. A crash type
   (`signature_of`) belongs to a bundle, which `write_bundle` writes from the folder of the run.
 
@@ -364,7 +364,7 @@ def call_in_threads(
         parallel: number of threads.
         ended: function called with each result, in the thread of the caller.
         tick: function called about ten times a second, in the thread of the caller.
-        over: event on which the functions return; it is set if an exception, such as Ctrl-C, ends the wait.
+        over: event that is set if an exception, such as Ctrl-C, ends the wait; running functions then return early.
     """
     with ThreadPoolExecutor(parallel) as threads:
         futures = [threads.submit(function, item) for item in items]

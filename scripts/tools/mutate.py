@@ -45,6 +45,7 @@ _TESTS_ELSEWHERE = {
     "base/git.py": ("base/test_git.py",),
     "base/integrity.py": ("base/test_integrity.py", "base/test_authentication.py"),
     "native/_generators.py": ("native/test_generator_seeds.py",),
+    "reruns.py": ("test_rerun_service.py",),
     "panels": ("render/test_panels*.py", "render/test_pictures.py"),
     "statistics/_rare.py": ("statistics/test_rare.py", "hunts/test_rare_hunts.py"),
     # These are tested as users run them: as commands.
