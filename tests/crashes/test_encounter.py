@@ -247,3 +247,21 @@ def test_a_driven_path_is_found_by_its_length_and_continues_straight():
 def test_the_manner_of_an_encounter_does_not_depend_on_the_map(other, manner, turned):
     two = recording({"ego": (0, 0, 0, 5), "other": (*other, 5)}, turned=turned)
     assert Encounter(two, "ego", "other").manner(0) == manner
+
+
+def test_the_moments_before_a_rear_end_collision():
+    moments = Encounter(follow(speed=20, gap=38.5, leader=10), "ego", "other").moments
+    first, *_, last, touch = moments
+    assert (first.gap_m, first.closing_speed, first.time_to_collision_s) == pytest.approx((38.5, 10, 3.85))
+    assert first.required_deceleration == pytest.approx(100 / 77)
+    assert touch.gap_m == pytest.approx(0, abs=1e-9)
+    assert 0 < last.time_to_collision_s < 0.2
+    assert last.required_deceleration == pytest.approx(10 / (2 * last.time_to_collision_s))
+    assert [moment.step for moment in moments] == list(range(len(moments)))
+
+
+def test_where_brakes_do_not_help_there_is_no_escape():
+    assert last_escape(follow(speed=30, gap=20), "ego", "other", braking=8.0) is None
+    overlap = {"ego": (0, 0, 0, 5), "other": (3, 0, 0, 0)}
+    assert last_escape(recording(overlap), "ego", "other", braking=8.0) is None
+    assert Encounter(recording(), "ego", "other").moments == []
