@@ -17,8 +17,10 @@ import subprocess
 import sys
 import tempfile
 import threading
+import tomllib
 from dataclasses import dataclass
 from importlib.machinery import SourceFileLoader
+from importlib.metadata import distribution
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -216,7 +218,12 @@ def pytest_configure(config: pytest.Config) -> None:
     Compiling the tests of a fresh clone takes 7 s of a processor, most of it for what pytest adds to assertions, and
     the servers that commands are forked from take 3 s.
     """
-    if not config.getoption("tx", None) or "PYTEST_XDIST_WORKER" in os.environ:
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        return
+    if others := outdated_entry_points(Path(_REPOSITORY, "pyproject.toml")):
+        what = f"crashhunt was installed before pyproject.toml changed its entry points: {', '.join(others)}"
+        pytest.exit(f"{what}. Fix: scripts/test, or pip install --no-deps --editable .", pytest.ExitCode.USAGE_ERROR)
+    if not config.getoption("tx", None):
         return
     if config.args_source is pytest.Config.ArgsSource.TESTPATHS:
         compile_once(config, Path(__file__).parent, max(1, os.cpu_count() or 1))
@@ -224,6 +231,18 @@ def pytest_configure(config: pytest.Config) -> None:
     servers = Commands(_usual_environment(), name)
     os.environ[_OF_ALL_WORKERS] = name
     config.add_cleanup(servers.close)
+
+
+def outdated_entry_points(pyproject: Path) -> list[str]:
+    """Return the names of commands and plugins that were installed otherwise than `pyproject.toml` has them now.
+
+    With ``pytest`` alone, which does not make the environment anew, tests of hunts failed one by one for such a name.
+    """
+    project = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]
+    groups = {"console_scripts": project["scripts"], **project["entry-points"]}
+    wanted = {(group, name, value) for group, named in groups.items() for name, value in named.items()}
+    installed = {(one.group, one.name, one.value) for one in distribution("crashhunt").entry_points}
+    return sorted({name for _, name, _ in wanted ^ installed})
 
 
 def compile_once(config: pytest.Config, tests: Path, processes: int) -> None:

@@ -1,4 +1,4 @@
-"""The processes that commands and keepers of tests are forked from: they outlast what ends those."""
+"""The processes that commands and keepers of tests are forked from, and what is installed for them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import subprocess
 import sys
 import time
 import types
+from pathlib import Path
 
 import pytest
 import warm
 from commands import state_of
-from conftest import _commands
+from conftest import _commands, outdated_entry_points
 
 from crashhunt.episode._failures import _contents_of
 
@@ -111,3 +112,10 @@ def test_fork_records_a_module_again_that_has_changed_since(change, monkeypatch)
     assert warm._contents_of(record, "place", place) == _contents_of("place", place)
     assert recorded == ([] if change == "nothing" else ["place"])
     assert set(known.found[1]) == {place.Kind}
+
+
+def test_installation_with_other_entry_points_is_named(tmp_path):
+    ours, other = Path(__file__).parents[1] / "pyproject.toml", tmp_path / "pyproject.toml"
+    assert outdated_entry_points(ours) == []
+    other.write_text(ours.read_text().replace(':ToySimulator"', ':AnotherSimulator"'))
+    assert outdated_entry_points(other) == ["toy"]
