@@ -238,7 +238,6 @@ _TESTS_ELSEWHERE = {
     "results/_state.py": (
         "results/test_directory.py",
         "hunts/test_hunt_parts.py",
-        "hunts/test_logs.py",
         "hunts/test_phases.py",
         "hunts/test_states_and_reports.py",
         "results/test_states_of_facts.py",

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from crashhunt.hunts._progress import HuntStatus, Progress, StrategyTally
+from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.trial import Branches, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
 
 BRAKE = Disturbance(5, "ahead", "brake", 4.0, 2.0, "ego")
@@ -93,31 +93,6 @@ def test_least_robust_trial_and_crashed_branches_are_counted():
     )  # fmt: skip
     assert progress.stressed is weak
     assert (progress.branched, progress.not_fully_asked) == (0, 1)
-
-
-def test_disturbed_crash_that_is_not_saved_counts():
-    crash = result(2, Outcome.COLLISION, disturbances=(BRAKE,))
-    assert counted(crash, crashed=(2,)).disturbed == 1
-
-
-def test_strategies_have_their_shares_and_mean_criticality():
-    tally = StrategyTally()
-    tally.resume(4, [("random", 2, 2, 0.4, 0), ("mutation", 2, 1, 1.0, 1)])
-    for one, crashed in (
-        (result(0, origin="mutation", danger=0.5), False), (result(1, origin="mutation"), True), (result(2), False),
-        (result(3, origin="mutation"), False),
-    ):  # fmt: skip
-        tally.take(one, crashed=crashed)
-    mutation, plain = tally.status().strategies
-    assert (mutation.name, mutation.trials, mutation.share, mutation.crashes) == ("mutation", 5, 5 / 8, 2)
-    assert mutation.danger == pytest.approx((1.0 + 0.5 + 1.0) / 3)  # a crash counts as 1, an unmeasured trial not
-    assert (plain.name, plain.trials, plain.danger, plain.crashes) == ("random", 2, pytest.approx(0.2), 0)
-    assert (tally.status().grown_trials, tally.status().grown_s) == (None, None)
-    tally.grow()
-    tally.take(result(4), crashed=False)
-    grown = tally.status()
-    assert grown.grown_trials == 1
-    assert 0 <= grown.grown_s < 5
 
 
 def test_time_limit_of_a_hunt_counts_down_to_zero():

@@ -12,18 +12,6 @@ def told(progress, danger, origin="", *, crashed=False):
     progress.count(result, crashed=crashed, planned=9)
 
 
-def test_shares_and_mean_dangers_are_those_of_the_trials_and_a_crash_counts_as_one():
-    progress = Progress()
-    assert progress.searching.status().strategies == ()
-    for danger, origin in ((0.1, "random"), (0.3, "mutation"), (None, "random"), (0.5, "mutation")):
-        told(progress, danger, origin)
-    told(progress, 0.2, "mutation", crashed=True)
-    mutation, random = progress.searching.status().strategies
-    assert (mutation.name, mutation.trials, mutation.share, mutation.crashes) == ("mutation", 3, 0.6, 1)
-    assert abs(mutation.danger - 0.6) < 1e-12
-    assert (random.name, random.danger, random.crashes) == ("random", 0.1, 0)
-
-
 def test_the_greatest_danger_grew_with_the_last_trial_that_was_more_dangerous_than_all():
     progress = Progress()
     assert progress.searching.status().grown_trials is None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import shutil
 import socket
@@ -20,7 +19,7 @@ import crashhunt
 from crashhunt.base import layout
 from crashhunt.episode import WorkerSettings
 from crashhunt.errors import CrashhuntError, HuntDirectoryError
-from crashhunt.hunts import HuntStatus, _trial_loop, check, salvage
+from crashhunt.hunts import _trial_loop, check, salvage
 from crashhunt.hunts._next_trials import Unanswered, find_unanswered
 from crashhunt.hunts._progress import Progress
 from crashhunt.hunts._verification import Audit
@@ -31,7 +30,6 @@ from crashhunt.results._state import draws_independently, ledger_owner, sums_of_
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.statistics import CountingRule, RateWatch
 from crashhunt.trial import KILLED, Branches, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
-from crashhunt.world import ClosestApproach
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
 
@@ -96,13 +94,6 @@ def test_a_hunt_whose_process_is_there_runs(hunt):
     for other in ({**me, "started": me["started"] + 1}, {**me, "pid": 2**22 + 5}):
         note(hunt, owner=other)
         assert hunt_state(hunt).state == "killed"
-
-
-@pytest.mark.parametrize(("silent_s", "state"), [(5, "running"), (55, "running"), (65, "killed")])
-def test_on_another_machine_a_heartbeat_reports_that_it_runs(hunt, silent_s, state):
-    owner = {"host": "elsewhere", "pid": 1, "started": 1}
-    note(hunt, state="running", owner=owner, heartbeat=time.time() - silent_s)
-    assert hunt_state(hunt).state == state
 
 
 def test_what_not_every_hunt_has_is_in_its_json_only_where_it_has_it(hunt):
@@ -196,66 +187,6 @@ def test_trials_are_independent_where_the_sampler_said_so(hunt):
     assert not draws_independently({"independent": True}, replace(settings, seeds=3))
 
 
-def status(**figures):
-    plain = {"phase": "hunting", "planned": 10, "done": 4, "outcomes": {}, "rate_per_s": 2.0, "elapsed_s": 2.0}
-    return HuntStatus(**plain | {"nearest": None, "workers": {}, "crashes": 0} | figures)
-
-
-@pytest.mark.parametrize(
-    ("figures", "left", "share"),
-    [
-        ({}, 3.0, 0.4),
-        ({"time_left_s": 1.0}, 1.0, 2 / 3),
-        ({"time_left_s": 8.0}, 3.0, 0.4),
-        ({"trials_left_s": 5.0}, 5.0, 0.4),
-        ({"trials_left_s": 5.0, "time_left_s": 4.0}, 4.0, 0.4),
-        ({"planned": 0}, math.inf, 0.0),
-        ({"planned": 0, "time_left_s": 6.0}, 6.0, 0.25),
-        ({"rate_per_s": 0.0}, math.inf, 0.4),
-        ({"elapsed_s": 0.0, "time_left_s": 0.0}, 0.0, 1.0),
-    ],
-)
-def test_how_long_it_takes_is_reported_by_trials_or_by_the_clock(figures, left, share):
-    found = status(**figures)
-    assert found.seconds_left == pytest.approx(left)
-    assert found.share_done == pytest.approx(share)
-
-
-def near(number, ttc_s):
-    return result(number, closest=ClosestApproach(ttc_s, ttc_s, 0.0), danger=1 / (1 + ttc_s))
-
-
-def test_the_trial_that_came_nearest_is_kept():
-    progress = Progress()
-    for one in (near(0, 5.0), near(1, 2.0), near(2, 3.0)):
-        progress.count(one, crashed=False, planned=9)
-    progress.count(result(3, Outcome.COLLISION), crashed=True, planned=9)
-    progress.count(result(4, failure=Failure("ValueError", "no")), crashed=False, planned=9)
-    assert progress.nearest.spec.number == 1
-    assert progress.ended_here == 5
-    assert progress.outcomes == {"survived": 4, "collision": 1}
-    assert progress.found.keys() == {3}
-    assert progress.not_fully_asked == 0
-    assert progress.time_left_s == math.inf
-    assert Progress(until=time.monotonic() + 9).time_left_s == pytest.approx(9, abs=3)
-    assert Progress(until=time.monotonic() - 9).time_left_s == 0
-
-
-def test_the_trial_with_the_least_margin_is_kept_and_open_ones_are_counted():
-    progress, brake = Progress(), Disturbance(20, "ahead", "brake", 4.0, 2.0, "ego")
-    for number, margin, disturbance in (
-        (0, 0.8, brake),
-        (1, 0.3, brake),
-        (2, 0.5, brake),
-        (3, 1.0, None),
-        (4, None, None),
-    ):
-        stress = Stress(margin=margin, probes=2, steps=9, disturbance=disturbance)
-        progress.count(result(number, stress=stress), crashed=False, planned=9)
-    assert progress.stressed.spec.number == 1
-    assert progress.not_fully_asked == 1
-
-
 def test_a_status_sums_up_probes_and_how_many_of_their_crashes_were_confirmed(tmp_path):
     brake = Disturbance(20, "ahead", "brake", 4.0, 2.0, "ego")
     with closing(Ledger(tmp_path / "l.sqlite", writable=True)) as ledger:
@@ -275,35 +206,6 @@ def test_a_status_sums_up_probes_and_how_many_of_their_crashes_were_confirmed(tm
 
 def saved(number):
     return SimpleNamespace(result=result(number, Outcome.COLLISION), id=str(number))
-
-
-def test_a_hunt_ends_with_the_crash_of_the_least_number():
-    progress = Progress()
-    assert (progress.last_wanted, progress.is_done, progress.unsaved, progress.ended_by_copy) == (
-        None, False, None, None,
-    )  # fmt: skip
-    progress.found = {number: result(number, Outcome.COLLISION) for number in (7, 5)}
-    assert progress.last_wanted == 5
-    assert progress.unsaved == progress.found[5]
-    assert progress.disturbed == 0
-    progress.save(saved(5))
-    assert progress.unsaved is None
-    assert progress.is_done
-    progress.copied = {3: saved(3)}
-    assert progress.last_wanted == 3
-    assert progress.ended_by_copy is progress.copied[3]
-    assert progress.unsaved is None
-    progress.replace([])
-    assert progress.crashes == []
-
-
-@pytest.mark.parametrize(
-    ("options", "wanted"), [({"only_at_fault": True}, 1), ({"keep_going": True, "distinct": 3}, 3)]
-)
-def test_hunt_that_does_not_keep_going_ends_with_its_first_crash_at_fault(options, wanted):
-    progress = Progress()
-    progress.resume([], RunSettings(**options), {})
-    assert progress.kinds._wanted == wanted
 
 
 def test_new_type_is_of_the_trial_that_is_counted_after_its_row(monkeypatch):

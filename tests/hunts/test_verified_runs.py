@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,11 +14,9 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import NodeFigures
-from crashhunt.hunts import _next_trials, _progress, _verification
-from crashhunt.hunts._next_trials import find_unanswered
+from crashhunt.hunts import _progress, _verification
 from crashhunt.hunts._progress import PhaseClock, Progress, RemainingTime, StrategyTally
 from crashhunt.hunts._verification import Audit, Found, Judged, PendingAudits, TrialReruns, VerificationRuns, _finish
-from crashhunt.ledger import Ledger
 from crashhunt.plans import RunSettings
 from crashhunt.recording import Divergence
 from crashhunt.scenario import AgentSetup, Scenario
@@ -359,16 +356,6 @@ def test_audits_of_an_earlier_run_are_made_up_for(audit, again):
 # What runs again, and what a hunt knows.
 
 
-def test_trials_that_were_killed_or_have_no_answer_run_again(tmp_path):
-    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
-        for one in (result(0), killed(1), result(2, Outcome.INVALID, failure=Failure("invalid", "no map")), killed(3)):
-            ledger.record(one, snapshot="0")
-        assert [one.spec.number for one in find_unanswered(ledger)] == [1, 3]
-        unanswered = _next_trials.Unanswered(ledger)
-        assert [one.number for one in unanswered.specs] == [1, 3]
-        assert len(unanswered) == 2
-
-
 def test_progress_of_a_hunt_ends_with_its_lowest_crash():
     progress = Progress()
     assert (progress.ended_here, progress.branched, progress.not_fully_asked, progress.failed_steps) == (0, 0, 0, 0)
@@ -575,13 +562,3 @@ def test_machines_of_a_hunt_are_noted_if_there_are_several():
     assert progress.noted()["running_rate"] is False
     progress.phase = _progress.PhaseStatus(name="probes", done=1, total=2, seconds_left=3.0)
     assert progress.noted()["phase"] == {"name": "probes", "done": 1, "total": 2, "seconds_left": 3.0}
-
-
-def test_status_without_forks_has_no_counts_of_them():
-    status = _progress.HuntStatus("hunting", 10, 4, {}, 2.0, 2.0, None, {}, 0)
-    assert (status.branched, status.not_fully_asked, status.time_left_s) == (0, 0, math.inf)
-    assert replace(status, done=12).seconds_left == 0.0
-    assert replace(status, planned=0).share_done == 0.0
-    assert replace(status, elapsed_s=0.0, time_left_s=0.0, planned=0).share_done == 1.0
-    assert replace(status, elapsed_s=0.25, time_left_s=0.5).share_done == 0.4
-    assert replace(status, elapsed_s=0.25, time_left_s=0.25).share_done == 0.5

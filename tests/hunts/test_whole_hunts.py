@@ -146,17 +146,6 @@ def test_a_hunt_ends_with_its_first_crash_and_does_not_depend_on_how_many_run_at
     assert not (tmp_path / "again").exists()
 
 
-def test_a_hunt_without_one_valid_trial_states_why(tmp_path):
-    (tmp_path / "toy.toml").write_text(TOY + "\n[arguments.fail_reset]\ndefault = true\n")
-    report = crashhunt.run(tmp_path / "h", 2, 3, 60, **OPTIONS)
-    assert (report.stopped_because, report.outcomes) == ("no_valid_trial", {"invalid": 3})
-    assert report.reason
-    state = hunt_state(tmp_path / "h")
-    assert (state.state, state.errors) == ("error", 3)
-    assert "fails as its scenario arguments demand" in state.detail
-    assert report.crashes == ()
-
-
 @pytest.mark.parametrize(
     ("number", "kind", "says"),
     [
