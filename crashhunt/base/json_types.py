@@ -1,7 +1,8 @@
 """The types of JSON data of unknown structure: everything that a JSON file may contain.
 
-Data of a known structure have a `TypedDict` in the module that writes them, so the type checker finds misspelt keys. At
-run time, all of these are dicts, and nothing is converted or checked.
+Data of a known structure are converted from a dataclass (`crashhunt.base.codec`), or have a `TypedDict` in the module
+that writes them. In both cases, the type checker finds misspelt keys. A `TypedDict` is for data that are never objects,
+such as messages: at run time it is a dict, and nothing is converted or checked.
 """
 
 from __future__ import annotations
