@@ -185,7 +185,7 @@ def read_params(folder: Path) -> list[str]:
 def collect_output(result: TrialResult, scratch: Path, target: Path) -> None:
     """Copy the output of a trial to a folder, and write its failure to ``error.log``."""
     run_log = scratch / layout.RUN_LOG
-    if run_log.is_file():
+    if run_log.is_file() and run_log.stat().st_size:
         shutil.copyfile(run_log, target / layout.RUN_LOG)
     failure = result.failure
     if failure is not None:

@@ -145,6 +145,13 @@ def test_bundle_that_is_gone_damaged_or_of_another_crash_is_not_taken_from_the_d
     assert as_stored(bundle) is bundle
 
 
+def test_a_trial_that_printed_nothing_has_no_empty_log(tmp_path):
+    bundle = made(tmp_path, printed="")
+    assert sorted(path.name for path in bundle.path.iterdir()) == ["crash.json", "foxglove-layout.json", "log.mcap"]
+    assert set(read_bundle(bundle.path).files) == {"log.mcap", "foxglove-layout.json"}
+    assert bundle.faults() == []
+
+
 def test_a_fault_comes_with_what_was_said(tmp_path):
     failure = Failure("KeyError", "'x'", "Traceback …\n", "b", last_output="the end\n")
     result = dataclasses.replace(CRASH, outcome=Outcome.AGENT_ERROR, collision=None, failure=failure, escape=None)
