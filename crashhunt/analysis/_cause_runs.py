@@ -101,9 +101,9 @@ def maneuvers_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> 
     dt = recording.prologue.step_length_s
     first = max(0, end - round(_BEFORE_S / dt))
     numbered = [
-        (step.step, step.scene)
-        for step in recording.all_steps
-        if first <= step.step < end and step.scene is not None and actor in step.scene.roster.index
+        (number, scene)
+        for number, scene in enumerate(recording.scenes()[first:end], first)
+        if actor in scene.roster.index
     ]
     if len(numbered) < 2:
         return []
@@ -145,7 +145,7 @@ def _change(recording: Recording, scenes: Sequence[Scene], actor: str, lanes: La
         return None
     if actor in recording.agents:  # with the last scene, in which it may just reach over
         after = recording.scenes()[-1]
-        scenes = [*scenes, after] if actor in after.roster.index and after is not scenes[-1] else scenes
+        scenes = [*scenes, after] if actor in after.roster.index and after.time_s != scenes[-1].time_s else scenes
     place = lanes.change_began(scenes, actor)
     return None if place is None else min(place, len(scenes) - 2)
 

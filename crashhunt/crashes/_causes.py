@@ -263,22 +263,20 @@ def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[flo
     recording = recording or bundle.recording()
     encounter = Encounter(recording, hit.agent, hit.other)
     moments = encounter.moments
-    scenes = {step.step: step.scene for step in recording.all_steps}
     found = []
     for before_s in _LOOKS_S:
         end_s = moments[-1].time_s if moments else 0.0
         moment = next(
             (one for one in reversed(moments) if one.time_s <= end_s - before_s), moments[0] if moments else None
         )
-        scene = None if moment is None else scenes.get(moment.step)
-        if moment is None or scene is None:
+        if moment is None:
             found += [0.0] * 4
             continue
         found += [
             moment.speed / _RELEVANT_DIFFERENCES["speed"],
             moment.other_speed / _RELEVANT_DIFFERENCES["speed"],
             min(moment.gap_m, _MAX_GAP_M) / _RELEVANT_DIFFERENCES["gap"],
-            _aside_m(scene, hit.agent, hit.other) / _RELEVANT_DIFFERENCES["aside"],
+            _aside_m(recording.scene(moment.step), hit.agent, hit.other) / _RELEVANT_DIFFERENCES["aside"],
         ]
     found.append(_length(recording, hit.other) / _RELEVANT_DIFFERENCES["length"])
     return tuple(found)

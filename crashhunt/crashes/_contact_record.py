@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -138,7 +138,7 @@ class ContactRecord:
         """The scenes before the contact and the first scene after it."""
         last = self.scenes[-1]
         there = self.agent in last.roster.index and self.other in last.roster.index
-        return [*self.before, last] if there and last is not self.before[-1] else self.before
+        return [*self.before, last] if there and last.time_s != self.before[-1].time_s else self.before
 
     @cached_property
     def times(self) -> NDArray[np.float64]:
@@ -372,8 +372,9 @@ class ContactRecord:
         poses = [(float(front[0]), float(front[1]), heading)]
         after = (*poses[0], *size)
         left = _TRAIL_M
-        earlier = [scene for scene in self.scenes if scene.time_s < self.time_s - 1e-6]
-        for scene in reversed(earlier):
+        for scene in reversed(self.scenes):
+            if scene.time_s >= self.time_s - 1e-6:
+                continue
             row = scene.roster.index.get(actor)
             if row is None or left <= 0:
                 break
@@ -556,8 +557,8 @@ class ContactRecord:
         lanes = {
             actor: [
                 scene.lanes[scene.roster.index[actor]]
-                for scene in self.scenes
-                if scene.lanes and actor in scene.roster.index and scene.time_s >= self.time_s - _WINDOW_S
+                for scene in _scenes_since(self.scenes, self.time_s - _WINDOW_S)
+                if scene.lanes and actor in scene.roster.index
             ]
             for actor in actors
         }
@@ -567,12 +568,12 @@ class ContactRecord:
 
     def was_in_junction(self, actor: str, before_s: float) -> bool:
         """Return whether an actor was inside a junction of SUMO at the given time before the contact."""
-        lanes = [
+        lanes = (
             scene.lanes[scene.roster.index[actor]]
-            for scene in self.scenes
+            for scene in reversed(self.scenes)
             if scene.lanes and actor in scene.roster.index and scene.time_s <= self.time_s - before_s
-        ]
-        return bool(lanes) and lanes[-1].startswith(":")
+        )
+        return next(lanes, "").startswith(":")
 
     def is_past(self, event: Event, time_s: float) -> bool:
         """Return whether the actor of an event at a junction had already left the junction.
@@ -581,7 +582,7 @@ class ContactRecord:
             event: the event, recorded on the first lane of the junction.
             time_s: simulation time for which the answer holds.
         """
-        after = [scene for scene in self.scenes if scene.time_s >= time_s and event.agent in scene.roster.index]
+        after = [scene for scene in _scenes_since(self.scenes, time_s) if event.agent in scene.roster.index]
         points = [scene.points[scene.roster.index[event.agent]] for scene in after]
         driven = sum(math.dist(a, b) for a, b in pairwise(points))
         # In a long step, its front may have passed the junction when the event was found, but not its back.
@@ -637,13 +638,18 @@ class ContactRecord:
         assert self.right_of_way is not None
         lanes = [
             scene.lanes[scene.roster.index[actor]]
-            for scene in self.scenes
-            if scene.lanes and actor in scene.roster.index and scene.time_s >= self.time_s - 3 * _WINDOW_S
+            for scene in _scenes_since(self.scenes, self.time_s - 3 * _WINDOW_S)
+            if scene.lanes and actor in scene.roster.index
         ]
         if actor == self.agent and self.lane:
             lanes.append(self.lane)
         x, y = self.way(actor).points[-1].tolist()
         return self.right_of_way.places(tuple(lane for lane in lanes if lane), x, y)
+
+
+def _scenes_since(scenes: Sequence[Scene], time_s: float) -> list[Scene]:
+    """Return the last of the given scenes, without the scenes before a time."""
+    return [*takewhile(lambda scene: scene.time_s >= time_s, reversed(scenes))][::-1]
 
 
 def record_in(scenes: Sequence[Scene], hit: Collision) -> ContactRecord | None:
@@ -689,10 +695,7 @@ def contact_record(bundle: Bundle, recording: Recording | None = None) -> Contac
         return None
     last = scenes[-1]
     events = tuple(
-        (step.scene.time_s, event)
-        for step in found.all_steps
-        if step.scene is not None and step.scene.time_s >= last.time_s - _EVENTS_S
-        for event in step.scene.events
+        (scene.time_s, event) for scene in _scenes_since(scenes, last.time_s - _EVENTS_S) for event in scene.events
     )
     return ContactRecord(
         agent=hit.agent,

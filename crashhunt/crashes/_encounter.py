@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
+from array import array
+from collections import deque
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from crashhunt.world import (
     DangerMeter,
+    DangerousMoment,
     Roster,
     Scene,
     approaches,
     dangers,
     followers_danger,
+    join_frames,
     lane_jump,
     on_one_level,
     outlines,
@@ -25,12 +28,12 @@ from crashhunt.world import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Iterator, Reversible, Sequence
 
     from numpy.typing import NDArray
 
     from crashhunt.recording import Recording
-    from crashhunt.world import DangerousMoment, Rectangle
+    from crashhunt.world import Frame, Rectangle
 
 
 _LOOKS_BACK_S = 30.0  # before the end; what was longer ago has not led to it
@@ -101,19 +104,16 @@ class Encounter:
     def __init__(self, recording: Recording, agent: str, other: str) -> None:
         self.agent = agent
         self.other = other
-        self._scenes = [
-            (step.step, step.scene)
-            for step in recording.all_steps
-            if step.scene is not None and agent in step.scene.roster.index and other in step.scene.roster.index
-        ]
+        self._recording = recording
         self.moments = self._measure()
 
     def position(self, step: int) -> Position | None:
         """Return the position of the other actor relative to the agent after a step; None if one of them was absent."""
-        scene = next((scene for number, scene in self._scenes if number == step), None)
-        if scene is None:
+        scenes = self._recording.scenes()
+        found = next(_pairs(scenes[step : step + 1], self.agent, self.other), None) if step >= 0 else None
+        if found is None:
             return None
-        own, other = scene.roster.index[self.agent], scene.roster.index[self.other]
+        _, scene, (own, other) = found
         offset = scene.centers[other] - scene.centers[own]
         c, s = math.cos(scene.headings[own]), math.sin(scene.headings[own])
         ahead, left = float(offset[0] * c + offset[1] * s), float(offset[1] * c - offset[0] * s)
@@ -141,22 +141,24 @@ class Encounter:
         return "crossing from the right" if found.faces == "left" else "crossing from the left"
 
     def _measure(self) -> list[Moment]:
-        if not self._scenes:
+        steps: list[int] = []
+        times: list[float] = []
+        measured = array("d")
+        bent: dict[int, tuple[Scene, tuple[int, int]]] = {}
+        for step, scene, (own, other) in _pairs(self._recording.scenes(), self.agent, self.other):
+            if own in scene.spines or other in scene.spines:
+                bent[len(steps)] = scene, (own, other)
+            steps.append(step)
+            times.append(scene.time_s)
+            centers, half = scene.centers, scene.roster.half_sizes
+            measured.extend(
+                (*centers[own], *centers[other], scene.headings[own], scene.headings[other],
+                 scene.speeds[own], scene.speeds[other], *half[own], *half[other])
+            )  # fmt: skip
+        if not steps:
             return []
-        rows = [(scene.roster.index[self.agent], scene.roster.index[self.other]) for _, scene in self._scenes]
-        states = np.array(
-            [
-                (*scene.centers[own], *scene.centers[other], scene.headings[own], scene.headings[other],
-                 scene.speeds[own], scene.speeds[other])
-                for (_, scene), (own, other) in zip(self._scenes, rows, strict=True)
-            ]
-        )  # fmt: skip
-        half_own, half_other = (
-            np.array(
-                [scene.roster.half_sizes[pair[which]] for (_, scene), pair in zip(self._scenes, rows, strict=True)]
-            )
-            for which in (0, 1)
-        )
+        states = np.array(measured).reshape(len(steps), -1)
+        states, half_own, half_other = states[:, :8], states[:, 8:10], states[:, 10:]
         heading, other_heading, speed, other_speed = states[:, 4:].T
         offset = states[:, 2:4] - states[:, 0:2]
         own_velocity = speed[:, None] * np.stack((np.cos(heading), np.sin(heading)), axis=1)
@@ -168,14 +170,13 @@ class Encounter:
         turn = other_heading - heading
         gap = rectangle_gap(_turned(offset, heading), turn, half_own, half_other)
         contact = time_to_contact(_turned(offset, heading), _turned(velocity, heading), turn, half_own, half_other)
-        for place, (_, scene) in enumerate(self._scenes):
-            if any(row in scene.spines for row in rows[place]):
-                contact[place], gap[place] = self._bent(scene, rows[place], gap[place])
+        for place, (scene, rows) in bent.items():
+            contact[place], gap[place] = self._bent(scene, rows, gap[place])
         needed = np.where(contact > 0, np.hypot(*velocity.T) / (2 * np.maximum(contact, 1e-9)), 0.0)
         return [
-            Moment(number, scene.time_s, *map(float, values))
-            for (number, scene), *values in zip(
-                self._scenes, speed, other_speed, gap, closing, contact, needed, strict=True
+            Moment(step, time_s, *map(float, values))
+            for step, time_s, *values in zip(
+                steps, times, speed, other_speed, gap, closing, contact, needed, strict=True
             )
         ]
 
@@ -191,6 +192,14 @@ class Encounter:
         )
         times, gaps, _ = approaches([pair.frame], self.agent)
         return float(times[0]), float(gaps[0]) if math.isfinite(gaps[0]) else straight_m
+
+
+def _pairs(scenes: Iterable[Scene], agent: str, other: str) -> Iterator[tuple[int, Scene, tuple[int, int]]]:
+    """Yield place, scene and the rows of two actors for each scene that contains both."""
+    for place, scene in enumerate(scenes):
+        index = scene.roster.index
+        if agent in index and other in index:
+            yield place, scene, (index[agent], index[other])
 
 
 def last_escape(recording: Recording, agent: str, other: str, *, braking: float) -> int | None:
@@ -221,22 +230,20 @@ class _Model:
     """A model of a crash: the other actor moves as recorded, and the agent follows its path at another speed."""
 
     def __init__(self, recording: Recording, agent: str, other: str) -> None:
-        found = Encounter(recording, agent, other)._scenes
-        self.steps = [step for step, _ in found]
         self._dt = recording.prologue.step_length_s
-        scenes = [scene for _, scene in found]
-        own = [scene.roster.index[agent] for scene in scenes]
-        them = [scene.roster.index[other] for scene in scenes]
-        self._speeds = [scene.speeds[row] for scene, row in zip(scenes, own, strict=True)]
-        self._path, self._others = (
-            _Path([(*scene.points[row], scene.headings[row]) for scene, row in zip(scenes, rows, strict=True)])
-            for rows in (own, them)
-        )
-        self._beyond = scenes[-1].speeds[them[-1]] if scenes else 0.0
-        self._sizes = [
-            (actor.length, actor.width)
-            for actor in (scenes[-1].roster.actors[own[-1]], scenes[-1].roster.actors[them[-1]])
-        ] if scenes else []  # fmt: skip
+        self.steps: list[int] = []
+        self._speeds: list[float] = []
+        self._beyond = 0.0
+        self._sizes: list[tuple[float, float]] = []
+        poses: tuple[list[tuple[float, float, float]], ...] = [], []
+        for step, scene, rows in _pairs(recording.scenes(), agent, other):
+            self.steps.append(step)
+            self._speeds.append(scene.speeds[rows[0]])
+            self._beyond = scene.speeds[rows[1]]
+            self._sizes = [(actor.length, actor.width) for actor in (scene.roster.actors[row] for row in rows)]
+            for path, row in zip(poses, rows, strict=True):
+                path.append((*scene.points[row], scene.headings[row]))
+        self._path, self._others = map(_Path, poses)
 
     def collides_without_braking(self) -> bool:
         """Return whether the recorded actors touch up to the last step, or would touch within the next step."""
@@ -348,7 +355,7 @@ class DangerCourse:
     """
 
     agent: str
-    steps: tuple[int, ...]
+    steps: range
     own: NDArray[np.float64]
     behind: NDArray[np.float64]
     greatest: DangerousMoment
@@ -367,62 +374,82 @@ class DangerCourse:
 
 def danger_course(recording: Recording, agent: str) -> DangerCourse | None:
     """Return the criticality of an agent in each step of a trial; None if no scene contains the agent."""
-    steps = tuple(step.step for step in recording.all_steps if step.scene is not None)
-    frames = [scene.frame for scene in recording.scenes()]
+    lane_changes = _LaneChanges(agent)
+    frames = list(join_frames(lane_changes.watch(recording.scenes())))
     if not any(agent in frame.roster.index for frame in frames):
         return None
     dt = recording.prologue.step_length_s
-    own, greatest = dangers(frames, [agent], dt)
-    own, greatest = _with_lane_changes(recording.scenes(), agent, own, greatest)
+    own, greatest = lane_changes.added_to(*dangers(frames, [agent], dt))
     meter = DangerMeter([agent], dt)
     meter.add(frames)
     behind, greatest_behind, behind_total = followers_danger(frames, agent, dt)
-    there = np.flatnonzero([agent in frame.roster.index for frame in frames])
-    known = np.zeros(len(steps), bool)
-    known[there] = True
-    unsure = np.arange(len(steps)) > there[-1] - _UNKNOWN_S / dt
+    known = np.concatenate([np.full(len(frame.columns), agent in frame.roster.index) for frame in frames])
+    steps = range(len(known))
+    unsure = np.arange(len(known)) > np.flatnonzero(known)[-1] - _UNKNOWN_S / dt
     return DangerCourse(
         agent=agent,
         steps=steps,
         own=np.where(known & ((own > 0) | ~unsure), own, np.nan),
         behind=np.where(known & ((behind > 0) | ~unsure), behind, np.nan),
-        greatest=greatest._replace(step=steps[greatest.step]),
-        greatest_behind=greatest_behind._replace(step=steps[greatest_behind.step]),
+        greatest=greatest,
+        greatest_behind=greatest_behind,
         own_total=meter.danger or 0.0,
         behind_total=behind_total,
-        nearest=_nearest(recording.scenes(), steps, agent),
+        nearest=_nearest(recording.scenes(), frames, agent),
     )
 
 
-def _with_lane_changes(
-    scenes: Sequence[Scene], agent: str, own: NDArray[np.float64], greatest: DangerousMoment
-) -> tuple[NDArray[np.float64], DangerousMoment]:
-    """Return the criticality, including lane changes in front of vehicles that approach in the target lane.
+class _LaneChanges:
+    """Lane changes of an agent in front of vehicles that approach in the target lane, found while scenes pass by.
 
     After a lane change, the agent's path does not lead through the vehicles behind it, so `dangers` does not count
     them. In this case, the post-encroachment time is the time from the lane change until the vehicle behind reaches the
     agent's position.
+
+    Args:
+        agent: identifier of the agent.
     """
-    own = own.copy()
-    for number, (before, after) in enumerate(pairwise(scenes), 1):
-        if agent not in before.roster.index or agent not in after.roster.index:
-            continue
-        row = after.roster.index[agent]
+
+    def __init__(self, agent: str) -> None:
+        self._agent = agent
+        self._found: list[DangerousMoment] = []
+        self._recent: deque[Scene] = deque()  # as long as a lane change takes
+
+    def watch(self, scenes: Iterable[Scene]) -> Iterator[Scene]:
+        """Yield the given scenes, and remember the lane changes in them."""
+        before: Scene | None = None
+        for number, scene in enumerate(scenes):
+            self._recent.append(scene)
+            while self._recent[0].time_s < scene.time_s - _CHANGE_S - 1e-6:
+                self._recent.popleft()
+            if before is not None and self._agent in before.roster.index and self._agent in scene.roster.index:
+                self._compare(number, before, scene)
+            before = scene
+            yield scene
+
+    def added_to(
+        self, own: NDArray[np.float64], greatest: DangerousMoment
+    ) -> tuple[NDArray[np.float64], DangerousMoment]:
+        """Return the criticality of each scene and the most critical moment, including the lane changes."""
+        own = own.copy()
+        for found in self._found:
+            own[found.step] = max(own[found.step], found.danger)
+            greatest = found if found.danger > greatest.danger else greatest
+        return own, greatest
+
+    def _compare(self, number: int, before: Scene, after: Scene) -> None:
+        row = after.roster.index[self._agent]
         entered = _behind_in_its_way(after, row)
-        if not lane_jump(before, after, agent):
-            followed = {before.roster.actors[one].id for one in _behind_in_its_way(before, before.roster.index[agent])}
+        if entered and not lane_jump(before, after, self._agent):
+            own = before.roster.index[self._agent]
+            followed = {before.roster.actors[one].id for one in _behind_in_its_way(before, own)}
             fresh = [other for other in entered if after.roster.actors[other].id not in followed]
-            entered = [other for other in fresh if _moved_into_its_way(scenes[: number + 1], agent, after, other)]
+            entered = [other for other in fresh if _moved_into_its_way(self._recent, self._agent, after, other)]
         for other in entered:
             gap_m = max(0.0, -_ahead_m(after, row, other) - after.roster.half_sizes[row][0])
             gap_m = max(0.0, gap_m - after.roster.half_sizes[other][0])
             danger = min(math.exp(-gap_m / max(after.speeds[other], 1e-3) / _DECAY_S), _MOST)
-            own[number] = max(own[number], danger)
-            if danger > greatest.danger:
-                greatest = greatest._replace(
-                    danger=danger, step=number, agent=agent, other=after.roster.actors[other].id
-                )
-    return own, greatest
+            self._found.append(DangerousMoment(danger, number, self._agent, after.roster.actors[other].id))
 
 
 def _ahead_m(scene: Scene, row: int, other: int) -> float:
@@ -441,7 +468,7 @@ def _behind_in_its_way(scene: Scene, row: int) -> list[int]:
     return [int(other) for other in np.flatnonzero(over) if other != row and on_one_level(scene, row, int(other))]
 
 
-def _moved_into_its_way(scenes: Sequence[Scene], agent: str, after: Scene, other: int) -> bool:
+def _moved_into_its_way(scenes: Reversible[Scene], agent: str, after: Scene, other: int) -> bool:
     """Return whether an agent moved sideways into the path of another actor on a straight road.
 
     In a bend, the paths of two lanes do not show which of the two vehicles changed lanes.
@@ -464,9 +491,9 @@ def _moved_into_its_way(scenes: Sequence[Scene], agent: str, after: Scene, other
     return bool(abs(own @ across) > abs(its @ across) + _SIDEWAYS_M)
 
 
-def _nearest(scenes: Sequence[Scene], steps: Sequence[int], agent: str) -> tuple[str, float, int] | None:
+def _nearest(scenes: Sequence[Scene], frames: Sequence[Frame], agent: str) -> tuple[str, float, int] | None:
     """Return the actor that came nearest to an agent, the gap in m, and the step."""
-    _, gaps, _ = approaches([scene.frame for scene in scenes], agent)
+    _, gaps, _ = approaches(frames, agent)
     if not len(gaps) or not math.isfinite(gaps.min()):
         return None
     number = int(gaps.argmin())
@@ -477,7 +504,7 @@ def _nearest(scenes: Sequence[Scene], steps: Sequence[int], agent: str) -> tuple
         pairs = [(one, two) for one in outlines(scene, row) for two in outlines(scene, other)]
         if on_one_level(scene, row, other):
             found.append((min(_outline_gap(one, two) for one, two in pairs), scene.roster.actors[other].id))
-    return (min(found)[1], float(gaps[number]), steps[number]) if found else None
+    return (min(found)[1], float(gaps[number]), number) if found else None
 
 
 def closest_actors(recording: Recording, agent: str) -> list[tuple[str, str]]:
@@ -492,7 +519,7 @@ def closest_actors(recording: Recording, agent: str) -> list[tuple[str, str]]:
         equally close.
     """
     scenes = recording.scenes()
-    times, gaps, _ = approaches([scene.frame for scene in scenes], agent)
+    times, gaps, _ = approaches([*join_frames(scenes)], agent)
     found = []
     for scene, time_s, gap_m in zip(scenes, times, gaps, strict=True):
         if agent not in scene.roster.index or not (math.isfinite(time_s) or math.isfinite(gap_m)):
@@ -537,12 +564,11 @@ def _outline_gap(one: Rectangle, two: Rectangle) -> float:
 
 def most_dangerous(recording: Recording) -> DangerousMoment | None:
     """Return the moment of the greatest criticality of any controlled vehicle; None if the criticality was always 0."""
-    steps = [step.step for step in recording.all_steps if step.scene is not None]
-    frames = [scene.frame for scene in recording.scenes()]
+    frames = [*join_frames(recording.scenes())]
     if not frames:
         return None
     _, most = dangers(frames, recording.agents, recording.prologue.step_length_s)
-    return most._replace(step=steps[most.step]) if most.danger > 0 else None
+    return most if most.danger > 0 else None
 
 
 # From when on an agent was shown the other one of a collision: looked up in what it was shown.

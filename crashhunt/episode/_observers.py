@@ -345,7 +345,7 @@ class Recorder(Observer):
     def end(self, result: TrialResult) -> TrialResult:
         """Record the end of the episode, and add the digest of the recording to the result."""
         self._box.mark(Phase.DONE)
-        digest = digest_of(*self._box.evidence()) if result.outcome is not Outcome.INVALID else ""
+        digest = digest_of(self._box.evidence()) if result.outcome is not Outcome.INVALID else ""
         return replace(result, digest=digest, events=None if self._events is None else dict(self._events))
 
 

@@ -21,7 +21,7 @@ from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import scratch_of
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, Tag, digest_of, read_black_box, read_header
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, in_effect
-from crashhunt.world import ClosestApproach, DangerMeter, DrivenMeter, Lane, closest_approach
+from crashhunt.world import ClosestApproach, DangerMeter, DrivenMeter, Lane, closest_approach, join_frames
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -195,7 +195,7 @@ def _result(
         steps, sim_time_s, digest = recording.steps, scenes[-1].time_s, recording.digest
         closest = closest_approach(scenes, recording.agents)
         meter = DangerMeter(recording.agents, recording.prologue.step_length_s)
-        frames = [scene.frame for scene in scenes]
+        frames = [*join_frames(scenes)]
         meter.add(frames)
         danger = meter.danger
         driven = DrivenMeter(recording.agents, recording.prologue.step_length_s)
@@ -370,7 +370,7 @@ def check_report(
         return evidence
     if (header.trial, header.pid) != (spec.number, pid):
         return f"it says that process {header.pid} ran trial {header.trial}"
-    digest = digest_of(*evidence) if records else ""
+    digest = digest_of(evidence) if records else ""
     text = report[_CHECKSUM_BYTES:]
     if report[:_CHECKSUM_BYTES] != _checksum(text):
         return "its report was overwritten"

@@ -28,7 +28,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from crashhunt.base.errors import BundleError
 from crashhunt.recording.records import RECORD_TYPES
 from crashhunt.recording.records._type import BytesForm
-from crashhunt.world import approaches, is_person, levels, outlines
+from crashhunt.world import approaches, is_person, join_frames, levels, outlines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -121,7 +121,7 @@ def foxglove_layout(recording: Recording) -> dict[str, object]:
 
 def _write_map(log: LogWriter, recording: Recording, scenes: Sequence[Scene], lanes: Sequence[Lane]) -> None:
     """Write both borders of every lane near a controlled vehicle, once, at the beginning."""
-    rows = [(scene, scene.roster.index.get(agent)) for scene in scenes[::10] for agent in recording.agents]
+    rows = ((scene, scene.roster.index.get(agent)) for scene in scenes[::10] for agent in recording.agents)
     driven = np.array([scene.points[row] for scene, row in rows if row is not None]).reshape(-1, 2)
     if not len(driven):
         return
@@ -274,7 +274,7 @@ def _bend(entity: SceneEntity, scene: Scene, row: int) -> None:
 
 def _write_metrics(log: LogWriter, agent: str, scenes: Sequence[Scene]) -> None:
     kind = MESSAGES["Metrics"]
-    times, gaps, brakes = approaches([scene.frame for scene in scenes], agent)
+    times, gaps, brakes = approaches([*join_frames(scenes)], agent)
     for scene, time, gap, brake in zip(scenes, times.tolist(), gaps.tolist(), brakes.tolist(), strict=True):
         row = scene.roster.index.get(agent)
         speed = scene.speeds[row] if row is not None else math.nan

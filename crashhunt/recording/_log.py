@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import struct
 from dataclasses import asdict, dataclass
-from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
@@ -30,7 +29,7 @@ from crashhunt.recording.records._scene_record import STEP, time_of
 from crashhunt.recording.records._type import BytesForm, TextForm
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.recording.records._type import Form
@@ -101,14 +100,13 @@ def read_log(path: Path) -> Recording:
                     f"the schema version of the log is {version}; this crashhunt reads {SCHEMA}",
                     "use the version of crashhunt that wrote it",
                 )
-            evidence = [
+            evidence = (
                 _Message(
                     sequence=sequence, topic=channel.topic, data=data, schema=schema.name, metadata=channel.metadata
                 )
                 for schema, channel, sequence, data in messages_of(file, reader, validate_crcs=True)
                 if schema is not None and sequence and schema.name.startswith(NAMESPACE)
-            ]
-            evidence.sort(key=itemgetter(0), reverse=True)  # so that each message is freed as soon as it was read
+            )
             return Recording(_read_evidence(evidence), compact)
     except OSError as error:
         raise refuse(f"cannot be read: {error.strerror}", "give the path of a log.mcap") from None
@@ -191,16 +189,13 @@ def _times_ns(records: Sequence[Record]) -> list[int]:
     return times_ns
 
 
-def _read_evidence(messages: list[_Message]) -> Iterator[Record]:
-    """Yield the records of messages in reverse order, which are removed from the list."""
+def _read_evidence(messages: Iterable[_Message]) -> Iterator[Record]:
+    """Yield the records of messages."""
     channels = {
         kind.topic: _Channel(tag=tag, aux=0, topic=kind.topic, form=kind.form) for tag, kind in RECORD_TYPES.items()
     }
     prologue: Prologue | None = None
-    for expected in range(1, len(messages) + 1):
-        message = messages.pop()
-        if message.sequence != expected:
-            raise BundleError(f"message {expected} of the log is missing", fix="get an undamaged copy of the log")
+    for message in _in_order(messages):
         channel = channels.get(message.topic)
         if channel is None:
             channel = channels[message.topic] = _unknown(message)
@@ -212,6 +207,22 @@ def _read_evidence(messages: list[_Message]) -> Iterator[Record]:
                 of_agent = [_channel(tag, aux, prologue) for tag, kind in RECORD_TYPES.items() if kind.per_agent]
                 channels |= {channel.topic: channel for channel in of_agent}
         yield Record(channel.tag, channel.aux, payload)
+
+
+def _in_order(messages: Iterable[_Message]) -> Iterator[_Message]:
+    """Yield messages in the order of their numbers; only the program that wrote them last may have moved them."""
+    expected, early = 1, dict[int, _Message]()
+    for message in messages:
+        if message.sequence < expected or message.sequence in early:
+            raise BundleError(
+                f"message {message.sequence} of the log is there twice", fix="get an undamaged copy of the log"
+            )
+        early[message.sequence] = message
+        while expected in early:
+            yield early.pop(expected)
+            expected += 1
+    if early:
+        raise BundleError(f"message {expected} of the log is missing", fix="get an undamaged copy of the log")
 
 
 def _unknown(message: _Message) -> _Channel:

@@ -122,7 +122,7 @@ class Reading:
     Args:
         prologue: the agents and the step length of the episode.
         actors: all actors that were introduced, in the order of their numbers.
-        steps: the complete steps.
+        steps: the complete steps since the beginning of the reading.
         current: the step of which records are being read.
         roster: the actors of the next scene.
         scene: further arguments of the next scene, by their names; the next step uses them.
@@ -136,6 +136,11 @@ class Reading:
     roster: Roster = field(default_factory=lambda: Roster(()))
     scene: SceneParts = field(default_factory=SceneParts)
     events: tuple[Event, ...] = ()
+
+    def finish(self) -> None:
+        """Add the step in which the process ended, if there is one."""
+        if self.current.observations or self.current.actions or self.current.more:
+            self.steps.append(self.current)
 
 
 # What is said of a difference between two recordings: step, agent, field, both values.

@@ -11,10 +11,10 @@ import numpy as np
 
 from crashhunt.base.errors import BundleError
 from crashhunt.base.text import format_time, one_of
-from crashhunt.recording._blackbox import digest_of, is_evidence
-from crashhunt.recording._reading import Prologue, Reading
+from crashhunt.recording._blackbox import Records, digest_of, is_evidence
+from crashhunt.recording._decoded_steps import DecodedScenes, DecodedSteps
+from crashhunt.recording._reading import Prologue
 from crashhunt.recording._values import is_opaque
-from crashhunt.recording.records import RECORD_TYPES
 from crashhunt.recording.records._agent_records import OBSERVATION, PROLOGUE
 from crashhunt.recording.records._scene_record import (
     ACTORS,
@@ -52,17 +52,18 @@ class Recording:
     """
 
     def __init__(self, records: Iterable[Record], compact: Compact | None = None) -> None:
-        self.records = tuple(records)
+        self.records = records if isinstance(records, Records) else Records.of(records)
         self.compact = compact
         if not self.records or self.records[0].tag != PROLOGUE.tag:
             raise BundleError("the recording has no beginning", fix="get an undamaged copy of the log")
         try:
-            reading = _read(self.records)
+            self.prologue = Prologue.decode(self.records[0].payload)
+            steps = DecodedSteps(self.records, self.prologue)
         except (ValueError, IndexError, KeyError, TypeError, struct.error) as error:
             raise BundleError(f"the recording is damaged: {error}", fix="get an undamaged copy of the log") from error
-        self.prologue: Prologue = reading.prologue
-        self.actors: list[Actor] = reading.actors
-        self.all_steps: list[StepRecord] = reading.steps
+        self.actors: list[Actor] = steps.actors
+        self.all_steps: Sequence[StepRecord] = steps
+        self._scenes = DecodedScenes(steps, range(steps.scenes))
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -74,12 +75,12 @@ class Recording:
         """The digest of the trace, in hexadecimal; for a compact recording, the digest of the complete recording."""
         if self.compact is not None and self.compact.digest:
             return self.compact.digest
-        return digest_of(b"".join(record.encode() for record in self.records if is_evidence(record.tag)))
+        return digest_of(record.encode() for record in self.records if is_evidence(record.tag))
 
     @property
     def steps(self) -> int:
         """The number of completed steps."""
-        return max((step.step for step in self.all_steps if step.whole), default=0)
+        return max(0, len(self._scenes) - 1)
 
     def compacted(self, always: Collection[str], radius_m: float, *, observations: bool = True) -> Recording:
         """Return the recording with only the agents, some other actors, and in each step the actors near an agent.
@@ -135,10 +136,9 @@ class Recording:
         Raises:
             IndexError: the recording has no such step.
         """
-        found = self.all_steps[step].scene if 0 <= step < len(self.all_steps) else None
-        if found is None:
+        if not 0 <= step < len(self._scenes):
             raise IndexError(f"no scene of step {step}; the recording has the steps 0 to {self.steps}")
-        return found
+        return self._scenes[step]
 
     def before_end_s(self, step: int) -> float:
         """Return the time from the end of a step to the end of the last step, in s.
@@ -149,16 +149,15 @@ class Recording:
         Raises:
             IndexError: the recording has no such step.
         """
-        last = next(record.scene for record in reversed(self.all_steps) if record.scene is not None)
-        return last.time_s - self.scene(step).time_s
+        return self._scenes[-1].time_s - self.scene(step).time_s
 
     def ago(self, step: int) -> str:
         """Return as text how long before the end of the last step a step ended, such as ``0.4 s before``."""
         return f"{format_time(self.before_end_s(step), self.prologue.step_length_s)} before"
 
-    def scenes(self) -> list[Scene]:
-        """All scenes of the episode, in order."""
-        return [step.scene for step in self.all_steps if step.scene is not None]
+    def scenes(self) -> Sequence[Scene]:
+        """All scenes of the episode, in order; those of a long episode are decoded at each use."""
+        return self._scenes
 
     @property
     def disturbances(self) -> tuple[Disturbance, ...]:
@@ -172,19 +171,6 @@ class Recording:
         raise BundleError(
             f"there is no agent {agent!r} in the recording", fix=one_of(agent, self.agents, give="it has")
         )
-
-
-def _read(records: tuple[Record, ...]) -> Reading:
-    reading = Reading(Prologue.decode(records[0].payload))
-    readers = {tag: kind.read for tag, kind in RECORD_TYPES.items()}
-    for tag, aux, payload in records[1:]:
-        read = readers.get(tag)
-        if read is not None:  # else it is of a later version: it is kept, and means nothing here
-            read(reading, aux, payload)
-    current = reading.current
-    if current.observations or current.actions or current.more:
-        reading.steps.append(current)  # the process ended in it
-    return reading
 
 
 def _stacked(found: list[NDArray[np.generic]], dtype: str, shape: tuple[int, ...]) -> NDArray[np.generic]:

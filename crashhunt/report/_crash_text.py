@@ -200,7 +200,7 @@ class Story:
 
     def _steps(self) -> list[StepRecord]:
         """Return the steps that are described."""
-        return [step for step in self.recording.all_steps if self._first <= step.step <= self._last]
+        return list(self.recording.all_steps[max(0, self._first) : self._last + 1])
 
     def _steps_shown(self) -> list[StepRecord]:
         """Return the steps that the table shows, a selection of the described steps."""

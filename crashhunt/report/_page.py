@@ -32,10 +32,10 @@ from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import by_likelihood, describe_versions, may_be_disturbed, traffic_of
 from crashhunt.results import CodeVersions, TrialRow, count_versions, find_crashes
 from crashhunt.trial import Outcome, steps_of
-from crashhunt.world import approaches
+from crashhunt.world import approaches, join_frames
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.results import FoundCrashes
     from crashhunt.trial import TrialResult, Value
-    from crashhunt.world import Actor
+    from crashhunt.world import Actor, Scene
 
 
 # The search on the page: the arguments that criticality depends on, and the trials that a crash was derived from.
@@ -510,20 +510,22 @@ def _scenes(recording: Recording, agent: str) -> dict[str, object]:
     scenes = recording.scenes()
     names: dict[str, Actor] = {}
     highest: dict[str, float] = {}
-    for scene in scenes:
-        for row, actor in enumerate(scene.roster.actors):
-            names.setdefault(actor.id, actor)
-            if scene.heights:
-                highest[actor.id] = max(highest.get(actor.id, -math.inf), scene.heights[row])
+
+    def noted() -> Iterator[Scene]:
+        for scene in scenes:
+            for row, actor in enumerate(scene.roster.actors):
+                names.setdefault(actor.id, actor)
+                if scene.heights:
+                    highest[actor.id] = max(highest.get(actor.id, -math.inf), scene.heights[row])
+            yield scene
+
+    times, gaps, _ = approaches([*join_frames(noted())], agent)
     if highest:  # the page draws them in this order
         names = dict(sorted(names.items(), key=lambda entry: highest.get(entry[0], 0.0)))
     place = {name: number for number, name in enumerate(names)}
     table = np.full((len(scenes), len(names), 4), np.nan)
-    for number, scene in enumerate(scenes):
-        table[number, [place[actor.id] for actor in scene.roster.actors]] = scene.data
+    bends: list[tuple[int, int, list[float]]] = []
     origin = _origin(recording)
-    table[:, :, :2] -= origin
-    times, gaps, _ = approaches([scene.frame for scene in scenes], agent)
     if recording.compact is not None:  # without the actors that are farther away, these would be too large
         times, gaps = np.full_like(times, np.nan), np.full_like(gaps, np.nan)
     actions = np.full((len(scenes), 0), np.nan)
@@ -533,18 +535,19 @@ def _scenes(recording: Recording, agent: str) -> dict[str, object]:
         size = math.prod(channel.action_shape)
         action_names = list(channel.action_names) or [f"action[{n}]" for n in range(size)]
         actions = np.full((len(scenes), size), np.nan)
-        for number, step in enumerate(step for step in recording.all_steps if step.scene is not None):
-            if agent in step.actions:
-                actions[number] = step.actions[agent].reshape(-1)
+    for number, (step, scene) in enumerate(zip(recording.all_steps, scenes, strict=False)):
+        table[number, [place[actor.id] for actor in scene.roster.actors]] = scene.data
+        for row, spine in scene.spines.items():
+            points = np.round(np.array(spine)[:, :2] - origin, 2).ravel().tolist()
+            bends.append((number, place[scene.roster.actors[row].id], points))
+        if actions.size and agent in step.actions:
+            actions[number] = step.actions[agent].reshape(-1)
+    table[:, :, :2] -= origin
     return {
         "origin": origin.tolist(),
         "time0": scenes[0].time_s if scenes else 0.0,
         "actors": [[actor.id, actor.kind, actor.length, actor.width] for actor in names.values()],
-        "bends": [
-            [number, place[scene.roster.actors[row].id], np.round(np.array(spine)[:, :2] - origin, 2).ravel().tolist()]
-            for number, scene in enumerate(scenes)
-            for row, spine in scene.spines.items()
-        ],
+        "bends": bends,
         "steps": len(scenes),
         "table": _packed(table),
         "ttc": _packed(times),
@@ -557,7 +560,7 @@ def _scenes(recording: Recording, agent: str) -> dict[str, object]:
 def _to_other(encounter: Encounter, recording: Recording) -> dict[str, str]:
     """Return gap and time to collision to the actor that the text names, not to the nearest actor."""
     moments = {moment.step: moment for moment in encounter.moments}
-    steps = [step.step for step in recording.all_steps if step.scene is not None]
+    steps = range(len(recording.scenes()))
     found = {"gap": "gap_m", "ttc": "time_to_collision_s"}
     return {
         key: _packed(np.array([getattr(moments[step], name) if step in moments else np.nan for step in steps]))

@@ -14,7 +14,7 @@ from crashhunt.crashes import Encounter
 from crashhunt.recording import describe_value, is_opaque
 from crashhunt.snapshots import latest_snapshot
 from crashhunt.trial import signature_of
-from crashhunt.world import approaches
+from crashhunt.world import approaches, join_frames
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -82,7 +82,7 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
     names = check_fields(recording, fields, agent)
     measured: dict[str, NDArray[np.float64]] = {}
     if set(names) & set(NEAREST):
-        frames = [step.scene.frame for step in recording.all_steps if step.scene is not None]
+        frames = [*join_frames(recording.scenes())]
         measured = dict(zip(NEAREST, approaches(frames, agent), strict=True))
     moments = {moment.step: moment for moment in Encounter(recording, agent, other).moments} if other else {}
     rows = []

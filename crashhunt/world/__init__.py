@@ -67,6 +67,7 @@ if TYPE_CHECKING:
         Scene as Scene,
         Spine as Spine,
         is_person as is_person,
+        join_frames as join_frames,
         joined_frame as joined_frame,
     )
     from ._tracks import ActorState as ActorState, Path as Path, Paths as Paths, paths_of as paths_of

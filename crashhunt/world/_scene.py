@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain, groupby, islice
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -223,6 +225,17 @@ def joined_frame(
         if spines is not None:
             spines = tuple({kept.index(row): one for row, one in each.items() if row in kept} for each in spines)
     return Frame(roster=roster, columns=columns, heights=heights, spines=spines, core=core)
+
+
+_MAX_JOINED_SCENES = 256
+
+
+def join_frames(scenes: Iterable[Scene]) -> Iterator[Frame]:
+    """Yield scenes as frames; consecutive scenes with the same roster are in one frame, up to 256 of them."""
+    for _, same in groupby(scenes, key=attrgetter("roster")):
+        while run := [*islice(same, _MAX_JOINED_SCENES)]:
+            columns = [[*chain.from_iterable(scene.points), *scene.headings, *scene.speeds] for scene in run]
+            yield joined_frame(run[0].roster, np.array(columns).reshape(len(run), -1), run)
 
 
 class Scene:

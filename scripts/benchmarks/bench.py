@@ -1257,7 +1257,7 @@ def _large_bundle(directory: Path, *, actors: int, steps: int) -> None:
         box.step(step, Scene(step / 10, roster, points, [0.0] * actors, speeds.tolist()), (0.0,))
     collision = Collision(agent="ego", role="collider", collider="ego", victim="car 1", seen_by=("overlap",))
     spec = TrialSpec(number=0, seed=1, arguments={"ego": {}}, scenario_arguments={}, max_steps=steps)
-    digest = digest_of(box.committed())
+    digest = digest_of([box.committed()])
     result = TrialResult(spec, Outcome.COLLISION, steps=steps, digest=digest, collision=collision)
     snapshot = next((directory / "snapshots").iterdir()).name
     write_bundle(directory, result, scratch, hunt_seed=0, snapshot=snapshot, lanes=[])

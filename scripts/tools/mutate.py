@@ -142,7 +142,6 @@ _TESTS_ELSEWHERE = {
         "executors/test_last_words.py",
         "executors/test_new_processes.py",
     ),
-    "reruns.py": ("test_rerun_service.py", "analysis/test_reruns.py"),
     "executors/_pool.py": (
         "executors/test_lost_processes.py",
         "executors/test_new_processes.py",

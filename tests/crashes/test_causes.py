@@ -191,7 +191,10 @@ def features(side, turn):
         steps.append(StepRecord(number, Scene(number / 10, roster, points, [turn] * 2, [20.0] * 2)))
     hit = SimpleNamespace(agent="ego", other="x")
     crash = SimpleNamespace(result=SimpleNamespace(collision=hit))
-    recording = SimpleNamespace(all_steps=steps, prologue=Prologue((), 0.1), actors=roster.actors)
+    scenes = [step.scene for step in steps]
+    recording = SimpleNamespace(
+        scenes=lambda: scenes, scene=scenes.__getitem__, prologue=Prologue((), 0.1), actors=roster.actors
+    )
     return features_of(crash, recording)
 
 

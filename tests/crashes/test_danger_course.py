@@ -36,7 +36,7 @@ def recording(steps, there):
 
 def test_there_is_none_where_the_agent_is_not_and_at_the_end_where_no_one_knows():
     found = danger_course(recording(100, range(20, 90)), "ego")
-    assert found.steps == tuple(range(100))
+    assert found.steps == range(100)
     assert np.isnan(found.own[:20]).all()
     assert np.isnan(found.own[90:]).all()
     assert found.own[21:60] == pytest.approx(np.exp(-1 / 1.2), abs=0.02)

@@ -26,7 +26,9 @@ def recording(*steps, dt=0.1, sizes=None, turned=0.0, **more):
         return Scene(number * dt, Roster(actors), points, headings, speeds, **more)
 
     records = [StepRecord(number, rows and scene(number, rows)) for number, rows in enumerate(steps)]
-    return SimpleNamespace(all_steps=records, prologue=Prologue((), dt))
+    return SimpleNamespace(
+        all_steps=records, scenes=lambda: [record.scene for record in records], prologue=Prologue((), dt)
+    )
 
 
 def follow(*, speed, gap, leader=0.0, dt=0.1, **more):

@@ -177,7 +177,7 @@ def test_an_episode_that_goes_well_is_recorded_in_order(run):
         *zip(step, (0, 0, 1, 1), strict=True), (Tag.STEP, 0),
     ]  # fmt: skip
     recording = run.recording()
-    assert result.digest == recording.digest == digest_of(*run.box.evidence())
+    assert result.digest == recording.digest == digest_of(run.box.evidence())
     assert [step.rewards for step in recording.all_steps[:2]] == [
         {"ego": 0.0, "second": 0.0}, {"ego": 1.0, "second": 2.0},
     ]  # fmt: skip

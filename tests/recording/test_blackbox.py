@@ -11,7 +11,7 @@ import pytest
 
 from crashhunt.base.errors import BundleError, RecorderError
 from crashhunt.recording import BlackBox, Phase, Record, Tag, read_black_box, read_header
-from crashhunt.recording._blackbox import decode_records
+from crashhunt.recording._blackbox import Records
 from crashhunt.world import Actor, Roster, Scene
 
 ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "passenger", 5.0, 2.0)))
@@ -110,12 +110,12 @@ def test_the_numbers_on_disk_stay_what_they_are():
 
 def test_an_incomplete_record_is_excluded():
     whole = Record(Tag.LANES, 0, b"12345").encode() + Record(Tag.EVENTS, 1, b"{}").encode()
-    assert [record.tag for record in decode_records(whole)] == [Tag.LANES, Tag.EVENTS]
-    assert [record.tag for record in decode_records(whole[:-6])] == [Tag.LANES, Tag.EVENTS]  # without its padding
+    assert [record.tag for record in Records(whole)] == [Tag.LANES, Tag.EVENTS]
+    assert [record.tag for record in Records(whole[:-6])] == [Tag.LANES, Tag.EVENTS]  # without its padding
     for size in (16, 17, 23, 24, 25):
-        assert [record.tag for record in decode_records(whole[:size])] == [Tag.LANES]
-    assert list(decode_records(b"")) == list(decode_records(bytes(64))) == []
-    assert [record.tag for record in decode_records(whole[:16] + bytes(16) + whole[16:])] == [Tag.LANES]
+        assert [record.tag for record in Records(whole[:size])] == [Tag.LANES]
+    assert list(Records(b"")) == list(Records(bytes(64))) == []
+    assert [record.tag for record in Records(whole[:16] + bytes(16) + whole[16:])] == [Tag.LANES]
 
 
 def test_notes_are_no_part_of_the_evidence(box):
@@ -128,7 +128,7 @@ def test_notes_are_no_part_of_the_evidence(box):
     lanes = Record(Tag.LANES, 0, b"a").encode()
     assert b"".join(box.evidence()) == begun + lanes
     assert len(bytes(box.committed())) == len(begun + lanes) + 3 * 16
-    assert {record.aux for record in decode_records(bytes(box.committed()))} == {0}
+    assert {record.aux for record in Records(bytes(box.committed()))} == {0}
     box.append(Tag.LANES, 0, b"a")
     assert b"".join(box.evidence()) == begun + 2 * lanes
     box.begin(pid=1, trial=1, started=0.0)

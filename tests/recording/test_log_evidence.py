@@ -73,7 +73,7 @@ def test_without_any_evidence_or_its_end_it_is_another_recording(recording, tmp_
     assert read_log(path).digest != recording.digest
     write_log(path, recording)
     rewrite(path, lambda messages: [*messages, evidence(messages)[3]])  # twice
-    with pytest.raises(BundleError, match="message 5 of the log is missing"):
+    with pytest.raises(BundleError, match="message 4 of the log is there twice"):
         read_log(path)
 
 

@@ -64,7 +64,7 @@ def recorded(path, *, wind=(3.0, 4.0), weather=b"\xff rain", steps=2):
             box.append(WIND, 0, json.dumps({"wind_m_s": wind[step - 1]}).encode())
             box.append(WEATHER, 3, weather)
         box.step(step, Scene(step / 10, roster, [(step, 0.0)], [0.0], [10.0]), (0.0,))
-    digest = digest_of(*box.evidence())
+    digest = digest_of(box.evidence())
     box.close()
     found = Recording(read_black_box(path))
     assert found.digest == digest

@@ -145,9 +145,9 @@ def _read_step(reading: Reading, _aux: int, payload: bytes) -> None:
     values = np.frombuffer(payload, "<f8", offset=_STEP_HEAD.size).tolist()
     rewards, values = values[: len(agents)], values[len(agents) :]
     count = len(reading.roster)
-    if step != len(steps) or len(rewards) != len(agents) or len(values) != 4 * count:
+    if step != current.step or len(rewards) != len(agents) or len(values) != 4 * count:
         raise ValueError(
-            f"the scene of step {step} follows that of step {len(steps) - 1}, but steps must be consecutive"
+            f"the scene of step {step} follows that of step {current.step - 1}, but steps must be consecutive"
         )
     points = list(zip(values[: 2 * count : 2], values[1 : 2 * count : 2], strict=True))
     headings, speeds = values[2 * count : 3 * count], values[3 * count :]
@@ -157,7 +157,6 @@ def _read_step(reading: Reading, _aux: int, payload: bytes) -> None:
         raise ValueError(f"the scene of step {step} has data of more actors than the recording lists")
     scene.events = reading.events
     scene.previous = steps[-1].scene if steps else None
-    current.step = step
     current.rewards = {agent.id: reward for agent, reward in zip(agents, rewards, strict=True)}
     steps.append(current)
     reading.current, reading.scene, reading.events = StepRecord(step + 1), {}, ()

@@ -1,0 +1,177 @@
+"""Long recordings are decoded anew at each use, a part at a time, and give the same as if they were kept."""
+
+from __future__ import annotations
+
+import gc
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from crashhunt.crashes import Encounter, closest_actors, danger_course
+from crashhunt.recording import (
+    BlackBox,
+    Prologue,
+    Record,
+    Recording,
+    Tag,
+    _decoded_steps,
+    encode_actors,
+    encode_disturbance,
+    encode_roster,
+    read_black_box,
+)
+from crashhunt.recording._blackbox import Records
+from crashhunt.recording._log import read_log, write_log
+from crashhunt.trial import Disturbance
+from crashhunt.world import Actor, Roster, Scene, join_frames
+
+PROLOGUE = Prologue((), 0.1)
+ACTORS = tuple(Actor(name, "car", 5.0, 2.0) for name in ("ego", "ahead", "late"))
+STEPS = 75
+
+
+@pytest.fixture
+def records(tmp_path):
+    """The ego approaches another vehicle and changes to its lane; a third vehicle comes late."""
+    box = BlackBox(tmp_path / "box")
+    box.begin(pid=1, trial=0, started=0.0)
+    box.prologue(replace(PROLOGUE).encode(), 0)
+    box.append(Tag.ACTORS, 0, encode_actors(ACTORS[:2]))
+    roster = Roster(ACTORS[:2])
+    box.append(Tag.ROSTER, 0, encode_roster([0, 1]))
+    for step in range(STEPS):
+        if step == 30:
+            box.append(Tag.ACTORS, 0, encode_actors(ACTORS[2:]))
+            box.append(Tag.ROSTER, 0, encode_roster([0, 1, 2]))
+            roster = Roster(ACTORS)
+        points = [(2.0 * step, min(0.1 * step, 3.2)), (20.0 + 1.8 * step, 3.2), (2.5 * step - 80.0, 3.2)]
+        count = len(roster)
+        speeds = [20.0, 18.0, 25.0][:count]
+        box.step(step, Scene(0.1 * step, roster, points[:count], [0.0] * count, speeds), ())
+    box.append(Tag.DISTURBANCE, 0, encode_disturbance(Disturbance(STEPS, "ahead", "brake", 3.0, 1.0)))
+    yield read_black_box(tmp_path / "box")
+    box.close()
+
+
+@pytest.fixture
+def decoded(monkeypatch):
+    """The number of times that each part of a recording was decoded, while only four parts may be kept."""
+    found = Counter()
+    decode = _decoded_steps.DecodedSteps._decode
+
+    def counted(self, number, actors):
+        found[number] += 1
+        return decode(self, number, actors)
+
+    monkeypatch.setattr(_decoded_steps.DecodedSteps, "_decode", counted)
+    monkeypatch.setattr(_decoded_steps, "_CHUNK_STEPS", 8)
+    monkeypatch.setattr(_decoded_steps, "_MAX_DECODED_BYTES", 0)
+    return found
+
+
+def everything(recording):
+    """All values of the steps of a recording, and of the scene before each."""
+    return [
+        (
+            step.step, step.rewards, step.more,
+            scene and (scene.time_s, scene.data.tolist(), scene.roster.actors),
+            scene and scene.previous and scene.previous.data.tolist(),
+        )
+        for step in recording.all_steps
+        for scene in [step.scene]
+    ]  # fmt: skip
+
+
+def measured(recording):
+    course = danger_course(recording, "ego")
+    arrays = course.own.tolist(), course.behind.tolist()
+    rest = replace(course, own=None, behind=None)
+    return repr((arrays, rest, Encounter(recording, "ego", "ahead").moments, closest_actors(recording, "ego")))
+
+
+def test_steps_that_are_decoded_at_each_use_are_those_that_are_kept(records, request):
+    kept = Recording(records)
+    expected, numbers = everything(kept), measured(kept)
+    times = [scene.time_s for scene in reversed(kept.scenes()[10:70:7])]
+    request.getfixturevalue("decoded")
+    long = Recording(records)
+    assert everything(long) == expected
+    assert measured(long) == numbers
+    assert long.actors == kept.actors
+    assert (long.steps, len(long.scenes()), len(long.all_steps)) == (STEPS - 1, STEPS, len(kept.all_steps))
+    assert long.digest == kept.digest
+    assert [scene.time_s for scene in reversed(long.scenes()[10:70:7])] == times
+
+
+def test_a_short_recording_is_decoded_once(records, decoded, monkeypatch):
+    monkeypatch.setattr(_decoded_steps, "_MAX_DECODED_BYTES", 64 << 20)
+    recording = Recording(records)
+    assert recording.scenes()[3] is recording.scenes()[3]
+    measured(recording)
+    assert set(decoded.values()) == {1}
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda recording: list(recording.all_steps),
+        lambda recording: list(recording.scenes()),
+        lambda recording: list(reversed(recording.scenes())),
+        lambda recording: list(join_frames(recording.scenes())),
+        lambda recording: Encounter(recording, "ego", "ahead"),
+        lambda recording: recording.disturbances,
+    ],
+)
+def test_a_use_of_all_steps_decodes_each_part_of_a_long_recording_once(records, decoded, use):
+    recording = Recording(records)
+    assert set(decoded.values()) == {1}, "reading the recording decodes it once"
+    decoded.clear()
+    recording.scenes()[0]  # so that no part is left that the use below needs first
+    recording.scenes()[20], recording.scenes()[30], recording.scenes()[40]
+    before = decoded.copy()
+    use(recording)
+    assert set((decoded - before).values()) == {1}
+
+
+def test_the_criticality_is_measured_while_the_scenes_pass_once(records, decoded):
+    recording = Recording(records)
+    decoded.clear()
+    danger_course(recording, "ego")
+    assert sum(decoded.values()) <= STEPS // 8 + 2, "at most one part more, of the nearest moment"
+
+
+def test_no_scene_of_a_long_recording_is_kept(records, decoded):
+    recording = Recording(records)
+    used = (danger_course(recording, "ego"), Encounter(recording, "ego", "ahead"))
+    gc.collect()
+    alive = sum(isinstance(one, Scene) for one in gc.get_objects())
+    assert used[1].moments
+    assert alive <= 4 * (8 + 1) + 4  # the parts that are kept, each with the scene before it
+
+
+def test_records_in_the_bytes_of_a_black_box_are_the_records(records):
+    listed = list(records)
+    assert Records.of(listed) == records == Records.of(iter(records))
+    assert (len(records), records[-1], records[2]) == (len(listed), listed[-1], listed[2])
+    assert list(records[1:-2]) == listed[1:-2]
+    assert list(records.since(5)) == listed[5:]
+    assert records[:-1] != records != Records.of([*listed[:-1], Record(Tag.NOTES, 0, b"x")])
+    with pytest.raises(IndexError):
+        records[len(records)]
+
+
+def test_a_log_that_is_written_and_read_in_parts_is_the_log(records, request, tmp_path):
+    write_log(tmp_path / "kept.mcap", Recording(records))
+    request.getfixturevalue("decoded")
+    write_log(tmp_path / "long.mcap", Recording(records))
+    assert (tmp_path / "long.mcap").read_bytes() == (tmp_path / "kept.mcap").read_bytes()
+    assert read_log(tmp_path / "long.mcap").records == records
+
+
+def test_joined_frames_have_the_columns_of_their_scenes(records):
+    scenes = Recording(records).scenes()
+    frames = list(join_frames(scenes))
+    assert [len(frame.columns) for frame in frames] == [30, STEPS - 30]
+    assert np.array_equal(np.concatenate([scene.frame.columns for scene in scenes[:30]]), frames[0].columns)
