@@ -156,6 +156,10 @@ def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
             ),
             options,
         )  # fmt: skip
+    except KeyboardInterrupt:
+        resume = command_line("crashhunt", "rerun", options.to or options.directory)
+        say(f"Interrupted. {resume} resumes the hunts that have begun.", as_json=options.json)
+        raise
     finally:
         finish()
     for place in replaced:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from contextlib import closing, suppress
@@ -17,7 +18,7 @@ from crashhunt.crashes import trust_repositories
 from crashhunt.episode import internal_error
 from crashhunt.executors import HostConditions
 from crashhunt.hunts._next_trials import Pace, settings_of_workers
-from crashhunt.hunts._running_hunt import HuntSetup, RunningHunt
+from crashhunt.hunts._running_hunt import QUIET_WAIT_S, HuntSetup, RunningHunt, refuse_long_wait
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.results import CodeVersions, HuntDirectory, resumed_versions
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
@@ -82,6 +83,7 @@ class Hunt:
         self._new_snapshot: Path | None = None  # that this run has added
         self._conditions: HostConditions | None = None  # once there is a snapshot
         self._code, self._is_new_code = CodeVersions(), False
+        self._has_waited = False  # for the ledger, and reported it
         self._notes: list[str] = []
         self._running: RunningHunt | None = None
 
@@ -101,7 +103,7 @@ class Hunt:
                 self.settings, self._command, overwrite=self._overwrite, seed_given=self._seed_given
             )
             self._compare_code()
-            ledger = Ledger(self.directory / layout.LEDGER, writable=True)
+            ledger = Ledger(self.directory / layout.LEDGER, writable=True, wait=self._wait_to_begin)
             try:
                 return self._run(ledger, watch or (lambda _: None))
             except Exception as error:
@@ -168,6 +170,17 @@ class Hunt:
             self._new_snapshot = taken.path if taken.path.name not in known else None
             self._snapshot = taken
         return self._snapshot
+
+    def _wait_to_begin(self, waited_s: float) -> None:
+        """Report that another program locks the ledger before the hunt can begin, as `RunningHunt` does later.
+
+        Raises:
+            HuntDirectoryError: the hunt waits no longer.
+        """
+        refuse_long_wait(waited_s, self._stops, self.directory)
+        if waited_s >= QUIET_WAIT_S and not self._has_waited:
+            self._has_waited = True
+            logging.getLogger("crashhunt").warning("waiting for another program that has locked ledger.sqlite")
 
     def _fail(self, ledger: Ledger, why: str) -> None:
         """Record why the hunt ends, if the ledger can still be written.

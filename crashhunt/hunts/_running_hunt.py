@@ -55,7 +55,21 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.snapshots import Snapshot
 
-_QUIET_WAIT_S, _MAX_WAIT_S = 3.0, 600.0  # for another program that locks the ledger
+QUIET_WAIT_S, _MAX_WAIT_S = 3.0, 600.0  # for another program that locks the ledger
+
+
+def refuse_long_wait(waited_s: float, stops: Sequence[int], directory: Path) -> None:
+    """Stop waiting for another program that locks the ledger, at a request to stop or after minutes.
+
+    Raises:
+        HuntDirectoryError: the hunt waits no longer.
+    """
+    if stops or waited_s > _MAX_WAIT_S:
+        raise HuntDirectoryError(
+            f"another program has locked the ledger for {waited_s:.0f} s",
+            fix="close the program that has it open, and run the same command again",
+            where=str(directory / layout.LEDGER),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -289,14 +303,9 @@ class RunningHunt:
         Raises:
             HuntDirectoryError: the hunt waits no longer.
         """
-        if waited_s < _QUIET_WAIT_S:
+        if waited_s < QUIET_WAIT_S:
             return
-        if self.setup.stops or waited_s > _MAX_WAIT_S:
-            raise HuntDirectoryError(
-                f"another program has locked the ledger for {waited_s:.0f} s",
-                fix="close the program that has it open, and run the same command again",
-                where=str(self.setup.place.path / layout.LEDGER),
-            )
+        refuse_long_wait(waited_s, self.setup.stops, self.setup.place.path)
         note = "the hunt waited for another program that had locked ledger.sqlite; no trial was lost"
         if note not in self.progress.notes:
             self.progress.notes.append(note)

@@ -61,12 +61,20 @@ class Ledger(LedgerReader):
         writable: whether to write. The only writer creates the file, and migrates a file of an earlier version.
         read_only: whether to leave SQLite's auxiliary files next to the ledger unchanged; for readers of other users'
             hunts.
+        wait: function called while another process locks the file, as for `wait_while_locked`, from the beginning on.
 
     Raises:
         HuntDirectoryError: the file cannot be opened, is not a ledger, or is damaged.
     """
 
-    def __init__(self, path: Path, *, writable: bool = False, read_only: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        writable: bool = False,
+        read_only: bool = False,
+        wait: Callable[[float], None] | None = None,
+    ) -> None:
         self._writable = False
         self._together_since = math.inf
         if not writable and not path.exists():
@@ -79,6 +87,7 @@ class Ledger(LedgerReader):
                 create(path)
             may_write = os.access(path.parent, os.W_OK)  # not on a read-only file system, or in another user's folder
             database = opened(path, read_only=read_only or (not writable and (is_untouched() or not may_write)))
+            database.wait = wait
             with ExitStack() as failed:
                 failed.callback(database.close)
                 super().__init__(database, path, shape_of(database, path))

@@ -278,7 +278,7 @@ def test_error_of_a_hunt_is_in_its_ledger(hunt, monkeypatch, error, raised, why)
         locked=locked, claim=lambda *given, **more: SETTINGS, scratch="scratch", has_begun=True
     )
     monkeypatch.setattr(_hunt, "stop_requests", stops)
-    monkeypatch.setattr(_hunt, "Ledger", lambda path, *, writable: ledger if writable else None)
+    monkeypatch.setattr(_hunt, "Ledger", lambda path, *, writable, wait: ledger if writable else None)
     monkeypatch.setattr(_hunt, "remove_scratch", removed.append)
     monkeypatch.setattr(found, "_fail", lambda given, reason: failed.append((given, reason)))
 
@@ -310,6 +310,15 @@ def test_hunt_waits_for_a_locked_ledger_and_reports_it(running):
     running._wait_for_ledger(1.0)
     with pytest.raises(HuntDirectoryError, match="has locked the ledger for 4 s"):
         running._wait_for_ledger(4.0)
+
+
+def test_hunt_waits_for_a_locked_ledger_before_it_begins(hunt, caplog):
+    found = hunt()
+    for waited_s in (0.5, 4.0, 5.0):
+        found._wait_to_begin(waited_s)
+    assert caplog.messages == ["waiting for another program that has locked ledger.sqlite"]
+    with pytest.raises(HuntDirectoryError, match="has locked the ledger for 601 s; close the program"):
+        found._wait_to_begin(601.0)
 
 
 def test_trial_is_written_recorded_and_counted(running, loop, monkeypatch):

@@ -328,6 +328,17 @@ def test_writer_waits_while_a_backup_locks_the_ledger(path, monkeypatch, act):
             assert 0 in reader.finished() or reader.replaced_count() == 1
 
 
+def test_writer_may_wait_while_a_backup_locks_the_ledger_that_it_opens(path, monkeypatch):
+    monkeypatch.setattr(_schema, "_LOOK_EVERY_S", 0.001)
+    monkeypatch.setattr(_schema, "_BUSY_S", 0.0)
+    Ledger(path, writable=True).close()
+    with closing(sqlite3.connect(path, isolation_level=None)) as backup:
+        backup.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(HuntDirectoryError, match="another program keeps it busy"):
+            Ledger(path, writable=True)
+        Ledger(path, writable=True, wait=lambda _: backup.execute("ROLLBACK")).close()
+
+
 def test_writer_of_trials_may_stop_waiting_and_loses_no_earlier_one(path, monkeypatch):
     monkeypatch.setattr(_schema, "_LOOK_EVERY_S", 0.001)
     ledger = Ledger(path, writable=True)
