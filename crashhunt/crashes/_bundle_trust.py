@@ -10,7 +10,7 @@ import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from crashhunt.plans import HuntSettings
     from crashhunt.scenario import Scenario
     from crashhunt.snapshots import Snapshot
-    from crashhunt.trial import Distribution, TrialSpec
+    from crashhunt.trial import Distribution, TrialSpec, Value
 
 
 # What this user trusts although it was not made here: a file for each origin in the folder of the user's state.
@@ -407,7 +407,7 @@ def signature(index: ArchiveIndex) -> str:
 # What a stranger's crash may make this process do when its recorded actions are driven: simulate, and nothing else.
 
 
-def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapping[str, Any]) -> None:
+def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapping[str, Value]) -> None:
     """Refuse a scenario that has side effects, or whose side effects are unknown.
 
     Args:

@@ -12,7 +12,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, InternalError
@@ -375,10 +375,10 @@ def check_report(
     if report[:_CHECKSUM_BYTES] != _checksum(text):
         return "its report was overwritten"
     try:
-        loaded: Any = json.loads(text)
+        loaded: JsonObject = json.loads(text)
         if "fault" in loaded:
-            raise _fault_of(loaded["fault"])
-        said: Report = loaded
+            raise _fault_of(cast("ErrorData", loaded["fault"]))
+        said = cast("Report", loaded)
         data = cast("JsonObject", {**said["result"], "spec": spec.to_json()})
         result = TrialResult.from_json(data)
     except (ValueError, KeyError, TypeError, AttributeError) as error:

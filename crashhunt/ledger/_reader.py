@@ -8,7 +8,7 @@ import re
 import sqlite3
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict, cast
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.ledger._schema import OWN_FACTS, SEAL, WITH_EVENTS, Row, checked, damaged, explained, plain_trial
@@ -190,14 +190,14 @@ class Noted(TypedDict, total=False):
     disturb: list[str] | None
     copies: list[str] | None
     confirmed: Mapping[str, Sequence[int]] | None
-    nodes: list[dict[str, Any]]
+    nodes: list[JsonObject]
     kinds: list[KindData]
     kinds_version: int
     types_by_cause: int
     crash_on: list[str]
     newest_kind: float | None
     audits_left: list[int] | None
-    phase: dict[str, Any] | None
+    phase: JsonObject | None
     ends_at: float | None
     failed_steps: int
     dropped: dict[str, list[int]]
