@@ -13,6 +13,7 @@ from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError, remedy
 from crashhunt.base.files import cannot_write, is_empty_folder, sync_folder, sync_tree
+from crashhunt.base.older_formats import OlderFormatError
 from crashhunt.base.resources import error_of_next_files, limit_behind
 from crashhunt.base.temporary import has_ended, new_folder, owner_in
 from crashhunt.crashes import Bundle, read_bundle, read_params
@@ -58,7 +59,6 @@ class Checked(Serializable):
     Args:
         dir: path of the hunt or crash.
         kind: either ``hunt``, ``crash`` or ``file``.
-        protected: whether every trial has a digest; the ledgers of early versions have none.
         trials: the numbers of the trials whose rows are unchanged since they were written.
         damaged_trials: reason for each damaged trial.
         crashes: the names of the bundles that are unchanged since they were written.
@@ -70,7 +70,6 @@ class Checked(Serializable):
 
     dir: Path
     kind: Literal["hunt", "crash", "file"] = "hunt"
-    protected: bool = True
     trials: set[int] = field(default_factory=set)
     damaged_trials: set[int] = field(default_factory=set)
     crashes: list[str] = field(default_factory=list)
@@ -103,6 +102,11 @@ class Checked(Serializable):
     def trial_count(self) -> int:
         """The number of trials whose rows are unchanged."""
         return len(self.trials)
+
+    @property
+    def protected(self) -> bool:
+        """Whether digests protect the trials: those of every ledger of format version 1 do."""
+        return True
 
 
 def check(directory: Path) -> list[Checked]:
@@ -196,11 +200,7 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
         return None
     try:
         with closing(Ledger(path)) as ledger:
-            found.protected = ledger.protected
-            if not ledger.protected:
-                note = "an earlier crashhunt wrote it, and its rows have no digests: not every change would be seen"
-                found.findings.append(CheckFinding(str(path), note, damaged=False))
-            elif not ledger.sealed and hunt_state(hunt).state != "running":
+            if not ledger.sealed and hunt_state(hunt).state != "running":
                 note = "its writer was killed; a missing trial would not be detected"
                 found.findings.append(CheckFinding(str(path), note, damaged=False))
             try:
@@ -215,6 +215,8 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
                 if row is not None and settings is not None and row[2] in settings.crash_on:
                     crashes[number] = row[10]
             return {number: TrialResult.from_json(json.loads(text)) for number, text in crashes.items()}
+    except OlderFormatError:
+        raise  # nothing is damaged
     except HuntDirectoryError as error:
         found.findings.append(
             CheckFinding(where=str(path), what=error.message, lost="all trials but the crashes", fix=_RESUME_FIX)

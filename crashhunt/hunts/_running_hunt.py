@@ -42,6 +42,7 @@ from crashhunt.training import held_out_traffics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
 
     from crashhunt.base.plugins import ImportedModules
     from crashhunt.episode import WorkerSettings

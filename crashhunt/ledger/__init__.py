@@ -1,4 +1,4 @@
-"""The ledger of a hunt: facts about its trials in one SQLite file, with schema, migrations, writer and reader."""
+"""The ledger of a hunt: facts about its trials in one SQLite file, with schema, writer and reader."""
 
 from typing import TYPE_CHECKING
 

@@ -222,16 +222,16 @@ class Facts(Noted, total=False):
 
 
 class Seal(TypedDict):
-    """The contents of a ledger when it was closed; earlier versions of crashhunt recorded fewer fields."""
+    """The contents of a ledger when it was closed."""
 
     outcomes: Mapping[str, int]
     steps: int
     table: str
-    dangers: NotRequired[str]
-    other_steps: NotRequired[int]
+    dangers: str
+    other_steps: int
     events: int
     replaced: int
-    proposals: NotRequired[int]
+    proposals: int
     facts: int
 
 
@@ -271,11 +271,6 @@ class LedgerReader:
         self._shape = shape
 
     @property
-    def protected(self) -> bool:
-        """Whether every row has a digest; ledgers of the first version have no digests."""
-        return self._shape.protected
-
-    @property
     def sealed(self) -> bool:
         """Whether the last writer sealed the ledger when it closed the file."""
         return self._seal() is not None
@@ -300,8 +295,6 @@ class LedgerReader:
         Raises:
             HuntDirectoryError: a proposal is damaged or missing; the proposals before it have been yielded.
         """
-        if not self._proposing:
-            return
         seal, count = self._seal(), 0
         for row in self._select(f"{self._shape.select('proposals')} ORDER BY turn"):
             count += 1
@@ -312,7 +305,7 @@ class LedgerReader:
         """Return the intact proposals, even if other proposals are damaged."""
         found: list[Turn] = []
         try:
-            for row in self._select(f"{self._shape.select('proposals')} ORDER BY turn") if self._proposing else ():
+            for row in self._select(f"{self._shape.select('proposals')} ORDER BY turn"):
                 try:
                     found.append(self._turn(row))
                 except HuntDirectoryError:
@@ -435,7 +428,7 @@ class LedgerReader:
         """Return the number of simulated steps.
 
         The number includes the steps of trials, of their warm-ups, of their forks, and of confirmations that ended
-        differently. Steps that an older ledger does not record are not included.
+        differently.
         """
         seal = self._seal()
         other = self._other_steps()
@@ -487,7 +480,7 @@ class LedgerReader:
                 row = self._row(number)
                 if row is not None:
                     self._plain(row)
-                    yield number, row[:-1] if self.protected else row
+                    yield number, row[:-1]
             except HuntDirectoryError:
                 yield number, None
 
@@ -557,8 +550,6 @@ class LedgerReader:
             count: maximum number of trials.
             snapshots: digests of the snapshots whose trials count; empty for all trials.
         """
-        if "danger" not in self._shape.columns["trials"]:
-            return []
         which = f"AND {_among('snapshot', snapshots)} " if snapshots else ""
         found = [
             row
@@ -670,20 +661,16 @@ class LedgerReader:
         return next(self._select(f"{self._shape.select('trials')} WHERE number = ?", (number,)), None)
 
     def _checked(self, row: Row, what: str) -> Row:
-        return checked(row, what, self._path) if self.protected else row
+        return checked(row, what, self._path)
 
     def _plain(self, row: Row) -> JsonObject:
-        return plain_trial(self._checked(row, f"trial {row[0]}"), self._path, trusted=self.protected)
+        return plain_trial(self._checked(row, f"trial {row[0]}"), self._path)
 
     def _result(self, data: JsonObject) -> TrialResult:
         try:
             return TrialResult.from_json(data)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise damaged(self._path, f"a trial cannot be read: {type(error).__name__}: {error}") from None
-
-    @property
-    def _proposing(self) -> bool:
-        return "proposals" in self._shape.columns
 
     def _turn(self, row: Row) -> Turn:
         try:
@@ -693,8 +680,6 @@ class LedgerReader:
             raise damaged(self._path, f"a proposal cannot be read: {type(error).__name__}: {error}") from None
 
     def _seal(self) -> Seal | None:
-        if not self.protected:
-            return None
         row = next(self._select(f"{self._shape.select('hunt')} WHERE key = ?", (SEAL,)), None)
         if row is None:
             return None
@@ -702,36 +687,31 @@ class LedgerReader:
         return found
 
     def _make_seal(self) -> Seal:
-        said = hashlib.blake2b(digest_size=16)
-        for rows in self._chunks():
-            said.update(_as_text(rows))
-        seal: Seal = {
+        table, ranked = hashlib.blake2b(digest_size=16), hashlib.blake2b(digest_size=16)
+        for digest, query in ((table, _BY_TIME), (ranked, _BY_DANGER)):
+            for rows in self._chunks(query):
+                digest.update(_as_text(rows))
+        return {
             "outcomes": self._outcomes(),
             "steps": self._steps(),
-            "table": said.hexdigest(),
+            "table": table.hexdigest(),
             "events": self._count("events"),
             "replaced": self._count("replaced"),
-            "proposals": self._count("proposals") if self._proposing else 0,
+            "proposals": self._count("proposals"),
             "facts": self._count(f"hunt WHERE key <> '{SEAL}'"),
+            "dangers": ranked.hexdigest(),
+            "other_steps": self._other_steps(),
         }
-        if "danger" in self._shape.columns["trials"]:
-            ranked = hashlib.blake2b(digest_size=16)
-            for rows in self._chunks(_BY_DANGER):
-                ranked.update(_as_text(rows))
-            seal["dangers"] = ranked.hexdigest()
-        if "other_steps" in self._shape.columns["trials"]:
-            seal["other_steps"] = self._other_steps()
-        return seal
 
     def _fits(self, seal: Seal) -> bool:
-        """Return whether the contents match the seal, which another version of crashhunt may have written."""
+        """Return whether the contents match the seal, in which a later version may have recorded more."""
         found: Plain = self._make_seal()
         said: Plain = seal
-        return all(found[name] == said[name] for name in found.keys() & said.keys())
+        return all(found[name] == said.get(name) for name in found)
 
     def _compare_seal(self, seal: Seal | None, name: str, found: object) -> None:
-        # A writer may have come meanwhile; then it is another seal, or none. One of before may say less.
-        if seal is not None and found != seal.get(name, found) and self._seal() == seal:
+        # A writer may have come meanwhile. Then the ledger has another seal, or none.
+        if seal is not None and found != seal.get(name) and self._seal() == seal:
             raise damaged(self._path, f"its {name} differ from those that were written")
 
     def _outcomes(self) -> dict[str, int]:
@@ -744,8 +724,6 @@ class LedgerReader:
         return int(next(self._select("SELECT coalesce(sum(steps), 0) FROM trials"))[0])
 
     def _other_steps(self) -> int:
-        if "other_steps" not in self._shape.columns["trials"]:
-            return 0
         return int(next(self._select("SELECT coalesce(sum(other_steps), 0) FROM trials"))[0])
 
     def _chunks(self, query: str = _BY_TIME) -> Iterator[list[Row]]:

@@ -1,4 +1,4 @@
-"""The file of a ledger: its tables in every version, migrations, and checks for damage."""
+"""The file of a ledger: its tables, and checks for damage."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from crashhunt.base.errors import HuntDirectoryError, remedy
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import digest_of_row
+from crashhunt.base.older_formats import OlderFormatError
 from crashhunt.base.resources import error_of_next_files, limit_behind
 from crashhunt.base.text import command_line
-from crashhunt.trial import check_plain
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -26,30 +26,23 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
 
 
-VERSION = 5  # of the tables, as PRAGMA user_version
-_MIN_READER_VERSION = 3  # the least version of a crashhunt that reads what this one writes
+VERSION = 1  # of the tables, as PRAGMA user_version
+_MIN_READER_VERSION = 1  # the least version of a crashhunt that reads what this one writes
+_APPLICATION_ID = 0x63726831  # "crh1", as PRAGMA application_id: ledgers from before format version 1 have none
 _MAX_CELL_BYTES = 64 << 20  # of a ledger that may be a stranger's; the state of a sampler has some MB
 _FILES_OF_LEDGER = 3  # that SQLite opens: the ledger, its write-ahead log and its shared memory
-_FIRST_VERSION_WITH_DIGESTS = 2  # the first version in which every row has a digest of its content
-_FIRST_VERSION_WITH_PROPOSALS = 3  # the first version that has proposals
 SEAL, _READER_FACT = "seal", "reader"
 OWN_FACTS = (SEAL, _READER_FACT)  # on the ledger itself, in addition to the facts of the hunt
 
-PROPOSALS = """
-CREATE TABLE IF NOT EXISTS proposals (
-    turn INTEGER PRIMARY KEY, number INTEGER NOT NULL UNIQUE, told TEXT NOT NULL, spec TEXT NOT NULL,
-    digest INTEGER NOT NULL
-) STRICT;
-"""
 # Most trials have no traffic event, so that those that have some are counted without reading all the others.
 WITH_EVENTS = """instr(result, '"events": {"') > 0"""
-EVENTS_INDEX = f"CREATE INDEX IF NOT EXISTS trials_with_events ON trials (number) WHERE {WITH_EVENTS};"
+_EVENTS_INDEX = f"CREATE INDEX IF NOT EXISTS trials_with_events ON trials (number) WHERE {WITH_EVENTS};"
 # What counts, ranks and compares trials reads this instead of the rows, which are fifty times as large.
-OUTCOME_INDEX = (
+_OUTCOME_INDEX = (
     "CREATE INDEX IF NOT EXISTS trials_by_outcome "
     "ON trials (outcome, time_to_collision_s, number, steps, seed, other_steps);"
 )
-DANGER_INDEX = "CREATE INDEX IF NOT EXISTS trials_by_danger ON trials (outcome, danger, number);"
+_DANGER_INDEX = "CREATE INDEX IF NOT EXISTS trials_by_danger ON trials (outcome, danger, number);"
 _SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS trials (
     number INTEGER PRIMARY KEY,
@@ -67,9 +60,9 @@ CREATE TABLE IF NOT EXISTS trials (
     danger REAL,
     other_steps INTEGER
 ) STRICT;
-{OUTCOME_INDEX}
-{EVENTS_INDEX}
-{DANGER_INDEX}
+{_OUTCOME_INDEX}
+{_EVENTS_INDEX}
+{_DANGER_INDEX}
 CREATE TABLE IF NOT EXISTS replaced (
     number INTEGER, replaced_at REAL, result TEXT NOT NULL, digest INTEGER NOT NULL
 ) STRICT;
@@ -79,21 +72,24 @@ CREATE TABLE IF NOT EXISTS events (
 CREATE TABLE IF NOT EXISTS hunt (
     key TEXT PRIMARY KEY, value TEXT NOT NULL, digest INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
-{PROPOSALS}
+CREATE TABLE IF NOT EXISTS proposals (
+    turn INTEGER PRIMARY KEY, number INTEGER NOT NULL UNIQUE, told TEXT NOT NULL, spec TEXT NOT NULL,
+    digest INTEGER NOT NULL
+) STRICT;
 """
-# The tables of version 1, each without its digest, and those that came later.
-FIRST = {
+# The columns of the tables in the order in which they are hashed. A later version adds columns at the end of a table,
+# after the digest, and tables. It keeps the rest, so that every version checks the rows of all others.
+COLUMNS = {
     "trials": (
         "number", "seed", "outcome", "steps", "time_to_collision_s", "gap_m", "required_deceleration",
-        "wall_s", "ended_at", "snapshot", "result",
+        "wall_s", "ended_at", "snapshot", "result", "danger", "other_steps",
     ),
     "replaced": ("number", "replaced_at", "result"),
     "events": ("at", "state", "detail"),
     "hunt": ("key", "value"),
+    "proposals": ("turn", "number", "told", "spec"),
 }  # fmt: skip
-# Columns that came later stand after the digest, where a migration puts them.
-_ADDED_COLUMNS = {"trials": {"danger": 4, "other_steps": 5}}  # table to column to the first version that has it
-_LATER_TABLES = {"proposals": ("turn", "number", "told", "spec")}
+_DIGEST_PLACES = {table: len(columns) for table, columns in COLUMNS.items()} | {"trials": 11}
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,25 +99,15 @@ class Shape:
     Args:
         version: version of the table layout.
         columns: columns of each table except the digest, in the order in which they are hashed. A table of a newer
-            version may have further columns at its end; a table of an older version may lack columns.
+            version may have further columns at its end.
     """
 
     version: int
     columns: Mapping[str, tuple[str, ...]]
 
-    @property
-    def protected(self) -> bool:
-        """Whether every row has a digest; ledgers of the first version have no digests."""
-        return self.version >= _FIRST_VERSION_WITH_DIGESTS
-
     def select(self, table: str) -> str:
         """Return the beginning of an SQL query for whole rows, with the digest as the last column."""
-        return f"SELECT {', '.join((*self.columns[table], *(('digest',) if self.protected else ())))} FROM {table}"
-
-
-def columns_of_trials() -> tuple[str, ...]:
-    """Return the columns of a trial's row in this version except the digest, in the order in which they are hashed."""
-    return (*FIRST["trials"], *_ADDED_COLUMNS["trials"])
+        return f"SELECT {', '.join((*self.columns[table], 'digest'))} FROM {table}"
 
 
 def create(path: Path) -> None:
@@ -129,11 +115,13 @@ def create(path: Path) -> None:
     path.with_name(f"{path.name}-wal").unlink(missing_ok=True)  # SQLite would take that of an earlier one for its own
     with whole_file(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as database:
         database.execute("PRAGMA synchronous = OFF")  # the whole file is synced at once
-        database.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
-        note_reader(database)
+        database.executescript(
+            f"BEGIN; {_SCHEMA} PRAGMA user_version = {VERSION}; PRAGMA application_id = {_APPLICATION_ID}; COMMIT;"
+        )
+        _note_reader(database)
 
 
-def note_reader(database: sqlite3.Connection) -> None:
+def _note_reader(database: sqlite3.Connection) -> None:
     """Record the oldest version of crashhunt that can read the ledger."""
     row = (_READER_FACT, json.dumps(_MIN_READER_VERSION))
     database.execute("INSERT OR REPLACE INTO hunt VALUES (?, ?, ?)", (*row, digest_of_row(row)))
@@ -143,32 +131,30 @@ def shape_of(database: sqlite3.Connection, path: Path) -> Shape:
     """Return the columns of the tables of a ledger.
 
     Raises:
-        HuntDirectoryError: the tables cannot be read, or do not belong to their version.
+        HuntDirectoryError: the tables cannot be read, do not belong to their version, or are older than version 1.
         sqlite3.Error: the file is not a database.
     """
-    version = int(database.execute("PRAGMA user_version").fetchone()[0])
+    version, application = (
+        int(database.execute(f"PRAGMA {name}").fetchone()[0]) for name in ("user_version", "application_id")
+    )
     names = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    if not names & FIRST.keys():
+    if not names & COLUMNS.keys():
         raise HuntDirectoryError(
             "not a ledger of crashhunt: its tables are missing", fix="choose another directory", where=str(path)
         )
-    if version < 1:
-        raise damaged(path, f"its version is {version}")
+    if not application:
+        raise OlderFormatError.of("the ledger", str(path))
+    if version < 1 or application != _APPLICATION_ID:
+        raise damaged(path, f"its version is {version} of {application:x}")
     if version > VERSION:
         _refuse_unreadable(database, path, version)
-    expected = {**FIRST, **(_LATER_TABLES if version >= _FIRST_VERSION_WITH_PROPOSALS else {})}
-    for table in names & _LATER_TABLES.keys() - expected.keys():
-        raise damaged(path, f"it contains the table {table}, which version {version} does not have")
-    return Shape(version, {table: _columns(database, path, version, table, expected[table]) for table in expected})
+    return Shape(version, {table: _columns(database, path, version, table) for table in COLUMNS})
 
 
-def _columns(
-    database: sqlite3.Connection, path: Path, version: int, table: str, known: tuple[str, ...]
-) -> tuple[str, ...]:
+def _columns(database: sqlite3.Connection, path: Path, version: int, table: str) -> tuple[str, ...]:
     there = tuple(name for _, name, *_ in database.execute(f"PRAGMA table_info({table})"))
-    added = tuple(name for name, since in _ADDED_COLUMNS.get(table, {}).items() if version >= since)
-    expected = known if version < _FIRST_VERSION_WITH_DIGESTS else (*known, "digest", *added)
-    known = (*known, *added)
+    known, place = COLUMNS[table], _DIGEST_PLACES[table]
+    expected = (*known[:place], "digest", *known[place:])
     if version > VERSION and "digest" in there:
         columns = tuple(name for name in there if name != "digest")
         if columns[: len(known)] == known:
@@ -197,73 +183,6 @@ def _refuse_unreadable(database: sqlite3.Connection, path: Path, version: int) -
     )
 
 
-# Migrations: when a hunt resumes, its ledger is migrated to this version, one version at a time.
-
-
-def _add_digests(database: sqlite3.Connection) -> None:
-    """Add digests, computed from the present contents."""
-    database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
-    for table, columns in FIRST.items():
-        database.execute(f"ALTER TABLE {table} ADD COLUMN digest INTEGER NOT NULL DEFAULT 0")
-        database.execute(f"UPDATE {table} SET digest = digest_of_row({', '.join(columns)})")
-
-
-def _add_proposals(database: sqlite3.Connection) -> None:
-    database.execute(PROPOSALS)
-    database.execute(EVENTS_INDEX)
-    note_reader(database)
-
-
-def _add_danger(database: sqlite3.Connection) -> None:
-    """Add an empty criticality to existing rows; a damaged row keeps a digest that shows the damage."""
-    database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
-    database.execute("ALTER TABLE trials ADD COLUMN danger REAL")
-    was = ", ".join(FIRST["trials"])
-    database.execute(f"UPDATE trials SET digest = digest_of_row({was}, danger) WHERE digest = digest_of_row({was})")
-    database.execute(DANGER_INDEX)
-
-
-def _add_other_steps(database: sqlite3.Connection) -> None:
-    """Add the simulated steps outside of trials; forks are in the existing data, and warm-ups are unknown."""
-    database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
-    database.execute("ALTER TABLE trials ADD COLUMN other_steps INTEGER")
-    was = ", ".join((*FIRST["trials"], "danger"))
-    data = "iif(json_valid(result), result, '{}')"
-    copies = " + ".join(f"coalesce(json_extract({data}, '$.{name}.steps'), 0)" for name in ("stress", "branches"))
-    now = f"other_steps = {copies}, digest = digest_of_row({was}, {copies})"
-    database.execute(f"UPDATE trials SET {now} WHERE digest = digest_of_row({was})")
-    database.execute("DROP INDEX IF EXISTS trials_by_outcome")
-    database.execute(OUTCOME_INDEX)
-
-
-MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {
-    1: _add_digests,
-    2: _add_proposals,
-    3: _add_danger,
-    4: _add_other_steps,
-}
-"""Version to what makes of a ledger of it one of the next.
-
-A version may add tables, and columns at the end of a table, each with a value for the rows that are there. The digest
-of a row is over all columns in the order of the table, so that versions before can check rows that have columns which
-they do not know. A version that older readers would misread raises the version that it requires of readers.
-"""
-
-
-def migrate(database: sqlite3.Connection, version: int) -> None:
-    """Convert the tables of an earlier version to this version, either completely or not at all."""
-    database.execute("BEGIN IMMEDIATE")
-    try:
-        for earlier in range(version, VERSION):
-            MIGRATIONS[earlier](database)
-        database.execute(f"PRAGMA user_version = {VERSION}")
-        database.execute("COMMIT")
-    except BaseException:
-        if database.in_transaction:
-            database.execute("ROLLBACK")
-        raise
-
-
 # The file of a ledger, and what can be wrong with it.
 
 Row: TypeAlias = tuple[Any, ...]
@@ -281,21 +200,15 @@ def checked(row: Row, what: str, path: Path) -> Row:
     return row
 
 
-def plain_trial(row: Row, path: Path, *, trusted: bool) -> JsonObject:
-    """Return the trial that a row of all columns contains, as JSON data.
+def plain_trial(row: Row, path: Path) -> JsonObject:
+    """Return the trial that a checked row of all columns contains, as JSON data.
 
     Raises:
-        HuntDirectoryError: the row contains no valid trial, or an unprotected row contradicts its own JSON text.
+        HuntDirectoryError: the row contains no valid trial.
     """
     try:
         data: JsonObject = json.loads(row[10])
-        if not trusted:
-            check_plain(data)
-            spec, closest = data["spec"], data["closest"]
-            said = (spec["number"], spec["seed"], data["outcome"], data["steps"], *closest.values(), data["wall_s"])
-            if row[:8] != said:
-                raise ValueError("the columns of a row differ from the JSON text in it")
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise damaged(path, f"trial {row[0]} cannot be read: {error}") from None
     return data
 

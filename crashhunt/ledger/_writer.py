@@ -19,14 +19,13 @@ from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.integrity import digest_of_row
 from crashhunt.ledger._reader import LedgerReader, Turn as Turn
 from crashhunt.ledger._schema import (
+    COLUMNS,
     SEAL,
     VERSION,
-    columns_of_trials,
     create,
     damaged,
     explained,
     is_untouched,
-    migrate,
     opened,
     removed,
     rewrite,
@@ -42,7 +41,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 
-_COLUMNS = columns_of_trials()
+_COLUMNS = COLUMNS["trials"]
 _PLACEHOLDERS = ", ".join("?" * (len(_COLUMNS) + 1))
 _INSERT = f"INSERT OR REPLACE INTO trials ({', '.join(_COLUMNS)}, digest) VALUES ({_PLACEHOLDERS})"
 _TOGETHER_S = 0.5  # a kill loses no more than this of what was recorded together
@@ -58,7 +57,7 @@ class Ledger(LedgerReader):
 
     Args:
         path: path of ``ledger.sqlite``.
-        writable: whether to write. The only writer creates the file, and migrates a file of an earlier version.
+        writable: whether to write. The only writer creates the file.
         read_only: whether to leave SQLite's auxiliary files next to the ledger unchanged; for readers of other users'
             hunts.
         wait: function called while another process locks the file, as for `wait_while_locked`, from the beginning on.
@@ -154,9 +153,8 @@ class Ledger(LedgerReader):
             raise explained(self._path, error) from error
 
     def copy(self, row: Row) -> None:
-        """Add a row of any version that `intact_rows` of another ledger has yielded."""
-        count = len(_COLUMNS)
-        self._insert((*row, *(None,) * count)[:count])
+        """Add a row that `intact_rows` of another ledger has yielded, without the columns of a later version."""
+        self._insert(row[: len(_COLUMNS)])
 
     def propose(self, turns: Sequence[Turn]) -> None:
         """Add proposals of a learning sampler and the results that it received before, all or nothing.
@@ -290,7 +288,7 @@ class Ledger(LedgerReader):
                 self._together_since = time.monotonic()
 
     def _begin_to_write(self) -> None:
-        """Check that the existing contents are intact before the first write, and migrate them to this version.
+        """Check that the existing contents are intact before the first write.
 
         Raises:
             HuntDirectoryError: the contents are damaged, or are of a newer version.
@@ -310,9 +308,6 @@ class Ledger(LedgerReader):
                     pass
         elif not self._fits(seal):
             raise damaged(self._path, "trials are missing or have changed")
-        if self._shape.version < VERSION:
-            migrate(self._database, self._shape.version)
-            self._shape = shape_of(self._database, self._path)
         self._turns = int(next(self._select("SELECT coalesce(max(turn), 0) FROM proposals"))[0])
         if seal is not None:
             self._note(SEAL, None)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._data import check_disturbances as check_disturbances, check_parts as check_parts, check_plain as check_plain
+    from ._data import check_disturbances as check_disturbances, check_parts as check_parts
     from ._disturbance import (
         CELLS as CELLS,
         HOLD_KINDS as HOLD_KINDS,

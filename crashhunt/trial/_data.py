@@ -19,41 +19,6 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
 
-# The types of the plain data of a trial, which are checked before objects are built.
-
-_TEXT_OR_NUMBER = bool | float | str | None
-
-
-_SPECIFICATION_TYPES = {
-    "arguments": dict[str, dict[str, _TEXT_OR_NUMBER]],
-    "scenario_arguments": dict[str, _TEXT_OR_NUMBER],
-}
-
-
-def check_plain(data: JsonObject) -> None:
-    """Check that JSON data has the types that `TrialResult.from_json` needs.
-
-    Raises:
-        ValueError: A value has a wrong type or range; the message names the value.
-    """
-    typed(data, {"outcome": str, "steps": int, "spec": dict})
-    typed_where_there(data, {"sim_time_s": float, "digest": str, "wall_s": float})
-    spec = data["spec"]
-    typed(spec, dict.fromkeys(("number", "seed", "max_steps"), int))
-    typed_where_there(spec, _SPECIFICATION_TYPES)
-    typed({"events": data.get("events")}, {"events": dict | None})
-    typed(data.get("events") or {}, dict.fromkeys(data.get("events") or (), int))
-    for planned in (data.get("disturbances"), spec.get("disturbances")):
-        check_disturbances(planned)
-    typed_where_there(
-        data, dict.fromkeys(("log_likelihood", "danger", "driven_m", "driven_s", "step_length_s"), float | None)
-    )
-    typed_where_there(data, {"setup_steps": int | None})
-    parts = (data.get("collision"), data.get("failure"), data.get("escape"), data.get("event"))
-    check_parts(data.get("closest", {}), *parts)
-    if min(data["steps"], data.get("setup_steps") or 0, spec["number"], spec["seed"], spec["max_steps"]) < 0:
-        raise ValueError("a count of steps, a trial number or a seed is below 0")
-
 
 def check_disturbances(disturbances: Sequence[JsonObject] | None) -> None:
     """Check the types and ranges of a list of disturbances; None is valid.

@@ -122,7 +122,7 @@ def test_every_shipped_scenario_has_golden_trials():
     assert set(shipped_scenarios()) <= set(TRIALS)
 
 
-# --- ledgers and bundles of older versions
+# --- ledgers and bundles of earlier versions
 
 LEDGERS = sorted((TESTS / "ledger" / "versions").glob("version-*.sqlite"))
 BUNDLES = [
@@ -140,7 +140,7 @@ BUNDLES = [
         for number, path in enumerate(LEDGERS)
     ],
 )
-def test_commands_read_of_an_older_ledger_what_they_did(shell, ledger):
+def test_commands_read_of_an_earlier_ledger_what_they_did(shell, ledger):
     (shell.folder / "h").mkdir()
     shutil.copy(ledger, shell.folder / "h" / "ledger.sqlite")
     settings = (TESTS / "e2e" / "frozen" / "0.1.0-packages" / "hunt" / "hunt.toml").read_text(encoding="utf-8")

@@ -313,12 +313,11 @@ def test_hunt_waits_for_a_locked_ledger_and_reports_it(running):
 
 
 def test_hunt_waits_for_a_locked_ledger_before_it_begins(hunt, caplog):
-    found = hunt()
     for waited_s in (0.5, 4.0, 5.0):
-        found._wait_to_begin(waited_s)
+        hunt._wait_to_begin(waited_s)
     assert caplog.messages == ["waiting for another program that has locked ledger.sqlite"]
     with pytest.raises(HuntDirectoryError, match="has locked the ledger for 601 s; close the program"):
-        found._wait_to_begin(601.0)
+        hunt._wait_to_begin(601.0)
 
 
 def test_trial_is_written_recorded_and_counted(running, loop, monkeypatch):

@@ -12,11 +12,9 @@ from types import SimpleNamespace
 
 import pytest
 from climber import Climber
-from columns import FEWER_COLUMNS
 from conftest import examples
 from hypothesis import given, settings as how, strategies as st
 
-from crashhunt.base.integrity import digest_of_row
 from crashhunt.disturbances import FIRST_STEP
 from crashhunt.errors import HuntDirectoryError, PluginError
 from crashhunt.hunts import Trials, _next_trials, spec_of
@@ -276,27 +274,6 @@ def test_what_a_later_class_draws_in_another_way_is_not_independent_by_inheritan
 
     assert RandomSampler({}).independent
     assert not Stratified({}).independent
-
-
-def test_a_ledger_of_before_continues_with_a_sampler_that_learns(tmp_path):
-    path = tmp_path / "ledger.sqlite"
-    chosen = settings(deterministic=True)
-    hunt(path, settings(deterministic=True, trials=20), random.Random(1), lag=8)
-    with closing(sqlite3.connect(path)) as database, database:  # as version 2 was
-        database.execute("DROP TABLE proposals")
-        database.execute("DELETE FROM hunt")
-        for statement in FEWER_COLUMNS:
-            database.execute(statement)
-        database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values))
-        names = [name for _, name, *_ in database.execute("PRAGMA table_info(trials)") if name != "digest"]
-        database.execute(f"UPDATE trials SET digest = digest_of_row({', '.join(names)})")
-        database.execute("PRAGMA user_version = 2")
-    hunt(path, chosen, random.Random(1), lag=8)
-    assert [spec.number for spec in specs(path)] == list(range(TRIALS))
-    with closing(Ledger(path)) as ledger:
-        turns = list(ledger.turns())
-    assert [turn.spec.number for turn in turns] == list(range(20, TRIALS))
-    assert turns[0].told == tuple(range(20 - 8 + 1))
 
 
 @pytest.mark.parametrize(

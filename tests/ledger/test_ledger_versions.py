@@ -1,4 +1,4 @@
-"""Ledgers of other versions: those of before are read and gone on with, those of later are read where they allow it."""
+"""Ledgers of other versions: version 1 is read for ever, what is older names who reads it, later ones say who may."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ from pathlib import Path
 import pytest
 
 from crashhunt.base.integrity import digest_of_row
+from crashhunt.base.older_formats import LAST_REVISION
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger, Turn
-from crashhunt.ledger._schema import FIRST
 from crashhunt.trial import Branches, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
 # Every version of the tables leaves one here, written by the crashhunt of then: `write` is what was called.
-FROZEN = sorted((Path(__file__).parent / "versions").glob("version-*.sqlite"))
+VERSIONS = Path(__file__).parent / "versions"
+FROZEN = sorted(VERSIONS.glob("version-*.sqlite"))
 ORIGIN = {"parent": 1, "origin": "climb"}
 OUTCOMES = (Outcome.SURVIVED, Outcome.COLLISION, Outcome.FINISHED, Outcome.INVALID)
 EVENTS = {2: {"running_a_red_light": 2, "emergency_braking": 1}, 6: {"running_a_red_light": 6, "emergency_braking": 1}}
 
 
-def result(number, *, events=True, danger=True):
+def result(number):
     spec = TrialSpec(number, 7 * number, {"ego": {"speed": 1.5 + number}}, {"vehicles": number}, max_steps=20)
     closest = ClosestApproach(number / 3, 1.0, 2.0) if number % 3 else ClosestApproach()
-    some = {"events": EVENTS[number]} if events and number in EVENTS else {}
-    if danger and number % 5:
+    some = {"events": EVENTS[number]} if number in EVENTS else {}
+    if number % 5:
         some["danger"] = 1 / number
     digest = f"{number:032x}"
     return TrialResult(spec, OUTCOMES[number % 4], steps=number, wall_s=0.125, closest=closest, digest=digest, **some)
@@ -56,9 +57,9 @@ def version(path):
         return database.execute("PRAGMA user_version").fetchone()[0]
 
 
-def check(ledger, frozen):
+def check(ledger):
     """See that a ledger says what was written."""
-    trials = [result(number, events=frozen > 1, danger=frozen > 3) for number in range(10)]
+    trials = [result(number) for number in range(10)]
     gone = trials.pop(3)
     assert list(ledger.results()) == trials
     assert ledger.replaced() == [gone]
@@ -67,35 +68,37 @@ def check(ledger, frozen):
     assert ledger.outcomes() == {"collision": 3, "finished": 2, "invalid": 1, "survived": 3}
     assert ledger.steps_total() == 42
     assert ledger.nearest_miss().spec.number == 2
-    assert ledger.most_dangerous(3) == ([2, 4, 6] if frozen > 3 else [])
+    assert ledger.most_dangerous(3) == [2, 4, 6]
     assert ledger.snapshot_of(4) == "0123456789abcdef"
-    assert ledger.traffic_events() == (
-        {"running_a_red_light": (8, 2), "emergency_braking": (2, 2)} if frozen > 1 else {}
-    )
+    assert ledger.traffic_events() == {"running_a_red_light": (8, 2), "emergency_braking": (2, 2)}
     assert sorted(row[0] for row in ledger.table()) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
-    turns = [Turn((), result(10).spec), Turn((1, 0), replace(result(11).spec, **ORIGIN))]
-    assert list(ledger.turns()) == (turns if frozen > 2 else [])
+    assert list(ledger.turns()) == [Turn((), result(10).spec), Turn((1, 0), replace(result(11).spec, **ORIGIN))]
 
 
 @pytest.mark.parametrize("copy", FROZEN, indirect=True, ids=[path.stem for path in FROZEN])
-def test_a_ledger_of_before_is_read_as_it_is_and_continues_as_one_of_today(copy, tmp_path):
-    frozen = version(copy)
+def test_a_ledger_of_version_1_is_read_as_it_is_and_continues(copy):
     was = copy.read_bytes()
     with closing(Ledger(copy)) as ledger:
-        check(ledger, frozen)
-        assert ledger.protected == (frozen > 1)
+        check(ledger)
     assert copy.read_bytes() == was
     Ledger(copy, writable=True).close()
-    write(tmp_path / "new.sqlite")
-    assert version(copy) == version(tmp_path / "new.sqlite")
     with closing(Ledger(copy)) as ledger:
-        check(ledger, frozen)
-        assert ledger.protected
+        check(ledger)
         assert ledger.sealed
     with closing(Ledger(copy, writable=True)) as ledger:
         ledger.record(result(3), snapshot="")
         assert ledger.finished() == set(range(10))
-    assert _plan(copy) == _plan(tmp_path / "new.sqlite")
+
+
+@pytest.mark.parametrize("copy", [VERSIONS / "older.sqlite"], indirect=True)
+@pytest.mark.parametrize("writable", [False, True])
+def test_ledger_from_before_version_1_names_the_revision_that_reads_it(copy, writable):
+    was = copy.read_bytes()
+    with pytest.raises(HuntDirectoryError) as refused:
+        Ledger(copy, writable=writable)
+    assert refused.value.message == "the ledger is older than format version 1"
+    assert f"crashhunt of git revision {LAST_REVISION} (pip install " in refused.value.fix
+    assert copy.read_bytes() == was
 
 
 def _plan(path):
@@ -108,26 +111,6 @@ def _plan(path):
 def test_trials_with_traffic_events_are_found_without_reading_the_others(tmp_path):
     write(tmp_path / "new.sqlite")
     assert _plan(tmp_path / "new.sqlite") == ["SCAN trials USING INDEX trials_with_events"]
-
-
-@pytest.mark.parametrize("copy", FROZEN, indirect=True, ids=[path.stem for path in FROZEN])
-def test_a_migration_that_fails_leaves_the_ledger_as_it_was(copy, monkeypatch):
-    from crashhunt.ledger import _schema
-
-    def fail(database):
-        database.execute("CREATE TABLE half (number)")
-        raise sqlite3.OperationalError("database or disk is full")
-
-    was = version(copy)
-    last = max(_schema.MIGRATIONS)
-    if was > last:
-        return
-    monkeypatch.setitem(_schema.MIGRATIONS, last, fail)
-    with pytest.raises(HuntDirectoryError, match="the disk is full"):
-        Ledger(copy, writable=True)
-    assert version(copy) == was
-    with closing(Ledger(copy)) as ledger:
-        check(ledger, was)
 
 
 def newer(path, *, reader):
@@ -190,37 +173,6 @@ def test_a_proposal_that_is_gone_is_missed(tmp_path):
         list(ledger.turns())
     with pytest.raises(HuntDirectoryError, match="missing or have changed"):
         Ledger(path, writable=True)
-
-
-def test_a_row_that_was_changed_before_a_migration_is_still_known_to_be(tmp_path):
-    path = tmp_path / "ledger.sqlite"
-    shutil.copy(Path(__file__).parent / "versions" / "version-3.sqlite", path)
-    with closing(sqlite3.connect(path)) as database, database:
-        database.execute("UPDATE trials SET result = replace(result, '2.0', '2.5') WHERE number = 4")
-    Ledger(path, writable=True).close()
-    with closing(Ledger(path)) as ledger:
-        assert ledger.result(2) == result(2, danger=False)
-        with pytest.raises(HuntDirectoryError, match="trial 4 has changed since it was written"):
-            ledger.result(4)
-
-
-def test_of_a_ledger_of_before_the_steps_of_copies_are_counted(tmp_path):
-    path = tmp_path / "ledger.sqlite"
-    shutil.copy(Path(__file__).parent / "versions" / "version-4.sqlite", path)
-    columns = f"{', '.join(FIRST['trials'])}, danger"
-    with closing(sqlite3.connect(path)) as database, database:  # as trials with probes and branches were
-        database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values))
-        for number, name, found in ((2, "stress", Stress(1.0, steps=30)), (4, "branches", Branches(steps=500))):
-            values = (f"$.{name}", json.dumps(found.to_json()), number)
-            database.execute("UPDATE trials SET result = json_set(result, ?, json(?)) WHERE number = ?", values)
-        database.execute(f"UPDATE trials SET digest = digest_of_row({columns})")
-    with closing(Ledger(path)) as ledger:
-        assert (ledger.trial_steps(), ledger.steps_total()) == (42, 42)
-    for _ in range(2):
-        Ledger(path, writable=True).close()
-        with closing(Ledger(path)) as ledger:
-            assert len(list(ledger.results())) == 9
-            assert (ledger.trial_steps(), ledger.steps_total()) == (42, 572)
 
 
 def test_what_trials_cost_besides_is_summed(tmp_path):
