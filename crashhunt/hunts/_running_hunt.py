@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,6 @@ from crashhunt.hunts._next_trials import Pace, Trials, Unanswered, result_lag
 from crashhunt.hunts._preflight import why_invalid
 from crashhunt.hunts._progress import PhaseClock, Progress
 from crashhunt.hunts._reports import HuntReport
-from crashhunt.hunts._trial_loop import TrialLoop
 from crashhunt.hunts._verification import PendingAudits, TrialReruns, VerificationRuns, is_settled
 from crashhunt.plans import core_of, disturber_apart, parallel_here, sampler_of
 from crashhunt.reruns import SharedReruns
@@ -161,8 +159,12 @@ class RunningHunt:
         if not self.progress.is_done:
             self.trials.require_same_version()
 
-    def run(self) -> HuntReport:
-        """Run the hunt until a crash, the last trial or a request to stop."""
+    def run(self, run_trials: Callable[[RunningHunt], StoppedBecause]) -> HuntReport:
+        """Run the hunt until a crash, the last trial or a request to stop.
+
+        Args:
+            run_trials: function that runs the trials and returns why they stopped.
+        """
         setup, progress = self.setup, self.progress
         self._begin()
         self.ledger.wait_while_locked(self._wait_for_ledger)
@@ -185,8 +187,7 @@ class RunningHunt:
             self.fork_crashes.resume()
             stopped: StoppedBecause = progress.why_stopped(keep_going=setup.settings.run.keep_going)
             if not progress.is_done:
-                with closing(TrialLoop(self)) as loop:
-                    stopped = loop.run()
+                stopped = run_trials(self)
             return self._finish(stopped, copies)
         finally:
             self.reruns.executors.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -30,6 +31,12 @@ _TICK_S = 0.1  # how late a stop, a heartbeat or the screen may be
 # Trials, or seconds of work, that a hunt is ahead of its partner. Results that `Preflight` holds back are not in
 # the ledger, so the lead must be longer: otherwise, two hunts could wait for each other.
 _MAX_LEAD_PER_WORKER, _MAX_LEAD_S = 8, 5.0
+
+
+def run_trials(hunt: RunningHunt) -> StoppedBecause:
+    """Run the trials of a hunt; return why the hunt stopped."""
+    with closing(TrialLoop(hunt)) as loop:
+        return loop.run()
 
 
 class TrialLoop:

@@ -98,7 +98,9 @@ class DecodedSteps(Sequence[StepRecord]):
 
     def _decode(self, number: int, actors: list[Actor]) -> list[StepRecord]:
         mark, last = self._marks[number], (number + 1) * _CHUNK_STEPS - 1
-        reading = Reading(self._prologue, actors, [], StepRecord(mark.step), mark.roster)
+        reading = Reading(
+            prologue=self._prologue, actors=actors, steps=[], current=StepRecord(mark.step), roster=mark.roster
+        )
         readers = {tag: kind.read for tag, kind in RECORD_TYPES.items()}
         for index, (tag, aux, payload) in enumerate(self._records.since(mark.record), mark.record + 1):
             read = readers.get(tag)
