@@ -71,8 +71,8 @@ class OpenedFiles:
 def output_files() -> set[str]:
     """Return the absolute paths of the files to which the output of this command goes: they grow, and are no code.
 
-    They are the files to which the shell has redirected this command or a command that started it, such as a suite or
-    a script, and the files of programs that read its output through a pipe, such as ``tee``.
+    The shell may have redirected this command, or a command that started it, such as a suite or a script. A program
+    such as ``tee`` may read the output through a pipe; then its files count.
     """
     found: set[str] = set()
     waiting = [target for pid in _ancestors() for stream in (1, 2) if (target := _target(pid, stream))]

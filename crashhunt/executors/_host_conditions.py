@@ -91,7 +91,7 @@ class HostConditions:
 
     def _check_file(self, path: Path) -> None:
         if not os.path.lexists(path):
-            time.sleep(_REMOVAL_S)  # whoever deletes a whole hunt deletes the files of its snapshot first
+            time.sleep(_REMOVAL_S)  # `rm -r` of a whole hunt deletes the files of its snapshot first
             for folder in self._folders:
                 _check_folder(folder)
             fix = _AGAIN.removeprefix("and ")

@@ -128,17 +128,17 @@ class GymSimulator:
     @property
     def notices(self) -> list[str]:
         """Notices about the environment, and for each key of ``info`` that the scenario names, whether it occurred."""
-        told = list(self._notices)
+        found = list(self._notices)
         for condition, key in self._named.items() if self._steps else ():
             if condition not in self._missing:
-                told.append(f"{condition}{PRESENT_WORDS}")
+                found.append(f"{condition}{PRESENT_WORDS}")
                 continue
             what = f"info had only the keys {listed(self._keys)}" if self._keys else "info was empty"
             fix = did_you_mean(key, self._keys) or "name one of its keys."
             if key == self._setup.crash.info:
                 fix += " Keep it if info has this key only in the step of a crash"
-            told.append(f"{condition}{ABSENT_WORDS}{what}{NOTICE_TOPIC}{condition}{ABSENT_WORDS}{what}. Fix: {fix}")
-        return told
+            found.append(f"{condition}{ABSENT_WORDS}{what}{NOTICE_TOPIC}{condition}{ABSENT_WORDS}{what}. Fix: {fix}")
+        return found
 
     party = Party.ENVIRONMENT
     foreign_packages = ()  # boundaries are around all calls
