@@ -23,6 +23,7 @@ from crashhunt.base.integrity import (
     read_object,
     typed,
 )
+from crashhunt.base.older_formats import HOW_TO_READ
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.text import command_line, listed, near_path, one_of
 from crashhunt.recording import Recording, read_black_box
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
 
 # The shapes of what a crash consists of on disk: ``crash.json``, and the index of an archive.
 #
-# What an earlier version did not write need not be there, and what a later one has added may be there as well.
+# What a later version has added may be there as well.
 
 
 class Protected(TypedDict):
@@ -156,9 +157,8 @@ def files_of(folder: Path) -> dict[str, FileEntry]:
     for name in (layout.CRASH, layout.PARAMS):
         with suppress(OSError, ValueError):
             data = read_object(folder / name, Protected)
-            if "integrity" in data:
-                refuse_damaged(data)
-                return dict(data["files"])
+            refuse_damaged(data)
+            return dict(data["files"])
     return {}
 
 
@@ -174,10 +174,10 @@ def read_params(folder: Path) -> list[str]:
     """Return the names of a trial's saved files that have changed since they were written."""
     try:
         data = read_object(folder / layout.PARAMS, Protected)
-        if "integrity" in data:  # which earlier versions did not write
-            refuse_damaged(data)
-        files = data.get("files", {}).items()
-        return [f"{name} {wrong}" for name, entry in files if (wrong := changed_file(folder / name, entry))]
+        refuse_damaged(data)
+        return [
+            f"{name} {wrong}" for name, entry in data["files"].items() if (wrong := changed_file(folder / name, entry))
+        ]
     except (OSError, ValueError) as error:
         return [f"params.json: {error.strerror if isinstance(error, OSError) else error}"]
 
@@ -194,11 +194,8 @@ def collect_output(result: TrialResult, scratch: Path, target: Path) -> None:
         (target / layout.ERROR_LOG).write_text(text + "\n", encoding="utf-8", errors="replace")
 
 
-SCHEMA = 5
-_SCHEMA_BEFORE_SCRIPTS = 4  # schema of bundles without scripted actors
-_SCHEMA_BEFORE_EXCLUSIONS = 3  # schema of bundles without excluded actors
-_SCHEMA_BEFORE_DISTURBANCES = 2  # schema of bundles without disturbances, which older versions would ignore
-_FIRST_SCHEMA_WITH_DIGESTS = 2  # the first schema with digests of the file itself and of the other files
+SCHEMA = 1
+_MAX_OLDER_SCHEMA = 5  # from before format version 1, as schema 1 without ``integrity``
 _SCALAR = bool | float | str | None
 _REQUIRED_KEYS: Plain = {
     **dict.fromkeys(("trial", "seed", "max_steps", "step"), int),
@@ -236,7 +233,7 @@ class Bundle:
         snapshot: digest of the code that the trial ran.
         confirmed: Whether a replay in a new process was bit-identical; None if no replay has finished.
         divergence: The point where the replay deviated from the recording; None if it did not.
-        files: Size and digest of each other file of the bundle; empty in bundles of earlier versions.
+        files: Size and digest of each other file of the bundle.
         added: JSON keys of later versions of crashhunt, which are kept when the bundle is written.
         why_unconfirmed: The reason why no replay was completed; empty if a replay was completed, or if none was
             started.
@@ -343,7 +340,7 @@ class Bundle:
         plain = result.to_json()
         spec = plain["spec"]
         data: CrashData = {
-            "schema": _schema_of(result.spec),
+            "schema": SCHEMA,
             "id": self.id,
             "hunt_seed": self.hunt_seed,
             "trial": spec["number"],
@@ -393,15 +390,6 @@ class Bundle:
             temporary.write_text(text, encoding="utf-8", errors="surrogatepass")
 
 
-def _schema_of(spec: TrialSpec) -> int:
-    """Return the first schema version that can express everything that determines the trial."""
-    if spec.script is not None:
-        return SCHEMA
-    if spec.only is not None:
-        return _SCHEMA_BEFORE_SCRIPTS
-    return _SCHEMA_BEFORE_EXCLUSIONS if spec.disturbances else _SCHEMA_BEFORE_DISTURBANCES
-
-
 def read_bundle(path: Path) -> Bundle:
     """Read a crash bundle from its folder.
 
@@ -412,14 +400,15 @@ def read_bundle(path: Path) -> Bundle:
     try:
         data = read_object(file, CrashData)
         typed(data, {"schema": int})
-        if not 1 <= data["schema"] <= SCHEMA:
+        if 1 < data["schema"] <= _MAX_OLDER_SCHEMA or (data["schema"] == SCHEMA and "integrity" not in data):
+            raise BundleError("the crash is older than format version 1", fix=HOW_TO_READ, where=str(file))
+        if data["schema"] != SCHEMA:
             raise BundleError(
-                f"schema version {data['schema']} is not supported (supported: 1 to {SCHEMA})",
+                f"schema version {data['schema']} is not supported (supported: {SCHEMA})",
                 fix="use the version of crashhunt that wrote the trial",
                 where=str(file),
             )
-        if data["schema"] >= _FIRST_SCHEMA_WITH_DIGESTS or "integrity" in data:
-            refuse_damaged(data)
+        refuse_damaged(data)
         return _bundle(path, data)
     except OSError as error:
         raise BundleError(
@@ -486,7 +475,6 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         danger=data.get("danger"),
         why_no_escape=data.get("why_no_escape", ""),
     )
-    files = data.get("files", {}) if data["schema"] >= _FIRST_SCHEMA_WITH_DIGESTS else {}
     return Bundle(
         path=path,
         result=result,
@@ -494,7 +482,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         snapshot=data["snapshot"],
         confirmed=data.get("confirmed"),
         divergence=data.get("divergence"),
-        files=files,
+        files=data["files"],
         added=_added(data),
         why_unconfirmed=data.get("why_unconfirmed", ""),
         authentication_code=data.get("authentication_code", ""),
@@ -623,7 +611,7 @@ def write_trial(directory: Path, result: TrialResult, scratch: Path) -> None:
     target = directory / layout.TRIALS / f"{result.spec.number:06d}"
     target.mkdir(parents=True, exist_ok=True)
     collect_output(result, scratch, target)
-    data = {**result.to_json(), "schema": _SCHEMA_BEFORE_DISTURBANCES, "files": describe_other_files(target)}
+    data = {**result.to_json(), "schema": SCHEMA, "files": describe_other_files(target)}
     data["integrity"] = digest_of_data(data)
     with whole_file(target / layout.PARAMS, lasting=False) as temporary:
         temporary.write_text(json.dumps(data, indent=2), encoding="utf-8")

@@ -13,7 +13,7 @@ from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError, remedy
 from crashhunt.base.files import cannot_write, is_empty_folder, sync_folder, sync_tree
-from crashhunt.base.older_formats import OlderFormatError
+from crashhunt.base.older_formats import HOW_TO_READ
 from crashhunt.base.resources import error_of_next_files, limit_behind
 from crashhunt.base.temporary import has_ended, new_folder, owner_in
 from crashhunt.crashes import Bundle, read_bundle, read_params
@@ -157,6 +157,8 @@ def _check_file(path: Path) -> Checked:
                     )
                 )
     except BundleError as error:
+        if error.fix == HOW_TO_READ:
+            raise
         found.findings.append(CheckFinding(where=str(path), what=error.message, lost="the crash", fix=error.fix))
     return found
 
@@ -215,9 +217,9 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
                 if row is not None and settings is not None and row[2] in settings.crash_on:
                     crashes[number] = row[10]
             return {number: TrialResult.from_json(json.loads(text)) for number, text in crashes.items()}
-    except OlderFormatError:
-        raise  # nothing is damaged
     except HuntDirectoryError as error:
+        if error.fix == HOW_TO_READ:
+            raise  # nothing is damaged
         found.findings.append(
             CheckFinding(where=str(path), what=error.message, lost="all trials but the crashes", fix=_RESUME_FIX)
         )
@@ -276,6 +278,8 @@ def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
         faults = bundle.faults()
         bundle.recording()
     except CrashhuntError as error:
+        if error.fix == HOW_TO_READ:
+            raise
         found.findings.append(
             CheckFinding(
                 where=error.where or str(folder), what=error.message, lost=f"the crash {folder.name}", fix=_RERUN_FIX
@@ -283,9 +287,6 @@ def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
         )
         found.damaged_crashes.append(folder.name)
         return None
-    if not bundle.files:
-        note = "an earlier crashhunt wrote it, without digests: not every change would be seen"
-        found.findings.append(CheckFinding(str(folder / layout.CRASH), note, damaged=False))
     for fault in faults:
         added = fault.endswith("was not there")
         found.findings.append(CheckFinding(str(folder), fault, "" if added else "that file", damaged=not added))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from crashhunt.base.errors import HuntDirectoryError, remedy
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.base.older_formats import OlderFormatError
+from crashhunt.base.older_formats import HOW_TO_READ
 from crashhunt.base.resources import error_of_next_files, limit_behind
 from crashhunt.base.text import command_line
 
@@ -143,7 +143,7 @@ def shape_of(database: sqlite3.Connection, path: Path) -> Shape:
             "not a ledger of crashhunt: its tables are missing", fix="choose another directory", where=str(path)
         )
     if not application:
-        raise OlderFormatError.of("the ledger", str(path))
+        raise HuntDirectoryError("the ledger is older than format version 1", fix=HOW_TO_READ, where=str(path))
     if version < 1 or application != _APPLICATION_ID:
         raise damaged(path, f"its version is {version} of {application:x}")
     if version > VERSION:

@@ -27,6 +27,7 @@ from crashhunt.base.integrity import (
     read_object,
     typed,
 )
+from crashhunt.base.older_formats import HOW_TO_READ
 from crashhunt.plans import HuntSettings, read_settings
 from crashhunt.scenario import Scenario, digest_of_described, load_scenario
 from crashhunt.snapshots._environment import Environment, environment_of_simulation
@@ -38,11 +39,10 @@ if TYPE_CHECKING:
 class Manifest(TypedDict):
     """The contents of ``manifest.json``: the files of a snapshot, and the folders from which modules are imported.
 
-    ``described`` lists the files that describe the snapshot and do not belong to its digest. The earliest snapshots
-    have neither ``described`` nor ``integrity``. ``conditions`` are further facts on which trials depend. With
-    ``--no-snapshot``, they are the digests of the files of the code. They may also be the versions that distinguish the
-    snapshot from another snapshot of the same files. ``authentication_code`` proves to the user who took the snapshot
-    that it is unchanged.
+    ``described`` lists the files that describe the snapshot and do not belong to its digest. ``conditions`` are
+    further facts on which trials depend. With ``--no-snapshot``, they are the digests of the files of the code. They
+    may also be the versions that distinguish the snapshot from another snapshot of the same files.
+    ``authentication_code`` proves to the user who took the snapshot that it is unchanged.
     """
 
     schema: int
@@ -50,15 +50,15 @@ class Manifest(TypedDict):
     argument_files: dict[str, str]
     left_out: list[str]
     files: dict[str, FileEntry]
-    described: NotRequired[dict[str, FileEntry]]
+    described: dict[str, FileEntry]
     authentication_code: NotRequired[str]
     integrity: NotRequired[str]
     conditions: NotRequired[dict[str, str]]
 
 
-SCHEMA = 3
-SCHEMA_WITHOUT_CONDITIONS = 2
-_FIRST_VERSION_WITH_DIGESTS = 2  # the first version with a digest of its manifest and of what describes the rest
+SCHEMA = 1
+_VERSION_FIX = "use the version of crashhunt that wrote the trial"
+_MAX_OLDER_SCHEMA = 3  # from before format version 1, as schema 1 without ``integrity``
 _DESCRIPTION_FILES = (layout.HUNT, layout.ENVIRONMENT, layout.GIT_DIFF)
 _SNAPSHOT_FOLDERS = (layout.CODE, layout.FILES, layout.SCENARIO_FILES)
 # Suffixes of files that Python may import, or run at its start.
@@ -91,9 +91,8 @@ class Snapshot:
         try:
             return _parse_manifest(read_bounded(file))
         except _UnsupportedError as error:
-            raise BundleError(
-                str(error), fix="use the version of crashhunt that wrote the trial", where=str(file)
-            ) from None
+            message, fix = error.args
+            raise BundleError(message, fix=fix, where=str(file)) from None
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise BundleError(
@@ -191,7 +190,7 @@ class Snapshot:
         """Return the faults of the files that the manifest lists: missing and changed files. Nothing is written."""
         manifest = self.manifest
         found = []
-        for name, entry in {**manifest["files"], **manifest.get("described", {})}.items():
+        for name, entry in {**manifest["files"], **manifest["described"]}.items():
             wrong = changed_file(f"{self.path}/{name}", entry)  # hundreds of files, and a Path takes as long again
             if wrong:
                 found.append(f"{name} {wrong}")
@@ -260,7 +259,7 @@ def may_run(name: str) -> bool:
 
 
 class _UnsupportedError(Exception):
-    """The manifest is of another version."""
+    """The manifest is of another version. The arguments are the message and the fix."""
 
 
 @lru_cache(maxsize=4)
@@ -271,13 +270,16 @@ def _parse_manifest(text: bytes) -> Manifest:
     """
     found = parse_object(text, Manifest)
     typed(found, {"schema": int, "paths": list[str], "files": FILES})
-    if not 1 <= found["schema"] <= SCHEMA:
-        raise _UnsupportedError(f"schema version {found['schema']} is not supported (supported: 1 to {SCHEMA})")
-    if found["schema"] >= _FIRST_VERSION_WITH_DIGESTS or "integrity" in found:
-        typed(found, {"integrity": str, "described": FILES})
-        said = found.pop("integrity")
-        if digest_of_data(found) != said:
-            raise ValueError("the file has changed since it was written")
+    if 1 < found["schema"] <= _MAX_OLDER_SCHEMA or (found["schema"] == SCHEMA and "integrity" not in found):
+        raise _UnsupportedError("the snapshot is older than format version 1", HOW_TO_READ)
+    if found["schema"] != SCHEMA:
+        raise _UnsupportedError(
+            f"schema version {found['schema']} is not supported (supported: {SCHEMA})", _VERSION_FIX
+        )
+    typed(found, {"integrity": str, "described": FILES})
+    said = found.pop("integrity")
+    if digest_of_data(found) != said:
+        raise ValueError("the file has changed since it was written")
     found.setdefault("argument_files", {})
     typed(
         found, {"argument_files": dict[str, str], **({"conditions": dict[str, str]} if "conditions" in found else {})}
@@ -312,10 +314,10 @@ def _check_names(manifest: Manifest) -> None:
         parts = name.split("/")
         if parts[0] not in _SNAPSHOT_FOLDERS or not {"", ".", ".."}.isdisjoint(parts) or "\\" in name or "\0" in name:
             raise ValueError(f"the path {name!r} leads out of the snapshot")
-    for name in manifest.get("described", {}):
+    for name in manifest["described"]:
         if name not in _DESCRIPTION_FILES:
             raise ValueError(f"the snapshot has no file {name!r}")
-    for entry in (*manifest["files"].values(), *manifest.get("described", {}).values()):
+    for entry in (*manifest["files"].values(), *manifest["described"].values()):
         typed(entry, {"size": int, "blake2b": str})
 
 
@@ -358,13 +360,13 @@ def without_code(snapshot: Snapshot, snapshots: Path) -> Snapshot:
     environment = json.dumps(environment_of_simulation(snapshot.environment()), indent=1)
     (final / layout.ENVIRONMENT).write_text(environment, encoding="utf-8")
     manifest: Manifest = {
-        "schema": SCHEMA_WITHOUT_CONDITIONS,
+        "schema": SCHEMA,
         "paths": [],
         "argument_files": {},
         "left_out": [],
         "files": kept,
+        "described": describe_files(final),
     }
-    manifest["described"] = describe_files(final)
     manifest["authentication_code"] = code_of_manifest(manifest)
     manifest["integrity"] = digest_of_data(manifest)
     (final / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")

@@ -26,7 +26,6 @@ from crashhunt.scenario import Scenario, as_plain_data
 from crashhunt.snapshots._environment import differing_versions, environment
 from crashhunt.snapshots._snapshot import (
     SCHEMA,
-    SCHEMA_WITHOUT_CONDITIONS,
     Snapshot,
     code_of_manifest,
     digest_of_manifest,
@@ -415,11 +414,12 @@ def _build(
     entries |= _store_scenario(scenario, building)
     stored = {name: entry for name, entry in entries.items() if entry is not None}
     manifest: Manifest = {
-        "schema": SCHEMA_WITHOUT_CONDITIONS,
+        "schema": SCHEMA,
         "paths": found.paths,
         "argument_files": argument_files,
         "left_out": found.excluded,
         "files": stored,
+        "described": {},
     }
     final = _name(manifest, conditions, building)
     if _is_usable(final, stored):
@@ -452,7 +452,7 @@ def _build(
 def _name(manifest: Manifest, conditions: dict[str, str], building: Path) -> Path:
     """Add the conditions to a manifest; return the folder of its snapshot."""
     if conditions:
-        manifest["schema"], manifest["conditions"] = SCHEMA, conditions
+        manifest["conditions"] = conditions
     return building.with_name(digest_of_manifest(manifest))
 
 

@@ -7,10 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.analysis import SetArguments, WhatIfOptions, _whatif_runs as _engine, judge, what_if
+from crashhunt.analysis import SetArguments, WhatIfOptions, _whatif_runs as _engine, what_if
 from crashhunt.base.errors import UsageError, WorkerError
-from crashhunt.crashes import find_bundle, open_archive
-from crashhunt.replays import ReplayOptions
 from crashhunt.reruns import NotUnderstoodError, _require_same_trial
 from crashhunt.trial import Disturbance, Overruled, TrialSpec
 
@@ -59,16 +57,3 @@ def test_snapshot_that_does_not_know_a_change_is_too_old_for_it(monkeypatch, err
     assert caught.value.message.endswith(says or "no memory")
     assert not says or caught.value.fix == "add --code current"
     assert closed == [True]
-
-
-@pytest.mark.nightly
-def test_a_crash_of_the_first_version_is_judged_by_what_it_understands(request):
-    with open_archive(request.path.parent.parent / "e2e" / "bundles" / "crashhunt-0.1.0.zip") as archive:
-        found = judge(find_bundle(archive.directory), ReplayOptions(trusted=True), runs=2, why=10, parallel=2)
-    assert (found.attempts, found.why_not) == (
-        (),
-        "the snapshot contains a version of crashhunt that is too old for this command",
-    )
-    assert found.why is not None
-    assert {factor.kind for factor in found.why.factors} <= {"argument", "seed"}
-    assert found.why.why_not == found.why_not

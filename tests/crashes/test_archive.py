@@ -43,7 +43,9 @@ def crash(tmp_path_factory):
     (snapshot / "code").mkdir(parents=True)
     (snapshot / "code" / "agent.py").write_bytes(code)
     (snapshot / "code" / "data.bin").write_bytes(b"an agent's own")
-    (snapshot / layout.MANIFEST).write_text(json.dumps({"schema": 1, "paths": ["code"], "files": files}))
+    manifest = {"schema": 1, "paths": ["code"], "files": files, "described": {}}
+    manifest["integrity"] = integrity.digest_of_data(manifest)
+    (snapshot / layout.MANIFEST).write_text(json.dumps(manifest))
     (snapshot / layout.ENVIRONMENT).write_text("{}")
     scratch = directory / "scratch"
     scratch.mkdir()

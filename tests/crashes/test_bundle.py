@@ -14,6 +14,7 @@ from episodes import Episode, write
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.integrity import digest_of_data
+from crashhunt.base.older_formats import HOW_TO_READ
 from crashhunt.crashes import (
     Judgement,
     as_stored,
@@ -101,7 +102,7 @@ def test_what_is_written_is_read(tmp_path):
     assert list((tmp_path / "scratch").iterdir()) == []
     assert [path.name for path in (tmp_path / "crashes").iterdir()] == ["000012-collision"]
     data = json.loads((bundle.path / layout.CRASH).read_text())
-    assert (data["schema"], data["id"], data["category"]) == (2, "000012-collision", "traffic crash")
+    assert (data["schema"], data["id"], data["category"]) == (1, "000012-collision", "traffic crash")
     assert data["summary"] == "ego was hit by other at step 6"
     assert (data["step"], data["sim_time_s"], data["max_steps"], data["trial"], data["seed"]) == (6, 20.6, 40, 12, 99)
     assert data["collision"]["time_s"] is None
@@ -230,20 +231,15 @@ def test_values_at_the_edge_are_read(bundle):
     assert (spec.seed, spec.number, spec.max_steps) == (2**31 - 1, 0, 1)
 
 
-def test_a_bundle_of_the_first_schema_had_no_digests(bundle):
+@pytest.mark.parametrize("older", [{"schema": 2}, {"schema": 5}, {"integrity": None}])
+def test_crash_from_before_version_1_names_the_revision_that_reads_it(bundle, older):
     file = bundle.path / layout.CRASH
-    data = json.loads(file.read_text())
-    for name in ("integrity", "files", "escape", "event", "events"):
-        del data[name]
-    file.write_text(json.dumps({**data, "schema": 1}))
-    found = read_bundle(bundle.path)
-    assert (found.files, found.result.escape, found.result.event, found.result.events) == ({}, None, None, None)
-    (bundle.path / "note.txt").write_text("mine")
-    assert found.faults() == []
-    assert found.recording().digest == found.result.digest
-    file.write_text(json.dumps({**data, "schema": 2}))
-    with pytest.raises(BundleError, match="integrity"):
+    data = {**json.loads(file.read_text()), **older}
+    file.write_text(json.dumps({name: value for name, value in data.items() if (name, value) != ("integrity", None)}))
+    with pytest.raises(BundleError) as refused:
         read_bundle(bundle.path)
+    assert refused.value.message == "the crash is older than format version 1"
+    assert refused.value.fix == HOW_TO_READ
 
 
 def test_a_log_of_another_crash_or_with_other_views_is_refused(tmp_path):
@@ -359,7 +355,7 @@ def test_a_trial_that_is_kept_can_be_checked(tmp_path):
     assert not scratch.exists()
     assert sorted(path.name for path in folder.iterdir()) == ["error.log", "params.json", "run.log"]
     data = json.loads((folder / "params.json").read_text())
-    assert (data["outcome"], data["schema"], data["spec"]["number"]) == ("invalid", 2, 12)
+    assert (data["outcome"], data["schema"], data["spec"]["number"]) == ("invalid", 1, 12)
     assert read_params(folder) == []
     assert set(files_of(folder)) == {"error.log", "run.log"}
     (folder / "run.log").write_text("other")
@@ -372,6 +368,6 @@ def test_a_trial_that_is_kept_can_be_checked(tmp_path):
     assert read_params(folder) == ["params.json: No such file or directory"]
     del data["integrity"], data["files"]
     (folder / "params.json").write_text(json.dumps(data))
-    assert read_params(folder) == []
+    assert read_params(folder) == ["params.json: 'integrity' is missing"]
     assert files_of(folder) == {}
     assert set(files_of(made(tmp_path).path)) == {"log.mcap", "run.log", "foxglove-layout.json"}

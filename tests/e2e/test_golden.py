@@ -126,7 +126,7 @@ def test_every_shipped_scenario_has_golden_trials():
 
 LEDGERS = sorted((TESTS / "ledger" / "versions").glob("version-*.sqlite"))
 BUNDLES = [
-    *sorted((TESTS / "e2e" / "bundles").glob("*.zip")),
+    *sorted((TESTS / "e2e" / "bundles").glob("version-*.zip")),
     *sorted((TESTS / "e2e" / "frozen").glob("*/*.zip")),
     *sorted((TESTS / "e2e" / "frozen").glob("*/hunt")),
 ]

@@ -14,10 +14,9 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.integrity import digest_of_data
-from crashhunt.base.older_formats import OlderFormatError
 from crashhunt.base.temporary import this_process
 from crashhunt.crashes import export_crash, find_bundle
-from crashhunt.errors import CrashhuntError, HuntDirectoryError
+from crashhunt.errors import BundleError, CrashhuntError, HuntDirectoryError
 from crashhunt.hunts import check, salvage
 from crashhunt.hunts._disk_check import intact_snapshots
 from crashhunt.ledger import Ledger, Turn
@@ -297,7 +296,9 @@ def test_ledger_without_seal_is_no_damage(hunt):
 
 def test_older_ledger_is_no_damage_but_ends_the_check_with_what_to_do(hunt):
     execute(hunt, "PRAGMA application_id = 0")
-    with pytest.raises(OlderFormatError, match=r"the ledger is older than format version 1; read it with crashhunt of"):
+    with pytest.raises(
+        HuntDirectoryError, match=r"the ledger is older than format version 1; read it with crashhunt of"
+    ):
         found_in(hunt)
 
 
@@ -339,22 +340,18 @@ def test_damaged_trials_are_named_up_to_five(hunt, planned, lost):
 def test_output_of_a_trial_that_has_changed_is_reported(hunt):
     folder = hunt / "trials" / "000001"
     folder.mkdir(parents=True)
-    (folder / "params.json").write_text(json.dumps({"files": {"run.log": {"size": 3, "blake2b": "0" * 32}}}))
+    data = {"files": {"run.log": {"size": 3, "blake2b": "0" * 32}}}
+    (folder / "params.json").write_text(json.dumps({**data, "integrity": digest_of_data(data)}))
     where, what, lost, damaged = finding_of(found_in(hunt))
     assert (where, lost, damaged) == (str(folder), "what the trial printed", True)
     assert what.startswith("run.log ")
 
 
-def test_bundle_without_digests_is_no_damage(hunt):
+def test_older_crash_is_no_damage_but_ends_the_check_with_what_to_do(hunt):
     file = hunt / "crashes" / CRASH / "crash.json"
-    data = json.loads(file.read_text())
-    early = {name: value for name, value in data.items() if name not in ("escape", "files", "integrity")}
-    file.write_text(json.dumps(early | {"schema": 1}))
-    found = found_in(hunt)
-    where, what, lost, damaged = finding_of(found)
-    assert (where, lost, damaged) == (str(file), "", False)
-    assert "without digests" in what
-    assert found.crashes == [CRASH, "000002-collision"]
+    file.write_text(json.dumps({**json.loads(file.read_text()), "schema": 2}))
+    with pytest.raises(BundleError, match=r"the crash is older than format version 1; read it with crashhunt of git"):
+        found_in(hunt)
 
 
 def test_file_that_was_added_to_a_snapshot_is_no_damage_and_many_changes_are_counted(hunt):
