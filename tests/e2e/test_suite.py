@@ -133,30 +133,6 @@ def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
     assert (found["a/0"], found["b/0"], found["c/0"]) == ("interrupted", "interrupted", "queued")
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("", "the key 'hunts' is missing"),
-        ("hunts = []", "the file lists no hunts"),
-        ("[[hunts]]\nid = 'a'\n[[hunts]]\nid = 'A'", "the id 'A' is used twice"),
-        ("[[hunts]]\nscenario = 'toy'", "hunts[0].id = ''"),
-        ("[[hunts]]\nid = '../a'", "'../a' is not a valid folder name"),
-        ("[[hunts]]\nid = 'a'\nspeed = 3", "unknown key 'speed'"),
-        ("[[hunts]]\nid = 'a'\ntrials = 'many'", "trials = 'many'"),
-        ("[[hunts]]\nid = 'a'\nruns = 0", "hunts.a.runs = 0"),
-        ("[[hunts]]\nid = 'a'\nagent = 'x:Y'\nagents = { ego = 'x:Y' }", "both agent and agents"),
-        ("schema = 9\n[[hunts]]\nid = 'a'", "schema = 9"),
-        ("[[hunts", "not valid TOML"),
-    ],
-)
-def test_a_mistake_in_the_file_is_one_line(toy, text, says):
-    written(toy, text)
-    done = toy.crashhunt("suite", "run", "suite.toml", "out", expect=2)
-    assert says in done.err
-    assert len(done.err.splitlines()) == 1
-    assert not (toy.folder / "out").exists()
-
-
 def test_snapshots_of_a_suite_take_in_what_is_asked_for(toy):
     (toy.folder / "maps").mkdir()
     (toy.folder / "maps" / "town.csv").write_text("1,2")

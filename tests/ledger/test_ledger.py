@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -110,18 +109,6 @@ def test_what_is_recorded_together_is_not_kept_back_while_trials_are_waited_for(
         assert reader.finished() == {1, 2, 3, 4, 5, 6}
 
 
-def test_what_is_replaced_is_kept(tmp_path):
-    ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
-    for number in range(4):
-        ledger.record(result(number, Outcome.INVALID if number % 2 else Outcome.SURVIVED), snapshot="")
-    assert ledger.replace([1, 3, 99]) == 2
-    assert ledger.finished() == {0, 2}
-    assert ledger.replaced() == [result(1, Outcome.INVALID), result(3, Outcome.INVALID)]
-    ledger.record(result(1), snapshot="")
-    assert ledger.outcomes() == {"survived": 3}
-    ledger.close()
-
-
 def test_every_state_is_written_down(tmp_path):
     ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
     ledger.enter("running", owner={"pid": 1})
@@ -202,19 +189,6 @@ def test_a_trial_that_ran_again_counts_once(tmp_path):
     ledger.close()
 
 
-def test_the_nearest_miss_is_no_crash_and_no_void(tmp_path):
-    ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
-    assert ledger.nearest_miss() is None
-    for number, (outcome, ttc) in enumerate(
-        [(Outcome.COLLISION, 0.0), (Outcome.SURVIVED, 2.0), (Outcome.FINISHED, 1.5), (Outcome.SURVIVED, float("inf"))]
-    ):
-        ledger.record(result(number, outcome, ttc=ttc), snapshot="")
-    nearest = ledger.nearest_miss()
-    assert nearest is not None
-    assert nearest.spec.number == 2
-    ledger.close()
-
-
 # Not what the ledger says of itself, which Hypothesis knows from its source.
 NAMES = st.text().filter(lambda name: name not in ("seal", "reader"))
 
@@ -227,40 +201,6 @@ def test_facts_are_kept_and_none_removes_one(tmp_path_factory, facts):
     ledger.note(**facts)
     assert ledger.facts() == {key: value for key, value in facts.items() if value is not None}
     ledger.close()
-
-
-def test_what_a_killed_writer_recorded_is_there(tmp_path):
-    path = tmp_path / "ledger.sqlite"
-    script = (
-        "import sys, time; from pathlib import Path\n"
-        "from crashhunt.ledger import Ledger; from crashhunt.trial import Outcome, TrialResult, TrialSpec\n"
-        "ledger = Ledger(Path(sys.argv[1]), writable=True)\n"
-        "for number in range(100):\n"
-        "    ledger.record(TrialResult(TrialSpec(number, 1, {}, {}, max_steps=9), Outcome.SURVIVED), snapshot='')\n"
-        "print('written', flush=True); time.sleep(60)\n"
-    )
-    with subprocess.Popen([sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"written\n"
-        process.send_signal(signal.SIGKILL)
-    ledger = Ledger(path, writable=True)
-    assert ledger.finished() == set(range(100))
-    ledger.close()
-
-
-def test_what_is_no_ledger_is_refused(tmp_path):
-    with pytest.raises(HuntDirectoryError, match="not the directory of a hunt"):
-        Ledger(tmp_path / "ledger.sqlite")
-    (tmp_path / "text.sqlite").write_text("no database at all, but long enough to be taken for a header " * 3)
-    with pytest.raises(HuntDirectoryError, match="not a ledger"):
-        Ledger(tmp_path / "text.sqlite")
-    other = sqlite3.connect(tmp_path / "other.sqlite")
-    other.execute("CREATE TABLE pets (name)")
-    other.close()
-    with pytest.raises(HuntDirectoryError, match="not a ledger"):
-        Ledger(tmp_path / "other.sqlite")
-    with pytest.raises(HuntDirectoryError, match="does not exist"):
-        Ledger(tmp_path / "missing" / "ledger.sqlite", writable=True)
 
 
 def test_trials_that_run_again_are_those_with_a_cause_outside_of_them(tmp_path):

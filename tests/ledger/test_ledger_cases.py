@@ -86,6 +86,7 @@ def test_traffic_events_are_counted_with_their_trials(ledger):
 
 
 def test_the_nearest_miss_is_the_least_of_both_ways_to_survive(ledger):
+    assert ledger.nearest_miss() is None
     for number, (outcome, ttc) in enumerate(
         [(Outcome.FINISHED, 2.0), (Outcome.SURVIVED, 2.5), (Outcome.COLLISION, 0.0), (Outcome.SURVIVED, math.inf)]
     ):

@@ -325,7 +325,13 @@ def suite(tmp_path, text):
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [("hunts = [", "TOML"), ("hunts = []", "no hunts"), ("schema = 2\n[[hunts]]\nid = 'a'", "schema = 2"),
+    [("hunts = [", "TOML"), ("hunts = []", "the file lists no hunts"), ("", "the key 'hunts' is missing"),
+     ("[[hunts]]\nid = 'a'\n[[hunts]]\nid = 'A'", "the id 'A' is used twice"),
+     ("[[hunts]]\nscenario = 'toy'", r"hunts\[0\].id = ''"),
+     ("[[hunts]]\nid = '../a'", r"'\.\./a' is not a valid folder name"),
+     ("[[hunts]]\nid = 'a'\ntrials = 'many'", "trials = 'many'"),
+     ("[[hunts]]\nid = 'a'\nagent = 'x:Y'\nagents = { ego = 'x:Y' }", "both agent and agents"),
+     ("schema = 2\n[[hunts]]\nid = 'a'", "schema = 2"),
      ("[[hunts]]\nid = 'a'\nruns = 0", "hunts.a.runs = 0"), ("[[hunts]]\nid = 'a'\nodd = 1", "odd"),
      ("[[hunts]]\nid = 'a'\n[[hunts]]\nid = 'b'\ntrials = -3", "suite.toml: hunts.b: trials is -3; give at least 0$"),
      ("[[hunts]]\nid = 'a'\nmax_steps = 0", "hunts.a: max_steps is 0; give at least 1"),
