@@ -86,7 +86,7 @@ class Serializable:
         return to_plain(self)
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Self:
+    def from_json(cls, data: Plain) -> Self:
         """Rebuild an object from data of `to_json` of any version: unknown keys are ignored, missing ones get defaults.
 
         Raises:
@@ -100,7 +100,7 @@ def to_plain(value: Serializable) -> JsonObject:
     return cast(JsonObject, _write_function(cast(Any, type(value)))(value))
 
 
-def from_plain(kind: type[_T], data: Mapping[str, Any]) -> _T:
+def from_plain(kind: type[_T], data: Plain) -> _T:
     """Convert a JSON object to a dataclass, according to its annotations; see `Serializable.from_json`."""
     if not isinstance(data, dict):
         raise TypeError(f"{str(data)[:60]!r} is not a JSON object")
@@ -228,7 +228,7 @@ def _plain_at(path: list[str]) -> _Convert:
     return get
 
 
-def plain(value: object) -> Any:
+def plain(value: object) -> object:
     """Return a value for JSON by its class, where no annotation of a field determines the conversion.
 
     A named tuple becomes an object, and null replaces a number that is not finite.
@@ -244,7 +244,7 @@ def plain(value: object) -> Any:
     if isinstance(value, Mapping):
         return {str(key): plain(held) for key, held in value.items()}
     if isinstance(value, AbstractSet):
-        return sorted(map(plain, value))
+        return [plain(held) for held in sorted(value)]
     return [plain(held) for held in value] if isinstance(value, list | tuple) else value
 
 

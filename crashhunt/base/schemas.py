@@ -32,7 +32,7 @@ from crashhunt.base.codec import JsonObject, Serializable, names_of_tuple, writt
 _JSON_TYPES = {bool: "boolean", int: "integer", float: "number", str: "string", NoneType: "null"}
 
 
-def json_schema(kind: Any, title: str) -> JsonObject:
+def json_schema(kind: object, title: str) -> JsonObject:
     """Return the JSON schema of a type, with its title and the schema dialect.
 
     Args:
@@ -93,7 +93,7 @@ def describe_type(hint: Any) -> JsonObject:
     return {}
 
 
-def _of_keys(keys: Mapping[str, Any]) -> JsonObject:
+def _of_keys(keys: Mapping[str, object]) -> JsonObject:
     """Return the schema of an object from the type of each key; see `json_schema`."""
     properties: JsonObject = {}
     required: list[str] = []

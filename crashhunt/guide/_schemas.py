@@ -172,7 +172,7 @@ _TOPIC = {"topic": str, "section": str, "title": str}
 _DIVERGENCE = {"step": int, "agent": str, "field": str, "recorded": Any, "replayed": Any}
 _REPLAY = {"**": ReplayReport, "divergence": (_DIVERGENCE, None), "table?": list[Plain]}
 
-SCHEMAS: dict[str, Any] = {
+SCHEMAS: dict[str, object] = {
     "run": _RUN,
     "init": _INIT,
     "replay": ({**_REPLAY, "written?": dict[str, int]}, {"crashes": [_REPLAY], "written": dict[str, int]}),
