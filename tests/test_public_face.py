@@ -3,7 +3,9 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import json
 import pkgutil
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -45,3 +47,13 @@ def test_a_package_offers_at_run_time_what_type_checkers_see(file):
     assert package.__all__ == sorted(seen)
     assert dir(package) == sorted(seen)
     assert not hasattr(package, "a_name_that_it_lacks")
+
+
+def test_entry_points_stay_as_they_are():
+    """A crashhunt of a bundle finds its simulators by the entry points of the installed one: add, and never change."""
+    tests = Path(__file__).parent
+    points = tomllib.loads((tests.parent / "pyproject.toml").read_text())["project"]["entry-points"]
+    frozen = json.loads((tests / "golden" / "entry_points.json").read_text())
+    assert {group: {**points.get(group, {}), **targets} for group, targets in frozen.items()} == {
+        group: points.get(group, {}) for group in frozen
+    }
