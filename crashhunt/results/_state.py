@@ -743,11 +743,11 @@ class LogReader:
                 yield f"{title}{kind}{changed}", text
 
     def _as_written(self, path: Path) -> bool:
-        """Return whether a file still has the digest that its crash recorded.
+        """Return whether a file still has the digest that its crash recorded; files of hunts have no digest.
 
-        Files of hunts and of early crashes have no recorded digest.
+        A crash records the digests of all its files, so another file was added later.
         """
         if path.parent not in self._files:
             self._files[path.parent] = files_of(path.parent)
-        entry = self._files[path.parent].get(path.name)
-        return entry is None or not changed_file(path, entry)
+        files = self._files[path.parent]
+        return not changed_file(path, files[path.name]) if path.name in files else not files

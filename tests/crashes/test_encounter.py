@@ -27,7 +27,9 @@ def recording(*steps, dt=0.1, sizes=None, turned=0.0, **more):
 
     records = [StepRecord(number, rows and scene(number, rows)) for number, rows in enumerate(steps)]
     return SimpleNamespace(
-        all_steps=records, scenes=lambda: [record.scene for record in records], prologue=Prologue((), dt)
+        all_steps=records,
+        scenes=lambda: [record.scene for record in records if record.scene is not None],
+        prologue=Prologue((), dt),
     )
 
 

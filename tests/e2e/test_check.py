@@ -78,8 +78,7 @@ def test_a_crash_json_that_was_edited_is_refused(hunt, crash):
     for change, says in (
         (lambda data: data["collision"].update(role="victim"), "the file has changed since it was written"),
         (lambda data: data.update(seed=data["seed"] + 1), "the file has changed since it was written"),
-        (lambda data: data.pop("integrity"), "'integrity' is missing"),
-        (lambda data: data.update(schema=1), "the file has changed since it was written"),
+        (lambda data: data.pop("integrity"), "older than format version 1"),
         (lambda data: data.update(schema=99), "schema version 99"),
     ):
         edited(file, change)
@@ -89,21 +88,14 @@ def test_a_crash_json_that_was_edited_is_refused(hunt, crash):
             assert says in err
             assert "crash.json" in err
         file.write_text(before)
-    # An early one is read, but not where it leads out of the hunt.
-    for name in ("../../elsewhere", "/etc", "", ".", "a/b"):
-        edited(file, lambda data, name=name: data.update(snapshot=name), schema=1)
-        assert "is not the name of a snapshot" in command("replay", crash)[2]
-        file.write_text(before)
 
 
 def test_a_log_belongs_to_its_crash(hunt, crash):
     other = max((hunt / "crashes").iterdir())
     shutil.copy(other / "log.mcap", crash / "log.mcap")
-    for schema in (2, 1):
-        edited(crash / "crash.json", lambda data: None, schema=schema)
-        for words in (("show", crash), ("replay", crash), ("report", "h")):
-            code, _, err = command(*words)
-            assert (code, "the digest of the log differs" in err) == (2, True), words
+    for words in (("show", crash), ("replay", crash), ("report", "h")):
+        code, _, err = command(*words)
+        assert (code, "log.mcap" in err) == (2, True), words
     assert command("show", other)[0] == 0
     assert command("show", "h", "--crash", other.name)[0] == 0  # one that is damaged is in nobody's way
 

@@ -221,7 +221,8 @@ def test_pytests_start_imports_the_thin_module_only():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     ours = {name for name in done.stdout.split() if name.startswith("crashhunt")}
     assert ours == {
-        "crashhunt", "crashhunt.base", "crashhunt.base.version", "crashhunt.corpus", "crashhunt.corpus.pytest_plugin",
+        "crashhunt", "crashhunt.base", "crashhunt.base.doors", "crashhunt.base.version", "crashhunt.corpus",
+        "crashhunt.corpus.pytest_plugin",
     }  # fmt: skip
     assert {"numpy", "libsumo", "gymnasium", "pydantic"}.isdisjoint(done.stdout.split())
 

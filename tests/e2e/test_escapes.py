@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from pathlib import Path
@@ -30,17 +29,6 @@ def test_on_sumo_it_brakes_as_hard_as_its_type(shell):
     assert facts["full_braking"] == pytest.approx(8.0, abs=0.01)
     found = shell.crashhunt("show", "h").out
     assert "Braking at 8 m/s², the maximum of its vehicle type, could have avoided it" in found
-
-
-def test_a_crash_from_before_states_nothing(toy):
-    toy.crashhunt("run", "h", "1", "1", "300", "--scenario", "toy", "--arg", "speed=14", "--seed", "1")
-    (file,) = (toy.folder / "h" / "crashes").glob("*/crash.json")
-    data = json.loads(file.read_text())
-    for new in ("escape", "integrity", "files"):
-        del data[new]
-    file.write_text(json.dumps({**data, "schema": 1}))
-    assert "Braking" not in toy.crashhunt("show", "h").out
-    assert "This is a calculation, not a run" in toy.crashhunt("show", "h", "--braking", "6").out
 
 
 @pytest.mark.skipif("CRASHHUNT_ESCAPE_STUDY" not in os.environ, reason="needs the directories of many hunts")

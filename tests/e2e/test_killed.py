@@ -388,7 +388,7 @@ def test_a_signal_ends_a_command_after_it_has_removed_everything(toy, made_once,
     made_once(keeps_going, toy)
     toy.environment["TMPDIR"] = str(temporary_files)
     process = toy.begin("replay", "h")
-    wait_for(lambda: [*temporary_files.glob("crashhunt-temporary-*/*/replay-1/*")])
+    wait_for(lambda: [*temporary_files.glob("crashhunt-temporary-*/*/rerun-1/*")])
     process.terminate()
     process.communicate(timeout=300)
     assert process.returncode == -signal.SIGTERM
