@@ -260,7 +260,7 @@ def is_dataclass(node: ast.ClassDef) -> bool:
     return any("dataclass" in ast.unparse(one) for one in node.decorator_list)
 
 
-ROLES = frozenset({"_backend", "_disturbances", "_protocol", "_scripted", "_simulator", "_surroundings", "errors"})
+ROLES = frozenset({"_descriptor", "_disturbances", "_protocol", "_scripted", "_simulator", "_surroundings", "errors"})
 """Names of files that several packages have, because a file has the same role in each."""
 
 

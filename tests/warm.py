@@ -64,10 +64,10 @@ _BEGIN_WITH = ("crashhunt.executors._fork_server", "crashhunt.executors._fresh")
 # What these import as soon as they have read what is to be done.
 _ALL = ("crashhunt.scenario._load", "crashhunt.crashes._last_avoidable_step", "crashhunt.recording._foxglove")
 _GO_ON_WITH = {
-    "": (*_ALL, "crashhunt.simulators._toy_backend", "crashhunt.simulators.toy"),
+    "": (*_ALL, "crashhunt.simulators._toy_descriptor", "crashhunt.simulators.toy"),
     "gym": _ALL,
     "highway": _ALL,  # whose accelerator knows the folder that it was imported from
-    "sumo": (*_ALL, "crashhunt.sumo._backend", "crashhunt.sumo._simulator"),
+    "sumo": (*_ALL, "crashhunt.sumo._descriptor", "crashhunt.sumo._simulator"),
 }
 
 

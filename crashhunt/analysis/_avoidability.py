@@ -6,7 +6,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from crashhunt.analysis._cause_runs import find_why
+from crashhunt.analysis._causes import find_why
 from crashhunt.analysis._omissions import find_omission
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError

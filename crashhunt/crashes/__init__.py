@@ -40,7 +40,7 @@ if TYPE_CHECKING:
         trust_repository as trust_repository,
         trust_snapshot as trust_snapshot,
     )
-    from ._causes import (
+    from ._cause_groups import (
         Cause as Cause,
         CauseGroup as CauseGroup,
         CauseType as CauseType,

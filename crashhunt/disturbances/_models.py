@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING, TypeVar
 
-from crashhunt.base.draws import one_of
+from crashhunt.base.weighted_choice import one_of
 from crashhunt.disturbances._protocol import Drawn
 
 if TYPE_CHECKING:

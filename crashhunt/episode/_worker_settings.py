@@ -87,6 +87,11 @@ class WorkerSettings(Serializable):
         "find_escapes", "audit", "hunt_seed", "warm_copies", "probe_s", "branch", "force",
     )  # fmt: skip
 
+    def keeps(self, result: TrialResult) -> bool:
+        """Return whether the recording and the files of a trial are kept."""
+        is_wanted = self.keep_trials or result.outcome in self.crash_on or result.failure is not None
+        return is_wanted or self.is_audited(result)
+
     def is_audited(self, result: TrialResult) -> bool:
         """Return whether a trial belongs to the audited sample, which its number and the hunt's seed determine."""
         if self.audit <= 0.0 or result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):

@@ -203,8 +203,7 @@ class Supervisor:
     def _keep(self, result: TrialResult, report: Report) -> EndedTrial:
         """Write the files of a kept trial that the hunt expects."""
         settings, folder = self._settings, scratch_of(self._settings.scratch, result.spec.number)
-        kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
-        kept = kept or settings.is_audited(result)
+        kept = settings.keeps(result)
         self._write_map(report.get("map"), folder if kept else None)
         failure = result.failure
         if kept:

@@ -285,8 +285,7 @@ class TrialProcess:
             with suppress(Exception):  # the code of a trial may have replaced any function
                 snapshot = Snapshot(Path(settings.code[0]).parent)
                 report["notices"] += describe_unsaved(self._opened.paths(), snapshot, since=self._made_at)
-        kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
-        kept = kept or settings.is_audited(result)
+        kept = settings.keeps(result)
         wants_map = (kept or job["wants_map"]) and result.outcome is not Outcome.INVALID
         if wants_map and supports(simulator, HasMap):
             report["map"] = _dumps([[lane.id, lane.width, lane.shape] for lane in simulator.lanes()])

@@ -263,9 +263,9 @@ _SCENARIO = (
     ("[arguments.NAME], [agents.ID.arguments.NAME]", "crashhunt.scenario", "ArgumentSetup"),
     ("[agents.ID]", "crashhunt.scenario", "AgentSetup"),
     ("[sumo]", "crashhunt.sumo._options", "SumoSetup"),
-    ("[highway]", "crashhunt.highway._backend", "HighwaySetup"),
-    ("[gym]", "crashhunt.gym._backend", "GymSetup"),
-    ("crash, in [gym]", "crashhunt.gym._backend", "CrashRule"),
+    ("[highway]", "crashhunt.highway._descriptor", "HighwaySetup"),
+    ("[gym]", "crashhunt.gym._descriptor", "GymSetup"),
+    ("crash, in [gym]", "crashhunt.gym._descriptor", "CrashRule"),
 )
 # Fields of Scenario that no file has, and the one that represents the tables below.
 _NO_KEY = re.compile(r"^- `(?:tables|\w+`: .*not part of (?:the file|it)\b).*\n(?:  .*\n)*", re.MULTILINE)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._backend import CrashRule as CrashRule, GymSetup as GymSetup
+    from ._descriptor import CrashRule as CrashRule, GymSetup as GymSetup
     from ._simulator import GymSimulator as GymSimulator
 
 offer_lazily(__name__)

@@ -30,8 +30,8 @@ from crashhunt.base.text import (
     listed,
     one_of,
 )
-from crashhunt.gym._backend import GymSetup
-from crashhunt.gym._gym_crash_types import crash_cell
+from crashhunt.gym._descriptor import GymSetup
+from crashhunt.gym._end_state import crash_cell
 from crashhunt.gym._pettingzoo import OneLearner, is_parallel, takes_turns
 from crashhunt.scenario import argument_values
 from crashhunt.simulators import (
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from crashhunt.gym._backend import CrashRule
+    from crashhunt.gym._descriptor import CrashRule
     from crashhunt.scenario import Scenario
     from crashhunt.simulators import ActionForm, Info, Observations, Options, StepResult
     from crashhunt.trial import Value

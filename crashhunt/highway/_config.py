@@ -10,7 +10,7 @@ from highway_env.vehicle.objects import RoadObject
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.base.text import did_you_mean
-from crashhunt.highway._backend import HighwaySetup
+from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.simulators import as_tables, merge
 
 if TYPE_CHECKING:

@@ -31,8 +31,8 @@ from crashhunt.base.boundaries import Boundary, Party
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.base.plugins import describe_unused_clone
 from crashhunt.base.scalars import number_of, truth_of
-from crashhunt.highway._backend import BACKEND, HighwaySetup
 from crashhunt.highway._config import configured, mistake, restore_classes
+from crashhunt.highway._descriptor import BACKEND, HighwaySetup
 from crashhunt.highway._disturbances import HighwayDisturbances
 from crashhunt.highway._lanes_and_contacts import Hidden, HighwayEvents, VehicleFilter, contact_of, lanes_of
 from crashhunt.highway._scripted import Puppet, Puppets

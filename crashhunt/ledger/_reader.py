@@ -36,11 +36,15 @@ class KindData(TypedDict):
 
 
 class HuntOwner(TypedDict):
-    """Identifies a process by host, process id and start time; ``started`` is in ticks since the machine started."""
+    """Identifies a process by host, process id, and start time in ticks since the machine started.
+
+    The token also names the boot and the namespaces (`crashhunt.base.temporary.OwnerProcess`).
+    """
 
     host: str
     pid: int
     started: int
+    token: NotRequired[str]
 
 
 class UntilRate(TypedDict):

@@ -11,6 +11,14 @@ if TYPE_CHECKING:
         Overlap as Overlap,
         ReportedCollision as ReportedCollision,
     )
+    from ._event_oracles import (
+        OffRoute as OffRoute,
+        RedLight as RedLight,
+        Teleport as Teleport,
+        TooClose as TooClose,
+        TrafficEvents as TrafficEvents,
+        WrongWay as WrongWay,
+    )
     from ._protocol import (
         DEFAULT_ORACLES as DEFAULT_ORACLES,
         ORACLES_OF_ACTORS as ORACLES_OF_ACTORS,
@@ -26,14 +34,6 @@ if TYPE_CHECKING:
         oracle_name as oracle_name,
         outcomes_brought as outcomes_brought,
         parse_oracle as parse_oracle,
-    )
-    from ._traffic import (
-        OffRoute as OffRoute,
-        RedLight as RedLight,
-        Teleport as Teleport,
-        TooClose as TooClose,
-        TrafficEvents as TrafficEvents,
-        WrongWay as WrongWay,
     )
 
 offer_lazily(__name__)

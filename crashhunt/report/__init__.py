@@ -55,17 +55,17 @@ if TYPE_CHECKING:
         format_pace as format_pace,
         format_seconds as format_seconds,
     )
+    from ._step_table import (
+        argument_units as argument_units,
+        check_fields as check_fields,
+        format_table as format_table,
+        steps_table as steps_table,
+    )
     from ._summary import (
         describe_causes as describe_causes,
         describe_groups as describe_groups,
         describe_hunt as describe_hunt,
         describe_replay as describe_replay,
-    )
-    from ._table import (
-        argument_units as argument_units,
-        check_fields as check_fields,
-        format_table as format_table,
-        steps_table as steps_table,
     )
     from ._words import describe_types_by_version as describe_types_by_version, describe_versions as describe_versions
 

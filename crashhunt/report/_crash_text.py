@@ -18,7 +18,7 @@ from crashhunt.crashes import (
 )
 from crashhunt.recording import describe_value, is_opaque
 from crashhunt.report._status_screen import format_inputs
-from crashhunt.report._table import NEAREST, aligned, stacked, steps_table
+from crashhunt.report._step_table import NEAREST, aligned, stacked, steps_table
 from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import (
     COLUMNS,
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle, Moment
     from crashhunt.recording import StepRecord
-    from crashhunt.report._table import TableCell
+    from crashhunt.report._step_table import TableCell
 
 _MAX_ACTION_CHARACTERS = 60  # of an action that is no array of numbers
 _MAX_TABLE_ROWS = 20  # of the table; of more steps, the table shows a selection

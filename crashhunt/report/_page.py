@@ -27,7 +27,7 @@ from crashhunt.recording import is_opaque, read_lanes
 from crashhunt.report._crash_text import Story
 from crashhunt.report._rate_text import describe_running
 from crashhunt.report._status_screen import format_arguments
-from crashhunt.report._table import argument_units
+from crashhunt.report._step_table import argument_units
 from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import by_likelihood, describe_versions, may_be_disturbed, traffic_of
 from crashhunt.results import CodeVersions, TrialRow, count_versions, find_crashes

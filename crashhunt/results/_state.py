@@ -19,7 +19,14 @@ from crashhunt.base.codec import OMIT_DEFAULT, Serializable, written_if
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import changed_file
-from crashhunt.base.temporary import remove_ended, remove_scratch, temporary_beside, this_process
+from crashhunt.base.temporary import (
+    owner_in,
+    remove_ended,
+    remove_scratch,
+    start_time,
+    temporary_beside,
+    this_process,
+)
 from crashhunt.base.text import command_line, near_path
 from crashhunt.crashes import crash_folders, files_of
 from crashhunt.ledger import KindData, Ledger, RunningRate, damaged, has_begun
@@ -434,7 +441,8 @@ def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
 
 def ledger_owner() -> HuntOwner:
     """Return a description that identifies this process, so that others can check whether it is still running."""
-    return {"host": socket.gethostname(), "pid": os.getpid(), "started": _started(os.getpid())}
+    pid = os.getpid()
+    return {"host": socket.gethostname(), "pid": pid, "started": start_time(pid), "token": this_process().token}
 
 
 def trials_of_running(directory: Path) -> int | None:
@@ -459,26 +467,12 @@ def _planned(request: Path) -> int:
 
 
 def _is_alive(owner: HuntOwner, heartbeat: float) -> bool:
-    if owner["host"] != socket.gethostname():
+    # Two containers may have one host name, and process ids of their own.
+    known, here = owner_in(owner.get("token", "")), this_process()
+    is_here = known is None or (known.boot, known.namespace) == (here.boot, here.namespace)
+    if owner["host"] != socket.gethostname() or not is_here:
         return time.time() - heartbeat < _SILENCE_S
-    return bool(_started(owner["pid"]) == owner["started"])  # a process id is given to another one some day
-
-
-def _started(pid: int) -> int:
-    """Return when a process started, in clock ticks since boot; 0 if it does not exist, -1 if unknown."""
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
-    except OSError:
-        if Path("/proc/self/stat").exists():
-            return 0
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            return 0
-        except PermissionError:
-            pass
-        return -1
-    return 0 if stat[0] == "Z" else int(stat[19])
+    return start_time(owner["pid"]) == owner["started"]  # a process id is given to another one some day
 
 
 def _ordered_states(path: Path) -> tuple[tuple[int, int, str], ...]:

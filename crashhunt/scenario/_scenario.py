@@ -541,10 +541,10 @@ class Backend:
 # Crashhunt's own simulators are found by module and not by entry point: a bundle brings a crashhunt of its own along,
 # and what is installed around it may be of a version in which they are elsewhere.
 _OWN_BACKENDS = {
-    "gym": "crashhunt.gym._backend",
-    "highway": "crashhunt.highway._backend",
-    "sumo": "crashhunt.sumo._backend",
-    "toy": "crashhunt.simulators._toy_backend",
+    "gym": "crashhunt.gym._descriptor",
+    "highway": "crashhunt.highway._descriptor",
+    "sumo": "crashhunt.sumo._descriptor",
+    "toy": "crashhunt.simulators._toy_descriptor",
 }
 
 

@@ -12,12 +12,6 @@ if TYPE_CHECKING:
         compare as compare,
         held_out_by_seed as held_out_by_seed,
     )
-    from ._crash_rate import (
-        CrashRate as CrashRate,
-        RatePart as RatePart,
-        check_confidence as check_confidence,
-        make_rate as make_rate,
-    )
     from ._hunt_pairs import (
         GateCase as GateCase,
         GateReport as GateReport,
@@ -64,6 +58,12 @@ if TYPE_CHECKING:
         rate_watch as rate_watch,
         refuse_training_traffic as refuse_training_traffic,
         why_no_interval as why_no_interval,
+    )
+    from ._rate_report import (
+        CrashRate as CrashRate,
+        RatePart as RatePart,
+        check_confidence as check_confidence,
+        make_rate as make_rate,
     )
     from ._running import (
         BarWatch as BarWatch,

@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.plans import HuntSettings
-    from crashhunt.statistics._crash_rate import CrashRate
     from crashhunt.statistics._paired_test import Pair as TrialPair
+    from crashhunt.statistics._rate_report import CrashRate
     from crashhunt.statistics._units import CountingRule, TrialFacts
     from crashhunt.training import TrainedOn
 

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.statistics._anytime_interval import Interval
-    from crashhunt.statistics._crash_rate import CrashRate
     from crashhunt.statistics._paired_test import Pair, PairVerdict, PairWatch
+    from crashhunt.statistics._rate_report import CrashRate
     from crashhunt.statistics._units import TrialFacts
 
 _FAILED_STATES = ("no_valid_trial", "error")

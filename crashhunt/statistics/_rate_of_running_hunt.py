@@ -13,8 +13,8 @@ from crashhunt.base.errors import UsageError
 from crashhunt.disturbances import first_forcing
 from crashhunt.plans import rate_of, share_of
 from crashhunt.results import CodeVersions
-from crashhunt.statistics._crash_rate import make_rate
 from crashhunt.statistics._rare import BLOCK, TRIALS_PER_ROOT, RareCounter, is_root, learn_forcing, root_of, with_plain
+from crashhunt.statistics._rate_report import make_rate
 from crashhunt.statistics._running import WHY_NOT_UNTIL_RATE, BarWatch, Paced, RateWatch
 from crashhunt.statistics._units import CountingRule, TrialFacts
 from crashhunt.trial import Forcing, Outcome
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.ledger import Facts, Ledger, RunningRate
     from crashhunt.plans import HuntSettings
-    from crashhunt.statistics._crash_rate import CrashRate
     from crashhunt.statistics._rare import RareEstimate
+    from crashhunt.statistics._rate_report import CrashRate
     from crashhunt.training import HeldOutTraffics
     from crashhunt.trial import Forced, ForcedCopy, TrialResult
 

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._backend import BACKEND as BACKEND
     from ._bent_vehicles import height_at as height_at
     from ._demand_order import SORT_FIX as SORT_FIX, is_searched as is_searched, unsorted_notes as unsorted_notes
+    from ._descriptor import BACKEND as BACKEND
     from ._ego import NOT_ON_A_ROAD as NOT_ON_A_ROAD, SurveyedRun as SurveyedRun
     from ._files import (
         READ as READ,

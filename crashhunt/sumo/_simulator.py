@@ -17,7 +17,7 @@ from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
 from crashhunt.native import core_for, reseed_generators, why_no_reseeding
 from crashhunt.scenario import ObservationSetup
 from crashhunt.simulators import META_ACTIONS, FullBraking, Kinematics, MetaAction, SpeedAndLaneChange, Unseen
-from crashhunt.sumo._backend import BACKEND
+from crashhunt.sumo._descriptor import BACKEND
 from crashhunt.sumo._disturbances import SumoDisturbances
 from crashhunt.sumo._driving import Driving, hold_vehicle
 from crashhunt.sumo._fast_step import PresentVehicles, UsualSteps

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._approach import (
+    from ._closest_approach import (
         ApproachMeter as ApproachMeter,
         ClosestApproach as ClosestApproach,
         approaches as approaches,

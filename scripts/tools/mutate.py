@@ -311,7 +311,7 @@ _TESTS_ELSEWHERE = {
     "training/_prioritized_replay.py": ("training/test_draws.py", "training/test_training_env.py"),
     "training/_traffic_split.py": ("training/test_draws.py", "training/test_held_out_traffics.py"),
     "analysis/_avoidability.py": ("analysis/test_avoiding.py", "e2e/test_judging.py"),
-    "analysis/_cause_runs.py": ("analysis/test_maneuvers.py", "e2e/test_judging.py"),
+    "analysis/_causes.py": ("analysis/test_maneuvers.py", "e2e/test_judging.py"),
     "analysis/_whatif_runs.py": ("analysis/test_what_is_counted.py", "analysis/test_reruns.py", "e2e/test_what_if.py"),
     "analysis/_interventions.py": (
         "analysis/test_what_is_counted.py",

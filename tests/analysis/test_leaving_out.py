@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from crashhunt.analysis._cause_runs import _Candidate, _Search
+from crashhunt.analysis._causes import _Candidate, _Search
 from crashhunt.crashes import Factor
 from crashhunt.trial import Choice, Disturbance, Outcome, Range, TrialSpec
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.analysis._cause_runs import Maneuver, maneuvers_of, relevant_actors
+from crashhunt.analysis._causes import Maneuver, maneuvers_of, relevant_actors
 from crashhunt.world import Actor, Roster, Scene
 
 DT = 0.1

@@ -13,7 +13,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from crashhunt.analysis import _omissions
 from crashhunt.episode import overruled_agent, run_episode
 from crashhunt.highway import HighwaySimulator
-from crashhunt.highway._backend import HighwaySetup
+from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.oracles import OffRoad, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.report._words import about_reference

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from crashhunt.base.errors import ScenarioError, UsageError
 from crashhunt.base.validation import validate
-from crashhunt.highway._backend import HighwaySetup
+from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.plans import HuntSettings, Request, plan
 from crashhunt.scenario import Scenario, backend_of, shipped_folder
 from crashhunt.suites import SuiteEntry

@@ -8,7 +8,7 @@ import pytest
 
 from crashhunt.analysis import judge
 from crashhunt.analysis._avoidability import AvoidanceSearch
-from crashhunt.analysis._cause_runs import _Search
+from crashhunt.analysis._causes import _Search
 from crashhunt.crashes import find_bundle, judgement_of
 from crashhunt.errors import UsageError
 from crashhunt.replays import ReplayOptions, prepare

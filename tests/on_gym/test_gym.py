@@ -17,7 +17,7 @@ from crashhunt.base.text import ABSENT_WORDS, NOTICE_TOPIC, PRESENT_WORDS
 from crashhunt.episode import Nearness
 from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.gym import GymSimulator
-from crashhunt.gym._backend import BACKEND, CrashRule, GymSetup
+from crashhunt.gym._descriptor import BACKEND, CrashRule, GymSetup
 from crashhunt.oracles import ReportedCollision
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.testing import SimulatorContract

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from crashhunt.gym._gym_crash_types import crash_cell
+from crashhunt.gym._end_state import crash_cell
 
 
 def test_true_flags_and_short_texts_of_the_info_count_and_numbers_do_not():

@@ -17,8 +17,8 @@ from crashhunt.base.boundaries import ForeignError
 from crashhunt.base.errors import ActionError, InvalidEpisodeError, UnusableValueError
 from crashhunt.base.scalars import number_of
 from crashhunt.gym import GymSimulator, _simulator as gym
-from crashhunt.gym._backend import CrashRule, GymSetup
-from crashhunt.gym._gym_crash_types import crash_cell
+from crashhunt.gym._descriptor import CrashRule, GymSetup
+from crashhunt.gym._end_state import crash_cell
 from crashhunt.recording import encode_value
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.simulators import _any_space as _gymnasium

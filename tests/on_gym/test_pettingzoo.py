@@ -9,7 +9,7 @@ from gymnasium import spaces
 from crashhunt.base.boundaries import ForeignError
 from crashhunt.errors import ScenarioError
 from crashhunt.gym import GymSimulator
-from crashhunt.gym._backend import CrashRule, GymSetup
+from crashhunt.gym._descriptor import CrashRule, GymSetup
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.testing import SimulatorContract
 

@@ -11,7 +11,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from crashhunt.disturbances import disturber_of
 from crashhunt.episode import Episode, Observer
 from crashhunt.highway import HighwaySimulator
-from crashhunt.highway._backend import HighwaySetup
+from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.scenario import AgentSetup, ObservationSetup, Scenario
 from crashhunt.trial import CELLS, Disturbance, TrialSpec
 

@@ -14,7 +14,7 @@ from conftest import mostly_nightly
 
 from crashhunt.errors import InvalidEpisodeError, ScenarioError, UnusableValueError
 from crashhunt.highway import HighwaySimulator
-from crashhunt.highway._backend import HighwaySetup
+from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
 from crashhunt.scenario import (
     AgentSetup,

@@ -31,7 +31,7 @@ from crashhunt.highway import (
     _simulator,
     _surroundings,
 )
-from crashhunt.highway._backend import HighwaySetup
+from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.highway._disturbances import HighwayDisturbances
 from crashhunt.highway._lanes_and_contacts import Hidden, HighwayEvents, VehicleFilter
 from crashhunt.highway._surroundings import surroundings_of

@@ -14,7 +14,7 @@ from conftest import mostly_nightly
 
 from crashhunt.episode import run_episode
 from crashhunt.highway import HighwaySimulator
-from crashhunt.highway._backend import HighwaySetup
+from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.scenario import AgentSetup, Scenario

@@ -8,7 +8,7 @@ import pytest
 
 from crashhunt.crashes import find_bundle
 from crashhunt.errors import UsageError
-from crashhunt.report._table import NEAREST, aligned, check_fields, format_table, stacked, steps_table
+from crashhunt.report._step_table import NEAREST, aligned, check_fields, format_table, stacked, steps_table
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
 

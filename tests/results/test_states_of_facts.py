@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import time
 from contextlib import closing
 from dataclasses import replace
@@ -128,31 +127,14 @@ def test_owner_on_another_machine_is_alive_for_a_minute_after_its_heartbeat():
     assert not state(running(owner=owner)).owner_alive  # without any heartbeat
 
 
-def test_process_has_started_unless_it_does_not_exist_or_is_dead(monkeypatch):
-    assert _state._started(os.getpid()) > 0
-    assert _state._started(2**22 + 5) == 0
-    with subprocess.Popen(["true"]) as child:
-        os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
-        assert _state._started(child.pid) == 0
-
-    def missing(path, **_):
-        raise OSError
-
-    signals = []
-
-    def kill(pid, number):
-        signals.append((pid, number))
-        if pid == 1:
-            raise PermissionError
-        if pid == 2:
-            raise ProcessLookupError
-
-    monkeypatch.setattr(Path, "read_text", missing)
-    assert _state._started(3) == 0
-    monkeypatch.setattr(Path, "exists", lambda path: False)  # a system without /proc
-    monkeypatch.setattr(os, "kill", kill)
-    assert [_state._started(pid) for pid in (1, 2, 3)] == [-1, 0, -1]
-    assert signals == [(1, 0), (2, 0), (3, 0)]
+def test_owner_in_another_container_of_the_same_host_name_is_judged_by_its_heartbeat():
+    here = ledger_owner()
+    assert _state._is_alive(here, 0.0)
+    pid, started, boot, namespace = here["token"].split("-")
+    other = {**here, "token": f"{pid}-{started}-{boot}-{int(namespace, 16) ^ 1:08x}"}
+    assert (_state._is_alive(other, NOW - 59.0), _state._is_alive(other, NOW - 60.0)) == (True, False)
+    gone = {**here, "pid": 2**22 + 5}
+    assert not _state._is_alive(gone, NOW)
 
 
 def test_folders_of_runs_are_in_the_order_of_their_numbers():

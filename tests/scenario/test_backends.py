@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from crashhunt.errors import PluginError, ScenarioError
-from crashhunt.gym._backend import GymSetup
-from crashhunt.highway._backend import HighwaySetup
+from crashhunt.gym._descriptor import GymSetup
+from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.scenario import (
     AgentSetup,
     Backend,

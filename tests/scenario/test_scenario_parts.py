@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.errors import HuntDirectoryError, ScenarioError
-from crashhunt.gym._backend import BACKEND as GYM, CrashRule, GymSetup
-from crashhunt.highway._backend import BACKEND as HIGHWAY, HighwaySetup
+from crashhunt.gym._descriptor import BACKEND as GYM, CrashRule, GymSetup
+from crashhunt.highway._descriptor import BACKEND as HIGHWAY, HighwaySetup
 from crashhunt.scenario import (
     AgentSetup,
     ArgumentSetup,

@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from crashhunt.episode import run_episode
 from crashhunt.errors import ActionError
 from crashhunt.gym import GymSimulator
-from crashhunt.gym._backend import CrashRule, GymSetup
+from crashhunt.gym._descriptor import CrashRule, GymSetup
 from crashhunt.recording import (
     BlackBox,
     OpaqueValue,

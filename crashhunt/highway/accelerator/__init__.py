@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from ._kernel import Poses as Poses, kernel as kernel
     from ._lane_network import Network as Network
     from ._substep_loop import Onlooker as Onlooker, SkippedObservation as SkippedObservation
+    from ._supported import kind_of as kind_of, reason_against as reason_against
     from ._switch import (
         Acceleration as Acceleration,
         accelerate as accelerate,
@@ -16,6 +17,5 @@ if TYPE_CHECKING:
         switch_on as switch_on,
         why_not as why_not,
     )
-    from ._versions import kind_of as kind_of, reason_against as reason_against
 
 offer_lazily(__name__)

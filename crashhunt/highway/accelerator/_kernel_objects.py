@@ -11,7 +11,7 @@ from highway_env.vehicle.objects import Landmark, Obstacle
 
 from crashhunt.highway.accelerator._frames import are_plain
 from crashhunt.highway.accelerator._kernel import kernel
-from crashhunt.highway.accelerator._versions import NUMBERS_OF, are_numbers, kinds_of
+from crashhunt.highway.accelerator._supported import NUMBERS_OF, are_numbers, kinds_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from crashhunt.highway.accelerator._kernel import Traffic
     from crashhunt.highway.accelerator._lane_network import Network
-    from crashhunt.highway.accelerator._versions import VehicleClass
+    from crashhunt.highway.accelerator._supported import VehicleClass
 
     Row = tuple[object, ...]
 

@@ -11,7 +11,7 @@ from highway_env.road.lane import AbstractLane, CircularLane, SineLane, Straight
 from highway_env.road.road import RoadNetwork
 
 from crashhunt.highway.accelerator._kernel import kernel
-from crashhunt.highway.accelerator._versions import are_numbers, is_plain
+from crashhunt.highway.accelerator._supported import are_numbers, is_plain
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

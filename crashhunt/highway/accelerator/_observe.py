@@ -13,7 +13,7 @@ from highway_env.road.lane import AbstractLane
 from highway_env.vehicle.kinematics import Vehicle
 
 from crashhunt.highway.accelerator._frames import are_plain
-from crashhunt.highway.accelerator._versions import are_numbers, kind_of
+from crashhunt.highway.accelerator._supported import are_numbers, kind_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

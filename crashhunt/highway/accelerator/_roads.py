@@ -11,7 +11,7 @@ from highway_env.road.road import Road
 from crashhunt.highway.accelerator._frames import TrafficFrame
 from crashhunt.highway.accelerator._kernel_objects import KernelObjects
 from crashhunt.highway.accelerator._lane_network import Network
-from crashhunt.highway.accelerator._versions import Own, Watch, is_plain, kinds_of
+from crashhunt.highway.accelerator._supported import Own, Watch, is_plain, kinds_of
 
 if TYPE_CHECKING:
     from crashhunt.highway.accelerator._kernel import Traffic

@@ -26,7 +26,7 @@ from highway_env.road.road import Road
 from crashhunt.highway.accelerator._agent_steps import choose
 from crashhunt.highway.accelerator._roads import cached, is_known, look, methods_of, prepared, watches
 from crashhunt.highway.accelerator._rules import finish
-from crashhunt.highway.accelerator._versions import Own, is_genuine, kinds_of, originals
+from crashhunt.highway.accelerator._supported import Own, is_genuine, kinds_of, originals
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -44,7 +44,7 @@ from crashhunt.highway.accelerator._roads import (
 )
 from crashhunt.highway.accelerator._rules import collide_one_by_one, enforce, finish
 from crashhunt.highway.accelerator._substep_loop import can_run_alone, run_step, simulate
-from crashhunt.highway.accelerator._versions import (
+from crashhunt.highway.accelerator._supported import (
     Watch,
     is_genuine,
     kind_of,

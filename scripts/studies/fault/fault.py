@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 from towns import TOWNS, make_town
 
-from crashhunt.analysis._cause_runs import _Search
+from crashhunt.analysis._causes import _Search
 from crashhunt.crashes import ending_of, fault_of, list_bundles, overruled_trial
 from crashhunt.replays import ReplayOptions, Rerun, prepare, reruns_of
 from crashhunt.trial import KINDS, Disturbance, Outcome

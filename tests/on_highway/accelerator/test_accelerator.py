@@ -36,8 +36,8 @@ from crashhunt.highway.accelerator import (
     Onlooker,
     TrafficFrame,
     _kernel,
+    _supported,
     _switch as accelerator,
-    _versions,
     kind_of,
     reason_against,
     switch_off,
@@ -375,7 +375,7 @@ def test_it_steps_aside_for_another_version(monkeypatch):
 
 
 def test_it_steps_aside_for_a_changed_installation(monkeypatch):
-    monkeypatch.setattr(_versions, "ACCELERATED", {highway_env.__version__: "0123"})
+    monkeypatch.setattr(_supported, "ACCELERATED", {highway_env.__version__: "0123"})
     assert "not the published one" in reason_against()
 
 

@@ -28,7 +28,7 @@ from crashhunt.highway.accelerator import (
     _kernel_objects,
     _lane_network as _network,
     _roads,
-    _versions,
+    _supported,
     kind_of,
     switch_off,
     switch_on,
@@ -125,14 +125,14 @@ def test_a_class_is_looked_at_again_when_it_or_its_bases_have_changed():
 
 
 def test_left_alone_names_members_of_moving_classes_only(caplog, monkeypatch):
-    monkeypatch.setattr(_versions, "left_alone", {})
+    monkeypatch.setattr(_supported, "left_alone", {})
     moving = type("Walker", (IDMVehicle,), {"mobil": lambda *_: False, "step": lambda *_: None})
     still = type("Post", (Obstacle,), {"polygon": lambda *_: None})
     with caplog.at_level("INFO", "crashhunt"):
         kind_of(moving), kind_of(still)
         moving.note = 1
         kind_of(moving)  # the same again
-    names = [name.rpartition(".")[2] for name in _versions.left_alone]
+    names = [name.rpartition(".")[2] for name in _supported.left_alone]
     assert "Walker" in names
     assert "Post" not in names
     assert [record.message.partition(": ")[2].rpartition(".")[2] for record in caplog.records] == [
@@ -161,7 +161,7 @@ def test_left_alone_names_members_of_moving_classes_only(caplog, monkeypatch):
 def test_watch_reports_replaced_functions_and_no_numbers(change, reason, caplog):
     space = {"function": max, "number": 1, "free": max, "__doc__": "text"}
     kind = type("Kind", (), {"method": lambda self: None, "value": 1})
-    watch = _versions.Watch([("place", space), ("Kind", kind)], ["place.free"])
+    watch = _supported.Watch([("place", space), ("Kind", kind)], ["place.free"])
     assert watch.intact
     assert watch.reason == ""
     change(space, kind)
@@ -174,7 +174,7 @@ def test_watch_reports_replaced_functions_and_no_numbers(change, reason, caplog)
 
 def test_watch_is_intact_again_when_a_function_is_put_back_and_reports_the_next_change():
     space = {"one": max, "two": min}
-    watch = _versions.Watch([("place", space)])
+    watch = _supported.Watch([("place", space)])
     for name, original in (("one", max), ("two", min), ("one", max)):
         space[name] = len
         assert watch.reason == f"place.{name} has been replaced"
@@ -183,7 +183,7 @@ def test_watch_is_intact_again_when_a_function_is_put_back_and_reports_the_next_
 
 
 def test_watch_of_roads_reports_functions_of_numpy_and_values_that_hide_methods(monkeypatch):
-    watch = _versions.Watch.of_roads(())
+    watch = _supported.Watch.of_roads(())
     assert watch.intact
     for owner, name, value, said in [
         (np, "cos", np.sin, "numpy.cos"), (np.linalg, "norm", np.sin, "numpy.linalg.norm"),
@@ -198,11 +198,11 @@ def test_watch_of_roads_reports_functions_of_numpy_and_values_that_hide_methods(
 
 
 def test_genuine_function_is_one_of_highway_envs_files_under_its_own_name():
-    assert _versions.is_genuine("Road.act", Road.act)
-    assert not _versions.is_genuine("Road.step", Road.act)
-    assert not _versions.is_genuine("wrapped", lambda: None)
-    assert not _versions.is_genuine("len", len)
-    names = [name for name, _ in _versions._functions()]
+    assert _supported.is_genuine("Road.act", Road.act)
+    assert not _supported.is_genuine("Road.step", Road.act)
+    assert not _supported.is_genuine("wrapped", lambda: None)
+    assert not _supported.is_genuine("len", len)
+    names = [name for name, _ in _supported._functions()]
     assert {"Road.act", "IDMVehicle.mobil", "Vehicle.velocity", "StraightLane.from_config", "wrap_to_pi"} <= {*names}
     assert not any(name.endswith(".") or "MAX_SPEED" in name for name in names)
 
@@ -489,7 +489,7 @@ def test_vehicle_of_the_dynamic_model_moves_without_a_search_for_its_lane():
 
 
 def parameters(*things):
-    return _kernel_objects._read_parameters(list(things), _versions.kinds_of(things))
+    return _kernel_objects._read_parameters(list(things), _supported.kinds_of(things))
 
 
 def test_parameters_of_vehicles_are_refused_where_they_are_not_usual_numbers():
@@ -524,7 +524,7 @@ def test_objects_need_fewer_parameters_than_vehicles():
     things = [*place.vehicles, Obstacle(place, [0.0, 0.0]), Landmark(place, [9.0, 0.0])]
     known = [np.isfinite(row).sum() for row in np.frombuffer(parameters(*things)).reshape(5, -1)]
     assert known == [19, 4, 9, 2, 2]
-    kinds = _versions.kinds_of(things)
+    kinds = _supported.kinds_of(things)
     assert [_kernel_objects._flags_of(*pair) for pair in zip(things, kinds, strict=True)] == [4, 0, 0, 8, 1]
     assert _kernel_objects._flags_of(*((slide := small_road(BicycleVehicle).vehicles[0]), kind_of(type(slide)))) == 2
     assert parameters() == b""
@@ -534,11 +534,11 @@ def test_one_example_of_each_class_shows_its_parameters_and_all_that_have_their_
     first, second, third, other = small_road(IDMVehicle, IDMVehicle, IDMVehicle, Vehicle).vehicles
     first.LENGTH = third.LENGTH = 9.0
     things = [first, second, third, other]
-    found = _kernel_objects._examples(things, _versions.kinds_of(things))
+    found = _kernel_objects._examples(things, _supported.kinds_of(things))
     assert [thing for thing, _ in found] == things
     assert [len(names) for _, names in found] == [18, 18, 18, 4]
     del first.LENGTH, third.LENGTH
-    found = _kernel_objects._examples(things, _versions.kinds_of(things))
+    found = _kernel_objects._examples(things, _supported.kinds_of(things))
     assert [thing for thing, _ in found] == [first, other]
 
 

@@ -33,8 +33,8 @@ from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle, RoadObject
 from hypothesis import example, given, settings, strategies as st
 
-from crashhunt.highway import _backend as highway
-from crashhunt.highway._backend import BACKEND
+from crashhunt.highway import _descriptor as highway
+from crashhunt.highway._descriptor import BACKEND
 from crashhunt.highway.accelerator import _kernel, _roads, _switch, switch_off, switch_on
 from crashhunt.scenario import load_scenario
 

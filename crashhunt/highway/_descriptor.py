@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.errors import ScenarioError
-from crashhunt.highway.accelerator._supported import ACCELERATED
+from crashhunt.highway.accelerator._known_versions import ACCELERATED
 from crashhunt.scenario import STEP_LENGTH_S, Accelerator, Backend
 
 if TYPE_CHECKING:
