@@ -6,8 +6,8 @@ Every analysis that runs a recorded trial again uses this module. The parts of a
   at a step (`overruled`, `disturbances`, `handover`, `reseeding`) leaves the steps before as recorded. They are
   simulated again. The caller chooses which specifications run next.
 - **Where** (`Where`): ``current`` forks processes that have imported the current crashhunt. ``snapshot`` does the same
-  with the crashhunt of a snapshot, if that crashhunt has a fork server. ``alone`` starts a new Python process for each
-  run. `SharedReruns` serves several threads.
+  with the crashhunt of a snapshot. ``alone`` starts a new Python process for each run. `SharedReruns` serves several
+  threads.
 - **Limits**: `Budget` decides about a stop of the user and the wall time. The caller limits the number of runs,
   because only the caller knows which of the runs count.
 - **Comparison**: an `EndedRun` has the outcome, the recording and the files of a run. Bit-identical runs have the same
@@ -40,7 +40,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.episode import scratch_of
-from crashhunt.executors import FreshProcessExecutor, PoolExecutor, has_fork_server, read_map
+from crashhunt.executors import FreshProcessExecutor, PoolExecutor, read_map
 from crashhunt.recording import Recording, read_black_box
 
 if TYPE_CHECKING:
@@ -276,8 +276,7 @@ class Reruns:
 
 
 def _executor(worker: WorkerSettings, where: Where, parallel: int) -> Executor:
-    """Return the executor for reruns; snapshots of crashhunt 0.1.0 and before have no fork server."""
-    if where == "alone" or (where == "snapshot" and not has_fork_server(worker)):
+    if where == "alone":
         return FreshProcessExecutor(worker, parallel=parallel)
     return PoolExecutor(worker, parallel=parallel, snapshot=where == "snapshot")
 

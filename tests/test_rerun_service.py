@@ -147,22 +147,17 @@ def test_one_trial_that_is_run_alone_ends_with_its_process(worker, monkeypatch):
     assert executor.closed == 2
 
 
-def test_crashhunt_of_a_snapshot_may_have_no_fork_server(worker, monkeypatch, tmp_path):
-    old, new = tmp_path / "old", tmp_path / "new"
-    (old / "crashhunt").mkdir(parents=True)
-    (new / "crashhunt/executors").mkdir(parents=True)
-    (new / "crashhunt/executors/_fork_server.py").touch()
+def test_only_reruns_that_are_alone_run_without_a_pool(worker, monkeypatch):
     made = []
     monkeypatch.setattr(reruns, "PoolExecutor", lambda given, **more: made.append(("pool", more)))
     monkeypatch.setattr(reruns, "FreshProcessExecutor", lambda given, **more: made.append(("fresh", more)))
-    for code in ((), (str(tmp_path),), (str(new),), (str(tmp_path), str(old))):
-        Reruns(replace(worker, code=code), "snapshot", parallel=3)
-    pool, fresh = ("pool", {"parallel": 3, "snapshot": True}), ("fresh", {"parallel": 3})
-    assert made == [pool, pool, pool, fresh]
-    made.clear()
-    for where in ("current", "alone"):
+    for where in ("snapshot", "current", "alone"):
         Reruns(worker, where, parallel=2)
-    assert made == [("pool", {"parallel": 2, "snapshot": False}), ("fresh", {"parallel": 2})]
+    assert made == [
+        ("pool", {"parallel": 2, "snapshot": True}),
+        ("pool", {"parallel": 2, "snapshot": False}),
+        ("fresh", {"parallel": 2}),
+    ]
 
 
 class Failing:

@@ -11,18 +11,17 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-import runpy
 import select
 import signal
 import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
 from typing import IO, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+    from types import ModuleType
 
 _FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _LOOK_EVERY_S = 0.02  # where the kernel does not notify when a child ends
@@ -106,13 +105,9 @@ def _main() -> None:
         # A signal of the terminal ends the imports, and prints no traceback of them.
         interrupted = signal.signal(signal.SIGINT, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _FORWARDED_SIGNALS)
-        found = _imported(module)
+        found = importlib.import_module(module)
         signal.signal(signal.SIGINT, interrupted)
-        if "main" in vars(found):
-            found.main()
-        else:  # the debugger of older versions
-            del sys.modules[module]
-            runpy.run_module(module, run_name="__main__", alter_sys=True)
+        found.main()
         return
     for number in _FORWARDED_SIGNALS:  # the child, or the owner, handles signals that are sent to the whole group
         signal.signal(number, signal.SIG_IGN)
@@ -120,19 +115,6 @@ def _main() -> None:
     status = _wait(child, int(lifeline), processes.resume)
     processes.end_descendants()
     _exit_as(status)
-
-
-def _imported(name: str) -> ModuleType:
-    """Import a module of a snapshot, and return it."""
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name != "pebble":
-            raise
-    # Snapshots of before the first release import pebble, which their pools need and no replay calls.
-    sys.modules["pebble"] = stand_in = ModuleType("pebble")
-    stand_in.ProcessPool = stand_in.ProcessExpired = type("NotInstalled", (Exception,), {})  # type: ignore[attr-defined]
-    return importlib.import_module(name)
 
 
 def _import_sibling(name: str) -> ModuleType:

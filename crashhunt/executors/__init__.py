@@ -16,7 +16,6 @@ if TYPE_CHECKING:
         ExecutorFactory as ExecutorFactory,
         HasNodes as HasNodes,
         NodeFigures as NodeFigures,
-        has_fork_server as has_fork_server,
         make_executor as make_executor,
         snapshot_environment as snapshot_environment,
         worker_environment as worker_environment,

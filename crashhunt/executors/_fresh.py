@@ -23,8 +23,8 @@ from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
 from crashhunt.executors._fork_server import fork_zygote
 from crashhunt.executors._host_conditions import HostConditions
-from crashhunt.executors._postmortem import TrialAttempt, damaged, hung, result_of_death, where_it_is
-from crashhunt.executors._protocol import Notes, has_fork_server, snapshot_environment
+from crashhunt.executors._postmortem import TrialAttempt, hung, result_of_death, where_it_is
+from crashhunt.executors._protocol import Notes, snapshot_environment
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError, with_escape
 from crashhunt.executors._time_limits import START_UP_S, ImportKilledError, PauseMeter, has_hung, import_died
 from crashhunt.trial import TrialResult, TrialSpec
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 
 _LOOK_EVERY_S = 0.01  # starting one takes thirty times as long
-_DAMAGED_EXIT_CODE = 79  # the exit code of a process of crashhunt 0.2 and before whose trial damaged it
 _FULL_BYTES = 1 << 20  # with less free space, a recording cannot be made
 _ESCAPE_S = 60.0  # for what is found out about a crash after its own trial has ended
 
@@ -66,7 +65,6 @@ class FreshProcessExecutor:
         self._notes = Notes(settings.scratch)
         self._waiting: deque[TrialAttempt] = deque()
         self._running: dict[int, _Running] = {}
-        self._has_supervisor = has_fork_server(settings)
 
     def submit(self, spec: TrialSpec) -> None:
         """Queue a trial."""
@@ -120,12 +118,12 @@ class FreshProcessExecutor:
                 "answer": str(answer),
             }
             job.write_text(json.dumps(content), encoding="utf-8")
-            with log_file.open("wb") as log, job.open("rb") as described:
+            with log_file.open("wb") as log:
                 kept = Kept(
                     "crashhunt.executors._fresh",
                     [str(job)],
                     environment=snapshot_environment(self._settings),
-                    stdin=described,  # which older versions read
+                    stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=log,
                 )
@@ -144,11 +142,10 @@ class FreshProcessExecutor:
         header = where_it_is(self._settings.scratch, number)
         # A supervisor begins the recording before the process of the trial does. It ends that process, or its own
         # imports, where they hang; so what is left for this one is a supervisor that hangs itself.
-        supervised = self._has_supervisor and (header is None or header.pid in children_of(running.kept.process.pid))
-        begun = header is not None and not supervised
+        supervised = header is None or header.pid in children_of(running.kept.process.pid)
         limit_s += paused_s + (START_UP_S if supervised else 0.0)
         has_words = partial(_has_words, scratch_of(self._settings.scratch, number) / layout.STACK)
-        if has_hung(header, begun=begun, given_at=running.began, limit_s=limit_s, has_words=has_words):
+        if has_hung(header, begun=not supervised, given_at=running.began, limit_s=limit_s, has_words=has_words):
             running.killed = True
             running.kept.end()
         return None
@@ -162,8 +159,6 @@ class FreshProcessExecutor:
         except (OSError, ValueError):
             if exit_code > 0 and where_it_is(scratch, spec.number) is None:
                 raise _not_started(spec.number, self._log(spec.number), exit_code) from None
-            if exit_code == _DAMAGED_EXIT_CODE:
-                return damaged(spec, scratch, "the process could not report the result, as it is damaged")
             return self._account_for_end(running, exit_code)
         # The answer is there, so that what was killed is the search for the escape: without it the answer is half.
         why_no_escape = ""

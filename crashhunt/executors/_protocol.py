@@ -288,12 +288,6 @@ def snapshot_environment(settings: WorkerSettings) -> dict[str, str]:
     return {**os.environ, **worker_environment(), **ours}
 
 
-def has_fork_server(settings: WorkerSettings) -> bool:
-    """Return whether the settings' crashhunt has a fork server and supervisors, as versions after 0.1.0 do."""
-    package = [Path(folder) / layout.PACKAGE.name for folder in settings.code]
-    return all((found / "executors" / "_fork_server.py").is_file() for found in package if found.is_dir())
-
-
 def _compiled(settings: WorkerSettings) -> Path | None:
     """Return the folder for the compiled code of a snapshot; None if no such folder can be used."""
     parts = Path(settings.code[0]).parts

@@ -514,7 +514,7 @@ def _copy_rows(found: Checked, settings: HuntSettings, to: Path) -> int:
 
 # How the copied trials were drawn, which their rows do not show. Without its sampler's version, a hunt cannot resume.
 _KEPT_FACTS = frozenset((
-    "code_versions", "crash_on", "disturb", "independent", "lag", "lag_grows", "origins", "plain_origin", "replanned",
+    "code_versions", "crash_on", "disturb", "independent", "lag", "origins", "plain_origin", "replanned",
     "sampler_version", "under_way",
 ))  # fmt: skip
 _DROPPED_FACTS = frozenset(("dropped", "dropped_at_fault", "dropped_judged"))  # about crashes without a bundle

@@ -65,8 +65,8 @@ def trials_under_way(parallel: int) -> int:
     return parallel * (1 + _QUEUED_PER_WORKER)
 
 
-def result_lag(before: Facts, run: RunSettings, parallel: int) -> tuple[int, bool]:
-    """Return the number of trials by which results reach the sampler late, and whether it is smaller at first.
+def result_lag(before: Facts, run: RunSettings, parallel: int) -> int:
+    """Return the maximum number of trials by which results reach the sampler late.
 
     Args:
         before: facts from the hunt's ledger.
@@ -75,10 +75,8 @@ def result_lag(before: Facts, run: RunSettings, parallel: int) -> tuple[int, boo
     """
     under_way = trials_under_way(parallel)
     if not run.deterministic:
-        return under_way, False
-    if lag := before.get("lag"):  # a hunt of before has one lag for all trials
-        return lag, bool(before.get("lag_grows"))
-    return max(GREATEST_LAG, under_way), True
+        return under_way
+    return before.get("lag") or max(GREATEST_LAG, under_way)
 
 
 class Trials:
@@ -97,8 +95,7 @@ class Trials:
             missing for an external reason. The sampler receives the result in the ledger, not the result of the second
             run, so a resumed hunt proposes the same trials.
         lag: delay, in trials, with which a learning sampler receives results: the number of trials that run at a time;
-            in a deterministic hunt, the maximum delay.
-        lag_grows: whether the first trials of a deterministic hunt have a smaller lag (`growing_lag`).
+            in a deterministic hunt, the maximum delay, which the first trials do not reach (`growing_lag`).
         disturber: object that draws the disturbances of trials; None if trials have no disturbances.
         forcings: object that returns the forcing of each root in rare mode; None in any other hunt.
         apart: the finished trials of other versions of the code, whose results a learning sampler does not receive.
@@ -116,7 +113,6 @@ class Trials:
         finished: set[int],
         *,
         lag: int,
-        lag_grows: bool = False,
         begun_with: int | None = None,
         disturber: DisturbanceSampler | None = None,
         unanswered: Sequence[TrialSpec] = (),
@@ -127,7 +123,6 @@ class Trials:
         self._sampler = sampler
         self._ledger = ledger
         self._lag = lag
-        self._lag_grows = lag_grows
         self._begun_with = sampler.version if begun_with is None else begun_with
         self._disturber = disturber
         self._waiting = iter(number for number in range(settings.most_trials) if number not in finished)
@@ -231,7 +226,7 @@ class Trials:
         return self._settings.run.deterministic and min(self._open, default=number) <= number - self._lag_of(number)
 
     def _lag_of(self, number: int) -> int:
-        return growing_lag(number, self._lag) if self._lag_grows else self._lag
+        return growing_lag(number, self._lag) if self._settings.run.deterministic else self._lag
 
     def _report_to_sampler(self, last: int) -> tuple[int, ...]:
         """Pass the results of finished trials up to a number to the sampler; return the numbers of these trials."""

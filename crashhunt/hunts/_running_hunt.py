@@ -148,9 +148,8 @@ class RunningHunt:
             self._sampler,
             ledger,
             self.finished,
-            lag=self._lag[0],
-            lag_grows=self._lag[1],
-            begun_with=(before.get("sampler_version") or 1) if self.finished else None,
+            lag=self._lag,
+            begun_with=before.get("sampler_version") if self.finished else None,
             disturber=self.disturber,
             unanswered=self.unanswered.specs,
             forcings=forcings_of(settings, ledger, self.disturber),
@@ -249,7 +248,6 @@ class RunningHunt:
         """Record in the ledger that the hunt runs, and with what."""
         setup, settings, before, sampler = self.setup, self.setup.settings, self._before, self._sampler
         progress, has_lag = self.progress, sampler.learns and settings.run.deterministic
-        version = before.get("sampler_version") or (1 if self.finished else sampler.version)
         self.ledger.enter(
             "running",
             owner=ledger_owner(),
@@ -270,9 +268,8 @@ class RunningHunt:
             disturb=list(settings.disturb) or None,
             copies=copies_to_come(settings),
             audits_left=self.audits_left.numbers or before.get("audits_left"),
-            lag=self._lag[0] if has_lag else None,
-            lag_grows=self._lag[1] if has_lag else None,
-            sampler_version=version if sampler.learns else None,
+            lag=self._lag if has_lag else None,
+            sampler_version=(before.get("sampler_version") or sampler.version) if sampler.learns else None,
             until_rate=None if progress.rate is None else progress.rate.noted(),
             phase=None,
             ends_at=None,

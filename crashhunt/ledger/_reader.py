@@ -137,10 +137,7 @@ class Noted(TypedDict, total=False):
         plain_origin: origin of the independent trials, if the sampler also draws some trials that it does not guide;
             else None.
         lag: maximum number of trials by which results reach a learning sampler late.
-        lag_grows: whether ``lag`` is shorter at the beginning of the hunt; None in hunts of earlier versions, where it
-            is constant.
-        sampler_version: version of the proposals of a learning sampler; None in hunts of earlier versions of crashhunt,
-            which have version 1.
+        sampler_version: version of the proposals of a learning sampler; None for other samplers.
         origins: whether the sampler reports the origin of each trial.
         core: whether the compiled core of the simulator is used; None if the simulator has no compiled core.
         notices: what trials test otherwise than the user's files say, such as demand that the simulator omits;
@@ -186,7 +183,6 @@ class Noted(TypedDict, total=False):
     independent: bool
     plain_origin: str | None
     lag: int | None
-    lag_grows: bool | None
     sampler_version: int | None
     origins: bool
     core: str | None

@@ -36,7 +36,6 @@ from crashhunt.simulators import HasWindow, NamesMetaActions
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from typing import TextIO
 
     import numpy as np
@@ -212,7 +211,7 @@ def _run_once(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
         (scratch / layout.JOB).write_text(json.dumps(job), encoding="utf-8")
         with (scratch / "log").open("wb") as log:
             kept = Kept(
-                _module_in(settings.code),
+                __name__,
                 [str(scratch)],
                 environment=snapshot_environment(settings),
                 apart=False,
@@ -441,12 +440,6 @@ class _Debugger(pdb.Pdb):
         """End the process without a verdict."""
         print(flush=True)
         os._exit(_LEFT_EXIT_CODE)
-
-
-def _module_in(code: Sequence[str]) -> str:
-    """Return the name of this module in the crashhunt of a snapshot, which may be an older version."""
-    of_it = next((path for folder in code if (path := Path(folder) / "crashhunt").is_dir()), None)
-    return "crashhunt.debugger" if of_it is not None and (of_it / "debugger.py").is_file() else __name__
 
 
 def main() -> None:

@@ -158,8 +158,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     settings = replace(settings, run=replace(settings.run, accelerate=settings.run.accelerate and options.accelerate))
     scenario = with_settings(snapshot.scenario(), settings)
     environment = snapshot.environment()
-    if code != "snapshot" or "load_order" in environment:  # an earlier crashhunt inside has the simulator's own order
-        scenario = with_recorded_load_order(scenario, environment.get("load_order"))
+    scenario = with_recorded_load_order(scenario, environment.get("load_order"))
     warnings += [f"{name} was {then} and is {now}" for name, (then, now) in environment_changes(environment).items()]
     warnings += filter(None, [load_order_change(scenario, environment.get("load_order"))])
     there, here = environment.get("cpu", ""), processor()

@@ -1,4 +1,4 @@
-"""The reaper of a process: it resumes what another process stops, and imports modules of old snapshots."""
+"""The reaper of a process: it resumes what another process stops, and forwards how its module ended."""
 
 from __future__ import annotations
 
@@ -36,23 +36,13 @@ def test_keeper_resumes_what_it_keeps_after_a_stop_from_outside(tmp_path):
         kept.end()
 
 
-def run_kept(folder: Path, source: str) -> int:
-    (folder / "old.py").write_text(source)
-    kept = Kept("old", environment={**os.environ, "PYTHONPATH": str(folder)}, stdin=subprocess.DEVNULL)
+def test_missing_module_of_a_snapshot_ends_its_process(tmp_path):
+    (tmp_path / "imports.py").write_text("import no_such_library\ndef main(): pass\n")
+    kept = Kept("imports", environment={**os.environ, "PYTHONPATH": str(tmp_path)}, stdin=subprocess.DEVNULL)
     try:
-        return kept.process.wait(60)
+        assert kept.process.wait(60) == 1
     finally:
         kept.end()
-
-
-def test_snapshot_of_the_first_version_runs_without_pebble(tmp_path):
-    (tmp_path / "pebble.py").write_text("raise ModuleNotFoundError('not installed', name='pebble')\n")
-    source = "from pebble import ProcessExpired, ProcessPool\ndef main():\n    raise SystemExit(7)\n"
-    assert run_kept(tmp_path, source) == 7
-
-
-def test_other_missing_module_of_a_snapshot_ends_its_process(tmp_path):
-    assert run_kept(tmp_path, "import no_such_library\ndef main(): pass\n") == 1
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])

@@ -33,8 +33,8 @@ def test_judge_names_an_unsafe_lane_change(shell):
 
 
 @pytest.mark.nightly
-def test_a_bundle_of_the_first_version_has_its_omission(shell):
-    archive = Path(__file__).parent / "bundles" / "crashhunt-0.1.0-packages.zip"
+def test_crash_of_format_version_1_has_its_omission(shell):
+    archive = Path(__file__).parent / "bundles" / "version-1.zip"
     words = ("judge", str(archive), "--runs", "1", "--why", "0", "--trust", "--json")
     (judged,) = shell.crashhunt(*words).json["judged"]
     omission = judged["reference"]["omission"]

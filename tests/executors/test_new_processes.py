@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -46,7 +47,7 @@ def started(monkeypatch):
 
     class Kept:
         def __init__(self, module, words, *, environment, stdin, stdout, stderr):
-            self.job = json.loads(stdin.read())
+            self.job = json.loads(Path(words[0]).read_text())
             self.words, self.code, self.ended, self.pid = words, None, 0, 4321
             self.process = self
             stderr.write(b"first\nlast words\n" if module == "crashhunt.executors._fresh" else b"")

@@ -204,7 +204,7 @@ def test_a_trial_that_hangs_keeps_no_one_from_learning(tmp_path):
 def test_first_results_of_a_deterministic_hunt_arrive_soon_with_any_number_of_workers(tmp_path, parallel):
     path = tmp_path / "ledger.sqlite"
     chosen = settings(deterministic=True, parallel=parallel)
-    hunt(path, chosen, random.Random(1), lag=10, lag_grows=True)
+    hunt(path, chosen, random.Random(1), lag=10)
     with closing(Ledger(path)) as ledger:
         turns = list(ledger.turns())
     last = [max((number for turn in turns[: n + 1] for number in turn.told), default=-1) for n in range(TRIALS)]
@@ -216,7 +216,7 @@ def test_first_results_of_a_deterministic_hunt_arrive_soon_with_any_number_of_wo
 def test_a_hunt_that_began_with_another_version_of_the_sampler_is_refused_before_its_next_proposal(tmp_path):
     path = tmp_path / "ledger.sqlite"
     chosen = settings(trials=20)
-    hunt(path, chosen, random.Random(1), begun_with=1)  # which is the version of one that has none
+    hunt(path, chosen, random.Random(1), begun_with=1)
     hunt(path, chosen, random.Random(1), begun_with=2)  # nothing is left to propose
     with pytest.raises(HuntDirectoryError) as refused:
         hunt(path, settings(trials=21), random.Random(1), begun_with=2)

@@ -59,7 +59,6 @@ def ends(monkeypatch):
 
     monkeypatch.setattr(_debugger, "Kept", Kept)
     monkeypatch.setattr(_debugger, "snapshot_environment", lambda settings: {})
-    monkeypatch.setattr(_debugger, "_module_in", lambda code: "module")
     monkeypatch.setattr(_debugger, "read_black_box", lambda path: [])
     monkeypatch.setattr(_debugger, "Recording", lambda records: "recording")
     return found
@@ -373,14 +372,3 @@ def test_window_follows_both_and_pauses_once_before_the_crash(monkeypatch, capsy
     assert capsys.readouterr().err == "the window was closed\n" * 2
     with pytest.raises(UsageError, match="the simulator object has no window"):
         _debugger._open_window(object(), {})
-
-
-def test_module_of_the_debugger_has_another_name_in_an_older_snapshot(tmp_path):
-    (tmp_path / "new/crashhunt").mkdir(parents=True)
-    (tmp_path / "old/crashhunt").mkdir(parents=True)
-    (tmp_path / "old/crashhunt/debugger.py").touch()
-    (tmp_path / "agent").mkdir()
-    old, new, agent = (str(tmp_path / name) for name in ("old", "new", "agent"))
-    assert _debugger._module_in([agent, old]) == "crashhunt.debugger"
-    for code in ([], [agent], [agent, new], [new, old]):
-        assert _debugger._module_in(code) == "crashhunt.replays._debugger"

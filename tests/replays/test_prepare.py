@@ -146,7 +146,7 @@ def prepared(monkeypatch, tmp_path):
 def test_replay_runs_the_code_of_the_snapshot(prepared):
     found = prepared.run(changes={"speed": "9"}, accelerate=False)
     assert prepared.asked == [
-        "verified", ("trusted", []), ("edited", "original", {"speed": "9"}, ("snapshot/code",)),
+        "verified", ("trusted", []), ("order", None), ("edited", "original", {"speed": "9"}, ("snapshot/code",)),
     ]  # fmt: skip
     assert found.warnings == ("new.py was not in the snapshot, and may make a difference", "numpy was 1 and is 2")
     worker = found.worker

@@ -159,7 +159,7 @@ def test_run_that_braking_does_not_save_is_reported(exported):
 
 
 def test_lane_change_of_the_agent_and_the_touch_are_reported(exported):
-    story = exported(FROZEN.parents[1] / "bundles" / "crashhunt-0.1.0.zip")
+    story = exported(FROZEN.parents[1] / "bundles" / "version-1.zip")
     assert "ego decided to change lanes to the left at step 40." in story.words()
     assert story.table()[-1].split()[:5] == ["40", "24.1", "13.9", "13.91", "1"]
     assert story._speeds_at_contact() == pytest.approx((13.9, 18.2), abs=0.1)
