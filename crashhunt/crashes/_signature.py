@@ -30,8 +30,6 @@ _CALLER_MODULES = (
     ("crashhunt", "episode", "_fast_path.py"),
     ("crashhunt", "episode", "_episode.py"),
     ("crashhunt", "episode", "_blame.py"),
-    ("crashhunt", "episode", "_ahead.py"),  # crashes that were saved by earlier versions name their files
-    ("crashhunt", "episode.py"),
 )
 _FRAME_LINE = re.compile(r'^\s*File "(?P<file>[^"]+)", line (?P<line>\d+),? in (?P<function>\S+)', re.MULTILINE)
 _LIBRARY_PATH = re.compile(r"(site|dist)-packages|python3\.\d+")

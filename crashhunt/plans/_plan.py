@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 # The order in which a simulator processes a scenario at load: whether it is fixed, and as it was for a recorded crash.
 #
-# ``environment.json`` of a snapshot holds it (``load_order``). Corpus cases from before version 1 lack it: it was not fixed.
+# ``environment.json`` of a snapshot holds it (``load_order``). Where it is missing, the order was not fixed.
 
 FIXED = "fixed"
 

@@ -21,7 +21,7 @@ class Environment(TypedDict):
     The entry ``git`` has the revision of each work tree. The entry ``core`` is whether the simulator's compiled core
     was used, which does not change results. The entry ``origins`` has folders of the snapshot and the user's folders
     that they copy. If results depend on an order at load, ``load_order`` is ``fixed`` or ``not fixed: REASON``.
-    Corpus cases from before format version 1 have no ``load_order``.
+    Without ``load_order``, the order was not fixed.
     """
 
     schema: int

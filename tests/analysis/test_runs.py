@@ -41,7 +41,7 @@ class Refuses:
         self.spec = spec
 
     def completed(self, timeout_s):
-        raise self.error(f"trial {self.spec.number} has only, which crashhunt 0.1.0 does not know")
+        raise self.error(f"trial {self.spec.number} has only, which this crashhunt does not know")
 
     def cancel(self, *, above=-1):
         pass

@@ -15,7 +15,7 @@ from crashhunt.crashes import find_bundle
 from crashhunt.errors import UntrustedError, UsageError
 from crashhunt.trial import Outcome
 
-FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1" / "hunt"
 
 
 @pytest.fixture

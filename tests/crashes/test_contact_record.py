@@ -20,7 +20,7 @@ from crashhunt.crashes._lanes import LaneMap
 from crashhunt.trial import Collision
 from crashhunt.world import Actor, Event, Roster, Scene
 
-FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1" / "hunt"
 ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "passenger", 5.0, 2.0)))
 PHASES = st.floats(0.02, 0.98)
 STEPS = st.sampled_from((0.1, 0.2, 0.5, 1.0))

@@ -143,7 +143,7 @@ BUNDLES = [
 def test_commands_read_of_an_earlier_ledger_what_they_did(shell, ledger):
     (shell.folder / "h").mkdir()
     shutil.copy(ledger, shell.folder / "h" / "ledger.sqlite")
-    settings = (TESTS / "e2e" / "frozen" / "0.1.0-packages" / "hunt" / "hunt.toml").read_text(encoding="utf-8")
+    settings = (TESTS / "e2e" / "frozen" / "version-1" / "hunt" / "hunt.toml").read_text(encoding="utf-8")
     settings = settings.replace("\nseed = 1\n", "\nseed = 5\n").replace("\ntrials = 4\n", "\ntrials = 12\n")
     (shell.folder / "h" / "hunt.toml").write_text(settings, encoding="utf-8")
     found = {}

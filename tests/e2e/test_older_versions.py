@@ -1,6 +1,6 @@
 """What an older crashhunt has left is read, shown, replayed and gone on with.
 
-Every version that is released leaves some of it here, which ``frozen/make.sh .venv/bin/crashhunt VERSION`` makes; it is
+Every version of the formats leaves some of it here, which ``frozen/make.sh .venv/bin/crashhunt version-N`` makes; it is
 never made anew.
 """
 
@@ -16,11 +16,7 @@ import pytest
 
 BUNDLES = sorted((Path(__file__).parent / "bundles").glob("*.zip"))
 SAME_TRAFFIC = version("libsumo") == "1.28.0"  # which recorded them; another one may compute other traffic
-bundles = pytest.mark.parametrize(
-    "bundle",  # by day, one of the two of a version
-    [pytest.param(str(path), marks=[pytest.mark.nightly] * path.stem.endswith("-packages")) for path in BUNDLES],
-    ids=[path.stem for path in BUNDLES],
-)
+bundles = pytest.mark.parametrize("bundle", list(map(str, BUNDLES)), ids=[path.stem for path in BUNDLES])
 FROZEN = Path(__file__).parent / "frozen"
 HUNTS = sorted(path.parent for path in FROZEN.glob("*/hunt"))
 hunts = pytest.mark.parametrize("place", HUNTS, ids=[path.name for path in HUNTS])

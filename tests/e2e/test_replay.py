@@ -181,7 +181,7 @@ def test_a_crash_keeps_the_order_of_links_that_it_was_recorded_with(crash_on_sum
     monkeypatch.setattr("crashhunt.native._link_order._load_library", lambda: None)
     warning = "the order of SUMO's links was fixed and is not fixed: the library is not built"
     assert prepared("current", load_order="fixed") == (None, (warning,))
-    del environment["load_order"]  # as in a corpus case from before format version 1
+    del environment["load_order"]
     assert prepared("current") == (False, ())
     same = crash.crashhunt("replay", "h", "--code", "current", "--json").json
     assert (same["verdict"], same["warnings"]) == ("reproduced", [])

@@ -30,7 +30,7 @@ def hunt(toy, made_once, monkeypatch):
 
 def test_a_crash_becomes_smaller_and_replays(shell):
     """A crash that an older version recorded, so that no hunt is needed."""
-    shutil.copytree(Path(__file__).parent / "frozen" / "0.1.0-packages" / "hunt", shell.folder / "h")
+    shutil.copytree(Path(__file__).parent / "frozen" / "version-1" / "hunt", shell.folder / "h")
     words = ("--crash", "0", "--trust", "--budget", "12", "--parallel", "1")
     told = shell.crashhunt("shrink", "h", *words, "--json").json
     assert (told["verdict"], told["confirmed"], told["signature_kept"]) == ("shrunk", True, True)

@@ -23,7 +23,7 @@ from crashhunt.ledger import Ledger, Turn
 from crashhunt.results._state import ledger_owner
 from crashhunt.trial import Outcome
 
-FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1" / "hunt"
 CRASH = "000000-collision"
 
 

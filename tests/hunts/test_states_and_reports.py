@@ -31,7 +31,7 @@ from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.statistics import CountingRule, RateWatch
 from crashhunt.trial import KILLED, Branches, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
 
-FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1" / "hunt"
 
 
 @pytest.fixture

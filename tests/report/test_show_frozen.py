@@ -13,7 +13,7 @@ from crashhunt.crashes import find_bundle, open_archive
 from crashhunt.report._crash_text import Story, _steps_around, _thinned
 from crashhunt.report._page import _crash
 
-FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages"
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1"
 TABLE = """\
                                                        braking
      time  ego target_  lane_ leader  gap closing  TTC  needed          from

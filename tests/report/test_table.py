@@ -10,7 +10,7 @@ from crashhunt.crashes import find_bundle
 from crashhunt.errors import UsageError
 from crashhunt.report._step_table import NEAREST, aligned, check_fields, format_table, stacked, steps_table
 
-FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1" / "hunt"
 
 
 def test_words_of_a_heading_stand_at_its_bottom():

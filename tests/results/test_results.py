@@ -16,7 +16,7 @@ from crashhunt.errors import HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.results import FACTS, HuntResults, IncompleteHuntWarning, SuiteResults, load
 
-FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1" / "hunt"
 
 
 @pytest.fixture

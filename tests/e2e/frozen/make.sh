@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Makes what tests/e2e/test_older_versions.py reads of a version, with the crashhunt that is given:
 #   tests/e2e/frozen/make.sh .venv/bin/crashhunt NAME
-# NAME is the version, with a word where there is one of it already. Nothing that is here is ever made anew.
+# NAME is version-N, by the version of the formats. Nothing that is here is ever made anew.
 set -euo pipefail
 crashhunt=$(realpath "$1")
 here=$(realpath "$(dirname "$0")")
@@ -29,7 +29,7 @@ class Planner:
         return self.speed, 1 if self.steps % 40 == 0 and observation[0, 2] > 1.6 else 0
 END
 "$crashhunt" run sumo 1 40 800 --scenario loop --agent planner:Planner --arg speed=12:20 --seed 3
-"$crashhunt" export sumo "$here/../bundles/crashhunt-$name.zip"
+"$crashhunt" export sumo "$here/../bundles/$name.zip"
 
 # A highway-env crash and a software fault of the toy's, without code: today's drives.
 "$crashhunt" run highway 1 40 100 --scenario highway --no-snapshot --seed 3
@@ -42,4 +42,4 @@ cp -r "$here/toy" .
 "$crashhunt" run hunt 1 4 60 --scenario toy --no-snapshot --seed 1 --keep-going
 cp -r hunt "$place/hunt"
 rm -f "$place/hunt/.lock"
-du -sh "$place" "$here/../bundles/crashhunt-$name.zip"
+du -sh "$place" "$here/../bundles/$name.zip"
