@@ -181,12 +181,12 @@ def _write_function(kind: Any) -> _Convert:
         names |= {
             f"to_{key}": convert,
             f"if_{key}": metadata.get("written_if"),
-            f"no_{key}": key in known and _default(known[key]),
+            f"no_{key}": key in known and default_of(known[key]),
         }
         if "written_if" in metadata:
             condition = f"if if_{key}(value): "
         elif "omit_default" in metadata:
-            names[f"no_{key}"] = _default(known[key])
+            names[f"no_{key}"] = default_of(known[key])
             condition = f"if value.{key} != no_{key}: "
         elif is_optional:
             condition = f"if value.{path} is not None: "
@@ -199,7 +199,8 @@ def _write_function(kind: Any) -> _Convert:
     return cast(_Convert, names["write"])
 
 
-def _default(item: Field[object]) -> object:
+def default_of(item: Field[object]) -> object:
+    """Return the default value of a dataclass field; ``MISSING`` if it has none."""
     return item.default_factory() if item.default_factory is not MISSING else item.default
 
 

@@ -47,7 +47,18 @@ def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -
     return Braking(driver, simulator, overruled.agent, overruled.after, overruled.manoeuvre)
 
 
-class Braking:
+class _Override:
+    """An agent in the place of another agent, the driver, with which it is closed."""
+
+    _driver: Agent
+
+    def close(self) -> None:
+        """Close the agent."""
+        if supports(self._driver, Closes):
+            self._driver.close()
+
+
+class Braking(_Override):
     """Lets an agent drive up to a step. After this step, the vehicle brakes as hard as it can, or changes lanes.
 
     Args:
@@ -82,13 +93,8 @@ class Braking:
             return self._first
         return self._driver.act(observation) if step < self._after else self._action
 
-    def close(self) -> None:
-        """Close the agent."""
-        if supports(self._driver, Closes):
-            self._driver.close()
 
-
-class Keeping:
+class Keeping(_Override):
     """Lets an agent drive, and after a step prevents lane changes or speed changes of its vehicle.
 
     Args:
@@ -127,11 +133,6 @@ class Keeping:
         action = self._driver.act(observation)
         return action if step < self._after else self._kept(action)
 
-    def close(self) -> None:
-        """Close the agent."""
-        if supports(self._driver, Closes):
-            self._driver.close()
-
     def _kept(self, action: object) -> object:
         encoded = self._form.encode(action)
         if self._idle is None:
@@ -143,7 +144,7 @@ class Keeping:
         return self._idle if word in (_LANE_ACTIONS if self._stays else _SPEED_ACTIONS) else action
 
 
-class HandedOver:
+class HandedOver(_Override):
     """Repeats the recorded actions of a vehicle up to a step, and lets its agent act after that.
 
     The agent is created before the first step, as in every trial. The agent is reset after the last recorded action,
@@ -173,11 +174,6 @@ class HandedOver:
         if step == self._after:
             self._driver.reset(self._seed)
         return self._driver.act(observation)
-
-    def close(self) -> None:
-        """Close the agent."""
-        if supports(self._driver, Closes):
-            self._driver.close()
 
 
 def _idle(form: ActionForm) -> int | None:
@@ -240,7 +236,7 @@ class _Response:
         }  # fmt: skip
 
 
-class ReferenceDriver:
+class ReferenceDriver(_Override):
     """Lets an agent drive, and after a step corrects its unsafe speeds, lane changes, or both.
 
     Args:
@@ -312,11 +308,6 @@ class ReferenceDriver:
         if (target, change) == tuple(encoded.tolist()):
             return action
         return float(target), int(change)
-
-    def close(self) -> None:
-        """Close the agent."""
-        if supports(self._driver, Closes):
-            self._driver.close()
 
     def _meta(self, step: int, action: object, word: str, around: Surroundings) -> object:
         speed = around.speed_mps

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -13,6 +13,7 @@ from crashhunt.base.codec import (
     ESSENTIAL,
     OMIT_DEFAULT,
     Serializable,
+    default_of,
     from_plain,
     merged,
     not_understood,
@@ -139,14 +140,10 @@ def _asked(value: object) -> Any:
     """Return plain data in which a dataclass contains only the fields that differ from their defaults."""
     if is_dataclass(value):
         pairs = ((item, getattr(value, item.name)) for item in fields(value))
-        return {item.name: _asked(held) for item, held in pairs if held != _default(item)}
+        return {item.name: _asked(held) for item, held in pairs if held != default_of(item)}
     if isinstance(value, dict):
         return {name: _asked(held) for name, held in value.items()}
     return [_asked(held) for held in value] if isinstance(value, list | tuple) else value
-
-
-def _default(item: Field[object]) -> object:
-    return item.default_factory() if item.default_factory is not MISSING else item.default
 
 
 def scratch_of(scratch: Path, number: int) -> Path:
