@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.disturbances import DisturbanceSampler
+    from crashhunt.episode import ObservedEpisode
     from crashhunt.scenario import Scenario
     from crashhunt.simulators import Simulator
     from crashhunt.trial import Disturbance, Kind, Value
@@ -231,7 +232,7 @@ class _Trail(Observer):
         self.scenes: deque[Scene] = deque(maxlen=length)
         self.disturbances: list[Disturbance] = []
 
-    def begin(self, episode: Episode) -> None:
+    def begin(self, episode: ObservedEpisode) -> None:
         self.disturbances.clear()
 
     def disturbance(self, disturbance: Disturbance) -> None:

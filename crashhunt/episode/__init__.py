@@ -15,16 +15,13 @@ if TYPE_CHECKING:
     from ._blame import has_users_code as has_users_code, internal_error as internal_error
     from ._branches import Brancher as Brancher
     from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
-    from ._failures import (
-        are_functions_replaced as are_functions_replaced,
-        failure_of as failure_of,
-        message_of_error as message_of_error,
-    )
+    from ._failures import are_functions_replaced as are_functions_replaced, failure_of as failure_of
     from ._fast_path import FastEpisode as FastEpisode
     from ._forced_onsets import OnsetForcer as OnsetForcer
     from ._forks import FirstCopy as FirstCopy, ForkRunner as ForkRunner
     from ._observers import (
         Nearness as Nearness,
+        ObservedEpisode as ObservedEpisode,
         Observer as Observer,
         Recorder as Recorder,
         observation_restorers as observation_restorers,

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.episode._episode import Episode
+    from crashhunt.episode._observers import ObservedEpisode
     from crashhunt.trial import TrialResult
     from crashhunt.world import Frame, Scene
 
@@ -114,7 +115,7 @@ class Brancher(Observer):
         self._disturber: DisturbanceSampler | None = None
         self._any = False  # whether there might have been any
 
-    def begin(self, episode: Episode) -> None:
+    def begin(self, episode: ObservedEpisode) -> None:
         """Begin the next episode, and compute the number of steps per second."""
         self._second = steps_of(1.0, episode.simulator.step_length_s)
         self._frames: deque[Frame] = deque(maxlen=_WINDOW_S * self._second + 1)

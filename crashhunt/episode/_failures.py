@@ -65,7 +65,7 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str 
     with blocked_signals(), _deep_enough():
         # crashhunt's own messages are complete, so they need no traceback.
         text = "" if issubclass(type(error), InvalidEpisodeError | UnusableValueError) else format_error(error)
-        words = message_of_error(error)
+        words = message_of(error)
         # A class of a user's may have a metaclass of any kind, so nothing is looked up by it.
         kind = next((kind for one, kind in _PARTY_BY_ERROR if type(error) is one), None) or class_name(error)
     message = words if issubclass(type(error), EpisodeError) else " ".join(words.split())
@@ -112,11 +112,6 @@ def restore_modules() -> None:
     if is_emptied() and _originals:
         sys.modules.update(_originals[0].modules)
         _originals[0].was_emptied = True
-
-
-def message_of_error(error: BaseException) -> str:
-    """Return the message of an exception, even if its class fails to produce it; a long message is cut."""
-    return message_of(error)
 
 
 def close_agent(agent: Agent) -> None:

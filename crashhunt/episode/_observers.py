@@ -10,7 +10,7 @@ import struct
 from collections import Counter
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.episode._episode import Episode
+    from crashhunt.agents import Agent
     from crashhunt.native import UsualSteps
     from crashhunt.simulators import ActionForm, Options, Simulator
     from crashhunt.trial import Disturbance, TrialResult, TrialSpec
@@ -59,6 +59,16 @@ if TYPE_CHECKING:
 # Observers of a running episode, which never change it.
 
 
+class ObservedEpisode(Protocol):
+    """The part of an `Episode` that its observers may use."""
+
+    simulator: Simulator
+    names: tuple[str, ...]
+    agents: dict[str, Agent]
+    steps: int
+    setup_steps: int | None
+
+
 class Observer:
     """Observes an episode; override the hooks that you need. Hooks that are not overridden cost nothing.
 
@@ -66,7 +76,7 @@ class Observer:
     like every error that is neither the agent's nor the simulator's.
     """
 
-    def begin(self, episode: Episode) -> None:
+    def begin(self, episode: ObservedEpisode) -> None:
         """Called after the simulator's reset, when `Episode.names` contains all actors and no agent exists yet."""
 
     def making(self, number: int) -> None:
@@ -196,7 +206,7 @@ class Nearness(Observer):
         self._measure()
         return self._meter.closest
 
-    def begin(self, episode: Episode) -> None:
+    def begin(self, episode: ObservedEpisode) -> None:
         """Register the controlled vehicles."""
         self._meter = ApproachMeter(episode.names)
         self._simulator = episode.simulator
@@ -274,7 +284,7 @@ class Recorder(Observer):
             self._note_roster(roster)
         self._box.lend(steps, roster)
 
-    def begin(self, episode: Episode) -> None:
+    def begin(self, episode: ObservedEpisode) -> None:
         """Record the actors of the episode."""
         simulator = episode.simulator
         columns = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()

@@ -21,12 +21,13 @@ from typing import TYPE_CHECKING, Final, NoReturn, TypedDict, cast
 from crashhunt.base import forks
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import DISK, CrashhuntError
+from crashhunt.base.exceptions import message_of
 from crashhunt.base.forks import ended
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.processes import adopt_orphans, children_of, die_with, end_descendants, kill
 from crashhunt.base.resources import FREE, free_memory, limit_behind
 from crashhunt.base.temporary import SharedMemoryWatch
-from crashhunt.episode import Parts, generators, message_of_error, options_of, seed_everything, set_generators, stage_of
+from crashhunt.episode import Parts, generators, options_of, seed_everything, set_generators, stage_of
 from crashhunt.executors._rehearsal import rehearse_trial
 from crashhunt.executors._trial_process import TrialProcess
 from crashhunt.simulators import CountsSetUp
@@ -511,5 +512,5 @@ def _why_not(error: BaseException) -> FromZygote:
     full = isinstance(error, OSError) and error.errno in DISK
     fix = limit_behind(error) or ("free some space" if full else "see to what it needs")
     fix = f"{fix}, and run the same command again"
-    said = f"{type(error).__name__}: {message_of_error(error)}"
+    said = f"{type(error).__name__}: {message_of(error)}"
     return {"error": CrashhuntError(f"the simulator cannot be made: {said}", fix=fix).to_json()["error"]}

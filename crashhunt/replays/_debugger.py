@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from crashhunt.agents import Agent
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.json_types import ErrorData
-    from crashhunt.episode import Episode
+    from crashhunt.episode import ObservedEpisode
     from crashhunt.replays._prepare import Look, Rerun
     from crashhunt.simulators import Simulator
     from crashhunt.world import Scene
@@ -258,7 +258,7 @@ class _Stop(Observer):
         self._step = step
         self.backwards: Backwards | None = None
 
-    def begin(self, episode: Episode) -> None:
+    def begin(self, episode: ObservedEpisode) -> None:
         self._episode = episode
 
     def stop_at(self, step: int) -> None:
@@ -323,7 +323,7 @@ class _Panels(Observer):
         self._first = first
         self._folder = folder
 
-    def begin(self, episode: Episode) -> None:
+    def begin(self, episode: ObservedEpisode) -> None:
         self._episode = episode
         for name in episode.names:
             space = episode.simulator.actions[name].space
@@ -385,7 +385,7 @@ class _Window(Observer):
         self._job = job
         simulator.open_window()
 
-    def begin(self, episode: Episode) -> None:
+    def begin(self, episode: ObservedEpisode) -> None:
         self._follow()
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:

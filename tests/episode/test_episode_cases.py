@@ -11,7 +11,8 @@ import pytest
 from gymnasium import spaces
 
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
-from crashhunt.episode import Braking, message_of_error, overruled_agent, run_episode
+from crashhunt.base.exceptions import message_of
+from crashhunt.episode import Braking, overruled_agent, run_episode
 from crashhunt.oracles import Finding, OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Phase, Recording, Tag, digest_of, read_black_box, read_header
 from crashhunt.simulators import FullBraking, MetaAction, SpeedAndLaneChange
@@ -441,8 +442,8 @@ def test_a_message_that_cannot_be_had_is_no_obstacle(run):
         def __str__(self):
             raise ValueError("not even this")
 
-    assert message_of_error(Silent()) == "(its message cannot be had: ValueError)"
-    assert message_of_error(KeyError("x")) == "'x'"
+    assert message_of(Silent()) == "(its message cannot be had: ValueError)"
+    assert message_of(KeyError("x")) == "'x'"
     result = run(drivers={"ego": Driver({1: RuntimeError("two\n  lines")})})
     assert result.failure.message == "two lines"
 
