@@ -93,6 +93,12 @@ def _signed(value: float, *, percent: bool) -> str:
     return text if float(text.rstrip("%")) or not value else f"{100 * value:+.1g}%"
 
 
+def log_of_sum(logs: NDArray[np.float64]) -> float:
+    """Return the logarithm of the sum of numbers that are given by their logarithms."""
+    top = float(logs.max())
+    return top + math.log(float(np.exp(logs - top).sum()))
+
+
 class Bets:
     """The bets against each possible rate, fixed before the first unit.
 
@@ -133,15 +139,11 @@ class Bets:
         won = log_capitals > 0
         if not won.any():
             return -math.inf
-        logs = (self._log_weights + log_capitals)[won]
-        top = float(logs.max())
-        return top + math.log(float(np.exp(logs - top).sum()))
+        return log_of_sum((self._log_weights + log_capitals)[won])
 
     def log_mixture(self, log_capitals: NDArray[np.float64]) -> float:
         """Return the logarithm of the sum of all components, which is the martingale."""
-        logs = self._log_weights + log_capitals
-        top = float(logs.max())
-        return top + math.log(float(np.exp(logs - top).sum()))
+        return log_of_sum(self._log_weights + log_capitals)
 
 
 class RateTest:

@@ -30,7 +30,7 @@ from crashhunt.training import held_out_traffics
 from crashhunt.trial import Choice, Range
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
@@ -88,12 +88,8 @@ def measure_rates(
         divide = _division(by, hunt, settings, facts)
         sequence = UnitSequence(rule)
         units: list[Unit] = []
-        bar_of_hunt = facts.get("until_rate")
-        decided = bar_of_hunt["decided_at"] if bar_of_hunt else None
-        for data in ledger.plain_results():
-            if decided is None or data["spec"]["number"] <= decided:
-                trial = facts_of_plain(data, settings.crash_on, (divide.tag(data),))
-                units += sequence.add(trial)
+        for data in _until_decision(ledger.plain_results(), facts):
+            units += sequence.add(facts_of_plain(data, settings.crash_on, (divide.tag(data),)))
     against = why_no_interval(settings, facts)
     open_end = _why_no_estimate(settings, facts, sequence)
     found = []
@@ -174,16 +170,20 @@ def rate_of_trials(
     """
     rule = counting_rule(settings, facts, held_out)
     sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")
-    bar_of_hunt = facts.get("until_rate")
-    decided = bar_of_hunt["decided_at"] if bar_of_hunt else None
-    for data in trials:
-        if decided is None or data["spec"]["number"] <= decided:
-            for unit in sequence.add(facts_of_plain(data, settings.crash_on)):
-                counter.add(unit)
+    for data in _until_decision(trials, facts):
+        for unit in sequence.add(facts_of_plain(data, settings.crash_on)):
+            counter.add(unit)
     return make_rate(
         str(directory), "trial", counter, sequence, confidence=confidence,
         why_no_interval=why_no_interval(settings, facts), why_no_estimate=_why_no_estimate(settings, facts, sequence),
     )  # fmt: skip
+
+
+def _until_decision(trials: Iterable[JsonObject], facts: Facts) -> Iterator[JsonObject]:
+    """Return the trials up to the one that decided about the threshold of the hunt; all if none has decided."""
+    bar = facts.get("until_rate")
+    decided = bar["decided_at"] if bar else None
+    return (data for data in trials if decided is None or data["spec"]["number"] <= decided)
 
 
 def _why_no_estimate(settings: HuntSettings, facts: Facts, sequence: UnitSequence) -> str:

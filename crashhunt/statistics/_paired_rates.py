@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.statistics._anytime_interval import Interval, RateTest
+from crashhunt.statistics._anytime_interval import Interval, RateTest, log_of_sum
 from crashhunt.statistics._paired_test import failures_of
 from crashhunt.statistics._units import exposure_of
 
@@ -126,9 +126,7 @@ def _end_at(rate: float, first: _Side, second: _Side, alpha: float) -> float:
 
     def is_excluded(difference: float) -> bool:
         bets = np.log1p(-np.outer(_SHARES, (known - difference * exposure) / bound)).sum(axis=1)
-        logs = bets + _LOG_WEIGHTS + lost.sum() * np.log1p(-_SHARES)
-        top = float(logs.max())
-        return top + math.log(float(np.exp(logs - top).sum())) >= -math.log(alpha)
+        return log_of_sum(bets + _LOG_WEIGHTS + lost.sum() * np.log1p(-_SHARES)) >= -math.log(alpha)
 
     inside = max(float(known.sum()) / max(float(exposure.sum()), 1e-300), -rate)  # no rate is negative
     step = bound / max(float(exposure.sum()), 1e-300)

@@ -47,7 +47,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from crashhunt.statistics._anytime_interval import Interval
+from crashhunt.statistics._anytime_interval import Interval, log_of_sum
 from crashhunt.statistics._units import MAX_INVALID_SHARE, has_too_many_invalid
 
 if TYPE_CHECKING:
@@ -94,7 +94,6 @@ class PairSequence:
     ) -> None:
         self._rules, self._is_same = rules, is_same
         self._waiting: tuple[dict[int, TrialFacts], dict[int, TrialFacts]] = ({}, {})
-        self._complete: dict[int, Pair] = {}
         self._next = max(rule.first for rule in rules)  # trial, or traffic
         self._traffics = rules[0].traffics
         self.rounds = min(rule.trials_per_unit for rule in rules) if self._traffics else 1
@@ -326,8 +325,7 @@ class PairTest:
             np.log1p(-np.outer(_SHARES, side - sign * difference) / (1 - sign * difference)) @ times + _LOG_WEIGHTS
             for sign, side in ((1, ends[:, 1]), (-1, -ends[:, 0]))
         ])  # fmt: skip
-        top = float(logs.max())
-        return top + math.log(float(np.exp(logs - top).sum()))
+        return log_of_sum(logs)
 
     def _end(self, inside: float, outside: float, alpha: float) -> float:
         """Return the end of the interval between the observed mean and the greatest or the least difference."""

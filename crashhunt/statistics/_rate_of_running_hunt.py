@@ -121,10 +121,6 @@ def rate_watch(settings: HuntSettings, ledger: Ledger, held_out: HeldOutTraffics
             has_ended=not was_killed,
             valid=outcome != Outcome.INVALID,
             crashed=outcome in settings.crash_on,
-            steps=0,
-            driven_s=None,
-            driven_m=None,
-            step_length_s=None,
             origin=origin,
             seed=seed,
         )

@@ -65,11 +65,11 @@ class TrialFacts(NamedTuple):
     has_ended: bool
     valid: bool
     crashed: bool
-    steps: int
-    driven_s: float | None
-    driven_m: float | None
-    step_length_s: float | None
-    origin: str
+    steps: int = 0
+    driven_s: float | None = None
+    driven_m: float | None = None
+    step_length_s: float | None = None
+    origin: str = ""
     tags: tuple[str, ...] = ()
     seed: int = 0
     failure: Failure | None = None
@@ -297,7 +297,6 @@ class RateCounter:
         self._rule, self._per = rule, per
         self._within, self._matches = within, matches
         self.test: RateTest | None = None
-        self._early = 0  # units with a crash before the step length was known
         self.units = self.trials = self.crashes = self.steps = 0
         self.driven_s = self.driven_m = 0.0
         self.is_measured = per == "trial"  # whether the exposure of any trial is known
