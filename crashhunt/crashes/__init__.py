@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from ._archive import Archive as Archive, export_crash as export_crash, open_archive as open_archive
     from ._bundle import (
         Bundle as Bundle,
-        CrashData as CrashData,
         CrashSummary as CrashSummary,
         as_stored as as_stored,
         authenticate_bundle as authenticate_bundle,

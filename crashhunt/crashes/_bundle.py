@@ -52,55 +52,7 @@ if TYPE_CHECKING:
     from crashhunt.world import Lane
 
 
-# The shapes of what a crash consists of on disk: ``crash.json``, and the index of an archive.
-#
-# What a later version has added may be there as well.
-
-
-class Protected(TypedDict):
-    """The keys that protect a JSON file: the digests of the file itself and of the other files in its folder."""
-
-    schema: int
-    files: dict[str, FileEntry]
-    integrity: NotRequired[str]
-
-
-class CrashData(Protected):
-    """The contents of ``crash.json``."""
-
-    id: str
-    hunt_seed: int
-    trial: int
-    seed: int
-    max_steps: int
-    arguments: Mapping[str, Mapping[str, Value]]
-    scenario_arguments: Mapping[str, Value]
-    outcome: str
-    category: NotRequired[str]
-    summary: str
-    step: int
-    sim_time_s: float
-    collision: JsonObject | None
-    failure: JsonObject | None
-    escape: NotRequired[JsonObject | None]
-    event: NotRequired[JsonObject | None]
-    events: NotRequired[dict[str, int] | None]
-    closest_approach: JsonObject
-    digest: str
-    snapshot: str
-    versions: dict[str, str]
-    confirmed: bool | None
-    divergence: JsonObject | None
-    disturbed: NotRequired[bool]
-    log_likelihood: NotRequired[float | None]
-    danger: NotRequired[float | None]
-    disturbances: NotRequired[list[JsonObject]]
-    planned_disturbances: NotRequired[list[JsonObject]]
-    only: NotRequired[list[str] | None]
-    script: NotRequired[JsonObject | None]
-    why_unconfirmed: NotRequired[str]
-    why_no_escape: NotRequired[str]
-    authentication_code: NotRequired[str]
+# The shapes of a crash for other programs, and of the index of an archive.
 
 
 class CrashSummary(TypedDict):
@@ -136,7 +88,7 @@ class ArchiveIndex(TypedDict):
 # The other files of a bundle, next to ``crash.json``, or next to ``params.json`` of a trial kept for another reason.
 
 
-def refuse_damaged(data: Protected) -> None:
+def refuse_damaged(data: JsonObject) -> None:
     """Raise an error if the description of a crash has changed since it was written.
 
     Raises:
@@ -156,7 +108,7 @@ def files_of(folder: Path) -> dict[str, FileEntry]:
     """Return the recorded size and digest of each file of a crash or kept trial; empty if the record cannot be read."""
     for name in (layout.CRASH, layout.PARAMS):
         with suppress(OSError, ValueError):
-            data = read_object(folder / name, Protected)
+            data: JsonObject = read_object(folder / name, dict)
             refuse_damaged(data)
             return dict(data["files"])
     return {}
@@ -173,7 +125,7 @@ def describe_other_files(folder: Path) -> dict[str, FileEntry]:
 def read_params(folder: Path) -> list[str]:
     """Return the names of a trial's saved files that have changed since they were written."""
     try:
-        data = read_object(folder / layout.PARAMS, Protected)
+        data: JsonObject = read_object(folder / layout.PARAMS, dict)
         refuse_damaged(data)
         return [
             f"{name} {wrong}" for name, entry in data["files"].items() if (wrong := changed_file(folder / name, entry))
@@ -215,9 +167,12 @@ _TYPES: Plain = {
     "script": dict | None,
     "authentication_code": str,
 }
-_KEYS = CrashData.__required_keys__ | CrashData.__optional_keys__
 _PARTS: Mapping[str, type] = {
     "collision": Collision, "failure": Failure, "escape": Escape, "event": Event, "closest_approach": ClosestApproach,
+}  # fmt: skip
+_KEYS = {
+    *_REQUIRED_KEYS, *_TYPES, *_PARTS, "schema", "id", "category", "summary", "events", "versions", "files",
+    "integrity", "disturbances", "planned_disturbances",
 }  # fmt: skip
 _DAMAGE_FIX = "get an undamaged copy, or run crashhunt check to see what can be recovered"
 
@@ -339,7 +294,7 @@ class Bundle:
         result = self.result
         plain = result.to_json()
         spec = plain["spec"]
-        data: CrashData = {
+        data: JsonObject = {
             "schema": SCHEMA,
             "id": self.id,
             "hunt_seed": self.hunt_seed,
@@ -398,7 +353,7 @@ def read_bundle(path: Path) -> Bundle:
     """
     file = path / layout.CRASH
     try:
-        data = read_object(file, CrashData)
+        data: JsonObject = read_object(file, dict)
         typed(data, {"schema": int})
         if 1 < data["schema"] <= _MAX_OLDER_SCHEMA or (data["schema"] == SCHEMA and "integrity" not in data):
             raise BundleError("the crash is older than format version 1", fix=HOW_TO_READ, where=str(file))
@@ -434,7 +389,7 @@ def as_stored(bundle: Bundle) -> Bundle:
     return stored if is_same else bundle
 
 
-def _bundle(path: Path, data: CrashData) -> Bundle:
+def _bundle(path: Path, data: JsonObject) -> Bundle:
     typed(data, _REQUIRED_KEYS)
     typed_where_there(data, _TYPES)
     hit, failure, event, escape = data.get("collision"), data.get("failure"), data.get("event"), data.get("escape")
@@ -489,7 +444,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
     )
 
 
-def _added(data: CrashData) -> dict[str, object]:
+def _added(data: JsonObject) -> dict[str, object]:
     """Return the JSON keys that a later version of crashhunt added to the crash and its parts."""
     added: dict[str, object] = {name: value for name, value in data.items() if name not in _KEYS}
     for name, kind in _PARTS.items():
@@ -534,11 +489,7 @@ def _statement(bundle: Bundle) -> dict[str, object]:
     """Return everything in a bundle that determines what runs, and the recording's digest, as text to authenticate."""
     spec = bundle.result.spec.to_json()
     return {
-        "number": spec["number"],
-        "seed": spec["seed"],
-        "max_steps": spec["max_steps"],
-        "arguments": spec["arguments"],
-        "scenario_arguments": spec["scenario_arguments"],
+        **{name: spec[name] for name in ("number", "seed", "max_steps", "arguments", "scenario_arguments")},
         "disturbances": spec.get("disturbances") or [],
         "only": spec.get("only"),
         "script": spec.get("script"),

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from crashhunt.base.codec import Serializable
+from crashhunt.base.codec import Serializable, typed_where_there
 from crashhunt.base.integrity import typed
-from crashhunt.crashes._last_avoidable_step import Ending
+from crashhunt.crashes._last_avoidable_step import Ending, last_avoiding
 from crashhunt.crashes._omission import Reference, Without as Without
 from crashhunt.trial import Value
 
@@ -117,32 +117,6 @@ class Why(Serializable):
         return sum(len(factor.runs) for factor in self.factors)
 
 
-def why_from(data: Any) -> Why | None:
-    """Return the `Why` that `Why.to_json` converted to data; None if there is no data.
-
-    Raises:
-        ValueError, KeyError, TypeError: the data is damaged.
-    """
-    if data is None:
-        return None
-    factors = [
-        Factor(
-            kind=str(each["kind"]), name=str(each["name"]), what=str(each["what"]), step=each["step"], was=each["was"],
-            runs=tuple(
-                LeftOut(
-                    given=run["given"],
-                    ending=run["ending"],
-                    into=str(run["into"]),
-                    changed=tuple(map(str, run.get("changed", ()))),
-                )
-                for run in each["runs"]
-            ),
-        )
-        for each in data["factors"]
-    ]  # fmt: skip
-    return Why(factors=tuple(factors), steps=int(data["steps"]), left=int(data["left"]), why_not=str(data["why_not"]))
-
-
 def wilson(found: int, of: int) -> tuple[float, float]:
     """Return the 95 % confidence interval of a proportion by Wilson's method.
 
@@ -200,7 +174,7 @@ class Attempt(Serializable):
     @property
     def last_step(self) -> int | None:
         """The last step from which a run avoided the crash; None if no run avoided it."""
-        return max((step for step, ending in self.endings.items() if ending == "avoided"), default=None)
+        return last_avoiding(self.endings)
 
     @property
     def too_late_step(self) -> int | None:
@@ -298,29 +272,15 @@ def judgement_of(bundle: Bundle) -> Judgement | None:
     """Return the stored result of `judge` for a bundle; None if it is missing or cannot be read."""
     data: Any = bundle.added.get(_CRASH_JSON_KEY)
     try:
+        typed_where_there(
+            data, {"visible_step": int | None, "why_not": str, "why": dict | None, "reference": dict | None}
+        )
         attempts = []
         for each in data["attempts"]:
             typed(each, {"manoeuvre": str, "endings": dict[str, str], "deceleration": float | None})
-            endings: dict[int, Ending] = {int(step): ending for step, ending in each["endings"].items()}
-            attempts.append(
-                Attempt(
-                    manoeuvre=each["manoeuvre"],
-                    end=bundle.result.steps,
-                    endings=endings,
-                    deceleration=each["deceleration"],
-                    changed=tuple(map(str, each.get("changed", ()))),
-                )
-            )
-        visible = data.get("visible_step")
-        seen = int(visible) if visible is not None else None
-        reference = data.get("reference")
-        return Judgement(
-            attempts=tuple(attempts),
-            why_not=str(data.get("why_not", "")),
-            why=why_from(data.get("why")),
-            visible_step=seen,
-            reference=Reference.from_json(reference) if reference is not None else None,
-        )
+            endings = {int(step): ending for step, ending in each["endings"].items()}
+            attempts.append({**each, "end": bundle.result.steps, "endings": endings})
+        return Judgement.from_json({**data, "attempts": attempts})
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
 

@@ -37,7 +37,6 @@ class _Place:
     """The position of a point relative to a lane."""
 
     aside_m: float  # to the left of the centre line
-    along_m: float  # from the beginning
     heading: float  # of the lane there
     inside: bool  # between its beginning and its end
 
@@ -72,7 +71,6 @@ class _Lane:
         inside = _END_M < driven < self._starts[-1] - _END_M
         return _Place(
             aside_m=math.copysign(float(away[nearest]), aside),
-            along_m=driven,
             heading=math.atan2(dy, dx),
             inside=inside,
         )

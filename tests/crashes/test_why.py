@@ -7,7 +7,7 @@ import json
 import pytest
 
 from crashhunt.crashes import Factor, LeftOut, Why
-from crashhunt.crashes._judgement import why_from, wilson
+from crashhunt.crashes._judgement import wilson
 
 
 def factor(*endings):
@@ -46,5 +46,4 @@ def test_the_interval_is_wilsons(found, of, interval):
 def test_it_comes_back_from_json():
     why = Why((factor("none", "same"), Factor("seed", "seed", "drawn", was=3)), 20, 4, "it was interrupted")
     assert why.runs == 2
-    assert why_from(json.loads(json.dumps(why.to_json()))) == why
-    assert why_from(None) is None
+    assert Why.from_json(json.loads(json.dumps(why.to_json()))) == why
