@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -133,7 +134,7 @@ class JunctionLanes:
         """Return the lanes to which SUMO might map a person within a radius of a point."""
         if self._lanes is None:
             self._lanes = [
-                _JunctionLane(tuple(libsumo.lane.getShape(lane)), walking_area=_is_walking_area(lane))
+                _JunctionLane(tuple(libsumo.lane.getShape(lane)), walking_area=bool(_WALKING_AREA.search(lane)))
                 for lane in sumo.lane_getIDList()
                 if lane.startswith(":") and _may_walk(lane)
             ]
@@ -190,10 +191,6 @@ def _between(one: float, other: float) -> float:
     """Return the angle between two directions, from 0 to 180 degrees."""
     found = abs(one - other) % 360.0
     return min(found, 360.0 - found)
-
-
-def _is_walking_area(lane: str) -> bool:
-    return bool(_WALKING_AREA.search(lane))
 
 
 def _may_walk(lane: str) -> bool:
@@ -309,6 +306,7 @@ _IGNORES_JUNCTIONS = 7  # speed mode: safe speed and physical limits, no checks 
 _NO_LANE_CHANGES = 0  # lane change mode
 _COMMANDED_LANE_CHANGES = 256  # lane change mode: commanded changes only, and not into another vehicle
 _FOR_EVER_S = 3600.0  # how long a command to change lanes holds: longer than any disturbance
+_IGNORE_DEPARTED = suppress(libsumo.TraCIException)  # SUMO's error for a vehicle that has left the simulation
 _LATERAL_M = 1.6  # half a lane: a vehicle with a smaller lateral offset is ahead or behind, not to the side
 
 
@@ -408,11 +406,11 @@ class _Slows:
         self._command()
 
     def keep(self) -> None:
-        with _ignore_departed():
+        with _IGNORE_DEPARTED:
             self._command()
 
     def end(self) -> None:
-        with _ignore_departed():
+        with _IGNORE_DEPARTED:
             sumo.vehicle_setSpeed(self._vehicle, -1.0)
 
     def _command(self) -> None:
@@ -436,7 +434,7 @@ class _Speeds:
         pass
 
     def end(self) -> None:
-        with _ignore_departed():
+        with _IGNORE_DEPARTED:
             sumo.vehicle_setSpeedFactor(self._vehicle, self._before)
 
 
@@ -453,13 +451,13 @@ class _CutsIn:
         sumo.vehicle_changeLane(vehicle, int(lane.rpartition("_")[2]), how_long)
 
     def keep(self) -> None:
-        with _ignore_departed():
+        with _IGNORE_DEPARTED:
             if self._change and sumo.vehicle_getLaneID(self._vehicle) == self._lane:
                 speed = sumo.vehicle_getSpeed(self._vehicle)
                 sumo.vehicle_setSpeed(self._vehicle, max(0.0, speed - self._change))
 
     def end(self) -> None:
-        with _ignore_departed():
+        with _IGNORE_DEPARTED:
             sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
             if self._change:
                 sumo.vehicle_setSpeed(self._vehicle, -1.0)
@@ -482,7 +480,7 @@ class _MergesLate:
         self._is_waiting = True
 
     def keep(self) -> None:
-        with _ignore_departed():
+        with _IGNORE_DEPARTED:
             if self._is_waiting and (
                 sumo.vehicle_getRoadID(self._vehicle) != self._edge
                 or self._length - sumo.vehicle_getLanePosition(self._vehicle) <= self.how_strong
@@ -493,7 +491,7 @@ class _MergesLate:
                     sumo.vehicle_changeLane(self._vehicle, self._target, _FOR_EVER_S)
 
     def end(self) -> None:
-        with _ignore_departed():
+        with _IGNORE_DEPARTED:
             sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
             if not self._is_waiting:  # otherwise the command would keep the vehicle in its lane for an hour
                 sumo.vehicle_changeLane(self._vehicle, sumo.vehicle_getLaneIndex(self._vehicle), 0.0)
@@ -512,11 +510,11 @@ class _Ignores:
         self._command()
 
     def keep(self) -> None:
-        with _ignore_departed():
+        with _IGNORE_DEPARTED:
             self._command()
 
     def end(self) -> None:
-        with _ignore_departed():
+        with _IGNORE_DEPARTED:
             sumo.vehicle_setSpeedMode(self._vehicle, self._before)
             sumo.vehicle_setSpeed(self._vehicle, -1.0)
 
@@ -525,16 +523,6 @@ class _Ignores:
         faster = speed + sumo.vehicle_getAccel(self._vehicle) * self._dt
         slower = speed - sumo.vehicle_getDecel(self._vehicle) * self._dt
         sumo.vehicle_setSpeed(self._vehicle, max(0.0, slower, min(allowed, faster)))
-
-
-class _ignore_departed:  # noqa: N801 - used as a context manager
-    """Suppresses SUMO's error for a vehicle that has left the simulation."""
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, _kind: object, error: object, _trace: object) -> bool:
-        return isinstance(error, libsumo.TraCIException)
 
 
 def _at(agent: str, who: str, *, left_hand: bool) -> str:
@@ -549,16 +537,12 @@ def _at(agent: str, who: str, *, left_hand: bool) -> str:
     near = []
     for ahead in (0, _AHEAD):
         for vehicle, gap in sumo.vehicle_getNeighbors(agent, bit | ahead):
-            gap += _min_gap(vehicle, agent, leads=bool(ahead))
+            # SUMO has subtracted the minimum gap of the rear vehicle from the bumper-to-bumper gap.
+            gap += float(sumo.vehicle_getMinGap(agent if ahead else vehicle))
             place = "" if gap < 0 else "ahead" if ahead else "behind"
             if place == along and gap <= _NEIGHBOUR_LANE_M:
                 near.append((gap, vehicle))
     return min(near)[1] if near else ""
-
-
-def _min_gap(vehicle: str, agent: str, *, leads: bool) -> float:
-    """Return the minimum gap of the rear vehicle in m, which SUMO has subtracted from the bumper-to-bumper gap."""
-    return float(sumo.vehicle_getMinGap(agent if leads else vehicle))
 
 
 def _way(vehicle: str) -> str:
@@ -572,11 +556,9 @@ def _way(vehicle: str) -> str:
 
 def _place(scene: Scene, here: int, row: int) -> str:
     """Return the place of one actor relative to another, such as ``left ahead``, from positions and not from lanes."""
-    from math import cos, sin
-
     (x, y), (own_x, own_y), heading = scene.points[row], scene.points[here], scene.headings[here]
     dx, dy = x - own_x, y - own_y
-    ahead, left = dx * cos(heading) + dy * sin(heading), dy * cos(heading) - dx * sin(heading)
+    ahead, left = dx * math.cos(heading) + dy * math.sin(heading), dy * math.cos(heading) - dx * math.sin(heading)
     half = scene.roster.actors[here].length / 2
     side = "" if abs(left) <= _LATERAL_M else "left" if left > 0 else "right"
     along = "ahead" if ahead > half else "behind" if ahead < -half else ""

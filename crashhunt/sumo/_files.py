@@ -106,31 +106,19 @@ def references(content: bytes, where: str) -> list[FileReference]:
     found: list[FileReference] = []
     parser = expat.ParserCreate()
 
+    def add(tag: str, attribute: str, value: str, kind: Literal["read", "written"]) -> None:
+        if value if kind == "read" else value not in _DISCARDED_OUTPUTS:
+            offset = parser.CurrentByteIndex
+            found.append(FileReference(tag=tag, attribute=attribute, value=value, kind=kind, offset=offset))
+
     def start(tag: str, attributes: dict[str, str]) -> None:
         for name, value in attributes.items():
             if (tag, name) in READ:
-                if value:
-                    found.append(
-                        FileReference(tag=tag, attribute=name, value=value, kind="read", offset=parser.CurrentByteIndex)
-                    )
-            elif name in WRITTEN and value not in _DISCARDED_OUTPUTS:
-                found.append(
-                    FileReference(tag=tag, attribute=name, value=value, kind="written", offset=parser.CurrentByteIndex)
-                )
-        if (
-            tag == "param"
-            and _is_written(attributes.get("key", ""))
-            and attributes.get("value", "") not in _DISCARDED_OUTPUTS
-        ):
-            found.append(
-                FileReference(
-                    tag=tag,
-                    attribute="value",
-                    value=attributes["value"],
-                    kind="written",
-                    offset=parser.CurrentByteIndex,
-                )
-            )
+                add(tag, name, value, "read")
+            elif name in WRITTEN:
+                add(tag, name, value, "written")
+        if tag == "param" and _is_written(attributes.get("key", "")):
+            add(tag, "value", attributes.get("value", ""), "written")
 
     parser.StartElementHandler = start
     try:

@@ -24,6 +24,7 @@ _XERCES_INITIALIZE_SYMBOL = (
 )
 
 
+@cache
 def keep_xml_ready() -> bool:
     """Keep SUMO's XML library (Xerces) initialized after the running simulation; return whether that was possible.
 
@@ -47,8 +48,6 @@ def keep_xml_ready() -> bool:
 
 VERSION = metadata.version("libsumo")  # libsumo before 1.26 has no version attribute
 _LINK_ORDER_WARNING = "the order of SUMO's links is not fixed, and trials may differ between processes"
-ready_xml = cache(keep_xml_ready)
-"""Keep SUMO's XML library initialized; runs once per process."""
 
 
 class Loading:
@@ -79,7 +78,7 @@ class Loading:
             libsumo.load(list(command))
         else:
             libsumo.start([*program, *command])
-            ready_xml()
+            keep_xml_ready()
         reason = self._order.check_load()
         if not reason or not self._fix_link_order or why_no_link_order(VERSION):
             return ""

@@ -23,7 +23,7 @@ from crashhunt.sumo._driving import Driving, hold_vehicle
 from crashhunt.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.sumo._files import StagedFiles
 from crashhunt.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
-from crashhunt.sumo._loading import VERSION, Loading, ready_xml
+from crashhunt.sumo._loading import VERSION, Loading, keep_xml_ready
 from crashhunt.sumo._omitted_demand import OmittedDemand
 from crashhunt.sumo._options import SumoSetup
 from crashhunt.sumo._range_of_sight import Sight
@@ -108,7 +108,7 @@ class SumoSimulator:
 
     def ready_process(self) -> None:
         """Initialize SUMO's XML library."""
-        ready_xml()
+        keep_xml_ready()
 
     @property
     def notices(self) -> list[str]:

@@ -50,9 +50,6 @@ _SCENES_PER_CALL = 256  # scenes per call, which costs a tenth of one scene per 
 _GAP_M = 50.0  # larger gaps are ignored
 _HORIZON_S = 10.0  # later collisions are ignored: velocities change within that time
 _NO_APPROACH = ClosestApproach()
-_SAME_WAY = math.cos(math.radians(30.0))  # of a vehicle ahead, the least cosine of the angle between the headings
-_HALF_LANE_M = 1.7  # of a vehicle ahead, the greatest lateral offset
-_LEAST_GAP_M = 0.01
 
 
 class ApproachMeter:
@@ -187,7 +184,9 @@ def _whole_block(frames: Sequence[Frame], agent: str, closest: ClosestApproach) 
         row = frame.roster.index.get(agent)
         if row is not None:
             near = _near_block([frame], agent, closest)
-            for block in [near] if near is not None else _blocks(frame, row):
+            if near is None and frame.spines is None:
+                near = _block(frame, row)
+            for block in _bent_blocks(frame, row) if near is None else [near]:
                 blocks.append(block.moved(step, first))
                 first += len(block.x)
         step += len(frame.columns)
@@ -221,10 +220,6 @@ def _near_block(
         grade=flat,
         tall=flat,
     )
-
-
-def _blocks(frame: Frame, row: int) -> list[_Block]:
-    return [_block(frame, row)] if frame.spines is None else _bent_blocks(frame, row)
 
 
 def _block(frame: Frame, row: int) -> _Block:

@@ -317,7 +317,7 @@ def loading(monkeypatch):
     order = SimpleNamespace(use=calls.order.append, check_load=lambda: calls.reason)
     monkeypatch.setattr(_loading, "link_order", lambda *_: order)
     monkeypatch.setattr(_loading, "why_no_link_order", lambda version: calls.missing)
-    monkeypatch.setattr(_loading, "ready_xml", lambda: calls.library.append("xml"))
+    monkeypatch.setattr(_loading, "keep_xml_ready", lambda: calls.library.append("xml"))
     monkeypatch.setattr(_loading, "libsumo", SimpleNamespace(
         isLoaded=lambda: calls.loaded, load=lambda command: calls.library.append(("load", command)),
         start=lambda command: calls.library.append(("start", command)),
