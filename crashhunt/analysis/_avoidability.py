@@ -6,9 +6,8 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from crashhunt.analysis._causes import find_why
+from crashhunt.analysis._causes import find_why, lanes_around_crash
 from crashhunt.analysis._omissions import find_omission
-from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.base.text import command_line
 from crashhunt.crashes import (
@@ -25,7 +24,6 @@ from crashhunt.crashes import (
     slowing,
     visible_from,
 )
-from crashhunt.recording import read_lanes
 from crashhunt.replays import ReplayOptions, prepare, reruns_of
 from crashhunt.reruns import NotUnderstoodError, StoppedError
 from crashhunt.trial import Outcome
@@ -245,7 +243,7 @@ def judge(
             watch(done, runs + why + reference)
 
     with closing(reruns_of(rerun, parallel=parallel, stopped=stopped)) as reruns:
-        lanes = LaneMap(read_lanes(bundle.path / layout.LOG), (hit.x, hit.y) if hit is not None else (0.0, 0.0))
+        lanes = lanes_around_crash(rerun)
         trials = _Trials(result=result, recorded=rerun.recorded, reruns=reruns, lanes=lanes, tell=tell)
         search = AvoidanceSearch(result.steps, _start(rerun) if of_two else 0, trials.run, runs=runs, parallel=parallel)
         found = None

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from crashhunt.analysis._delta_debugging import with_argument
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why, changes_of, partner, signature_of_fault
@@ -156,7 +157,7 @@ _EARLIER_S = (0.0, 0.5, 1.0)  # a manoeuvre is suppressed from these times befor
 _GONE_S = (3.0, 4.0, 5.0)  # an actor is removed at these times before the collision
 _LONGER_S = 5.0  # simulation time past the collision, so that one that only comes later is seen
 _TRAFFIC_STREAM = 0x776879  # apart from what else is drawn of a trial's seed
-_INCONCLUSIVE_OUTCOMES = (Outcome.INVALID, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
+INCONCLUSIVE_OUTCOMES = (Outcome.INVALID, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
 _HOLD_BY_MANEUVER = {"braked": "keep_speed", "sped up": "keep_speed", "changed lanes": "keep_lane"}
 _FACULTY_BY_MANEUVER = {"braked": "speed", "sped up": "speed", "changed lanes": "lane"}
 
@@ -226,6 +227,18 @@ def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], Non
     )
 
 
+def lanes_around_crash(rerun: Rerun) -> LaneMap:
+    """Return the lanes around the place of a crash: of its collision, or else where its agent was last."""
+    hit, agent = rerun.bundle.result.collision, rerun.bundle.driver
+    place = (0.0, 0.0) if hit is None else (hit.x, hit.y)
+    if hit is None:
+        last = next((scene for scene in reversed(rerun.recorded.scenes()) if agent in scene.roster.index), None)
+        if last is not None:
+            x, y = last.points[last.roster.index[agent]]
+            place = float(x), float(y)
+    return LaneMap(read_lanes(rerun.bundle.path / layout.LOG), place)
+
+
 class _Search:
     """The candidate causes of one crash, and the runs without each candidate."""
 
@@ -240,18 +253,7 @@ class _Search:
         self.steps = max(min(self._spec.max_steps, 2 * self._end + longer), self._end)
         self._inside = replace(self._spec, max_steps=self._end + longer)
         self._settings = read_settings(rerun.bundle.hunt / layout.HUNT)
-        self._lanes = LaneMap(read_lanes(rerun.bundle.path / layout.LOG), self._crash_place())
-
-    def _crash_place(self) -> tuple[float, float]:
-        """Return the place of the crash, around which lanes are known."""
-        hit = self._result.collision
-        if hit is not None:
-            return hit.x, hit.y
-        for scene in reversed(self._recording.scenes()):
-            if self._agent in scene.roster.index:
-                x, y = scene.points[scene.roster.index[self._agent]]
-                return float(x), float(y)
-        return 0.0, 0.0
+        self._lanes = lanes_around_crash(rerun)
 
     def asked(self) -> list[_Candidate]:
         """Return all candidates, the most informative first."""
@@ -267,7 +269,7 @@ class _Search:
         """Return what happened to the collision in a run."""
         given = asked.runs[place][0]
         result, recording = ended.result, ended.recording
-        if result.outcome in _INCONCLUSIVE_OUTCOMES and result.outcome is not self._result.outcome:
+        if result.outcome in INCONCLUSIVE_OUTCOMES and result.outcome is not self._result.outcome:
             return LeftOut(given, "unclear")
         into = ""
         changed: tuple[str, ...] = ()
@@ -382,14 +384,14 @@ class _Search:
 
     def _arguments(self) -> Iterator[_Candidate]:
         """Return each varied argument as a candidate cause, with its default and other values of the hunt."""
-        defaults = self._rerun.defaults
+        defaults, spec = self._rerun.defaults, replace(self._spec, max_steps=self.steps)
         for (agent, name), distribution in self._settings.space.items():
             known = self._spec.arguments.get(agent, {}) if agent else self._spec.scenario_arguments
             if isinstance(distribution, Constant) or name not in known:
                 continue
             was, title, default = known[name], f"{agent}.{name}" if agent else name, defaults.get((agent, name))
             if default is not None and default != was:
-                at_default = [(default, self._with(agent, name, default))]
+                at_default = [(default, with_argument(spec, (agent, name), default))]
                 yield _Candidate(Factor("argument", title, "default", was=was), at_default)
             drawn = dict.fromkeys(
                 self._drawn_argument(title, distribution)
@@ -397,7 +399,7 @@ class _Search:
             values = [value for value in drawn if value not in (was, default)]
             yield _Candidate(
                 Factor("argument", title, "drawn", was=was),
-                [(value, self._with(agent, name, value)) for value in values[:_DRAWS]],
+                [(value, with_argument(spec, (agent, name), value)) for value in values[:_DRAWS]],
             )
 
     def _drawn_argument(self, title: str, distribution: Distribution) -> list[Value]:
@@ -406,12 +408,6 @@ class _Search:
         if isinstance(distribution, Choice):
             return [distribution.options[place] for place in rng.permutation(len(distribution.options))]
         return [distribution.sample(rng) for _ in range(_DRAWS)]
-
-    def _with(self, agent: str, name: str, value: Value) -> TrialSpec:
-        spec = replace(self._spec, max_steps=self.steps)
-        if not agent:
-            return replace(spec, scenario_arguments={**spec.scenario_arguments, name: value})
-        return replace(spec, arguments={**spec.arguments, agent: {**spec.arguments[agent], name: value}})
 
     def _seeds(self) -> Iterator[_Candidate]:
         """Return the seed as a candidate cause; other seeds change the traffic and all other random numbers."""

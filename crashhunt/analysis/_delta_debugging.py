@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from crashhunt.trial import Value
+    from crashhunt.trial import TrialSpec, Value
 
 T = TypeVar("T")
 Tried = Callable[[Sequence[T]], int | None]
@@ -86,3 +87,13 @@ def _plainer(value: Value, default: Value | None) -> Iterator[Value]:
     for digits in _ROUNDING_DIGITS:
         rounded = float(f"{value:.{digits}g}")
         yield round(rounded) if isinstance(value, int) else rounded
+
+
+def with_argument(spec: TrialSpec, key: tuple[str, str], value: Value | None) -> TrialSpec:
+    """Return a trial with another value of the argument with a key, agent and name; None changes nothing."""
+    agent, name = key
+    if value is None:
+        return spec
+    if not agent:
+        return replace(spec, scenario_arguments={**spec.scenario_arguments, name: value})
+    return replace(spec, arguments={**spec.arguments, agent: {**spec.arguments[agent], name: value}})

@@ -18,11 +18,10 @@ from dataclasses import replace
 from itertools import takewhile
 from typing import TYPE_CHECKING
 
-from crashhunt.base import layout
+from crashhunt.analysis._causes import INCONCLUSIVE_OUTCOMES, lanes_around_crash
 from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.crashes import (
     INTERRUPTED,
-    LaneMap,
     Omission,
     Reference,
     ReferenceRun,
@@ -31,7 +30,7 @@ from crashhunt.crashes import (
     visible_from,
 )
 from crashhunt.plans import with_recorded_load_order
-from crashhunt.recording import has_same_scenes, read_lanes
+from crashhunt.recording import has_same_scenes
 from crashhunt.replays import is_current_code, reruns_of
 from crashhunt.reruns import StoppedError
 from crashhunt.trial import Outcome, Overruled
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Without
-    from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
     from crashhunt.reruns import EndedRun, Reruns
     from crashhunt.trial import TrialResult, TrialSpec
@@ -53,7 +51,6 @@ _MAX_CANDIDATES = 4
 _SPEED_CHANGED_MPS = 0.5  # less is no braking
 _INSTEAD_S = 2.0  # before the crash: whether the agent then sped up
 _SPEEDS_UP_MPS2 = 0.3  # on average over this time; less is a kept speed
-_INCONCLUSIVE_OUTCOMES = (Outcome.INVALID, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
 _NOT_IDENTICAL_REASON = "the trial was not bit-identical when it was run again"
 _OLD_SNAPSHOT_REASON = (
     "the crashhunt of the snapshot has no reference driver, and with this crashhunt the trial is not bit-identical"
@@ -112,9 +109,7 @@ class _Search:
         self._agent, self._other = rerun.bundle.driver, partner(self._result)
         self._dt = self._recording.prologue.step_length_s
         self._end = self._result.steps
-        hit = self._result.collision
-        place = (hit.x, hit.y) if hit is not None else _last_place(self._recording, self._agent)
-        self._lanes = LaneMap(read_lanes(rerun.bundle.path / layout.LOG), place)
+        self._lanes = lanes_around_crash(rerun)
 
     def find(self, differs: str) -> Reference:
         """Return the cause; `differs` is the reason for no result if the watching run is not bit-identical."""
@@ -202,7 +197,7 @@ class _Search:
     def _ending(self, result: TrialResult) -> Without:
         if result.outcome in (Outcome.SURVIVED, Outcome.FINISHED):
             return "none"
-        if result.outcome in _INCONCLUSIVE_OUTCOMES:
+        if result.outcome in INCONCLUSIVE_OUTCOMES:
             return "unclear"
         was, now = self._result.collision, result.collision
         if was is None or now is None:
@@ -246,11 +241,3 @@ class _Search:
         """Return for how long before the crash the agent kept the speed that it had in the end."""
         kept = list(takewhile(lambda speed: abs(speed - speeds[-1]) < _SPEED_CHANGED_MPS, reversed(speeds)))
         return (len(kept) - 1) * self._dt
-
-
-def _last_place(recording: Recording, agent: str) -> tuple[float, float]:
-    for scene in reversed(recording.scenes()):
-        if agent in scene.roster.index:
-            x, y = scene.points[scene.roster.index[agent]]
-            return float(x), float(y)
-    return 0.0, 0.0

@@ -8,7 +8,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
-from crashhunt.analysis._delta_debugging import as_type_of, fewest, plainest
+from crashhunt.analysis._delta_debugging import as_type_of, fewest, plainest, with_argument
 from crashhunt.analysis._scripting import Part, Scripting, can_be_scripted
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.reruns import OutOfTimeError, StoppedError
@@ -343,14 +343,14 @@ class Minimizer:
         for key in _keys(self.best):
             default = defaults.get(key)
             if default is not None:
-                at_default = _with(at_default, key, as_type_of(_value(self.best, key), default))
+                at_default = with_argument(at_default, key, as_type_of(_value(self.best, key), default))
         if at_default != self.best:
             self._try([at_default])
         for key in _keys(self.best):
             best = self.best
             values = plainest(_value(best, key), defaults.get(key))
             if values:
-                self._try([_with(best, key, value) for value in values])
+                self._try([with_argument(best, key, value) for value in values])
 
     # What came of it
 
@@ -432,12 +432,3 @@ def _keys(spec: TrialSpec) -> list[tuple[str, str]]:
 def _value(spec: TrialSpec, key: tuple[str, str]) -> Value:
     agent, name = key
     return spec.arguments[agent][name] if agent else spec.scenario_arguments[name]
-
-
-def _with(spec: TrialSpec, key: tuple[str, str], value: Value | None) -> TrialSpec:
-    agent, name = key
-    if value is None:
-        return spec
-    if not agent:
-        return replace(spec, scenario_arguments={**spec.scenario_arguments, name: value})
-    return replace(spec, arguments={**spec.arguments, agent: {**spec.arguments[agent], name: value}})

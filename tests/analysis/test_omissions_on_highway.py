@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("highway_env")
 from highway_env.vehicle.kinematics import Vehicle
 
-from crashhunt.analysis import _omissions
+from crashhunt.analysis import _causes, _omissions
 from crashhunt.episode import overruled_agent, run_episode
 from crashhunt.highway import HighwaySimulator
 from crashhunt.highway._descriptor import HighwaySetup
@@ -109,7 +109,7 @@ class SteersOffTheRoad(Steers):
 @pytest.fixture
 def find(tmp_path, monkeypatch):
     """Run a trial and, if it is a crash, find the omission; return the crash and what was found."""
-    monkeypatch.setattr(_omissions, "read_lanes", lambda _: [])  # they only add what else a run changes
+    monkeypatch.setattr(_causes, "read_lanes", lambda _: [])  # they only add what else a run changes
 
     def look(driver, speed, other, **more):
         simulator = Placed(speed, other, more)
