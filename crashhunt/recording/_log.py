@@ -16,6 +16,7 @@ from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.writer import Writer
 
+from crashhunt.base.codec import known_values
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
 from crashhunt.recording._blackbox import Record
@@ -68,7 +69,7 @@ def write_log(
     with whole_file(path, lasting=False, noted=False) as temporary, temporary.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="crashhunt")
-        compact = {} if recording.compact is None else {_COMPACT_KEY: _compact_to_text(recording.compact)}
+        compact = {} if recording.compact is None else {_COMPACT_KEY: json.dumps(asdict(recording.compact))}
         writer.add_metadata("crashhunt", {**(metadata or {}), **compact, "crashhunt_log_schema": SCHEMA})
         log = LogWriter(writer)
         _write_evidence(log, recording)
@@ -92,7 +93,8 @@ def read_log(path: Path) -> Recording:
             reader = SeekingReader(file, validate_crcs=True)
             entries = [entry.metadata for entry in reader.iter_metadata()]
             version = next((found for one in entries if (found := one.get("crashhunt_log_schema")) is not None), None)
-            compact = next((_compact_from_text(one[_COMPACT_KEY]) for one in entries if _COMPACT_KEY in one), None)
+            said = next((one[_COMPACT_KEY] for one in entries if _COMPACT_KEY in one), "")
+            compact = Compact(**known_values(Compact, json.loads(said))) if said else None
             if version is None:
                 raise refuse("this MCAP file was not written by crashhunt", "give a log.mcap of a crash bundle")
             if version != SCHEMA:
@@ -116,20 +118,6 @@ def read_log(path: Path) -> Recording:
         raise refuse(f"an incomplete MCAP file: {type(error).__name__}: {error}") from None
     except Exception as error:
         raise refuse(f"damaged: {type(error).__name__}: {error}") from None
-
-
-def _compact_to_text(compact: Compact) -> str:
-    return json.dumps(asdict(compact))
-
-
-def _compact_from_text(text: str) -> Compact:
-    said = json.loads(text)
-    return Compact(
-        digest=said["digest"],
-        actors=said["actors"],
-        radius_m=said["radius_m"],
-        observations=said["observations"],
-    )
 
 
 class _Message(NamedTuple):

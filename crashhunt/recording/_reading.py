@@ -8,19 +8,18 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
-from crashhunt.base.codec import Serializable, known_values
+from crashhunt.base.codec import Serializable
 from crashhunt.world import Roster
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.base.json_types import Plain
     from crashhunt.world import Actor, Contact, Event, Scene, Spine
 
 
 @dataclass(frozen=True, slots=True)
-class AgentChannel:
+class AgentChannel(Serializable):
     """Types and shapes of the observations and actions of one agent.
 
     Args:
@@ -43,7 +42,7 @@ class AgentChannel:
 
 
 @dataclass(frozen=True, slots=True)
-class Prologue:
+class Prologue(Serializable):
     """The agents and the step length of an episode.
 
     Args:
@@ -56,25 +55,12 @@ class Prologue:
 
     def encode(self) -> bytes:
         """Return the payload of the record."""
-        agents = [{name: getattr(agent, name) for name in AgentChannel.__slots__} for agent in self.agents]
-        return json.dumps({"agents": agents, "step_length_s": self.step_length_s}, sort_keys=True).encode()
+        return json.dumps(self.to_json(), sort_keys=True).encode()
 
     @classmethod
     def decode(cls, payload: bytes) -> Prologue:
         """Decode a payload of `encode`; keys that a later version has added are skipped."""
-        data: _PrologueJson = json.loads(payload)
-        agents = tuple(AgentChannel(**_columns_prologue(agent)) for agent in data["agents"])
-        return cls(agents, data["step_length_s"])
-
-
-class _PrologueJson(TypedDict):
-    agents: list[Plain]
-    step_length_s: float
-
-
-def _columns_prologue(agent: Plain) -> dict[str, Any]:
-    known = known_values(AgentChannel, agent)
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in known.items()}
+        return cls.from_json(json.loads(payload))
 
 
 @dataclass(slots=True)

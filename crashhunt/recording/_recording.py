@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from crashhunt.recording.records._scene_record import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -103,9 +103,11 @@ class Recording:
         """Return this recording reduced to the actors and observations of another recording, which may be compact."""
         if other.compact is None or self.compact is not None:
             return self
-        there = PresentActors(
-            [step.scene.roster.index.keys() if step.scene is not None else () for step in other.all_steps]
-        )
+        present = [step.scene.roster.index if step.scene is not None else {} for step in other.all_steps]
+
+        def there(step: int, actors: Sequence[str], _points: NDArray[np.float64]) -> NDArray[np.bool_]:
+            return np.array([name in present[step] if step < len(present) else False for name in actors], bool)
+
         records = compact_records(self.records, there, observations=other.compact.observations)
         return Recording(records, replace(other.compact, digest=self.digest))
 
@@ -205,18 +207,9 @@ class Compact:
     observations: bool
 
 
-class ActorSelector(Protocol):
-    """The interface of a function that selects the actors of a step to keep."""
-
-    def __call__(self, step: int, actors: Sequence[str], points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether to keep each actor, as an array of shape (actors,).
-
-        Args:
-            step: number of the step.
-            actors: identifiers of the actors that are present.
-            points: positions of these actors, in m, shape (actors, 2).
-        """
-        ...
+ActorSelector: TypeAlias = "Callable[[int, Sequence[str], NDArray[np.float64]], NDArray[np.bool_]]"
+"""Called with the number of a step, and of the actors that are present the identifiers and the positions in m, shape
+(actors, 2); returns whether to keep each actor, shape (actors,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,22 +233,6 @@ class Near:
             if name in self.agents:
                 mask |= np.hypot(*(points - points[row]).T) <= self.radius_m
         return mask
-
-
-@dataclass(frozen=True, slots=True)
-class PresentActors:
-    """Selects the actors that another recording contains in the same step.
-
-    Args:
-        actors: identifiers of the actors of each step.
-    """
-
-    actors: Sequence[Collection[str]]
-
-    def __call__(self, step: int, actors: Sequence[str], points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether to keep each actor."""
-        there = self.actors[step] if step < len(self.actors) else ()
-        return np.array([name in there for name in actors], bool)
 
 
 def compact_records(records: Iterable[Record], choose: ActorSelector, *, observations: bool) -> Iterator[Record]:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -30,6 +30,12 @@ _PLAIN_DTYPES: Final = frozenset("biufcSUMm")
 _DIGEST_BYTES: Final = 16
 _MAX_DEPTH: Final = 200  # of values inside values; deeper ones are written as their class only
 _MAX_SHOWN_ARRAY: Final = 12  # elements
+
+
+_COLLECTIONS: Final[Mapping[str, Callable[[Iterable[object]], object]]] = {
+    "list": list, "tuple": tuple, "set": set, "frozenset": frozenset,
+}  # fmt: skip
+_BYTES: Final[Mapping[str, Callable[[bytes], object]]] = {"bytes": bytes, "bytearray": bytearray}
 
 
 class OpaqueValue:
@@ -228,29 +234,15 @@ class _Decoder:
             self.is_whole = False
             name, digest, *rest = content
             return OpaqueValue(str(name), str(digest), self.value(rest[0]) if rest else None)
+        if kind in _COLLECTIONS:
+            return _COLLECTIONS[kind](map(self.value, content))
+        if kind in _BYTES:
+            return _BYTES[kind](base64.b64decode(content))
         made: object = getattr(self, f"_{kind}")(content)
         return made
 
-    def _list(self, content: Any) -> list[object]:
-        return [self.value(item) for item in content]
-
-    def _tuple(self, content: Any) -> tuple[object, ...]:
-        return tuple(self._list(content))
-
-    def _set(self, content: Any) -> set[object]:
-        return set(self._list(content))
-
-    def _frozenset(self, content: Any) -> frozenset[object]:
-        return frozenset(self._list(content))
-
     def _dict(self, content: Any) -> dict[object, object]:
         return {self.value(key): self.value(item) for key, item in content}
-
-    def _bytes(self, content: Any) -> bytes:
-        return base64.b64decode(content)
-
-    def _bytearray(self, content: Any) -> bytearray:
-        return bytearray(base64.b64decode(content))
 
     def _complex(self, content: Any) -> complex:
         return complex(*content)
