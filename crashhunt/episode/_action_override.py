@@ -47,10 +47,16 @@ def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -
     return Braking(driver, simulator, overruled.agent, overruled.after, overruled.manoeuvre)
 
 
-class _Override:
-    """An agent in the place of another agent, the driver, with which it is closed."""
+class _Overruling:
+    """The common part of the drivers that take the place of an agent: its episodes and its end."""
 
     _driver: Agent
+    _step: int
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode."""
+        self._step = 0
+        self._driver.reset(seed)
 
     def close(self) -> None:
         """Close the agent."""
@@ -58,7 +64,7 @@ class _Override:
             self._driver.close()
 
 
-class Braking(_Override):
+class Braking(_Overruling):
     """Lets an agent drive up to a step. After this step, the vehicle brakes as hard as it can, or changes lanes.
 
     Args:
@@ -81,11 +87,6 @@ class Braking(_Override):
         self._first = braking.action if manoeuvre == "brake" else _lane_change(simulator, agent, manoeuvre)
         self._step = 0
 
-    def reset(self, seed: int) -> None:
-        """Begin an episode."""
-        self._step = 0
-        self._driver.reset(seed)
-
     def act(self, observation: object) -> object:
         """Return the agent's action, or the braking action after the step."""
         step, self._step = self._step, self._step + 1
@@ -94,7 +95,7 @@ class Braking(_Override):
         return self._driver.act(observation) if step < self._after else self._action
 
 
-class Keeping(_Override):
+class Keeping(_Overruling):
     """Lets an agent drive, and after a step prevents lane changes or speed changes of its vehicle.
 
     Args:
@@ -119,11 +120,6 @@ class Keeping(_Override):
         self._after, self._stays = after, keeps == "lane"
         self._step, self._speed = 0, 0.0
 
-    def reset(self, seed: int) -> None:
-        """Begin an episode."""
-        self._step = 0
-        self._driver.reset(seed)
-
     def act(self, observation: object) -> object:
         """Return the agent's action, with the overruled parts replaced."""
         step, self._step = self._step, self._step + 1
@@ -144,7 +140,7 @@ class Keeping(_Override):
         return self._idle if word in (_LANE_ACTIONS if self._stays else _SPEED_ACTIONS) else action
 
 
-class HandedOver(_Override):
+class HandedOver(_Overruling):
     """Repeats the recorded actions of a vehicle up to a step, and lets its agent act after that.
 
     The agent is created before the first step, as in every trial. The agent is reset after the last recorded action,
@@ -236,7 +232,7 @@ class _Response:
         }  # fmt: skip
 
 
-class ReferenceDriver(_Override):
+class ReferenceDriver(_Overruling):
     """Lets an agent drive, and after a step corrects its unsafe speeds, lane changes, or both.
 
     Args:
@@ -282,9 +278,8 @@ class ReferenceDriver(_Override):
 
     def reset(self, seed: int) -> None:
         """Begin an episode."""
-        self._step = 0
         self._responses.clear()
-        self._driver.reset(seed)
+        super().reset(seed)
 
     def act(self, observation: object) -> object:
         """Return the agent's action if it is safe, and otherwise the corrected action."""

@@ -409,7 +409,7 @@ class Episode(Forkable, Ending):
             for show in self._on_scene:
                 show(0, scene, self._nothing)
         except BaseException as error:
-            return self._fail_in_set_up(error)
+            return self._fail_in_simulator(error, "reset", is_set_up=True)
         for oracle in self._oracles:
             if supports(oracle, SeesMap):
                 lanes = simulator.lanes() if supports(simulator, HasMap) else ()
@@ -441,7 +441,7 @@ class Episode(Forkable, Ending):
             if type(error) is InternalError and place == "constructor":  # an agent's constructor has a boundary
                 raise
             if is_at_boundary(error) and error.party is not Party.AGENT:  # the agent has asked for its mask
-                return self._fail_in_set_up(error)
+                return self._fail_in_simulator(error, "reset", is_set_up=True)
             error = error.error if type(error) is ForeignError else error
             return self._fail(Outcome.INVALID, error, agent, place=place)
         return None

@@ -501,8 +501,13 @@ class Ending:
         self.error = error
         return self._end(outcome, failure=failure_of(error, agent, cause=cause, party=party, place=place))
 
-    def _fail_in_simulator(self, error: BaseException, place: str = "step") -> TrialResult:
-        """End the episode with an exception that the simulator or an agent raised during a step of the simulator.
+    def _fail_in_simulator(self, error: BaseException, place: str = "step", *, is_set_up: bool = False) -> TrialResult:
+        """End the episode with an exception that the simulator or an agent raised outside the agents' own methods.
+
+        Args:
+            error: The exception.
+            place: The purpose for which the simulator was called.
+            is_set_up: Whether this was before the first step, so that the trial is invalid whoever failed.
 
         Raises:
             RecorderError: the disk is full.
@@ -510,28 +515,15 @@ class Ending:
         """
         blamed, found = self._blame(error, place)
         if found is not None:
-            return self._fail(Outcome.AGENT_ERROR, blamed.error, found.agent, found.cause)
+            outcome = Outcome.INVALID if is_set_up else Outcome.AGENT_ERROR
+            return self._fail(outcome, blamed.error, found.agent, found.cause)
         if blamed.party is Party.CRASHHUNT and not blamed.is_resource:
-            raise internal_error(error, self.spec.number, self.steps) from error
+            raise internal_error(error, self.spec.number, -1 if is_set_up else self.steps) from error
         party = party_of_simulator(self.simulator) if blamed.is_resource else blamed.party
         # Neither the agent nor the simulator has failed: the adapter cannot observe or control a vehicle any more.
-        outcome = Outcome.INVALID if type(blamed.error) is InvalidEpisodeError else Outcome.SIMULATOR_ERROR
+        is_invalid = is_set_up or type(blamed.error) is InvalidEpisodeError
+        outcome = Outcome.INVALID if is_invalid else Outcome.SIMULATOR_ERROR
         return self._fail(outcome, blamed.error, party=party, place=blamed.place)
-
-    def _fail_in_set_up(self, error: BaseException) -> TrialResult:
-        """End the episode with an exception that was raised before the first step, outside the agents' own methods.
-
-        Raises:
-            RecorderError: the disk is full.
-            InternalError: the exception is crashhunt's own.
-        """
-        blamed, found = self._blame(error, "reset")
-        if found is not None:
-            return self._fail(Outcome.INVALID, blamed.error, found.agent, found.cause)
-        if blamed.party is Party.CRASHHUNT and not blamed.is_resource:
-            raise internal_error(error, self.spec.number, -1) from error
-        party = party_of_simulator(self.simulator) if blamed.is_resource else blamed.party
-        return self._fail(Outcome.INVALID, blamed.error, party=party, place=blamed.place)
 
     def _fail_in_conversion(self, error: BaseException, agent: str) -> TrialResult:
         """End the episode with an exception that was raised while an agent's action was encoded.
