@@ -183,15 +183,12 @@ class RateTest:
             self.exposure += exposure * times
             self._as_arrays = None
             self._count(float(events), float(exposure), times)
-            if not self._spreads and len(self._units) > _MAX_EXPOSURES and self._has_few_events():
+            many = not self._spreads and len(self._units) > _MAX_EXPOSURES
+            if many and len({events for events, _ in self._units}) <= _MAX_EVENTS:  # they differ in their exposures
                 self._spreads = True
                 units, self._units = self._units, defaultdict(float)
                 for (some, over), count in units.items():
                     self._count(some, over, count)
-
-    def _has_few_events(self) -> bool:
-        """Return whether units differ in their exposures, but not in their events."""
-        return len({events for events, _ in self._units}) <= _MAX_EVENTS
 
     def _count(self, events: float, exposure: float, times: float) -> None:
         """Count units, or distribute them over the two grid points around their exposure."""

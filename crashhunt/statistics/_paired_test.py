@@ -48,7 +48,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from crashhunt.statistics._anytime_interval import Interval, log_of_sum
-from crashhunt.statistics._units import MAX_INVALID_SHARE, has_too_many_invalid
+from crashhunt.statistics._units import has_too_many_invalid, why_too_many_invalid
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -162,11 +162,6 @@ class PairSequence:
         return any(number not in self._waiting[1 - side] for number in self._waiting[side])
 
     @property
-    def invalid_share(self) -> float:
-        """The share of pairs with an invalid trial."""
-        return self.invalid / (self.invalid + self.valid) if self.invalid else 0.0
-
-    @property
     def is_hopeless(self) -> bool:
         """Whether too many pairs certainly have an invalid trial."""
         return has_too_many_invalid(self.invalid, self.valid)
@@ -174,10 +169,7 @@ class PairSequence:
     @property
     def why_not(self) -> str:
         """The reason why the pairs allow no verdict; empty if they allow one."""
-        if self.invalid_share <= MAX_INVALID_SHARE:
-            return ""
-        many = f"{self.invalid} of {self.invalid + self.valid} pairs have an invalid trial"
-        return f"{many}, more than {MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
+        return why_too_many_invalid(self.invalid, self.valid, "pairs have an invalid trial")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

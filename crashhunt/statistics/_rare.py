@@ -54,7 +54,7 @@ from typing import TYPE_CHECKING, Final
 from crashhunt.base.codec import Serializable, plain
 from crashhunt.disturbances import COPIES_PER_ROOT, SECONDS_PER_COPY
 from crashhunt.statistics._anytime_interval import Bets, RateTest
-from crashhunt.statistics._units import MAX_INVALID_SHARE
+from crashhunt.statistics._units import why_too_many_invalid
 from crashhunt.trial import Forcing, Outcome
 
 if TYPE_CHECKING:
@@ -500,13 +500,10 @@ class RareCounter:
         count, counts = self.roots, self._counts
         estimate = self._whole.total / count if count else None
         certain = self.certain()
-        why = ""
+        why = why_too_many_invalid(counts["invalid"], counts["plain"], "plain trials are invalid")
         if self.excluded > MAX_EXCLUDED * (count + self.excluded):
             why = f"{self.excluded} of {count + self.excluded} roots have no complete result"
             why += f" (allowed: {MAX_EXCLUDED:.0%})"
-        elif counts["invalid"] > MAX_INVALID_SHARE * (counts["plain"] + counts["invalid"]):
-            why = f"{counts['invalid']} of {counts['plain'] + counts['invalid']} plain trials are invalid, more than "
-            why += f"{MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
         certain = None if why else certain
         whole, why_not, more = self._interval()
         part, why_not_part, _ = self._disturbed.interval(count, self.confidence)

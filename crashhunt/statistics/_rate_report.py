@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import UsageError
 from crashhunt.statistics._anytime_interval import BarVerdict, Interval
-from crashhunt.statistics._units import MAX_INVALID_SHARE, Per
+from crashhunt.statistics._units import Per, why_too_many_invalid
 
 if TYPE_CHECKING:
     from crashhunt.statistics._units import RateCounter, UnitSequence
@@ -160,9 +160,7 @@ def make_rate(
         why_not = sequence.why_empty
     if not why_not and not counter.is_measured:
         why_not = "no trial has a driven distance and time"
-    if not why_not and sequence.invalid_share > MAX_INVALID_SHARE:
-        many = f"{sequence.invalid} of {sequence.invalid + sequence.valid} trials are invalid"
-        why_not = f"{many}, more than {MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
+    why_not = why_not or why_too_many_invalid(sequence.invalid, sequence.valid, "trials are invalid")
     alpha = 1 - confidence / 100
     certain = None if why_not else counter.interval(alpha)
     verdict: BarVerdict | Literal[""] = "" if bar is None else "undecided"

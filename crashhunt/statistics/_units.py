@@ -252,6 +252,14 @@ class UnitSequence:
         return self.invalid / (self.invalid + self.valid) if self.invalid else 0.0
 
 
+def why_too_many_invalid(invalid: int, valid: int, are_invalid: str) -> str:
+    """Return why units allow no rate or verdict because too many are invalid; empty if few enough are."""
+    if not invalid or invalid / (invalid + valid) <= MAX_INVALID_SHARE:
+        return ""
+    many = f"{invalid} of {invalid + valid} {are_invalid}"
+    return f"{many}, more than {MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
+
+
 def has_too_many_invalid(invalid: int, valid: int) -> bool:
     """Return whether the share of invalid trials exceeds `MAX_INVALID_SHARE`, and more trials will hardly change this.
 
