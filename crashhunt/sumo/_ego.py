@@ -6,7 +6,7 @@ import io
 import os
 import xml.etree.ElementTree as ET
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 
@@ -29,17 +29,8 @@ _BUSY_AFTER_S, _WINDOW_S = 200.0, 300.0
 """An earlier departure meets an empty town; a later one costs simulated time before each trial."""
 _MAX_FLOW_VEHICLES = 10_000  # of one flow
 _MAX_CANDIDATES = 200  # vehicles to draw from, spread over the window
-_OFF_ROAD_CLASSES = {
-    "rail",
-    "rail_urban",
-    "rail_electric",
-    "rail_fast",
-    "tram",
-    "subway",
-    "cable_car",
-    "ship",
-    "aircraft",
-}
+RAIL = frozenset({"tram", "rail_urban", "rail", "rail_electric", "rail_fast", "subway", "cable_car"})
+_OFF_ROAD_CLASSES = RAIL | {"ship", "aircraft"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +47,7 @@ class Ego:
     agent: str
     setup: AgentSetup
     note: str
-    arguments: dict[str, ArgumentSetup]
+    arguments: dict[str, ArgumentSetup] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,19 +107,17 @@ def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
             agent=_EGO,
             setup=AgentSetup(route=value),
             note=f"the controlled vehicle is added on the route {value!r}",
-            arguments={},
         )
     if kind == "edges":
         edges = tuple(edge for edge in value.split(",") if edge)
         note = f"the controlled vehicle is added on the edges {', '.join(edges)}"
-        return Ego(agent=_EGO, setup=AgentSetup(edges=edges), note=note, arguments={})
+        return Ego(agent=_EGO, setup=AgentSetup(edges=edges), note=note)
     if kind == "vehicle":
         depart = _departure_of(value, files)
         return Ego(
             agent=value,
             setup=AgentSetup(existing=True, depart_s=depart),
             note=f"the controlled vehicle is the vehicle {value!r}",
-            arguments={},
         )
     raise ScenarioError(
         f"--ego {ego!r} is not valid", fix="write VEHICLE, route=ID, edges=FROM,TO or any", where=str(path)
@@ -170,7 +159,7 @@ def draw_among(
         depart = next(one.depart_s for one in known if one.vehicle == names[0])
         when = "" if len(known) == 1 else f" from {since:.0f} to {since + _WINDOW_S:.0f} s"
         note = f"{why}the controlled vehicle is {names[0]!r}, the only one that {verb}s{when}"
-        return Ego(agent=names[0], setup=AgentSetup(existing=True, depart_s=depart), note=note, arguments={})
+        return Ego(agent=names[0], setup=AgentSetup(existing=True, depart_s=depart), note=note)
     if count > _MAX_CANDIDATES:
         names = [names[index * count // _MAX_CANDIDATES] for index in range(_MAX_CANDIDATES)]
     others = {one.vehicle for one in known}
@@ -202,7 +191,7 @@ def _on_any_route(files: list[Path], path: Path) -> Ego:
     for route in _elements(files, "route"):
         if route.get("id"):
             note = f"no vehicle departs that the files name: one is added on the route {route.get('id')!r}"
-            return Ego(agent=_EGO, setup=AgentSetup(route=str(route.get("id"))), note=note, arguments={})
+            return Ego(agent=_EGO, setup=AgentSetup(route=str(route.get("id"))), note=note)
     raise ScenarioError(
         "the files of the scenario define no vehicle and no route", fix="give --ego edges=FROM,TO", where=str(path)
     )
@@ -299,15 +288,8 @@ def _nested(files: list[Path]) -> list[Path]:
 
 # From simulated plain traffic to the vehicles that ``--ego any`` draws from.
 
-NOT_ON_A_ROAD = frozenset(
-    {
-        *("tram", "rail_urban", "rail", "rail_electric", "rail_fast", "subway", "cable_car"),
-        *("ship", "container", "aircraft", "drone"),
-        *("pedestrian", "wheelchair", "bicycle", "scooter"),
-    }
-)
+NOT_ON_A_ROAD = _OFF_ROAD_CLASSES | {"container", "drone", "pedestrian", "wheelchair", "bicycle", "scooter"}
 """SUMO's vehicle classes that an agent for cars cannot drive: on rails, on water, in the air, or no motor vehicles."""
-RAIL = frozenset({"tram", "rail_urban", "rail", "rail_electric", "rail_fast", "subway", "cable_car"})
 FEW_CANDIDATES = 3
 """Below this the window of entry times is extended to all entries, so that trials differ."""
 GRIDLOCK_BUILDS_UP_S = 60.0
@@ -418,7 +400,9 @@ def _entering_in_all_runs(runs: Sequence[SurveyedRun]) -> list[Departure]:
     times = {vehicle: max(run[vehicle] for run in found) for vehicle in in_every_run}
     if not times:
         times = max(found, key=len)
-    return sorted((Departure(vehicle, time_s, off_road=False) for vehicle, time_s in times.items()), key=_by_time)
+    return sorted(
+        (Departure(vehicle, time_s, off_road=False) for vehicle, time_s in times.items()), key=lambda one: one.depart_s
+    )
 
 
 def _entering_before_gridlock(stuck_s: float | None, known: list[Departure]) -> list[Departure]:
@@ -427,10 +411,6 @@ def _entering_before_gridlock(stuck_s: float | None, known: list[Departure]) -> 
         return known
     early = [one for one in known if one.depart_s < stuck_s - GRIDLOCK_BUILDS_UP_S]
     return early if len(early) >= FEW_CANDIDATES else [one for one in known if one.depart_s < stuck_s] or known
-
-
-def _by_time(one: Departure) -> float:
-    return one.depart_s  # sorting is stable: vehicles of one step stay in SUMO's order
 
 
 def _refuse_undrivable(scenario: Scenario, runs: Sequence[SurveyedRun]) -> None:

@@ -456,8 +456,8 @@ def test_lanes_of_junctions_are_those_for_pedestrians_and_read_once(person, sumo
     assert reads == [1]
     person.disallowed[":j_6_0"] = ("pedestrian",)
     assert len(JunctionLanes().near((0.0, 0.0), 1.0)) == 1
-    assert all(map(_disturbances._is_walking_area, (":j_w0_0", ":j_w12_3")))
-    assert not any(map(_disturbances._is_walking_area, (":j_c0_0", ":x_w_0", ":j_w0_0x")))
+    assert all(map(_disturbances._WALKING_AREA.search, (":j_w0_0", ":j_w12_3")))
+    assert not any(map(_disturbances._WALKING_AREA.search, (":j_c0_0", ":x_w_0", ":j_w0_0x")))
 
 
 # Actions.
