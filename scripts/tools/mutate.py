@@ -120,6 +120,11 @@ _TESTS_ELSEWHERE = {
     "corpus": ("corpus/test_*.py", "e2e/test_corpus.py"),
     "corpus/_bisection.py": ("corpus/test_bisection.py", "e2e/test_bisect.py"),
     "crashes/_bundle_trust.py": ("crashes/test_trust.py", "e2e/test_foreign_hunts.py"),
+    "crashes/_encounter.py": (
+        "crashes/test_danger_course.py",
+        "crashes/test_encounter.py",
+        "crashes/test_visible.py",
+    ),
     "dashboard/_control.py": ("dashboard/test_dashboard_parts.py", "dashboard/test_control.py"),
     "envs": ("envs/test_*.py",),
     "episode/_action_override.py": (

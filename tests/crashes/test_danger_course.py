@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from crashhunt.crashes import closest_actors, danger_course
+from crashhunt.crashes import closest_actors, danger_course, most_dangerous
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.report._words import about_danger
 from crashhunt.world import Actor, Roster, Scene
@@ -44,7 +44,19 @@ def test_there_is_none_where_the_agent_is_not_and_at_the_end_where_no_one_knows(
     assert 20 <= found.greatest.step < 90
     assert found.of_step(30) == (found.own[30], 0.0)
     assert found.of_step(100) is None
+    assert np.isnan(found.behind[50:]).all()  # 4 s before the agent is seen for the last time
+    assert (found.behind[20:50] == 0.0).all()
     assert danger_course(recording(5, ()), "ego") is None
+
+
+@pytest.mark.parametrize(
+    ("agents", "steps", "other"), [(["ego"], 30, "ahead"), (["ahead"], 30, None), (["ego"], 0, None)]
+)
+def test_most_dangerous_moment_is_of_an_agent_with_an_actor_in_its_way(agents, steps, other):
+    trial = recording(steps, range(20))
+    trial.agents = agents
+    found = most_dangerous(trial)
+    assert (found and (found.agent, found.other)) == (other and ("ego", other))
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.9, -2.3])
@@ -128,3 +140,15 @@ def test_least_time_and_gap_have_the_name_of_their_actor():
     assert closest((1.0, 4.0), (1.0, -3.5)) == [("slow", "other side")]
     assert closest((1.0, 3.5), (1.0, -3.5)) == [("slow", "")]
     assert closest_actors(recording(3, (1,)), "ego") == [("", ""), ("", "ahead"), ("", "")]
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.2, -2.3])
+@pytest.mark.parametrize(("ahead_m", "behind_m", "nearest"), [(3.0, 3.5, "ahead"), (3.5, 3.0, "behind")])
+def test_nearest_actor_is_the_one_with_the_least_gap_between_outlines(turn, ahead_m, behind_m, nearest):
+    """The three stand in a line; a point is the middle of a front."""
+    c, s = math.cos(turn), math.sin(turn)
+    fronts = (0.0, ahead_m + 5.0, -5.0 - behind_m)
+    standing = Roster((*CARS, Actor("behind", "car", 8.0, 2.5)))
+    scene = Scene(0.0, standing, [(c * x, s * x) for x in fronts], [turn] * 3, [0.0] * 3)
+    trial = SimpleNamespace(all_steps=[StepRecord(0, scene)], scenes=lambda: [scene], prologue=Prologue((), DT))
+    assert danger_course(trial, "ego").nearest == (nearest, pytest.approx(3.0), 0)

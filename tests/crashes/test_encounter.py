@@ -269,3 +269,11 @@ def test_where_brakes_do_not_help_there_is_no_escape():
     overlap = {"ego": (0, 0, 0, 5), "other": (3, 0, 0, 0)}
     assert last_escape(recording(overlap), "ego", "other", braking=8.0) is None
     assert Encounter(recording(), "ego", "other").moments == []
+
+
+@pytest.mark.parametrize(("speed_at_the_end", "found"), [(10.0, 0), (0.0, None)])
+def test_crash_within_two_steps_has_an_escape_and_a_stop_short_of_the_other_is_no_crash(speed_at_the_end, found):
+    """The rear of the other vehicle is 0.5 m ahead of the agent at the end."""
+    other = (14.5, 0.0, 0.0, 0.0)
+    steps = [{"ego": (0.0, 0.0, 0.0, 10.0), "other": other}, {"ego": (9.0, 0.0, 0.0, speed_at_the_end), "other": other}]
+    assert last_escape(recording(*steps, dt=1.0), "ego", "other", braking=20.0) == found

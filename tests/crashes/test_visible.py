@@ -40,6 +40,7 @@ def recording(*distances, rows=2, noise=1.0, normalize=False, names=None):
         ({"noise": 1.01}, None),
         ({"normalize": True}, None),
         ({"names": ()}, None),
+        ({"names": ("presence", "x")}, None),
     ],
 )
 def test_it_is_the_first_step_in_whose_observation_it_is(options, expected):
