@@ -40,3 +40,14 @@ def nodes(cluster: Cluster) -> Iterator[list]:
     for one in added:
         with contextlib.suppress(Exception):
             cluster.remove_node(one)
+
+
+def below(pid: int) -> list[int]:
+    """Return all processes below one."""
+    found: list[int] = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            fields = stat.read_text().rpartition(")")[2].split()
+            if int(fields[1]) == pid:
+                found += [int(stat.parent.name), *below(int(stat.parent.name))]
+    return found

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from ray_cluster import head, nodes
+from ray_cluster import below, head, nodes
 
 if find_spec("ray") is None:  # to import it takes a while, wherever its tests are not run
     pytest.skip("Ray is not installed: pip install 'crashhunt[ray]'", allow_module_level=True)
@@ -122,17 +122,6 @@ class TestRayExecutor(ExecutorContract):
 
 def digests(results):
     return {number: (result.outcome, result.steps, result.digest) for number, result in results.items()}
-
-
-def below(pid):
-    """All processes below one."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            fields = stat.read_text().rpartition(")")[2].split()
-            if int(fields[1]) == pid:
-                found += [int(stat.parent.name), *below(int(stat.parent.name))]
-    return found
 
 
 def raylet(node):

@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from ray_cluster import head, nodes
+from ray_cluster import below, head, nodes
 
 if find_spec("ray") is None:  # to import it takes a while, wherever its tests are not run
     pytest.skip("Ray is not installed: pip install 'crashhunt[ray]'", allow_module_level=True)
@@ -60,17 +60,6 @@ def started(toy):
         if process.poll() is None:
             process.kill()
         process.communicate()
-
-
-def below(pid):
-    """All processes below one."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            fields = stat.read_text().rpartition(")")[2].split()
-            if int(fields[1]) == pid:
-                found += [int(stat.parent.name), *below(int(stat.parent.name))]
-    return found
 
 
 def alive(pids):

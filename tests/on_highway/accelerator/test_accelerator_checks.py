@@ -21,6 +21,7 @@ from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle
+from small_roads import small_road
 
 from crashhunt.highway.accelerator import (
     _frames,
@@ -40,16 +41,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning"),
     needs_kernel,
 ]
-
-
-def small_road(*kinds, lanes=3, connected=False, regulated=False):
-    """Vehicles on a straight road, one beside and behind the other."""
-    place = (RegulatedRoad if regulated else Road)(
-        RoadNetwork.straight_road_network(lanes), np_random=np.random.default_rng(1)
-    )
-    place.neighbour_vehicles_connected_lanes = connected
-    place.vehicles += [kind(place, [17.0 * n, 4.0 * (n % lanes)], 0.02 * n, 20.0 + n) for n, kind in enumerate(kinds)]
-    return place
 
 
 GROUPS = {

@@ -25,11 +25,12 @@ from highway_env.envs.exit_env import ExitEnv
 from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.road.lane import StraightLane
 from highway_env.road.regulation import RegulatedRoad
-from highway_env.road.road import Road, RoadNetwork
+from highway_env.road.road import RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle
+from small_roads import small_road
 
 from crashhunt.highway.accelerator import (
     Onlooker,
@@ -256,16 +257,6 @@ def test_step_of_a_usual_environment_is_the_accelerators_alone():
         assert calls == {"AbstractEnv.step": 3} | ({"AbstractEnv._simulate": 3} if alone else {}), (name, config)
         assert made == {kind: 3 * count for kind, count in new.items()}, (name, config)
         assert ran & LEFT_TO_THE_KERNEL == set(), (name, config)
-
-
-def small_road(*kinds, lanes=3, connected=False, regulated=False):
-    """Vehicles on a straight road, one beside and behind the other."""
-    place = (RegulatedRoad if regulated else Road)(
-        RoadNetwork.straight_road_network(lanes), np_random=np.random.default_rng(1)
-    )
-    place.neighbour_vehicles_connected_lanes = connected
-    place.vehicles += [kind(place, [17.0 * n, 4.0 * (n % lanes)], 0.02 * n, 20.0 + n) for n, kind in enumerate(kinds)]
-    return place
 
 
 def test_searches_have_the_answers_of_highway_env_for_all_arguments():
