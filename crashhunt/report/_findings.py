@@ -153,15 +153,15 @@ def crashes_summary(findings: Sequence[CrashFinding], *, compared: bool = False)
     title = f"### crashhunt: {_count(crashes, 'crash', 'crashes')} of {_count(len(findings), 'type', 'types')}"
     lines = [f"{title}, {new} new" if compared else title, ""]
     names = ["crashes", "type", "at fault", "shortest", "steps", *(["in the corpus"] if compared else [])]
-    lines += [_row(names), _row(["---:", "---", "---", "---", "---:", *(["---"] if compared else [])])]
+    lines += [row_of(names), row_of(["---:", "---", "---", "---", "---:", *(["---"] if compared else [])])]
     for finding in findings:
         group, shortest = finding.group, finding.group.shortest
-        cells = [str(group.count), _plain(finding.title), group.fault, f"`{shortest.id}`", str(shortest.result.steps)]
-        lines.append(_row([*cells, *([f"`{finding.known}`" if finding.known else "**new**"] if compared else [])]))
+        cells = [str(group.count), plain(finding.title), group.fault, f"`{shortest.id}`", str(shortest.result.steps)]
+        lines.append(row_of([*cells, *([f"`{finding.known}`" if finding.known else "**new**"] if compared else [])]))
     lines += ["", "The shortest crash of each type:", ""]
     for finding in findings:
         place = f" (`{finding.file}`, line {finding.line})" if finding.file else ""
-        lines.append(f"- {_plain(finding.group.shortest.result.summary)}{place}")
+        lines.append(f"- {plain(finding.group.shortest.result.summary)}{place}")
     return "\n".join([*lines, ""])
 
 
@@ -183,12 +183,12 @@ def corpus_summary(reports: Sequence[CaseReport]) -> str:
     wrong = sum(not report.ok for report in reports)
     said = f"{_count(wrong, 'is', 'are')} not as expected" if wrong else "all as expected"
     lines = [f"### crashhunt corpus: {_count(len(reports), 'case', 'cases')}, {said}", ""]
-    lines += [_row(["", "case", "expected", "today", "what happens", "note"]), _row(["---"] * 6)]
+    lines += [row_of(["", "case", "expected", "today", "what happens", "note"]), row_of(["---"] * 6)]
     for report in sorted(reports, key=lambda report: report.ok):
         got = report.got.replace("_", " ")
         today = got if report.ok else f"**{got}**"
-        cells = [f"`{report.path}`", report.expected, today, _plain(report.now), _plain(report.note)]
-        lines.append(_row([_ICONS[report.got] if report.ok else "❌", *cells]))
+        cells = [f"`{report.path}`", report.expected, today, plain(report.now), plain(report.note)]
+        lines.append(row_of([_ICONS[report.got] if report.ok else "❌", *cells]))
     tighter = [report for report in reports if report.may_be_tightened]
     if tighter:
         lines += ["", "Fixed cases. Set `expect` to `fixed` in:"]
@@ -227,11 +227,12 @@ def _count(number: int, one: str, many: str) -> str:
     return f"{number} {one if number == 1 else many}"
 
 
-def _row(cells: Sequence[str]) -> str:
+def row_of(cells: Sequence[str]) -> str:
+    """Return a row of a table in Markdown."""
     return f"| {' | '.join(cells)} |"
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
     """Return text for Markdown with all special characters escaped."""
     return _MARKDOWN_SPECIAL.sub(r"\\\1", one_line(text))
 

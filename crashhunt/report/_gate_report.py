@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as Xml
 
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import command_line, in_lines, one_line, visible
+from crashhunt.base.text import command_line, in_lines, visible
+from crashhunt.report._findings import plain, row_of
 from crashhunt.report._rate_text import count_training_trials, format_interval
 
 if TYPE_CHECKING:
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     from crashhunt.statistics import CrashRate, GateReport, SideCounts
 
-_MARKDOWN_SPECIAL = re.compile(r"([\\`*_{}\[\]<>#|~])")
 _MAX_TYPES = 3  # named of each version
 _ICONS = {"better": "✅", "no_difference": "✅", "worse": "❌", "undecided": "❔"}
 
@@ -173,36 +172,36 @@ def _corpus(found: GateReport) -> list[str]:
 
 def gate_summary(found: GateReport) -> str:
     """Return the verdict of a gate as Markdown, for a pull request or the summary of a CI job."""
-    lines = [f"### {_ICONS[found.verdict]} crashhunt gate: {_plain(_answer(found))}", ""]
+    lines = [f"### {_ICONS[found.verdict]} crashhunt gate: {plain(_answer(found))}", ""]
     if found.why:
-        lines += [f"{_plain(found.why)}.", ""]
+        lines += [f"{plain(found.why)}.", ""]
     if found.pairs:
         verb = _plural(found)
-        lines += [_row("pairs of trials", f"{verb} only with BASE", "only with HEAD", "with both", "evidence")]
-        lines += [_row(*["---:"] * 5)]
+        lines += [row_of(("pairs of trials", f"{verb} only with BASE", "only with HEAD", "with both", "evidence"))]
+        lines += [row_of(["---:"] * 5)]
         counts = (found.pairs, found.only_base, found.only_head, found.both)
-        lines += [_row(*(f"{count:,}" for count in counts), f"{found.evidence:.3g}"), ""]
+        lines += [row_of([*(f"{count:,}" for count in counts), f"{found.evidence:.3g}"]), ""]
     if found.difference is not None:
         confidence = f"{found.confidence:g} %, valid whenever you look"
         difference = f"**{found.difference.as_difference()}** {_events(found)} per trial"
         lines += [f"Difference: {difference} (HEAD minus BASE, {confidence}).", ""]
     if other := [*found.cautions, *_invalid_pairs(found), *_new_types(found)]:
-        lines += [*(f"- {_plain(line)}" for line in other), ""]
+        lines += [*(f"- {plain(line)}" for line in other), ""]
     if found.trained_on:
         lines += [f"{_training_pairs(found)}.", ""]
     if found.rates is not None:
         lines += [f"- {line}" for line in _rates(found)]
         lines.append("")
     if len(found.scenarios) > 1:
-        lines += [_row("hunt", "pairs", "only BASE", "only HEAD", "both"), _row("---", *["---:"] * 4)]
+        lines += [row_of(("hunt", "pairs", "only BASE", "only HEAD", "both")), row_of(["---", *["---:"] * 4])]
         lines += [
-            _row(_plain(one.name), f"{one.pairs:,}", str(one.only_base), str(one.only_head), str(one.both))
+            row_of((plain(one.name), f"{one.pairs:,}", str(one.only_base), str(one.only_head), str(one.both)))
             for one in found.scenarios
         ]
         lines.append("")
     if found.corpus is not None:
         first, *others = _corpus(found)
-        lines += [f"{_plain(first)}.", "", *(f"- {_plain(other.strip())}" for other in others)]
+        lines += [f"{plain(first)}.", "", *(f"- {plain(other.strip())}" for other in others)]
         lines += [""] if others else []
     return "\n".join(lines)
 
@@ -255,12 +254,3 @@ def write_gate_junit(found: GateReport, path: Path) -> None:
 def _text(text: str) -> str:
     """Return text without the characters that XML does not allow."""
     return visible(text)
-
-
-def _row(*cells: str) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def _plain(text: str) -> str:
-    """Return text for Markdown with all special characters escaped."""
-    return _MARKDOWN_SPECIAL.sub(r"\\\1", one_line(text))
