@@ -588,7 +588,8 @@ class _TemporaryFiles:
 
     def _forget(self) -> None:
         """Ignore the temporary files of the parent process, because a fork does not own them."""
-        self._lock = threading.Lock()
+        # A finalizer may run anywhere, such as when `make` allocates memory, and then calls `end` in the same thread.
+        self._lock = threading.RLock()
         self._folder: Path | None = None
         self._is_shared = False
         self._opened = -1
@@ -603,16 +604,17 @@ class _TemporaryFiles:
         if not self.swept:
             remove_leftovers()
         with self._lock:
+            self._count += 1  # first, so that the folder stays if a finalizer ends the last other thing meanwhile
             for left in reversed(range(_MAX_MKDIR_ATTEMPTS)):
                 try:
-                    found = made(self._create_folder())
-                    self._count += 1
-                    return found
+                    return made(self._create_folder())
                 except FileNotFoundError:  # another process removed it or its parent, which were empty or old
                     self._close()
                     if not left:
+                        self._count -= 1
                         raise
                 except BaseException:
+                    self._count -= 1
                     self._remove_folder()
                     raise
         raise AssertionError

@@ -785,3 +785,22 @@ def test_owner_of_records_is_known_before_a_fork_that_may_outlive_it(monkeypatch
         temporary._know_owner()
         patched.setattr(temporary, "start_time", lambda _: 0)  # the process of the trial has ended
         assert temporary._owner(os.getpid()).started > 0
+
+
+def test_folder_that_is_lost_while_another_is_made_is_removed():
+    """The garbage collector may find it anywhere, also inside of the function that makes the other one."""
+    lost, made = TemporaryFolder("lost"), []
+
+    def make_another(folder):
+        lost.remove()
+        made.append(folder / "another")
+        made[0].mkdir()
+        return made[0]
+
+    thread = threading.Thread(target=lambda: temporary._things.make(make_another), daemon=True)
+    thread.start()
+    thread.join(60)
+    assert not thread.is_alive()
+    assert (made[0].is_dir(), lost.path.exists()) == (True, False)
+    temporary._things.end(made[0])
+    assert not made[0].parent.exists()
