@@ -507,7 +507,7 @@ class Ending:
         Args:
             error: The exception.
             place: The purpose for which the simulator was called.
-            is_set_up: Whether this was before the first step, so that the trial is invalid whoever failed.
+            is_set_up: Whether this was before the first step, so that the trial is invalid.
 
         Raises:
             RecorderError: the disk is full.

@@ -94,8 +94,8 @@ class Trials:
         unanswered: the finished trials that run again, in the order of their numbers, because some of their results are
             missing for an external reason. The sampler receives the result in the ledger, not the result of the second
             run, so a resumed hunt proposes the same trials.
-        lag: delay, in trials, with which a learning sampler receives results: the number of trials that run at a time;
-            in a deterministic hunt, the maximum delay, which the first trials do not reach (`growing_lag`).
+        lag: delay, in trials, with which a learning sampler receives results: the number of trials that run at a time.
+            In a deterministic hunt, it is the maximum delay, which the first trials do not reach (`growing_lag`).
         disturber: object that draws the disturbances of trials; None if trials have no disturbances.
         forcings: object that returns the forcing of each root in rare mode; None in any other hunt.
         apart: the finished trials of other versions of the code, whose results a learning sampler does not receive.

@@ -208,8 +208,8 @@ class Compact:
 
 
 ActorSelector: TypeAlias = "Callable[[int, Sequence[str], NDArray[np.float64]], NDArray[np.bool_]]"
-"""Called with the number of a step, and of the actors that are present the identifiers and the positions in m, shape
-(actors, 2); returns whether to keep each actor, shape (actors,)."""
+"""Called with the number of a step, and with identifiers and positions in m, shape (actors, 2), of its actors. Returns
+whether to keep each actor, shape (actors,)."""
 
 
 @dataclass(frozen=True, slots=True)
