@@ -25,7 +25,7 @@ from crashhunt.base.exceptions import class_name, format_error, is_users, messag
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import blocked_signals
 from crashhunt.episode._blame import Blame, blame, internal_error, party_of_simulator
-from crashhunt.scenario import Scenario
+from crashhunt.scenario import SIMULATOR_PACKAGES, Scenario
 from crashhunt.trial import UNUSABLE_VALUE, Failure, Outcome, TrialResult
 
 if TYPE_CHECKING:
@@ -254,7 +254,7 @@ def _packages_of_simulators() -> frozenset[str]:
     """Return the names of crashhunt and of the installed packages that its simulators use, including NumPy."""
     found = {"crashhunt"}
     for name, module in list(sys.modules.items()):
-        if name.startswith("crashhunt.simulators"):
+        if name.startswith(SIMULATOR_PACKAGES):
             found |= {_module_of_value(value).partition(".")[0] for value in vars(module).values()}
     return frozenset(found - sys.stdlib_module_names - {""})
 
@@ -546,7 +546,7 @@ class Ending:
         blamed = blame(error, self.simulator, place)
         found = self._attribute(blamed.error)
         if found is None and blamed.party is Party.AGENT:
-            found = Attribution("")
+            found = Attribution(next(iter(self.agents)) if len(self.agents) == 1 else "")
         # A user's environment or oracle that raises it has not recorded anything.
         is_ours = type(error) is not ForeignError or blamed.party is Party.SIMULATOR
         if found is None and isinstance(blamed.error, RecorderError) and is_ours:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         shipped_scenarios as shipped_scenarios,
     )
     from ._scenario import (
+        SIMULATOR_PACKAGES as SIMULATOR_PACKAGES,
         STEP_LENGTH_S as STEP_LENGTH_S,
         Accelerator as Accelerator,
         AgentSetup as AgentSetup,

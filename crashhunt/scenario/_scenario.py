@@ -546,6 +546,8 @@ _OWN_BACKENDS = {
     "sumo": "crashhunt.sumo._descriptor",
     "toy": "crashhunt.simulators._toy_descriptor",
 }
+SIMULATOR_PACKAGES = tuple(sorted({module.rpartition(".")[0] for module in _OWN_BACKENDS.values()}))
+"""The packages of crashhunt that contain its simulators."""
 
 
 def _plugin_backends() -> Mapping[str, EntryPoint]:

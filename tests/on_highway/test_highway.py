@@ -452,3 +452,14 @@ def test_environment_of_a_users_is_constructed_in_each_episode(how, tmp_path, mo
         monkeypatch.setattr(HighwayEnvFast, "_create_vehicles", lambda env: (random.random(), create(env)))
     simulator.ready_process()
     assert simulator._spare is None
+
+
+def test_packages_that_simulators_use_are_known_wherever_their_homes_are():
+    """Replaced functions of these packages are noticed, so that a failure in them is the agent's."""
+    code = (
+        "import crashhunt.gym._simulator, crashhunt.highway._simulator, crashhunt.sumo._simulator\n"
+        "from crashhunt.episode import _failures\n"
+        "print(*_failures._packages_of_simulators())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert {"crashhunt", "numpy", "gymnasium", "highway_env", "libsumo"} <= set(done.stdout.split())
