@@ -546,7 +546,7 @@ class Ending:
         blamed = blame(error, self.simulator, place)
         found = self._attribute(blamed.error)
         if found is None and blamed.party is Party.AGENT:
-            found = Attribution(next(iter(self.agents)) if len(self.agents) == 1 else "")
+            found = Attribution("")
         # A user's environment or oracle that raises it has not recorded anything.
         is_ours = type(error) is not ForeignError or blamed.party is Party.SIMULATOR
         if found is None and isinstance(blamed.error, RecorderError) and is_ours:
