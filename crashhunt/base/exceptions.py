@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 MAX_MESSAGE_CHARACTERS: Final = 10_000
 MAX_TRACEBACK_CHARACTERS: Final = 100_000
 _MAX_NAME_CHARACTERS: Final = 200
+_TRACEBACK_LINE: Final = "Traceback (most recent call last):\n"
 _MAX_FRAMES: Final = 2_000  # the last frames show where the error is; Python takes 13 s to format a million
 
 
@@ -45,7 +46,12 @@ def format_error(error: BaseException) -> str:
     fails.
     """
     try:
-        text = "".join(traceback.format_exception(error, limit=-_MAX_FRAMES))
+        message = message_of(error, MAX_TRACEBACK_CHARACTERS)
+        if len(message) > MAX_TRACEBACK_CHARACTERS:  # Python takes seconds to split a message of a million lines
+            frames = traceback.format_tb(error.__traceback__, limit=-_MAX_FRAMES)
+            text = "".join([_TRACEBACK_LINE, *frames, f"{class_name(error)}: {message}\n"])
+        else:
+            text = "".join(traceback.format_exception(error, limit=-_MAX_FRAMES))
     except BaseException:  # raised by a class of a user's, or by something that an agent has patched
         try:
             text = f"{class_name(error)}: {message_of(error)}\n"

@@ -134,3 +134,14 @@ def test_copy_of_an_error_has_its_text(kind):
     assert str(kind(error)) == str(error) == "hunt.toml: speed is 3; give 2"
     assert str(kind(error, fix="give 1")) == "hunt.toml: speed is 3; give 1"
     assert kind(error).to_json() == error.to_json()
+
+
+def test_python_does_not_format_a_message_of_a_million_lines(monkeypatch):
+    monkeypatch.setattr(traceback, "format_exception", lambda *_, **__: pytest.fail("it takes seconds"))
+    try:
+        raise ValueError("ab\n" * 1_000_000)
+    except ValueError as error:
+        text = format_error(error)
+    assert text.startswith("Traceback (most recent call last):\n")
+    assert f'File "{__file__}"' in text
+    assert text.endswith("… (2900000 more characters are left out)\n")
