@@ -16,16 +16,14 @@ if TYPE_CHECKING:
         Reseed as Reseed,
         SetArguments as SetArguments,
         interventions_of as interventions_of,
-        step_before as step_before,
     )
-    from ._minimization import Shrunk as Shrunk, shrink as shrink, shrunk_name as shrunk_name
+    from ._minimization import Shrunk as Shrunk, shrink as shrink
     from ._types_by_cause import (
         REPRESENTATIVES as REPRESENTATIVES,
         divide_by_cause as divide_by_cause,
         find_cause as find_cause,
     )
     from ._whatif_runs import (
-        FUTURES as FUTURES,
         Counts as Counts,
         Run as Run,
         WhatIfOptions as WhatIfOptions,

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from ._cases import (
         Added as Added,
         Case as Case,
-        Expectation as Expectation,
         KnownType as KnownType,
         add_case as add_case,
         cases_of_type as cases_of_type,

@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from ._cause_groups import (
         Cause as Cause,
         CauseGroup as CauseGroup,
-        CauseType as CauseType,
         Division as Division,
         cause_of as cause_of,
         count_causes as count_causes,
@@ -68,7 +67,6 @@ if TYPE_CHECKING:
         Attempt as Attempt,
         Factor as Factor,
         Judgement as Judgement,
-        JudgementVerdict as JudgementVerdict,
         LeftOut as LeftOut,
         Why as Why,
         judgement_of as judgement_of,
@@ -96,7 +94,6 @@ if TYPE_CHECKING:
     from ._signature import (
         SIGNATURE_VERSION as SIGNATURE_VERSION,
         Signature as Signature,
-        StackFrame as StackFrame,
         own_frames as own_frames,
         signature_of as signature_of,
         signature_of_fault as signature_of_fault,

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._disk_check import Checked as Checked, CheckFinding as CheckFinding, check as check, salvage as salvage
+    from ._disk_check import Checked as Checked, check as check, salvage as salvage
     from ._hunt import Hunt as Hunt
     from ._next_trials import (
         GREATEST_LAG as GREATEST_LAG,

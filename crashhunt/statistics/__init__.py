@@ -73,15 +73,12 @@ if TYPE_CHECKING:
     from ._units import (
         MAX_INVALID_SHARE as MAX_INVALID_SHARE,
         PER_WORDS as PER_WORDS,
-        PERS as PERS,
         CountingRule as CountingRule,
         Per as Per,
         RateCounter as RateCounter,
         TrialFacts as TrialFacts,
-        Unit as Unit,
         UnitSequence as UnitSequence,
         facts_of as facts_of,
-        facts_of_plain as facts_of_plain,
     )
 
 offer_lazily(__name__)

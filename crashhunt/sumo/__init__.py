@@ -6,11 +6,8 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._bent_vehicles import height_at as height_at
-    from ._demand_order import SORT_FIX as SORT_FIX, is_searched as is_searched, unsorted_notes as unsorted_notes
     from ._descriptor import BACKEND as BACKEND
-    from ._ego import NOT_ON_A_ROAD as NOT_ON_A_ROAD, SurveyedRun as SurveyedRun
     from ._files import (
-        READ as READ,
         WRITTEN as WRITTEN,
         StagedFiles as StagedFiles,
         filled_in as filled_in,
@@ -21,11 +18,10 @@ if TYPE_CHECKING:
         rewritten as rewritten,
         written_by as written_by,
     )
-    from ._names import check_names as check_names, explained as explained, places_of as places_of
+    from ._names import check_names as check_names, explained as explained
     from ._options import (
         HARMLESS as HARMLESS,
         INPUTS as INPUTS,
-        RESERVED as RESERVED,
         SumoSetup as SumoSetup,
         canonical as canonical,
         is_output as is_output,
@@ -34,7 +30,6 @@ if TYPE_CHECKING:
         writes as writes,
     )
     from ._range_of_sight import Sight as Sight
-    from ._side_effects import ATTRIBUTES as ATTRIBUTES, ELEMENTS as ELEMENTS, LABELS as LABELS
     from ._simulator import SumoSimulator as SumoSimulator
     from ._sumocfg import load_sumocfg as load_sumocfg
     from ._traffic_events import SumoEvents as SumoEvents

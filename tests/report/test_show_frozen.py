@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.analysis import step_before
+from crashhunt.analysis._interventions import step_before
 from crashhunt.crashes import find_bundle, open_archive
 from crashhunt.report._crash_text import Story, _steps_around, _thinned
 from crashhunt.report._page import _crash

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     )
     from ._road_network import RoadNetwork as RoadNetwork, read_network as read_network
     from ._source import (
-        ENDINGS as ENDINGS,
         MapSource as MapSource,
         check_source as check_source,
         parse_bbox as parse_bbox,
