@@ -16,6 +16,6 @@ if sys.argv[1] == "libsumo":
 else:
     done = crashhunt.accelerate()
     reasons = [] if done else [f"not accelerated: {done.reason}"]
-    todo = "run tests/on_highway/accelerator/test_accelerator.py with it, then add its digest to _supported.py"
+    todo = "run tests/on_highway/accelerator/test_accelerator.py with it, then add its digest to _known_versions.py"
 print(f"{sys.argv[1]} {version}: {'; '.join(reasons) or 'known'}")
 sys.exit(f"to do: {todo}" if reasons else 0)

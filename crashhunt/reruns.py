@@ -282,7 +282,7 @@ def _executor(worker: WorkerSettings, where: Where, parallel: int) -> Executor:
 
 
 def _require_same_trial(asked: TrialSpec, run: TrialSpec) -> None:
-    """Check that the specification of a trial came back unchanged, because early versions ignore unknown keys.
+    """Check that the specification of a trial came back unchanged, because an earlier crashhunt ignores unknown keys.
 
     Raises:
         NotUnderstoodError: a part of the specification was ignored.

@@ -236,7 +236,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def outdated_entry_points(pyproject: Path) -> list[str]:
     """Return the names of commands and plugins that were installed otherwise than `pyproject.toml` has them now.
 
-    With ``pytest`` alone, which does not make the environment anew, tests of hunts failed one by one for such a name.
+    scripts/test installs again when `pyproject.toml` changes, but ``pytest`` alone does not. Without this check, many
+    tests of hunts fail, and none names the reason.
     """
     project = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]
     groups = {"console_scripts": project["scripts"], **project["entry-points"]}

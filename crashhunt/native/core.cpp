@@ -1064,7 +1064,7 @@ struct Pair {
 };
 
 // may_be_near(parts, gap, horizon, gap so far, time so far, braking so far, only the best) -> (numbers, places) | None
-// The conditions of `approaches` in crashhunt/world/_approach.py with some slack: who fulfils them there does so here.
+// The conditions of `approaches` in world/_closest_approach.py with some slack: who fulfils them there does so here.
 // Where only the best is asked for, those are left out who are surely not as near, in any way, as somebody else.
 PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
     if (count != 7) {

@@ -156,12 +156,18 @@ def crashes_summary(findings: Sequence[CrashFinding], *, compared: bool = False)
     lines += [row_of(names), row_of(["---:", "---", "---", "---", "---:", *(["---"] if compared else [])])]
     for finding in findings:
         group, shortest = finding.group, finding.group.shortest
-        cells = [str(group.count), plain(finding.title), group.fault, f"`{shortest.id}`", str(shortest.result.steps)]
+        cells = [
+            str(group.count),
+            escaped(finding.title),
+            group.fault,
+            f"`{shortest.id}`",
+            str(shortest.result.steps),
+        ]
         lines.append(row_of([*cells, *([f"`{finding.known}`" if finding.known else "**new**"] if compared else [])]))
     lines += ["", "The shortest crash of each type:", ""]
     for finding in findings:
         place = f" (`{finding.file}`, line {finding.line})" if finding.file else ""
-        lines.append(f"- {plain(finding.group.shortest.result.summary)}{place}")
+        lines.append(f"- {escaped(finding.group.shortest.result.summary)}{place}")
     return "\n".join([*lines, ""])
 
 
@@ -187,7 +193,7 @@ def corpus_summary(reports: Sequence[CaseReport]) -> str:
     for report in sorted(reports, key=lambda report: report.ok):
         got = report.got.replace("_", " ")
         today = got if report.ok else f"**{got}**"
-        cells = [f"`{report.path}`", report.expected, today, plain(report.now), plain(report.note)]
+        cells = [f"`{report.path}`", report.expected, today, escaped(report.now), escaped(report.note)]
         lines.append(row_of([_ICONS[report.got] if report.ok else "❌", *cells]))
     tighter = [report for report in reports if report.may_be_tightened]
     if tighter:
@@ -232,7 +238,7 @@ def row_of(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def plain(text: str) -> str:
+def escaped(text: str) -> str:
     """Return text for Markdown with all special characters escaped."""
     return _MARKDOWN_SPECIAL.sub(r"\\\1", one_line(text))
 

@@ -7,7 +7,7 @@ from xml.etree import ElementTree as Xml
 
 from crashhunt.base.files import whole_file
 from crashhunt.base.text import command_line, in_lines, visible
-from crashhunt.report._findings import plain, row_of
+from crashhunt.report._findings import escaped, row_of
 from crashhunt.report._rate_text import count_training_trials, format_interval
 
 if TYPE_CHECKING:
@@ -172,9 +172,9 @@ def _corpus(found: GateReport) -> list[str]:
 
 def gate_summary(found: GateReport) -> str:
     """Return the verdict of a gate as Markdown, for a pull request or the summary of a CI job."""
-    lines = [f"### {_ICONS[found.verdict]} crashhunt gate: {plain(_answer(found))}", ""]
+    lines = [f"### {_ICONS[found.verdict]} crashhunt gate: {escaped(_answer(found))}", ""]
     if found.why:
-        lines += [f"{plain(found.why)}.", ""]
+        lines += [f"{escaped(found.why)}.", ""]
     if found.pairs:
         verb = _plural(found)
         lines += [row_of(("pairs of trials", f"{verb} only with BASE", "only with HEAD", "with both", "evidence"))]
@@ -186,22 +186,25 @@ def gate_summary(found: GateReport) -> str:
         difference = f"**{found.difference.as_difference()}** {_events(found)} per trial"
         lines += [f"Difference: {difference} (HEAD minus BASE, {confidence}).", ""]
     if other := [*found.cautions, *_invalid_pairs(found), *_new_types(found)]:
-        lines += [*(f"- {plain(line)}" for line in other), ""]
+        lines += [*(f"- {escaped(line)}" for line in other), ""]
     if found.trained_on:
         lines += [f"{_training_pairs(found)}.", ""]
     if found.rates is not None:
         lines += [f"- {line}" for line in _rates(found)]
         lines.append("")
     if len(found.scenarios) > 1:
-        lines += [row_of(("hunt", "pairs", "only BASE", "only HEAD", "both")), row_of(["---", *["---:"] * 4])]
         lines += [
-            row_of((plain(one.name), f"{one.pairs:,}", str(one.only_base), str(one.only_head), str(one.both)))
+            row_of(("hunt", "pairs", "only BASE", "only HEAD", "both")),
+            row_of(["---", *["---:"] * 4]),
+        ]
+        lines += [
+            row_of((escaped(one.name), f"{one.pairs:,}", str(one.only_base), str(one.only_head), str(one.both)))
             for one in found.scenarios
         ]
         lines.append("")
     if found.corpus is not None:
         first, *others = _corpus(found)
-        lines += [f"{plain(first)}.", "", *(f"- {plain(other.strip())}" for other in others)]
+        lines += [f"{escaped(first)}.", "", *(f"- {escaped(other.strip())}" for other in others)]
         lines += [""] if others else []
     return "\n".join(lines)
 

@@ -112,7 +112,7 @@ def test_an_outline_that_is_met_within_a_step_counts():
 
 @pytest.mark.parametrize("turned", [0.0, 2.2])
 def test_braking_follows_the_path_that_was_driven(turned):
-    """Round a corner stands somebody, beside the straight on."""
+    """The other vehicle stands around a corner, and not on the straight line ahead."""
     radius, speed, dt = 20.0, 10.0, 0.1
 
     def on_path(distance):
@@ -215,7 +215,7 @@ def test_a_bent_one_is_measured_by_its_parts():
     (away,) = Encounter(recording(far, sizes=sizes, spines={1: spine}), "ego", "other").moments
     assert away.gap_m == pytest.approx(118.75)  # as if it were straight
     assert away.time_to_collision_s == math.inf
-    # A spine of somebody else changes nothing.
+    # The spine of a third actor changes nothing.
     third = {**step, "tram": (99.0, 99.0, 0.0, 0.0)}
     (unbent,) = Encounter(recording(third, sizes=sizes, spines={2: spine}), "ego", "other").moments
     assert unbent.gap_m == pytest.approx(28.75)

@@ -1,4 +1,4 @@
-"""Long recordings are decoded anew at each use, a part at a time, and give the same as if they were kept."""
+"""A long recording is decoded in parts at each use, with the same result as a recording that stays decoded."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ REFUSED = "the code has changed since the"
 def agent(tmp_path, monkeypatch):
     """Writes the agent, which fails in trials whose seeds, modulo 4, are given.
 
-    The files of crashhunt itself do not count: somebody may work on them while these tests run.
+    The files of crashhunt itself do not count, because a developer may change them while these tests run.
     """
 
     def write(*fails):
