@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 import sysconfig
 import traceback
 from pathlib import Path
@@ -46,7 +47,7 @@ def format_error(error: BaseException) -> str:
     fails.
     """
     try:
-        message = message_of(error, MAX_TRACEBACK_CHARACTERS)
+        message = message_of(error, sys.maxsize)
         if len(message) > MAX_TRACEBACK_CHARACTERS:  # Python takes seconds to split a message of a million lines
             frames = traceback.format_tb(error.__traceback__, limit=-_MAX_FRAMES)
             text = "".join([_TRACEBACK_LINE, *frames, f"{class_name(error)}: {message}\n"])

@@ -434,13 +434,14 @@ def bench_orchestration() -> Iterator[Figure]:
             trials = 4000
             options = ("--scenario", str(_toy(place)), "--seed", "1", "--keep-going")
             hunt(directory, 1, 1, 1, *options)
+            (snapshot,) = (directory / "snapshots").iterdir()  # or the hunt refuses trials of other code
             ledger = Ledger(directory / "ledger.sqlite", writable=True)
             ledger._database.execute("BEGIN")
             for number in range(1, already):
                 spec = TrialSpec(
                     number=number, seed=number, arguments={"ego": {"speed": 1.0}}, scenario_arguments={}, max_steps=1
                 )
-                ledger.record(TrialResult(spec, Outcome.SURVIVED, steps=1, wall_s=0.0), snapshot="")
+                ledger.record(TrialResult(spec, Outcome.SURVIVED, steps=1, wall_s=0.0), snapshot=snapshot.name)
             ledger._database.execute("COMMIT")
             ledger.close()
             few = hunt(directory, 1, already + 1, 1, *options)["wall_s"]
