@@ -28,12 +28,14 @@ class _Mark(NamedTuple):
     Args:
         step: number of the step.
         record: index of its first record.
-        roster: the actors before this record.
+        roster: the actors of the scene before this record.
+        actors: number of actors that earlier records define.
     """
 
     step: int
     record: int
     roster: Roster
+    actors: int
 
 
 class DecodedSteps(Sequence[StepRecord]):
@@ -57,9 +59,9 @@ class DecodedSteps(Sequence[StepRecord]):
         decoded_bytes = _BYTES_PER_RECORD * len(records) + _BYTES_PER_RECORDED_BYTE * records.size
         self._max_chunks = _MAX_CHUNKS if decoded_bytes > _MAX_DECODED_BYTES else len(records)
         # One step before each chunk but the first, because a scene knows the scene before it.
-        self._marks = [_Mark(0, 1, Roster(()))]
+        self._marks = [_Mark(0, 1, Roster(()), 0)]
         chunk = 0
-        while len(self._chunk(chunk, self.actors)) == _CHUNK_STEPS:
+        while len(self._chunk(chunk)) == _CHUNK_STEPS:
             chunk += 1
         last = self._chunk(chunk)
         self._length = chunk * _CHUNK_STEPS + len(last)
@@ -86,18 +88,19 @@ class DecodedSteps(Sequence[StepRecord]):
         chunk, row = divmod(range(self._length)[place], _CHUNK_STEPS)
         return self._chunk(chunk)[row]
 
-    def _chunk(self, number: int, actors: list[Actor] | None = None) -> list[StepRecord]:
-        """Return the steps of a chunk; new actors are added to the given list at the first use of the chunk."""
+    def _chunk(self, number: int) -> list[StepRecord]:
         steps = self._chunks.get(number)
         if steps is None:
-            steps = self._chunks[number] = self._decode(number, [*self.actors] if actors is None else actors)
+            steps = self._chunks[number] = self._decode(number)
             if len(self._chunks) > self._max_chunks:
                 self._chunks.popitem(last=False)
         self._chunks.move_to_end(number)
         return steps
 
-    def _decode(self, number: int, actors: list[Actor]) -> list[StepRecord]:
+    def _decode(self, number: int) -> list[StepRecord]:
         mark, last = self._marks[number], (number + 1) * _CHUNK_STEPS - 1
+        # The chunk before has read past the mark, and the records define an actor by its place among all actors.
+        actors = self.actors[: mark.actors]
         reading = Reading(
             prologue=self._prologue, actors=actors, steps=[], current=StepRecord(mark.step), roster=mark.roster
         )
@@ -109,11 +112,13 @@ class DecodedSteps(Sequence[StepRecord]):
             read(reading, aux, payload)
             if tag == STEP.tag:
                 if reading.current.step == last and number + 1 == len(self._marks):
-                    self._marks.append(_Mark(last, index, reading.roster))
+                    self._marks.append(_Mark(last, index, reading.roster, len(actors)))
                 if reading.current.step > last:
                     break
         else:
             reading.finish()
+        if len(actors) > len(self.actors):
+            self.actors = actors
         return reading.steps[1:] if number else reading.steps
 
 

@@ -28,13 +28,19 @@ from crashhunt.trial import Disturbance
 from crashhunt.world import Actor, Roster, Scene, join_frames
 
 PROLOGUE = Prologue((), 0.1)
-ACTORS = tuple(Actor(name, "car", 5.0, 2.0) for name in ("ego", "ahead", "late"))
+ACTORS = tuple(Actor(name, "car", 5.0, 2.0) for name in ("ego", "ahead", "late", "last"))
 STEPS = 75
 
 
+@pytest.fixture(params=[30, 31], ids=["within a part", "in the step that two parts share"])
+def arrival(request):
+    """The step at which the third vehicle comes."""
+    return request.param
+
+
 @pytest.fixture
-def records(tmp_path):
-    """The ego approaches another vehicle and changes to its lane; a third vehicle comes late."""
+def records(tmp_path, arrival):
+    """The ego approaches another vehicle and changes to its lane; a third vehicle comes late, and a fourth later."""
     box = BlackBox(tmp_path / "box")
     box.begin(pid=1, trial=0, started=0.0)
     box.prologue(replace(PROLOGUE).encode(), 0)
@@ -42,13 +48,14 @@ def records(tmp_path):
     roster = Roster(ACTORS[:2])
     box.append(Tag.ROSTER, 0, encode_roster([0, 1]))
     for step in range(STEPS):
-        if step == 30:
-            box.append(Tag.ACTORS, 0, encode_actors(ACTORS[2:]))
-            box.append(Tag.ROSTER, 0, encode_roster([0, 1, 2]))
-            roster = Roster(ACTORS)
-        points = [(2.0 * step, min(0.1 * step, 3.2)), (20.0 + 1.8 * step, 3.2), (2.5 * step - 80.0, 3.2)]
+        if step in {arrival, arrival + 20}:
+            count = len(roster) + 1
+            box.append(Tag.ACTORS, 0, encode_actors(ACTORS[count - 1 : count]))
+            box.append(Tag.ROSTER, 0, encode_roster([*range(count)]))
+            roster = Roster(ACTORS[:count])
+        points = [(2.0 * step, min(0.1 * step, 3.2)), (20.0 + 1.8 * step, 3.2), (2.5 * step - 80.0, 3.2), (0.0, 9.0)]
         count = len(roster)
-        speeds = [20.0, 18.0, 25.0][:count]
+        speeds = [20.0, 18.0, 25.0, 1.0][:count]
         box.step(step, Scene(0.1 * step, roster, points[:count], [0.0] * count, speeds), ())
     box.append(Tag.DISTURBANCE, 0, encode_disturbance(Disturbance(STEPS, "ahead", "brake", 3.0, 1.0)))
     yield read_black_box(tmp_path / "box")
@@ -61,9 +68,9 @@ def decoded(monkeypatch):
     found = Counter()
     decode = _decoded_steps.DecodedSteps._decode
 
-    def counted(self, number, actors):
+    def counted(self, number):
         found[number] += 1
-        return decode(self, number, actors)
+        return decode(self, number)
 
     monkeypatch.setattr(_decoded_steps.DecodedSteps, "_decode", counted)
     monkeypatch.setattr(_decoded_steps, "_CHUNK_STEPS", 8)
@@ -99,7 +106,7 @@ def test_steps_that_are_decoded_at_each_use_are_those_that_are_kept(records, req
     long = Recording(records)
     assert everything(long) == expected
     assert measured(long) == numbers
-    assert long.actors == kept.actors
+    assert long.actors == kept.actors == [*ACTORS]
     assert (long.steps, len(long.scenes()), len(long.all_steps)) == (STEPS - 1, STEPS, len(kept.all_steps))
     assert long.digest == kept.digest
     assert [scene.time_s for scene in reversed(long.scenes()[10:70:7])] == times
@@ -175,8 +182,8 @@ def test_a_log_that_is_written_and_read_in_parts_is_the_log(records, request, tm
     assert read_log(tmp_path / "long.mcap").records == records
 
 
-def test_joined_frames_have_the_columns_of_their_scenes(records):
+def test_joined_frames_have_the_columns_of_their_scenes(records, arrival):
     scenes = Recording(records).scenes()
     frames = list(join_frames(scenes))
-    assert [len(frame.columns) for frame in frames] == [30, STEPS - 30]
-    assert np.array_equal(np.concatenate([scene.frame.columns for scene in scenes[:30]]), frames[0].columns)
+    assert [len(frame.columns) for frame in frames] == [arrival, 20, STEPS - arrival - 20]
+    assert np.array_equal(np.concatenate([scene.frame.columns for scene in scenes[:arrival]]), frames[0].columns)
