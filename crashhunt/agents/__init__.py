@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         StableBaselines3 as StableBaselines3,
         TorchPolicy as TorchPolicy,
     )
+    from ._programs import ProgramAgent as ProgramAgent, ProgramFactory as ProgramFactory
     from ._protocol import (
         Agent as Agent,
         Closes as Closes,

@@ -21,6 +21,7 @@
     └── EpisodeError               raised inside an episode; becomes the trial's outcome
         ├── InvalidEpisodeError    the episode could not be set up
         ├── ActionError            the agent returned something outside its action space
+        ├── ProgramError           the program of an agent has failed, or breaks the protocol
         ├── UnusableValueError     a value of the user's code is neither a bool nor a number; ends the hunt
         └── SimulatorError         the simulator failed
 """
@@ -188,6 +189,10 @@ class InvalidEpisodeError(EpisodeError):
 
 class ActionError(EpisodeError):
     """The agent returned something outside its action space."""
+
+
+class ProgramError(EpisodeError):
+    """The program of an agent has failed, or has sent something that the protocol does not contain."""
 
 
 class UnusableValueError(EpisodeError):

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 from crashhunt.base import layout
 from crashhunt.base.errors import FULL, CrashhuntError, UntrustedError, UsageError
 from crashhunt.base.files import cannot_write
+from crashhunt.base.programs import is_program
 from crashhunt.base.removed import removed_fix
 from crashhunt.base.text import command_line, did_you_mean, one_line, one_of, visible
 from crashhunt.plans import hunt_options
@@ -208,7 +209,7 @@ def pairs(words: list[str], option: str, *, named: bool = True) -> dict[str, str
     found: dict[str, str] = {}
     for word in words:
         name, equals, value = word.partition("=")
-        if not equals and not named:
+        if not named and (not equals or is_program(word)):
             name, value = "", word
         elif not equals or not name:
             raise UsageError(f"{option} {word!r} has no name", fix=f"write {option} NAME=VALUE")

@@ -15,6 +15,7 @@ from crashhunt.base.builds import BuildError, clean_tree, files_outside, run_bui
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.git import checked_out, commit_of, git, import_environment, run_to_end, top_of
+from crashhunt.base.programs import is_program
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.corpus._case_runs import Got
 from crashhunt.corpus._cases import add_case
@@ -81,7 +82,9 @@ def bisect(
     ends = [commit_of(folder, name) for name in (good, bad)]
     settings = read_settings(bundle.hunt / layout.HUNT)
     modules = {
-        agent.agent.partition(":")[0] for agent in settings.agents.values() if not agent.agent.startswith("crashhunt.")
+        agent.agent.partition(":")[0]
+        for agent in settings.agents.values()
+        if not agent.agent.startswith("crashhunt.") and not is_program(agent.agent)
     }
     tried: dict[str, Got] = {}
     with temporary_folder("bisect") as scratch, checked_out(top, ends[1], purpose="bisect") as tree:

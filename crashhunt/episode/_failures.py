@@ -17,6 +17,7 @@ from crashhunt.base.errors import (
     ActionError,
     EpisodeError,
     InvalidEpisodeError,
+    ProgramError,
     RecorderError,
     SimulatorError,
     UnusableValueError,
@@ -47,6 +48,7 @@ _MIN_RECURSION_LIMIT: Final = 1000
 _PARTY_BY_ERROR: tuple[tuple[type[BaseException], str], ...] = (
     (ActionError, "bad action"),
     (InvalidEpisodeError, "invalid"),
+    (ProgramError, "program"),
     (UnusableValueError, UNUSABLE_VALUE),
     (SimulatorError, "simulator error"),
 )
@@ -64,7 +66,8 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str 
     """
     with blocked_signals(), _deep_enough():
         # crashhunt's own messages are complete, so they need no traceback.
-        text = "" if issubclass(type(error), InvalidEpisodeError | UnusableValueError) else format_error(error)
+        own = InvalidEpisodeError | ProgramError | UnusableValueError
+        text = "" if issubclass(type(error), own) else format_error(error)
         words = message_of(error)
         # A class of a user's may have a metaclass of any kind, so nothing is looked up by it.
         kind = next((kind for one, kind in _PARTY_BY_ERROR if type(error) is one), None) or class_name(error)

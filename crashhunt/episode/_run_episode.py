@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crashhunt.agents import NeedsLibraries
+from crashhunt.agents import NeedsLibraries, ProgramFactory
 from crashhunt.base.boundaries import Boundary, Party, is_ours
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
@@ -251,6 +251,9 @@ class Parts:
         """
         try:
             factory, given = self._prepared(agent, simulator, arguments)
+            if isinstance(factory, ProgramFactory):
+                stage, files = stage_of(self._settings.scratch, os.getpid()), self._settings.argument_files
+                return factory.agent(agent, simulator, given, folder=stage, files=files)
         except CrashhuntError:
             raise
         except Exception as error:
@@ -286,6 +289,8 @@ class Parts:
         found = self._factories.get(agent)
         if found is None:
             factory = locate("agents", self._settings.scenario.agents[agent].agent)
+            if isinstance(factory, ProgramFactory):  # which would have to run to tell its arguments
+                return self._factories.setdefault(agent, (factory, ()))
             if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
                 require_origin(factory.__module__, self._settings.code)
             found = self._factories[agent] = factory, signature_of(factory).given

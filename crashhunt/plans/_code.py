@@ -12,8 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.errors import ProgramError
 from crashhunt.base.isolation import files_read_apart, work_apart
 from crashhunt.base.plugins import ImportedModules, is_foreign, is_foreign_module, locate
+from crashhunt.base.programs import is_program
+from crashhunt.base.temporary import temporary_folder
 from crashhunt.disturbances import described_model, modules_of_models, parse_rates
 from crashhunt.oracles import described_oracle, modules_of, oracle_name
 from crashhunt.plans._settings import executor_name
@@ -44,12 +47,14 @@ class CodeFacts:
         disturbances: the kind of each user-defined disturbance model, by name.
         imported: the modules that a process with all of this code has imported; None if all modules are crashhunt's
             own.
+        notes: what the user should know, as lines of text.
     """
 
     signatures: Mapping[str, Signature]
     oracles: Mapping[str, Mapping[str, Category]] = field(default_factory=dict)
     disturbances: Mapping[str, str] = field(default_factory=dict)
     imported: ImportedModules | None = None
+    notes: tuple[str, ...] = ()
 
 
 def describe_code(
@@ -69,6 +74,7 @@ def describe_code(
         CrashhuntError: user code cannot be imported, or has ended or stopped its process.
     """
     locators = sorted({setup.agent for setup in scenario.agents.values()})
+    programs = [locator for locator in locators if is_program(locator)]
     chosen = [text for text in oracles if is_foreign("oracles", oracle_name(text)) and text != "none"]
     models = [name for name in parse_rates(disturb) if is_foreign("disturbances", name)]
     modules = [*scenario.modules(), *modules_of(oracles), *modules_of_models(disturb)]
@@ -78,7 +84,7 @@ def describe_code(
 
     def described(report: Report) -> Plain:
         signatures, outcomes, kinds = {}, {}, {}
-        for locator in locators:
+        for locator in sorted({*locators} - {*programs}):
             report(f"{locator!r} cannot be imported")
             signatures[locator] = signature_of(locate("agents", locator)).to_json()
         for text in chosen:
@@ -95,12 +101,39 @@ def describe_code(
 
     if not (foreign or chosen or models or machinery or any(map(is_foreign_module, modules))):
         return CodeFacts({locator: signature_of(locate("agents", locator)) for locator in locators})
+    declared, notes = _declared(programs, scenario, IMPORT_S + timeout_s) if programs else ({}, [])
     data: Any = work_apart(described, task="what it names cannot be imported", timeout_s=IMPORT_S + timeout_s)
-    signatures = {locator: Signature.from_json(found) for locator, found in data["signatures"].items()}
+    signatures = {locator: Signature.from_json(found) for locator, found in data["signatures"].items()} | declared
     return CodeFacts(
         signatures=signatures, oracles=data["oracles"], disturbances=data["disturbances"],
-        imported=ImportedModules.from_json(data["imported"]),
+        imported=ImportedModules.from_json(data["imported"]), notes=tuple(notes),
     )  # fmt: skip
+
+
+def _declared(locators: Sequence[str], scenario: Scenario, timeout_s: float) -> tuple[dict[str, Signature], list[str]]:
+    """Return the arguments that programs declare, and a note for each program that has failed.
+
+    A program that fails takes any argument. The trials report the failure, each as an error of the agent. The
+    simulator, whose spaces a program receives, is created in a fork of its own, because its files are not the agent's.
+    """
+
+    def described(report: Report) -> Plain:
+        found: dict[str, Any] = {"signatures": {}, "notes": []}
+        with temporary_folder("agent") as stage:
+            for locator in locators:
+                report(f"{locator!r} cannot be described")
+                agent = next(name for name, setup in scenario.agents.items() if setup.agent == locator)
+                simulator = locate("simulators", scenario.simulator)(scenario, stage)
+                try:
+                    signature = locate("agents", locator).declared_signature(agent, simulator)
+                except ProgramError as error:
+                    found["notes"].append(f"{locator} has not declared its arguments: {error}")
+                    signature = Signature({}, open=True, given=())
+                found["signatures"][locator] = signature.to_json()
+        return found
+
+    data: Any = work_apart(described, task="the programs cannot be described", timeout_s=timeout_s)
+    return {locator: Signature.from_json(found) for locator, found in data["signatures"].items()}, data["notes"]
 
 
 def imported_by(scenario: Scenario, settings: HuntSettings) -> ImportedModules:

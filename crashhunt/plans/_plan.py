@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, UsageError
-from crashhunt.base.plugins import is_foreign, registered
+from crashhunt.base.plugins import is_foreign, locate, registered
+from crashhunt.base.programs import is_program
 from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import ModelApart, disturber_of, locate_model, parse_fixed, parse_rates, word_of
 from crashhunt.native import HOW_TO_REBUILD, outdated_modules
@@ -26,7 +27,17 @@ from crashhunt.plans._run_options import TrialOptions
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
 from crashhunt.scenario import Scenario, backend_of, load_scenario, scenario_digest, titles, with_action
-from crashhunt.trial import CRASHES, EVENTS, FILLED_BY_NAME, Argument, Constant, Outcome, Signature, parse_spec
+from crashhunt.trial import (
+    CRASHES,
+    EVENTS,
+    FILLED_BY_NAME,
+    Argument,
+    Constant,
+    Outcome,
+    Signature,
+    parse_spec,
+    signature_of,
+)
 from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
@@ -233,6 +244,8 @@ def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None)
         The accepted arguments. If they cannot be determined, every argument is accepted, because the first run reports
         the reason.
     """
+    if is_program(locator):
+        return _takes_of_program(locator)
     points = registered("agents")
     target = points[locator].value if locator in points else locator
     home = str(folder or Path.cwd())
@@ -247,6 +260,15 @@ def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None)
     except (OSError, ValueError, subprocess.SubprocessError):
         return Takes(open=True)
     return Takes(tuple(names), bool(is_open), {name: defaults[name] for name in names if name in defaults})
+
+
+def _takes_of_program(locator: str) -> Takes:
+    try:
+        signature = signature_of(locate("agents", locator))
+    except CrashhuntError:
+        return Takes(open=True)
+    defaults = {name: one.default for name, one in signature.arguments.items() if one.default is not None}
+    return Takes(tuple(signature.arguments), signature.open, defaults)
 
 
 def plan(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario, HuntSettings]:
@@ -314,10 +336,11 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
     scenario = _with_notes_on_crashes(_with_notes(scenario, request.run), settings, request, code.oracles)
-    scenario = replace(scenario, notes=(*scenario.notes, *_notes_on_statistics(settings, signatures)))
+    scenario = replace(scenario, notes=(*scenario.notes, *code.notes, *_notes_on_statistics(settings, signatures)))
     find = partial(_model_apart, code, request.run.timeout_s)
     with _name_scenario_in_errors(request, scenario):
         disturber(scenario, settings.disturb, tuple(settings.agents), find=find)  # it refuses what cannot be meant
+    _check_programs(settings)
     _check_branch(settings)
     _check_rare(settings, scenario, find)
     sampler_of(settings)  # it refuses what it cannot sample
@@ -478,6 +501,16 @@ def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
         *(f"{name}={rate!r}" for name, rate in parse_rates(words).items()),
         *(word_of(one, agents) for one in begun),
     )
+
+
+def _check_programs(settings: HuntSettings) -> None:
+    """Refuse forks of running trials in which a program drives: a fork of the trial has no copy of the program."""
+    agent = next((name for name, chosen in settings.agents.items() if is_program(chosen.agent)), None)
+    forking = {"--probe": settings.probe, "--branch": settings.branch, "--rare": settings.rare}
+    option = next((flag for flag, value in forking.items() if value), None)
+    if agent is not None and option is not None:
+        message = f"{option} forks running trials, and the program that drives {agent} cannot be forked"
+        raise UsageError(message, fix=f"omit {option}, or name an agent in Python")
 
 
 def _check_branch(settings: HuntSettings) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import tomllib
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from crashhunt.base.files import cannot_write
 from crashhunt.base.integrity import read_bounded
 from crashhunt.base.layout import PACKAGE, SCENARIO
 from crashhunt.base.plugins import registered
+from crashhunt.base.programs import PREFIX
 from crashhunt.base.text import any_of, did_you_mean, listed, near_path, one_of
 from crashhunt.base.validation import validate
 from crashhunt.scenario._scenario import (
@@ -355,6 +357,7 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
         for name, table in data.items():
             if isinstance(table, dict) and (backend := backend_of(name)) is not None:
                 data[name] = {**backend.implied, **table}
+    _join_commands(data, str(path))
     scenario = scenario_from_dict(data, where=str(path), folder=path.resolve().parent, tolerant=kept)
     scenario = replace(scenario, file=path.name)
     check_arguments(scenario, kept=kept)
@@ -368,6 +371,29 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
         return scenario
     notes = (note for backend in scenario.backends.values() for note in backend.notes(scenario))
     return replace(scenario, notes=(*scenario.notes, *notes))
+
+
+def _join_commands(data: Plain, where: str) -> None:
+    """Replace each ``agent = { exec = ["./planner", …] }`` in the contents of a file by the locator ``exec:…``.
+
+    Raises:
+        ScenarioError: the command is not a list of texts.
+    """
+    agents = data.get("agents")
+    for name, table in agents.items() if isinstance(agents, dict) else ():
+        agent = table.get("agent") if isinstance(table, dict) else None
+        if not isinstance(agent, dict):
+            continue
+        words = agent.get("exec")
+        if (
+            list(agent) != ["exec"]
+            or not isinstance(words, list)
+            or not words
+            or not all(isinstance(w, str) for w in words)
+        ):
+            fix = 'write agent = { exec = ["./planner", "--mode", "test"] }'
+            refuse(where, f"agents.{name}.agent", agent, "is not a command", fix)
+        table["agent"] = f"{PREFIX}{shlex.join(words)}"
 
 
 def _resolve_default_path(setup: AgentSetup, folder: Path) -> AgentSetup:

@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.exceptions import shown_path
 from crashhunt.base.integrity import changed_file
 from crashhunt.base.plugins import registered
+from crashhunt.base.programs import files_of, is_program
 from crashhunt.snapshots._changes import is_page
 from crashhunt.snapshots._take import code_of_tree
 
@@ -48,10 +50,20 @@ def code_differences(snapshot: Snapshot, locators: Iterable[str]) -> list[str] |
         if base.startswith(f"{layout.CODE}/@"):
             new = [name for name in code_of_tree(folder) if f"{base}/{name}" not in files]
             found += [f"{shown_path(str(folder / name))} is new" for name in new]
+    programs = {word: path for locator in locators for word, path in _program_files(locator).items()}
     for value, place in snapshot.manifest["argument_files"].items():
-        if place in files and (why := changed_file(value, files[place])):
+        compared = compared or value in programs
+        if place in files and (why := changed_file(str(programs.get(value, value)), files[place])):
             found.append(f"{value} {why}")
     return sorted(found) if compared else None
+
+
+def _program_files(locator: str) -> dict[str, Path]:
+    """Return today's files of an agent's command line; none if the agent is no program, or the program is gone."""
+    try:
+        return files_of(locator) if is_program(locator) else {}
+    except CrashhuntError:
+        return {}
 
 
 def _folders_of_today(snapshot: Snapshot, locators: Iterable[str]) -> dict[str, Path]:

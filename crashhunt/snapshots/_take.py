@@ -20,6 +20,7 @@ from crashhunt.base.files import put_in_place, sync_folder, sync_tree
 from crashhunt.base.git import query
 from crashhunt.base.integrity import describe_files, digest_of_content, digest_of_data, digest_of_file
 from crashhunt.base.opened_files import output_files
+from crashhunt.base.programs import files_of, is_program
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, load_order_of, write_settings
 from crashhunt.scenario import Scenario, as_plain_data
@@ -368,14 +369,14 @@ def take_snapshot(
     if imported is None:
         imported = imported_by(scenario, settings)
     found = find_sources(imported, roots=options.roots, without=snapshots.parent)
-    argument_files = _argument_files(settings)
-    files = found.files | {place: path for path, place in argument_files.items()}
+    argument_files = _argument_files(settings) | _program_files(settings, found, options.code, snapshots.parent)
+    files = _with_arguments(found, argument_files)
     conditions: dict[str, str] = {}
     if not options.code:
         conditions = {place: digest for place, path in files.items() if (digest := _digest_of_original(path))}
         found, argument_files = Sources(paths=[]), {}
     argument_files |= _training_records(imported.agents, argument_files)
-    files = found.files | {place: path for path, place in argument_files.items()}
+    files = _with_arguments(found, argument_files)
     _check_size(files, options.limit_mb)
     try:
         snapshots.mkdir(exist_ok=True)
@@ -384,6 +385,11 @@ def take_snapshot(
             return _build(building, files, found, argument_files, scenario, settings, environment(imported), conditions)
     except OSError as error:
         raise _cannot_make(error, snapshots) from error
+
+
+def _with_arguments(found: Sources, argument_files: Mapping[str, str]) -> dict[str, str]:
+    """Return all files of a snapshot; a word of a command line is not always the path of its file."""
+    return {place: path for path, place in argument_files.items()} | found.files
 
 
 def _cannot_make(error: OSError, snapshots: Path) -> SnapshotError:
@@ -488,6 +494,27 @@ def _argument_files(settings: HuntSettings) -> dict[str, str]:
                 if isinstance(value, str) and value not in found and os.path.isfile(value):  # noqa: PTH113
                     found[value] = f"{layout.FILES}/{len(found)}-{Path(value).name}"
     return found
+
+
+def _program_files(settings: HuntSettings, found: Sources, takes_code: bool, hunt: Path) -> dict[str, str]:
+    """Return the files of the agents' command lines, and their places; add the projects of programs to the sources.
+
+    A program of a git work tree keeps its place among the files of its project, even if git ignores it, as it does
+    most binaries.
+    """
+    places: dict[str, str] = {}
+    locators = sorted({agent.agent for agent in settings.agents.values() if is_program(agent.agent)})
+    for number, (word, path) in enumerate(pair for locator in locators for pair in files_of(locator).items()):
+        tree = _work_tree_of(path.parent) if takes_code else None
+        if tree is not None and path.resolve().is_relative_to(tree):
+            if tree not in found.trees:
+                _take_tree(tree, list(_listed(tree)), found, imports=(), without=hunt)
+            base = next(place for place, origin in found.origins if origin == str(tree))
+            places[word] = f"{base}/{path.resolve().relative_to(tree).as_posix()}"
+        else:
+            places[word] = f"{layout.FILES}/program-{number}-{path.name}"
+        found.files[places[word]] = str(path)
+    return places
 
 
 def _training_records(modules: Sequence[str], argument_files: dict[str, str]) -> dict[str, str]:

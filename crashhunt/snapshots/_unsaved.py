@@ -104,7 +104,7 @@ def _original(path: str, snapshot: Snapshot) -> Path | None:
 
 
 def _is_copied(path: str, snapshot: Snapshot) -> bool:
-    if path in snapshot.argument_files:
+    if path in {*snapshot.argument_files, *map(os.path.realpath, snapshot.argument_files)}:
         return True
     places = (f"{folder}{path.removeprefix(top)}" for folder, top in _origins(snapshot) if path.startswith(f"{top}/"))
     return any(place in snapshot.manifest["files"] for place in places)

@@ -31,6 +31,7 @@ from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError,
 from crashhunt.base.files import whole_file
 from crashhunt.base.git import checked_out, commit_of, git, import_environment, run_to_end, top_of
 from crashhunt.base.plugins import registered
+from crashhunt.base.programs import is_program
 from crashhunt.base.temporary import temporary_beside, temporary_folder
 from crashhunt.corpus import find_cases
 from crashhunt.ledger import Ledger
@@ -88,7 +89,7 @@ class GateVersion:
         Raises:
             UsageError: the word names neither an agent nor a commit.
         """
-        vehicle, equals, locator = word.rpartition("=")
+        vehicle, equals, locator = ("", "", word) if is_program(word) else word.rpartition("=")
         if ":" in locator or locator in registered("agents"):
             return cls(word, {vehicle: locator})
         if equals or not word:
@@ -711,7 +712,7 @@ def _modules_of(run: RunRequest) -> set[str]:
             return set()  # the hunt reports it
     points = registered("agents")
     targets = [points[name].value if name in points else name for name in agents.values()]
-    return {target.partition(":")[0] for target in targets}
+    return {target.partition(":")[0] for target in targets if not is_program(target)}
 
 
 def _origin_of(module: str, folder: Path, environment: Mapping[str, str]) -> Path:

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         Argument as Argument,
         Choice as Choice,
         Constant as Constant,
+        DeclaresArguments as DeclaresArguments,
         Distribution as Distribution,
         Kind as Kind,
         Range as Range,

@@ -455,12 +455,27 @@ class Signature:
                 raise ArgumentError(f"{where} takes no argument {name!r}", fix=fix)
 
 
+@typing.runtime_checkable
+class DeclaresArguments(typing.Protocol):
+    """A factory that reports its arguments itself, such as that of a program."""
+
+    def declared_signature(self, agent: str = "", simulator: Any = None) -> Signature:
+        """Return the arguments of the factory.
+
+        Args:
+            agent: the vehicle that the agent drives; empty if it is unknown.
+            simulator: the `Simulator`; None if there is none.
+        """
+
+
 def signature_of(factory: Callable[..., object]) -> Signature:
     """Return the arguments of a factory, read from its signature.
 
     A parameter may be annotated ``Annotated[float, Argument(...)]`` to define which values a hunt tries. Parameters in
     `FILLED_BY_NAME` are not arguments, because they receive facts about the simulation.
     """
+    if isinstance(factory, DeclaresArguments) and not isinstance(factory, type):
+        return factory.declared_signature()
     if _takes_nothing(factory):
         return Signature({}, open=False, given=())
     try:

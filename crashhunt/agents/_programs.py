@@ -1,0 +1,463 @@
+"""Agents that are programs: ``exec:PROGRAM``, in lock-step over standard input and output (protocol 1).
+
+Each message is one JSON object on one line. crashhunt sends ``hello``, ``reset``, ``observe`` and ``close``. The
+program answers with ``ready``, ``ok`` and ``act``, and ends after ``close``. Anything else is an error of the agent.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import select
+import signal
+import subprocess
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from crashhunt.base.capabilities import supports
+from crashhunt.base.errors import ArgumentError, ProgramError
+from crashhunt.base.processes import descendants_of, kill
+from crashhunt.base.programs import command_of, words_of
+from crashhunt.base.text import one_line
+from crashhunt.simulators import FlattensObservations, NamesMetaActions, NamesObservations
+from crashhunt.trial import Argument, Signature, kind_of, parse_spec
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from gymnasium import Space
+
+    from crashhunt.simulators import ActionForm, Simulator
+    from crashhunt.trial import Kind, Value
+
+PROTOCOL: Final = 1
+_ANSWERS: Final = {"hello": "ready", "reset": "ok", "observe": "act"}
+_CHUNK_BYTES: Final = 1 << 16
+_MAX_MESSAGE_BYTES: Final = 16 << 20
+_MAX_FILE_BYTES: Final = 64 << 20  # of each file that the program writes, such as its log
+_MAX_SHOWN_CHARACTERS: Final = 80
+_DESCRIPTION_S: Final = 60.0  # as long as a module may take to import
+_CLOSING_S: Final = 1.0  # from `close` to the end of the program
+_TERMINATION_S: Final = 0.2  # from SIGTERM to SIGKILL
+_UNITS: Final = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "heading": "rad", "target_speed": "m/s"}
+_DECLARATION_KEYS: Final = ("range", "unit", "default")
+
+
+class ProgramFactory:
+    """Creates the agents of one ``exec:`` locator: one process per trial and vehicle.
+
+    Args:
+        locator: the locator, such as ``exec:./planner --mode test``.
+    """
+
+    def __init__(self, locator: str) -> None:
+        self._locator = locator
+        words_of(locator)  # refuses what is not a command line
+
+    def declared_signature(self, agent: str = "", simulator: Simulator | None = None) -> Signature:
+        """Run the program once, and return the arguments that it declares in its first answer.
+
+        The program receives ``hello`` without arguments, and then ``close``.
+
+        Args:
+            agent: the vehicle that the program drives.
+            simulator: the simulator, which need not have been reset; without it, ``hello`` has no spaces.
+
+        Raises:
+            PluginError: the program does not exist or cannot be executed.
+            ProgramError: the program does not start, or does not answer according to the protocol.
+        """
+        command = command_of(self._locator)
+        with tempfile.TemporaryDirectory(prefix="crashhunt-agent-") as folder, tempfile.TemporaryFile() as log:
+            program = _Process(command, Path(folder), log.fileno(), limit_s=_DESCRIPTION_S)
+            try:
+                program.start()
+                return _signature_in(program.ask(_hello(agent, simulator, {}), "hello"))
+            except ProgramError as error:
+                raise ProgramError(f"{error.message}{_last_line(log)}", fix=error.fix) from None
+            finally:
+                program.close()
+
+    def agent(
+        self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path, files: Mapping[str, str]
+    ) -> ProgramAgent:
+        """Return the agent of a vehicle; its program starts in the first step.
+
+        Args:
+            name: identifier of the vehicle.
+            simulator: the simulator, with the spaces of the vehicle.
+            arguments: arguments of the agent.
+            folder: scratch folder of the trial, in which the program gets a folder of its own.
+            files: file of the snapshot by the word that names the original file.
+        """
+        given = {key: _absolute(value) for key, value in arguments.items()}
+        hello = _hello(name, simulator, given)
+        is_scalar = simulator.actions[name].space.shape == ()
+        return ProgramAgent(command_of(self._locator, files), hello, folder / f"agent-{name}", is_scalar=is_scalar)
+
+
+class ProgramAgent:
+    """An agent whose actions a program computes.
+
+    The program starts in the first step. Therefore a program that does not start is an error of the agent, with a
+    recorded trial, as in any other step.
+
+    Args:
+        command: the program and its words.
+        hello: the first message.
+        folder: the folder in which the program runs; it is created.
+        is_scalar: whether an action is one number, which the program sends as a list of one.
+    """
+
+    def __init__(self, command: Sequence[str], hello: Mapping[str, Any], folder: Path, *, is_scalar: bool) -> None:
+        self._process = _Process(command, folder)
+        self._hello = hello
+        self._is_scalar = is_scalar
+        self._step_length_s = float(hello["step_length_s"])
+        self._seed = 0
+        self._step = 0
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode; the program receives the seed in the first step."""
+        self._seed, self._step = int(seed), 0
+
+    def act(self, observation: Any) -> Any:
+        """Return the action that the program sends for an observation.
+
+        Raises:
+            ProgramError: the program has failed, or has sent something that the protocol does not contain.
+        """
+        try:
+            return self._act(observation)
+        except ProgramError as error:
+            raise ProgramError(f"{self._hello['agent']}: {error.message}", fix=error.fix) from None
+
+    def _act(self, observation: Any) -> Any:
+        process, step = self._process, self._step
+        if step == 0:
+            if not process.is_started:
+                process.start()
+                _signature_in(process.ask(self._hello, "hello"))
+            process.ask({"type": "reset", "seed": self._seed}, "reset")
+        message = {
+            "type": "observe", "step": step, "time_s": round(step * self._step_length_s, 9),
+            "observation": _plain(observation),
+        }  # fmt: skip
+        answer = process.ask(message, f"observe of step {step}")
+        if "action" not in answer:
+            raise ProgramError(
+                f"its answer to observe of step {step} has no action", fix='send {"type": "act", "action": […]}'
+            )
+        self._step = step + 1
+        action = answer["action"]
+        return action[0] if self._is_scalar and isinstance(action, list) and len(action) == 1 else action
+
+    def close(self) -> None:
+        """Send ``close`` to the program, and end it with all processes that it has started."""
+        self._process.close()
+
+
+class _Process:
+    """The process of a program, with its standard input and output.
+
+    Args:
+        command: the program and its words.
+        folder: the folder in which the program runs; it is created.
+        log: file descriptor for its standard error; None for that of this process.
+        limit_s: time limit for each answer, in s; None if the time limit of the trial applies.
+    """
+
+    def __init__(
+        self, command: Sequence[str], folder: Path, log: int | None = None, *, limit_s: float | None = None
+    ) -> None:
+        self._command = command
+        self._folder = folder
+        self._log = log
+        self._limit_s = limit_s
+        self._received = bytearray()
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def is_started(self) -> bool:
+        """Whether the process has been started."""
+        return self._process is not None
+
+    def start(self) -> None:
+        """Start the program.
+
+        Raises:
+            ProgramError: the operating system cannot run it.
+        """
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._process = process = subprocess.Popen(
+                self._command, cwd=self._folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                stderr=self._log if self._log is not None else 2, bufsize=0,
+            )  # fmt: skip
+        except OSError as error:
+            fix = "make it executable here: with #! in its first line if it is a script, and for this machine"
+            raise ProgramError(f"the program does not start: {error.strerror}: {self._command[0]}", fix=fix) from None
+        with suppress(OSError, ValueError, AttributeError):  # it has ended already, or the system has no such call
+            soft, hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
+            if soft == resource.RLIM_INFINITY or soft > _MAX_FILE_BYTES:
+                resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (_MAX_FILE_BYTES, hard))
+
+    def ask(self, message: Mapping[str, Any], shown: str) -> dict[str, Any]:
+        """Send a message, and return the program's answer to it.
+
+        Args:
+            message: the message.
+            shown: the message in errors, such as ``observe of step 3``.
+
+        Raises:
+            ProgramError: the program has ended, or its answer is not the one that the protocol defines.
+        """
+        process = self._process
+        assert process is not None
+        assert process.stdin is not None
+        if self._received:
+            raise ProgramError(f"it has sent something before {shown}: {_shown(self._received)}", fix=_LOGS_FIX)
+        data = memoryview(json.dumps(message, separators=(",", ":")).encode() + b"\n")
+        try:
+            while data:
+                data = data[os.write(process.stdin.fileno(), data) :]
+        except OSError:
+            raise self._ended(shown) from None
+        line = self._read_line(shown)
+        try:
+            answer = json.loads(line)
+        except (ValueError, RecursionError):
+            raise ProgramError(f"its answer to {shown} is not JSON: {_shown(line)}", fix=_LOGS_FIX) from None
+        expected = _ANSWERS[message["type"]]
+        if not isinstance(answer, dict) or answer.get("type") != expected:
+            fix = f'send {{"type": "{expected}", …}}'
+            raise ProgramError(f"its answer to {shown} is not of type {expected!r}: {_shown(line)}", fix=fix)
+        return answer
+
+    def close(self) -> None:
+        """Send ``close``, wait for the end of the program, and kill what is left of it."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        assert process.stdin is not None
+        assert process.stdout is not None
+        below = descendants_of(process.pid)
+        with suppress(OSError):
+            os.set_blocking(process.stdin.fileno(), False)
+            os.write(process.stdin.fileno(), b'{"type":"close"}\n')
+        with suppress(OSError):
+            process.stdin.close()
+        if not self._ends_within(process, _CLOSING_S):
+            with suppress(OSError):
+                process.terminate()
+            self._ends_within(process, _TERMINATION_S)
+        for pid in {*below, *(descendants_of(process.pid) if process.returncode is None else ())}:
+            kill(pid)
+        if process.returncode is None:
+            process.kill()
+            process.wait()
+        process.stdout.close()
+
+    def _read_line(self, shown: str) -> bytes:
+        process, received = self._process, self._received
+        assert process is not None
+        assert process.stdout is not None
+        output = process.stdout.fileno()
+        until = None if self._limit_s is None else time.monotonic() + self._limit_s
+        searched = 0
+        while (end := received.find(b"\n", searched)) < 0:
+            searched = len(received)
+            if searched > _MAX_MESSAGE_BYTES:
+                limit = f"{_MAX_MESSAGE_BYTES >> 20} MB"
+                raise ProgramError(
+                    f"its answer to {shown} is longer than {limit}", fix="end each message with a line break"
+                )
+            if until is not None and not select.select([output], [], [], max(0.0, until - time.monotonic()))[0]:
+                raise ProgramError(f"it has not answered {shown} within {self._limit_s:g} s")
+            data = os.read(output, _CHUNK_BYTES)
+            if not data:
+                raise self._ended(shown)
+            received += data
+        line = bytes(received[:end])
+        del received[: end + 1]
+        return line
+
+    def _ended(self, shown: str) -> ProgramError:
+        """Return the error for a program that has closed one of its ends."""
+        process = self._process
+        assert process is not None
+        half = f", in the middle of a message: {_shown(self._received)}" if self._received else ""
+        if not self._ends_within(process, _CLOSING_S):
+            return ProgramError(
+                f"the program has closed its end instead of answering {shown}{half}, and is still running"
+            )
+        code = process.returncode
+        if code < 0:
+            return ProgramError(f"the program died of {_signal_name(-code)} instead of answering {shown}{half}")
+        return ProgramError(f"the program exited with {code} instead of answering {shown}{half}")
+
+    @staticmethod
+    def _ends_within(process: subprocess.Popen[bytes], limit_s: float) -> bool:
+        """Return whether a process ends within a time limit; its output is read, so that it can end."""
+        assert process.stdout is not None
+        until = time.monotonic() + limit_s
+        while (left := until - time.monotonic()) > 0:
+            if select.select([process.stdout], [], [], left)[0] and not os.read(process.stdout.fileno(), _CHUNK_BYTES):
+                break
+        try:
+            process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+
+_LOGS_FIX = "write only messages to standard output, and logs to standard error"
+
+
+def _hello(agent: str, simulator: Simulator | None, arguments: Mapping[str, Value]) -> dict[str, Any]:
+    described: dict[str, Any] = {"observation": {}, "action": {}, "step_length_s": 0.0}
+    if simulator is not None:
+        shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
+        names = simulator.observation_names if supports(simulator, NamesObservations) else ()
+        described = {
+            "observation": _described_observation(shown.get(agent) or simulator.observation_spaces[agent], names),
+            "action": _described_action(simulator.actions[agent]),
+            "step_length_s": simulator.step_length_s,
+        }
+    return {"type": "hello", "protocol": PROTOCOL, "agent": agent, "arguments": dict(arguments), **described}
+
+
+def _check_ready(ready: Mapping[str, Any]) -> None:
+    """Refuse the first answer of a program that wants another protocol.
+
+    Raises:
+        ProgramError: the program wants another protocol or format.
+    """
+    protocol, form = ready.get("protocol", PROTOCOL), ready.get("format", "json")
+    if protocol != PROTOCOL:
+        raise ProgramError(
+            f"its protocol is {_shown(protocol)} (allowed: {PROTOCOL})", fix=f'send "protocol": {PROTOCOL}'
+        )
+    if form != "json":
+        raise ProgramError(f"its format is {_shown(form)} (allowed: json)", fix='send "format": "json"')
+
+
+def _signature_in(ready: Mapping[str, Any]) -> Signature:
+    """Return the arguments that a program declares; one that declares none accepts any argument.
+
+    Raises:
+        ProgramError: the program wants another protocol, or does not declare ranges, units and defaults.
+    """
+    _check_ready(ready)
+    declared = ready.get("arguments") or {}
+    if not isinstance(declared, dict):
+        raise ProgramError(f"its arguments are {_shown(declared)}, not an object")
+    arguments = {name: _argument(name, facts) for name, facts in declared.items()}
+    required = tuple(name for name, one in arguments.items() if one.default is None)
+    return Signature(arguments=arguments, open=not arguments, given=(), required=required)
+
+
+def _argument(name: str, facts: object) -> Argument:
+    if not isinstance(facts, dict) or (odd := sorted(facts.keys() - set(_DECLARATION_KEYS))):
+        said = _shown(facts) if not isinstance(facts, dict) else ", ".join(odd)
+        raise ProgramError(f"its argument {name} has {said} (allowed: {', '.join(_DECLARATION_KEYS)})")
+    default, unit, text = facts.get("default"), facts.get("unit") or "", facts.get("range")
+    if not (default is None or isinstance(default, bool | int | float | str)) or not isinstance(unit, str):
+        raise ProgramError(f"its argument {name} has the default {_shown(default)} and the unit {_shown(unit)}")
+    # JSON does not tell 12 from 12.0, so whether an argument takes whole numbers follows from the texts of its values.
+    kind: Kind | None = None if default is None or type(default) is int else kind_of(default)
+    try:
+        distribution = None if text is None else parse_spec(str(text), kind)
+    except ArgumentError as error:
+        raise ProgramError(f"its argument {name}: {error.message}", fix=error.fix) from None
+    return Argument(name=name, kind=kind, default=default, distribution=distribution, unit=unit)
+
+
+def _absolute(value: Value) -> Value:
+    """Return a value; one that names a file of the current folder becomes its absolute path."""
+    return str(Path(value).absolute()) if isinstance(value, str) and os.path.isfile(value) else value  # noqa: PTH113
+
+
+def _described_observation(space: Space[object], names: Sequence[str]) -> dict[str, Any]:
+    """Return the shape, columns and units of each part of an observation."""
+    from gymnasium.spaces import Dict
+
+    if isinstance(space, Dict):
+        return {str(part): _described_space(one, ()) for part, one in space.spaces.items()}
+    return {"kinematics" if names else "observation": _described_space(space, names)}
+
+
+def _described_action(form: ActionForm) -> dict[str, Any]:
+    """Return the shape, columns, units and bounds of an action."""
+    found = _described_space(form.space, form.names)
+    return found | ({"meanings": list(form.space.meanings)} if supports(form.space, NamesMetaActions) else {})
+
+
+def _described_space(space: Space[object], names: Sequence[str]) -> dict[str, Any]:
+    from gymnasium.spaces import Box, Tuple
+
+    columns = {"columns": list(names), "units": [_UNITS.get(name, "") for name in names]}
+    if isinstance(space, Tuple):
+        return {"shape": [len(space.spaces)], **columns, "bounds": [_bounds(one) for one in space.spaces]}
+    shape = [] if space.shape is None else [int(length) for length in space.shape]
+    found: dict[str, Any] = {"shape": shape, **columns}
+    if isinstance(space, Box) and len(shape) == 1:
+        found["bounds"] = [_ends(low, high) for low, high in zip(space.low, space.high, strict=True)]
+    elif (bounds := _bounds(space)) is not None:
+        found["bounds"] = [bounds]
+    return found
+
+
+def _bounds(space: Space[object]) -> list[float | None] | None:
+    """Return the least and the greatest value of a space of single numbers; None for other spaces."""
+    from gymnasium.spaces import Box, Discrete
+
+    if isinstance(space, Discrete):
+        return [int(space.start), int(space.start + space.n) - 1]
+    return _ends(space.low, space.high) if isinstance(space, Box) and space.shape == () else None
+
+
+def _ends(low: Any, high: Any) -> list[float | None]:
+    return [float(end) if np.isfinite(end) else None for end in (low, high)]
+
+
+def _plain(value: Any) -> Any:
+    """Return an observation as nested lists and objects of JSON."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, dict):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def _shown(value: object) -> str:
+    """Return a value for a message, on one line and cut."""
+    text = (
+        bytes(value[: 4 * _MAX_SHOWN_CHARACTERS]).decode("utf-8", "replace")
+        if isinstance(value, bytes | bytearray)
+        else json.dumps(value)
+    )
+    text = one_line(text)
+    return text if len(text) <= _MAX_SHOWN_CHARACTERS else f"{text[:_MAX_SHOWN_CHARACTERS]}…"
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _last_line(log: Any) -> str:
+    """Return the last line that a program has written to its standard error, in brackets; empty if there is none."""
+    size = log.seek(0, os.SEEK_END)
+    log.seek(max(0, size - 4000))
+    lines = log.read().decode("utf-8", "replace").split("\n")
+    last = next((line for line in reversed(lines) if line.strip()), "")
+    return f" (its last output: {one_line(last)[:300]})" if last else ""

@@ -1,0 +1,120 @@
+"""Locators of agents that are programs: ``exec:PROGRAM [WORD…]``, split as a shell would, without a shell."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from crashhunt.base.errors import PluginError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+PREFIX: Final = "exec:"
+_INTERPRETERS = re.compile(r"(python|pypy|perl|ruby|node|java|julia|lua|env|sh|bash|dash|zsh)[\d.]*")
+_SYSTEM_FOLDERS = ("/bin", "/sbin", "/usr/bin", "/usr/sbin", "/usr/lib", "/usr/libexec")
+_PROGRAM_FIX = "give the path of an executable file, such as exec:./planner"
+
+
+def is_program(locator: str) -> bool:
+    """Return whether the locator of an agent is the command line of a program."""
+    return locator.startswith(PREFIX)
+
+
+def words_of(locator: str) -> tuple[str, ...]:
+    """Return the words of the command line that an agent's locator contains.
+
+    Raises:
+        PluginError: the command line is empty, or a quotation has no end.
+    """
+    try:
+        words = tuple(shlex.split(locator.removeprefix(PREFIX)))
+    except ValueError as error:
+        fix = "close the quotation, or write \\ before the character"
+        raise PluginError(f"{locator!r} is not a command line: {error}", fix=fix) from None
+    if not words or not words[0]:
+        raise PluginError(f"{locator!r} names no program", fix=_PROGRAM_FIX)
+    return words
+
+
+def command_of(locator: str, files: Mapping[str, str] | None = None) -> tuple[str, ...]:
+    """Return the command to run, in which the files of the current folder have absolute paths.
+
+    Args:
+        locator: locator of the agent.
+        files: file of a snapshot by the word that names the original file; such a word becomes the path of the copy.
+
+    Raises:
+        PluginError: the program does not exist or cannot be executed.
+    """
+    first, *rest = words_of(locator)
+    copies = files or {}
+    return (copies.get(first) or str(_program(first, locator)), *(_absolute(word, copies) for word in rest))
+
+
+def files_of(locator: str) -> dict[str, Path]:
+    """Return the files that must travel with an agent's command line, by the text that names them in it.
+
+    Programs of the operating system and interpreters are not among them, because a copy would not find its own files.
+
+    Raises:
+        PluginError: the program does not exist or cannot be executed.
+    """
+    first, *rest = words_of(locator)
+    program = _program(first, locator)
+    found = {} if _is_of_system(program) else {first: program}
+    for word in rest:
+        name = _value_in(word)
+        if _is_path(name) and os.path.isfile(name):  # noqa: PTH113
+            found[name] = Path(name).absolute()
+    return found
+
+
+def _program(word: str, locator: str) -> Path:
+    """Return the executable file that the first word names: a path, or a program that ``PATH`` contains."""
+    if os.sep not in word:
+        found = shutil.which(word)
+        if found is None:
+            is_here = os.path.isfile(word)  # noqa: PTH113
+            fix = f"write exec:./{word}, because PATH does not contain the current folder" if is_here else _PROGRAM_FIX
+            raise PluginError(f"{locator!r}: the program {word!r} is not in PATH", fix=fix)
+        return Path(found).absolute()
+    path = Path(word).absolute()
+    if not path.is_file():
+        raise PluginError(f"{locator!r}: the program {word!r} is not a file", fix=_PROGRAM_FIX)
+    if not os.access(path, os.X_OK):
+        raise PluginError(f"{locator!r}: the program {word!r} is not executable", fix=f"chmod +x {word}")
+    return path
+
+
+def _absolute(word: str, copies: Mapping[str, str]) -> str:
+    name = _value_in(word)
+    if name in copies:
+        return f"{word[: len(word) - len(name)]}{copies[name]}"
+    # The program runs in a folder of its own, so a path relative to the current folder would lead nowhere.
+    is_there = _is_path(name) and os.path.exists(name)  # noqa: PTH110
+    return f"{word[: len(word) - len(name)]}{Path(name).absolute()}" if is_there else word
+
+
+def _value_in(word: str) -> str:
+    """Return the value in ``--option=VALUE``; any other word is returned as it is."""
+    return word.partition("=")[2] if word.startswith("-") and "=" in word else word
+
+
+def _is_path(word: str) -> bool:
+    """Return whether a word may name a file; a plain word such as ``test`` is a value, even if a file has this name."""
+    return os.sep in word or "." in word
+
+
+def _is_of_system(program: Path) -> bool:
+    homes = {Path(sys.prefix, "bin"), Path(sys.base_prefix, "bin")}
+    return (
+        _INTERPRETERS.fullmatch(program.name) is not None
+        or program.parent in homes
+        or any(program.resolve().is_relative_to(folder) for folder in _SYSTEM_FOLDERS)
+    )

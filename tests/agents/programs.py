@@ -1,0 +1,153 @@
+"""The same driver as a program in Python and in C, and as an agent in Python; the program also does harm when told."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+COMPILER = shutil.which("cc")
+
+DRIVER = """\
+class Driver:
+    def __init__(self, speed: float = 12.0):
+        self.speed = speed
+
+    def reset(self, seed): ...
+
+    def act(self, observation):
+        ahead = [float(row[1]) for row in observation[1:] if row[0] and row[1] > 0 and abs(row[2]) < 1.5]
+        return (0.0 if ahead and min(ahead) < 12.0 else self.speed), 0
+"""
+
+# The words of the command line: the harm, and the message at which it is done; none for a driver without harm.
+PROGRAM = """\
+#!/usr/bin/env python3
+import json, os, signal, subprocess, sys, time
+
+kind, when = [*sys.argv[1:], "", ""][:2]
+speed, in_trial = 12.0, False
+
+
+def answer(**message):
+    print(json.dumps(message), flush=True)
+
+
+def harm():
+    if kind == "garbage":
+        print("thinking", flush=True)
+    elif kind == "half":
+        os.write(1, b'{"type": "act", "act')
+        os._exit(0)
+    elif kind == "closes":
+        os.close(1)
+        time.sleep(100)
+    elif kind == "SIGSEGV":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    elif kind == "exits":
+        os._exit(3)
+    elif kind == "protocol":
+        answer(type="ready", protocol=2)
+    elif kind == "format":
+        answer(type="ready", format="xml")
+    elif kind == "other":
+        answer(type="ok")
+    elif kind == "without":
+        answer(type="act")
+    elif kind == "NaN":
+        answer(type="act", action=[float("nan"), 0])
+    elif kind == "shape":
+        answer(type="act", action=[1.0, 0, 5])
+    elif kind == "twice":
+        os.write(1, b'{"type": "act", "action": [1.0, 0]}\\n' * 2)
+    elif kind == "long":
+        while True:
+            os.write(1, b"x" * 65536)
+    elif kind == "flood":
+        while True:
+            os.write(2, b"x" * 65536)
+    elif kind == "late":
+        time.sleep(100)
+    elif kind == "children":
+        started = subprocess.Popen(["sleep", "100"], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        with open("child", "w") as file:
+            file.write(str(started.pid))
+        answer(type="act", action=[10.0, 0])
+    elif kind == "stays":
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        answer(type="act", action=[10.0, 0])
+
+
+for line in iter(sys.stdin.readline, ""):
+    message = json.loads(line)
+    if message["type"] == "hello":
+        print("hello", message["agent"], message["arguments"], file=sys.stderr, flush=True)
+        in_trial = bool(message["agent"])
+        speed = message["arguments"].get("speed", speed)
+    if in_trial and message["type"] == when and message.get("step", 3) == 3:
+        harm()
+    elif message["type"] == "hello":
+        answer(type="ready", format="json", arguments={"speed": {"range": "8.0:20.0", "unit": "m/s", "default": 12.0}})
+    elif message["type"] == "reset":
+        answer(type="ok")
+    elif message["type"] == "observe":
+        ahead = [row[1] for row in message["observation"][1:] if row[0] and row[1] > 0 and abs(row[2]) < 1.5]
+        answer(type="act", action=[0.0 if ahead and min(ahead) < 12.0 else speed, 0], panels=None)
+    elif kind != "stays":
+        break
+"""
+
+IN_C = r"""
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+static char line[1 << 20];
+
+int main(void) {
+    double speed = 12.0;
+    while (fgets(line, sizeof line, stdin)) {
+        if (strstr(line, "\"type\":\"hello\"")) {
+            char *found = strstr(line, "\"speed\":");
+            if (found) speed = atof(found + 8);
+            puts("{\"type\": \"ready\","
+                 " \"arguments\": {\"speed\": {\"range\": \"8.0:20.0\", \"unit\": \"m/s\", \"default\": 12.0}}}");
+        } else if (strstr(line, "\"type\":\"reset\"")) {
+            puts("{\"type\": \"ok\"}");
+        } else if (strstr(line, "\"type\":\"observe\"")) {
+            char *row = strstr(line, "\"observation\":[[") + 16;
+            double nearest = HUGE_VAL;
+            while ((row = strchr(row, '['))) {  /* the first row is the vehicle itself */
+                double present, x, y;
+                if (sscanf(++row, "%lf,%lf,%lf", &present, &x, &y) == 3 && present && x > 0 && fabs(y) < 1.5)
+                    nearest = fmin(nearest, x);
+            }
+            printf("{\"type\": \"act\", \"action\": [%.17g, 0]}\n", nearest < 12.0 ? 0.0 : speed);
+        } else {
+            return 0;
+        }
+        fflush(stdout);
+    }
+    return 0;
+}
+"""
+
+
+def write_program(folder: Path, name: str = "planner") -> Path:
+    """Write the program in Python into a folder, and return its path."""
+    path = folder / name
+    path.write_text(PROGRAM, encoding="utf-8")
+    path.chmod(0o755)
+    return path
+
+
+def compile_program(folder: Path, name: str = "planner") -> Path:
+    """Compile the program in C into a folder, and return its path."""
+    source = folder / f"{name}.c"
+    source.write_text(IN_C, encoding="utf-8")
+    subprocess.run([str(COMPILER), "-O1", "-o", name, source.name, "-lm"], cwd=folder, check=True)
+    return folder / name

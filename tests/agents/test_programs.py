@@ -1,0 +1,259 @@
+"""Agents that are programs: the protocol, the harm that programs do, and what is left of their processes."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from programs import COMPILER, DRIVER, compile_program, write_program
+
+from crashhunt.agents import ProgramFactory
+from crashhunt.base.errors import ActionError, PluginError, ProgramError
+from crashhunt.base.programs import command_of, files_of
+from crashhunt.plans import takes_of
+from crashhunt.simulators import MetaAction, SpeedAndLaneChange
+from crashhunt.trial import Range, signature_of
+
+COLUMNS = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
+SPACE = spaces.Box(-np.inf, np.inf, (8, 7), np.float32)
+
+
+def observations(count=20):
+    rng = np.random.default_rng(1)
+    return [rng.uniform(-30, 30, (8, 7)).astype(np.float32) for _ in range(count)]
+
+
+class Simulated:
+    """What a program is told of a simulator."""
+
+    observation_names = COLUMNS
+    observation_spaces: ClassVar = {"ego": SPACE}
+    step_length_s = 0.1
+
+    def __init__(self, form):
+        self.actions = {"ego": form}
+
+
+def agent_of(locator, folder, *, form=None, **arguments):
+    simulator = Simulated(form or SpeedAndLaneChange())
+    return ProgramFactory(locator).agent("ego", simulator, arguments, folder=folder, files={})
+
+
+def drive(agent):
+    return [agent.act(seen) for seen in observations()]
+
+
+@pytest.fixture
+def planner(tmp_path):
+    return write_program(tmp_path)
+
+
+def test_a_program_in_python_and_one_in_c_act_like_the_agent_in_python(tmp_path, planner):
+    names: dict = {}
+    exec(DRIVER, names)
+    expected = [names["Driver"](speed=9.125).act(seen) for seen in observations()]
+    programs = [planner, *([compile_program(tmp_path, "compiled")] if COMPILER else [])]
+    for program in programs:
+        agent = agent_of(f"exec:{program}", tmp_path / "scratch", speed=9.125)
+        agent.reset(7)
+        assert [tuple(agent.act(seen)) for seen in observations()] == expected
+        agent.close()
+    assert {speed for speed, _ in expected} == {0.0, 9.125}
+
+
+def test_the_command_is_split_as_a_shell_would_and_runs_in_the_scratch_folder_without_a_shell(tmp_path):
+    said = tmp_path / "said"
+    program = tmp_path / "two words"
+    program.write_text(f'#!/bin/sh\nprintf "%s|" "$PWD" "$@" > {said}\n', encoding="utf-8")
+    program.chmod(0o755)
+    agent = agent_of(f"exec:'{program}' --mode 'a b' $HOME ;", tmp_path / "scratch")
+    agent.reset(1)
+    with pytest.raises(ProgramError, match="exited with 0 instead of answering hello"):
+        agent.act(observations()[0])
+    agent.close()
+    assert said.read_text().split("|") == [str(tmp_path / "scratch" / "agent-ego"), "--mode", "a b", "$HOME", ";", ""]
+
+
+def test_messages_are_those_of_the_protocol(tmp_path):
+    program = tmp_path / "echo"
+    log = tmp_path / "log"
+    answers = ('{"type":"ready"}', '{"type":"ok"}', '{"type":"act","action":[2]}', '{"type":"act","action":3}')
+    lines = [f"read -r line; echo \"$line\" >&3; echo '{answer}'" for answer in answers]
+    lines = ["#!/bin/sh", f"exec 3> {log}", *lines, 'read -r line; echo "$line" >&3', ""]
+    program.write_text("\n".join(lines), encoding="utf-8")
+    program.chmod(0o755)
+    agent = agent_of(f"exec:{program}", tmp_path, form=MetaAction(), speed=5.0, mode="test")
+    agent.reset(7)
+    seen = np.zeros((8, 7), np.float32)
+    seen[0, 1] = 0.5
+    assert [agent.act(seen), agent.act(seen)] == [2, 3]
+    agent.close()
+    rows = str([[0.0, 0.5, *[0.0] * 5], *[[0.0] * 7] * 7]).replace(" ", "")
+    hello = (
+        '{"type":"hello","protocol":1,"agent":"ego","arguments":{"speed":5.0,"mode":"test"},"observation":{"kinematics":'
+        '{"shape":[8,7],"columns":["presence","x","y","vx","vy","cos_h","sin_h"],"units":["","m","m","m/s","m/s","",""]'
+        '}},"action":{"shape":[],"columns":["meta_action"],"units":[""],"bounds":[[0,4]],"meanings":["LANE_LEFT","IDLE",'
+        '"LANE_RIGHT","FASTER","SLOWER"]},"step_length_s":0.1}'
+    )
+    assert log.read_text().splitlines() == [
+        hello,
+        '{"type":"reset","seed":7}',
+        f'{{"type":"observe","step":0,"time_s":0.0,"observation":{rows}}}',
+        f'{{"type":"observe","step":1,"time_s":0.1,"observation":{rows}}}',
+        '{"type":"close"}',
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "when", "message"),
+    [
+        ("garbage", "observe", "its answer to observe of step 3 is not JSON: thinking"),
+        (
+            "half",
+            "observe",
+            'exited with 0 instead of answering observe of step 3, in the middle of a message: {"type": ',
+        ),
+        ("closes", "observe", "has closed its end instead of answering observe of step 3, and is still running"),
+        ("SIGSEGV", "observe", "died of SIGSEGV instead of answering observe of step 3"),
+        ("SIGSEGV", "reset", "died of SIGSEGV instead of answering reset"),
+        ("exits", "hello", "exited with 3 instead of answering hello"),
+        ("protocol", "hello", "its protocol is 2 (allowed: 1)"),
+        ("format", "hello", 'its format is "xml" (allowed: json)'),
+        ("other", "observe", "its answer to observe of step 3 is not of type 'act'"),
+        ("without", "observe", "its answer to observe of step 3 has no action"),
+        ("twice", "observe", "it has sent something before observe of step 4"),
+        ("long", "observe", "its answer to observe of step 3 is longer than 16 MB"),
+        ("flood", "observe", "instead of answering observe of step 3"),
+    ],
+)
+def test_harm_is_an_error_that_names_the_agent_and_the_message(planner, tmp_path, kind, when, message):
+    agent = agent_of(f"exec:{planner} {kind} {when}", tmp_path)
+    agent.reset(1)
+    kept = os.dup(2)
+    with open(tmp_path / "log", "wb") as log:
+        os.dup2(log.fileno(), 2)
+    try:
+        with pytest.raises(ProgramError, match=f"^ego: .*{re.escape(message)}"):
+            drive(agent)
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        agent.close()
+    assert (tmp_path / "log").stat().st_size <= 64 << 20
+
+
+@pytest.mark.parametrize("kind", ["NaN", "shape"])
+def test_an_action_outside_of_the_space_is_left_to_the_check_of_all_agents(planner, tmp_path, kind):
+    agent = agent_of(f"exec:{planner} {kind} observe", tmp_path)
+    agent.reset(1)
+    actions = [agent.act(seen) for seen in observations(4)]
+    agent.close()
+    with pytest.raises(ActionError):
+        SpeedAndLaneChange().encode(actions[3])
+
+
+@pytest.mark.parametrize("kind", ["children", "stays"])
+def test_a_program_and_its_children_end_with_the_trial(planner, tmp_path, kind):
+    agent = agent_of(f"exec:{planner} {kind} observe", tmp_path)
+    agent.reset(1)
+    for seen in observations(4):
+        agent.act(seen)
+    pids = [agent._process._process.pid]
+    if kind == "children":
+        pids.append(int((tmp_path / "agent-ego" / "child").read_text()))
+    agent.close()
+    until = time.monotonic() + 10
+    while any(map(is_running, pids)) and time.monotonic() < until:
+        time.sleep(0.01)
+    assert not any(map(is_running, pids))
+
+
+def is_running(pid):
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as file:
+            return file.read().rpartition(b")")[2].split()[0] != b"Z"
+    except OSError:
+        return False
+
+
+def test_the_arguments_that_a_program_declares_are_its_signature(planner):
+    signature = signature_of(ProgramFactory(f"exec:{planner}"))
+    (speed,) = signature.arguments.values()
+    assert (speed.name, speed.default, speed.unit, speed.distribution) == ("speed", 12.0, "m/s", Range(8.0, 20.0))
+    assert not signature.open
+    assert takes_of(f"exec:{planner}").defaults == {"speed": 12.0}
+    assert takes_of("exec:/nowhere/planner").open
+
+
+def declaring(folder, text):
+    program = folder / "declares"
+    program.write_text(f"#!/bin/sh\nread -r line\necho '{text}'\nread -r line\n", encoding="utf-8")
+    program.chmod(0o755)
+    return ProgramFactory(f"exec:{program}")
+
+
+def test_a_program_that_declares_nothing_takes_any_argument(tmp_path):
+    assert signature_of(declaring(tmp_path, '{"type": "ready", "format": "json"}')).open
+
+
+def test_whole_numbers_of_a_declaration_leave_the_type_to_the_values(tmp_path):
+    text = '{"type": "ready", "arguments": {"speed": {"range": "5:25", "default": 12}, "path": {"default": "a.yaml"}}}'
+    arguments = signature_of(declaring(tmp_path, text)).arguments
+    assert [arguments[name].kind for name in ("speed", "path")] == [None, "str"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"type": "ready", "arguments": {"speed": {"range": "25:5"}}}', "begins above its end"),
+        ('{"type": "ready", "arguments": {"speed": {"unit": 5}}}', "its argument speed has the default null and the"),
+        ('{"type": "ready", "arguments": {"speed": {"low": 5}}}', "speed has low (allowed: range, unit, default)"),
+        ('{"type": "ready", "arguments": {"speed": 5}}', "its argument speed has 5 (allowed: range, unit, default)"),
+        ('{"type": "ready", "arguments": [1]}', "its arguments are [1], not an object"),
+        ('{"type": "ready", "format": "msgpack"}', 'its format is "msgpack" (allowed: json)'),
+        ("ready", "its answer to hello is not JSON: ready"),
+    ],
+)
+def test_a_declaration_that_cannot_be_used_is_refused(tmp_path, text, message):
+    with pytest.raises(ProgramError, match=re.escape(message)):
+        declaring(tmp_path, text).declared_signature()
+
+
+def test_the_error_of_a_program_that_does_not_answer_shows_its_last_output(tmp_path):
+    program = tmp_path / "fails"
+    program.write_text("#!/bin/sh\necho 'no planner.yaml here' >&2\nexit 4\n", encoding="utf-8")
+    program.chmod(0o755)
+    with pytest.raises(ProgramError, match=r"exited with 4 instead of .*\(its last output: no planner.yaml here\)"):
+        ProgramFactory(f"exec:{program}").declared_signature()
+
+
+def test_what_is_no_program_is_refused_with_the_fix(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "planner").write_text("", encoding="utf-8")
+    for locator, message in {
+        "exec:": "names no program",
+        "exec:'a": "is not a command line",
+        "exec:planner": "write exec:./planner",
+        "exec:./planner": r"chmod \+x ./planner",
+        "exec:./no": "'./no' is not a file",
+    }.items():
+        with pytest.raises(PluginError, match=message):
+            command_of(locator)
+
+
+def test_files_of_the_command_line_travel_and_programs_of_the_system_do_not(tmp_path, monkeypatch, planner):
+    monkeypatch.chdir(tmp_path)
+    for name in ("config.yaml", "test"):
+        (tmp_path / name).write_text("", encoding="utf-8")
+    locator = "exec:./planner --mode test --config=config.yaml --rate 0.5"
+    assert files_of(locator) == {"./planner": planner, "config.yaml": tmp_path / "config.yaml"}
+    copies = {"./planner": "/copy/planner", "config.yaml": "/copy/config.yaml"}
+    words = ("--mode", "test", "--config=/copy/config.yaml", "--rate", "0.5")
+    assert command_of(locator, copies) == ("/copy/planner", *words)
+    assert list(files_of("exec:python3 ./planner")) == ["./planner"]
+    assert command_of("exec:/bin/sh ./planner") == ("/bin/sh", str(planner))
