@@ -8,6 +8,7 @@ from crashhunt.base.errors import (
     CallError as CallError,
     CrashhuntError as CrashhuntError,
     EpisodeError as EpisodeError,
+    FormulaError as FormulaError,
     HostError as HostError,
     HuntDirectoryError as HuntDirectoryError,
     InternalError as InternalError,

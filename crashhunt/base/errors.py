@@ -5,6 +5,7 @@
     CrashhuntError                 exit code 2 unless stated otherwise
     ├── UsageError                 a command line, call or setting that is not valid
     │   ├── ArgumentError          an argument specification or value
+    │   ├── FormulaError           a requirement that is not a formula; shows the place
     │   ├── CallError              a call from Python with unknown or missing arguments; a TypeError as well
     │   └── UntrustedError         code that this user has neither made on this machine nor trusted
     ├── ScenarioError              a scenario file: which file, which key, which value
@@ -55,6 +56,8 @@ class CrashhuntError(Exception):
     """
 
     exit_code = 2
+    excerpt = ""
+    """Lines that show the place of the problem; empty if the place is not inside a text."""
 
     def __init__(self, message: str | CrashhuntError, *, fix: str = "", where: str = "") -> None:
         if isinstance(message, CrashhuntError):  # Gymnasium's AsyncVectorEnv raises `type(error)(error)`
@@ -66,7 +69,12 @@ class CrashhuntError(Exception):
         self.where = where
 
     def __str__(self) -> str:
-        """Return the whole error as one line: ``where: message; fix``."""
+        """Return the whole error as one line, and below it the lines that show the place, if there are any."""
+        return f"{self.line}\n{self.excerpt}" if self.excerpt else self.line
+
+    @property
+    def line(self) -> str:
+        """The whole error as one line: ``where: message; fix``."""
         # A path with a line break is quoted, because it would be another path if the line break became a space.
         where = self.where if one_line(self.where) == self.where else command_line(self.where)
         text = f"{where}: {self.message}" if where else self.message
@@ -107,6 +115,33 @@ class UsageError(CrashhuntError):
 
 class ArgumentError(UsageError):
     """An argument specification or value that cannot be used."""
+
+
+_MAX_EXCERPT = 60  # characters on each side of the place, so that the lines fit a terminal
+
+
+class FormulaError(UsageError):
+    """A requirement that is not a formula.
+
+    Args:
+        message: description of the problem.
+        fix: the fix, as an instruction to the user.
+        where: the option or key of the requirement.
+        text: the text of the requirement; empty if the problem has no place in it.
+        begin: first character of the place.
+        end: character after the last of the place.
+    """
+
+    def __init__(
+        self, message: str | CrashhuntError, *, fix: str = "", where: str = "", text: str = "", begin: int = 0,
+        end: int = 0,
+    ) -> None:  # fmt: skip
+        super().__init__(message, fix=fix, where=where)
+        if text:
+            first, end = max(0, begin - _MAX_EXCERPT), min(end, begin + _MAX_EXCERPT)
+            # One visible character for each of the text, so that the caret is below its place.
+            shown = "".join(char if char.isprintable() else " " for char in text[first : end + _MAX_EXCERPT])
+            self.excerpt = f"  {shown}\n  {' ' * (begin - first)}{'^' * max(1, end - begin)}"
 
 
 class CallError(UsageError, TypeError):

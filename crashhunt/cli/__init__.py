@@ -162,7 +162,9 @@ def _report(error: CrashhuntError, *, as_json: bool) -> int:
         with suppress(OSError):
             print(error.traceback, file=sys.stderr, flush=True)
     with suppress(OSError):
-        print(one_line(f"crashhunt: {error}"), file=sys.stderr, flush=True)
+        print(one_line(f"crashhunt: {error.line}"), file=sys.stderr, flush=True)
+        if error.excerpt:
+            print(error.excerpt, file=sys.stderr, flush=True)
     if as_json:
         try:
             print(json.dumps(error.to_json()), flush=True)
