@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import math
 from random import Random
 
@@ -44,7 +45,7 @@ def test_20_000_formulas_have_the_value_of_their_definition():
         assert_as_defined(seed, depth=4, count=25)
 
 
-def _in_rtamt(tree, trace, step_s=1.0):
+def _in_rtamt(tree, trace):
     import rtamt
 
     monitor = rtamt.StlDiscreteTimeOfflineSpecification()
@@ -61,10 +62,11 @@ def _in_rtamt(tree, trace, step_s=1.0):
 @pytest.mark.skipif(importlib.util.find_spec("rtamt") is None, reason="pip install rtamt")
 @pytest.mark.filterwarnings("ignore")
 def test_20_000_formulas_have_the_value_that_rtamt_computes():
-    for seed in range(20_000):
+    trees = (random_formula(Random(seed), 3) for seed in itertools.count())
+    known = (tree for tree in trees if "min(" not in written(tree) and "max(" not in written(tree))
+    for seed, tree in enumerate(itertools.islice(known, 20_000)):
         draw = Random(seed)
-        tree = random_formula(draw, 3)
-        trace = random_trace(draw, draw.randint(1, 25))
+        trace = random_trace(draw, draw.randint(2, 25))
         values = np.broadcast_to(parse(written(tree)).values(arrays(trace), 1.0), len(trace["a"]))
         assert values == pytest.approx(_in_rtamt(tree, trace), abs=1e-9)
 
