@@ -21,6 +21,7 @@ BESIDE: Final = (NEAR_MISSES, PROBES, BRANCHES)
 """Folders of bundles that are no crashes of the hunt's own trials."""
 TRIALS: Final = "trials"
 REPORT: Final = "report.html"
+NOTES: Final = "notes.jsonl"
 
 # Of a bundle, and of a trial that is kept for another reason than a crash.
 CRASH: Final = "crash.json"

@@ -39,6 +39,7 @@ from crashhunt.cli._init import add_init
 from crashhunt.cli._judge import add_judge
 from crashhunt.cli._list import add_list, with_list
 from crashhunt.cli._logs import add_logs
+from crashhunt.cli._note import add_note_command
 from crashhunt.cli._rate import add_rate
 from crashhunt.cli._replay import add_replay
 from crashhunt.cli._report import add_report
@@ -80,7 +81,7 @@ _COMMANDS = {
     "find out why": (add_judge, add_whatif, add_shrink, add_crashes, add_bisect),
     "keep them fixed": (add_corpus, add_gate, add_split),
     "measure": (add_rate, add_compare, add_trials),
-    "manage hunts": (add_status, add_logs, add_check, add_trust_command),
+    "manage hunts": (add_status, add_logs, add_note_command, add_check, add_trust_command),
     "look things up": (add_guide, add_list, add_completion),
 }
 

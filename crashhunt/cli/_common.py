@@ -56,6 +56,13 @@ class Parser(argparse.ArgumentParser):
                 fix = removed_fix(name) or f"{did_you_mean(name, known)} see {self.prog} --help".lstrip()
                 raise UsageError(f"there is no option {name!r}", fix=fix)
         found, rest = super().parse_known_args(args, namespace)
+        ends_in_list = next(
+            (one for one in reversed(self._actions) if not one.option_strings and one.nargs == "*"), None
+        )
+        if ends_in_list is not None and ends_in_list.type is None and not any(word.startswith("-") for word in rest):
+            # argparse ends a list of arguments at the first option.
+            setattr(found, ends_in_list.dest, [*getattr(found, ends_in_list.dest), *rest])
+            rest = []
         if rest and " " in self.prog:
             is_option = rest[0].startswith("-")
             what = f"there is no option {rest[0]!r}" if is_option else f"too many arguments: {' '.join(rest)}"

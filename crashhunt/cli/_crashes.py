@@ -63,8 +63,8 @@ def add_known(parser: argparse.ArgumentParser) -> None:
 
 
 def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.crashes import count_causes, group_crashes, join_causes, list_bundles
-    from crashhunt.report import describe_causes, describe_groups, describe_types_by_version
+    from crashhunt.crashes import count_causes, group_crashes, join_causes, list_bundles, read_notes
+    from crashhunt.report import describe_causes, describe_groups, describe_note, describe_types_by_version
     from crashhunt.results import crashes_by_version, dropped_crashes, find_hunts
 
     if options.by_cause is not None and options.by_cause < 1:
@@ -86,6 +86,9 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
         say(f"skipped: {why}", as_json=True)
     for line in comparison.lines():
         say(line, as_json=options.json)
+    notes = [(hunt, note) for hunt in hunts for note in read_notes(hunt)]
+    for line in [f"{hunt}: {describe_note(note, whole=False)}" for hunt, note in notes]:
+        say(line, as_json=options.json)
     _print_groups(options, found.groups, known)
     if options.json:
         groups = comparison.to_json()
@@ -96,7 +99,8 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
             pairs = zip(groups, causes, strict=True)
             groups = [{**one, "causes": [each.to_json() for each in of]} for one, of in pairs]
         apart = {"code_versions": versions} if versions else {}
-        print(json.dumps({"groups": groups, **by_cause, "left_out": list(found.left_out), **apart}))
+        noted = {"notes": [{"hunt": str(hunt), **note.to_json()} for hunt, note in notes]} if notes else {}
+        print(json.dumps({"groups": groups, **by_cause, "left_out": list(found.left_out), **apart, **noted}))
     if interrupted:
         say("Interrupted: some causes are not known yet. Run the same command to resume.", as_json=options.json)
     if interrupted:
@@ -114,6 +118,7 @@ class _Comparison:
 
         self._found = found
         self._types: dict[Signature, KnownType] | None = None
+        self._is_corpus_empty = cases == []
         if cases is not None:
             given = None if causes is None else [[part.cause for part in parts] for parts in causes]
             self._types = compare_types(found.groups, cases, given)
@@ -145,6 +150,8 @@ class _Comparison:
                     f"Fix: judge a crash of this type, add it to the corpus again, and use --by-cause"
                 )
         known = self.known
+        if self._is_corpus_empty and self._found.groups:
+            lines.append("the corpus has no case yet, so every crash type is new")
         if known is not None and self.has_news:
             new, unknown = len(self._found.groups) - len(known), len(self._found.left_out)
             words = [f"{new} new crash type{'' if new == 1 else 's'}"] if new else []

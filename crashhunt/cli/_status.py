@@ -26,6 +26,7 @@ _NUMBERS = ("trials", "pace", "left", "crashes", "errors")  # columns
 _OMITTED_FIRST = ("pace", "errors", "left", "outcomes")  # columns that a narrow terminal does not show
 _MIN_NAME_COLUMNS = 12  # of the name of a hunt, which is folded
 _WIDEST = 10_000
+_MAX_NOTES = 3  # of a hunt, the latest ones
 _MAX_LISTED_NODES = 20  # of a hunt, one a line
 _STATE_COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "green", "interrupted": "yellow"}
 
@@ -158,7 +159,7 @@ def _table(states: Sequence[HuntState], omitted: Sequence[str] = ()) -> Table:
 
 def _facts(state: HuntState) -> list[str]:
     """Return the facts of a hunt that are not in a column, one line each."""
-    from crashhunt.report import describe_running, describe_versions
+    from crashhunt.report import describe_note, describe_running, describe_versions
 
     crashes = _crashes(state)
     lines = [f"{state.crashes} {'crash' if state.crashes == 1 else 'crashes'}: {crashes}"] if crashes else []
@@ -166,6 +167,9 @@ def _facts(state: HuntState) -> list[str]:
     lines += [describe_versions(state.code_versions)] if state.code_versions else []
     lines += fork_lines(state)
     lines += [one_line(notice) for notice in state.notices or ()]
+    notes = state.notes or []
+    lines += [describe_note(note, whole=False) for note in notes[-_MAX_NOTES:]]
+    lines += [f"and {len(notes) - _MAX_NOTES} earlier notes: see crashhunt note"] * (len(notes) > _MAX_NOTES)
     return [*lines, *([f"compiled core {state.core}"] if state.core is not None else [])]
 
 

@@ -85,6 +85,15 @@ if TYPE_CHECKING:
         partner as partner,
         slowing as slowing,
     )
+    from ._notes import (
+        Note as Note,
+        add_note as add_note,
+        read_notes as read_notes,
+        remove_note as remove_note,
+        subject_of as subject_of,
+        tags_of as tags_of,
+        unreadable_notes as unreadable_notes,
+    )
     from ._omission import (
         Omission as Omission,
         Reference as Reference,

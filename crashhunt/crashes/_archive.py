@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import getpass
 import hashlib
 import json
-import os
 import socket
 import stat
 import time
@@ -23,6 +21,7 @@ from crashhunt.base.progress import watched
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes._bundle import ArchiveIndex, is_bundle_made_here
 from crashhunt.crashes._bundle_trust import is_made_here, signature
+from crashhunt.crashes._notes import notes_as_text, read_notes, subject_of, user_name
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
@@ -94,10 +93,12 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
         index: ArchiveIndex = {
             "schema": SCHEMA,
             "crash": bundle.id,
-            "made_by": f"{_user()}@{socket.gethostname()}",
+            "made_by": f"{user_name()}@{socket.gethostname()}",
             "made_at": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
             "files": entries,
         }
+        if notes := read_notes(hunt, subject_of(bundle)):  # in the index, because earlier versions refuse further files
+            index["notes"] = notes_as_text(notes)
         if is_bundle_made_here(bundle):  # else a stranger's crash would become this user's
             index["signature"] = signature(index)
         archive.writestr(zipfile.ZipInfo(layout.ARCHIVE_INDEX), json.dumps(index, indent=1), zipfile.ZIP_DEFLATED)
@@ -119,6 +120,8 @@ def open_archive(path: Path) -> Iterator[Archive]:
                 index = _read_index(archive, path)
                 for entry in _checked(archive, index, path):
                     _extract(archive, entry, directory, index["files"][entry.filename], path)
+                if notes := index.get("notes"):
+                    (directory / layout.NOTES).write_text(str(notes), encoding="utf-8", errors="replace")
         except BundleError:
             raise
         except OSError as error:
@@ -200,13 +203,6 @@ def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, directory: Path, 
     if "executable" in listed:
         mode = target.stat().st_mode
         target.chmod(mode | (mode & 0o444) >> 2)  # by all who may read it
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # a container may run as a user without an entry in its user database
-        return str(os.getuid())
 
 
 def _refusal(path: Path, message: str) -> BundleError:

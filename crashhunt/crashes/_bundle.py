@@ -82,6 +82,7 @@ class ArchiveIndex(TypedDict):
     made_by: str
     made_at: str
     files: dict[str, FileEntry]
+    notes: NotRequired[str]
     signature: NotRequired[str]
 
 

@@ -32,6 +32,7 @@ _SKIPPED_FOLDERS = frozenset(
 _OWN_FILES = (
     layout.HUNT, layout.LEDGER, f"{layout.LEDGER}-wal", f"{layout.LEDGER}-shm", layout.REQUEST, layout.CRASHES,
     *layout.BESIDE, layout.SNAPSHOTS, layout.RUN_LOG, layout.ERROR_LOG,
+    layout.NOTES,
 )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.base.text import command_line
-from crashhunt.crashes import crash_folders
+from crashhunt.crashes import crash_folders, read_notes
 from crashhunt.dashboard._catalog import unreadable, unreadable_below
 from crashhunt.dashboard._trial_counts import Sample, TrialCounts
 from crashhunt.ledger import Ledger, damaged, has_begun
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
+    from crashhunt.crashes import Note
     from crashhunt.dashboard._catalog import FoundHunt
     from crashhunt.ledger import Facts, KindData
     from crashhunt.plans import HuntSettings
@@ -63,6 +64,8 @@ class HuntView:
         self._last: float | None = None
         self._state: HuntState | None = None
         self._copies: JsonObject = {}
+        self._notes: list[Note] = []
+        self._notes_key = (0, 0, 0)
         self._versions: list[JsonObject] = []
         self._copies_due = 0.0
         self._rate: JsonObject | None = None
@@ -129,8 +132,15 @@ class HuntView:
             crashes=found,
             crashes_saved=saved if saved < found else None,
             code_versions=self._versions or None,
+            notes=self._read_notes() or None,
             **self._copies,
         )
+
+    def _read_notes(self) -> list[Note]:
+        """Return the notes of users; the file is read again when it changes."""
+        if (key := _sign(self.path / layout.NOTES)) != self._notes_key:
+            self._notes, self._notes_key = list(read_notes(self.path)), key
+        return self._notes
 
     def unreadable(self) -> str:
         """Return the reason why a file of the hunt must not be opened; empty if all may be.

@@ -29,7 +29,7 @@ _PAGE_ORDER = [
     "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed", "how-often-does-it-crash",
     "which-version-is-better", "cluster", "your-town", "highway-env", "gymnasium", "ci",
     "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
-    "kinds-of-crashes", "fault", "judge", "shrink", "film", "near-misses",
+    "kinds-of-crashes", "notes", "fault", "judge", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
     "criticality", "determinism", "search", "counterfactuals", "crash-rates",
     "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "security",

@@ -14,7 +14,7 @@ from crashhunt.base.codec import JsonObject
 from crashhunt.base.json_types import ErrorData, Plain
 from crashhunt.base.schemas import json_schema
 from crashhunt.corpus import Bisected, CaseReport
-from crashhunt.crashes import CrashSummary, Fault, Group, Judgement, TrustedOrigin
+from crashhunt.crashes import CrashSummary, Fault, Group, Judgement, Note, TrustedOrigin
 from crashhunt.hunts import AuditReport, Checked, StoppedBecause
 from crashhunt.ledger import KindData
 from crashhunt.replays import ReplayReport
@@ -121,6 +121,7 @@ _SHOW = {
     "nearest": ({"step": int, "danger": float, "agent": str, "other": str}, None),
     "danger": (_DANGER, None),
     "moments": [_MOMENT],
+    "notes?": list[Note],
 }
 _BOTH = {"base": int, "head": int}
 _INVALID_PAIRS = {"invalid": int, "not_started": _BOTH, "killed": _BOTH, "unknown": _BOTH}
@@ -168,6 +169,7 @@ _LISTED_CRASHES = {
     "near_misses?": list[str],
     "near_misses_saved?": int,
 }
+_NOTE = {"hunt": str, "**": Note}
 _TOPIC = {"topic": str, "section": str, "title": str}
 _DIVERGENCE = {"step": int, "agent": str, "field": str, "recorded": Any, "replayed": Any}
 _REPLAY = {"**": ReplayReport, "divergence": (_DIVERGENCE, None), "table?": list[Plain]}
@@ -195,6 +197,7 @@ SCHEMAS: dict[str, object] = {
         "by_cause?": list[JsonObject],
         "left_out": list[str],
         "code_versions?": dict[str, dict[str, dict[str, int]]],
+        "notes?": [_NOTE],
     },
     "judge": {"judged": [{"**": Judgement, "crash": str}]},
     "whatif": Counts,
@@ -204,6 +207,7 @@ SCHEMAS: dict[str, object] = {
     "corpus-list": _CASES,
     "bisect": Bisected,
     "trust": ({"trusted": list[TrustedOrigin]}, {"removed": list[TrustedOrigin]}),
+    "note": ({"notes": [_NOTE]}, {"added": [_NOTE]}, {"removed": [_NOTE]}),
     "check": {"fine": bool, "hunts": list[Checked], "salvaged": ({"trials": int, "crashes": int}, None)},
     "split": Split,
     "compare": Comparison,

@@ -16,7 +16,7 @@ from crashhunt.base.files import cannot_write, is_empty_folder, sync_folder, syn
 from crashhunt.base.older_formats import HOW_TO_READ
 from crashhunt.base.resources import error_of_next_files, limit_behind
 from crashhunt.base.temporary import has_ended, new_folder, owner_in
-from crashhunt.crashes import Bundle, read_bundle, read_params
+from crashhunt.crashes import Bundle, read_bundle, read_params, unreadable_notes
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import HuntSettings, read_settings, write_settings
 from crashhunt.results import find_hunts, hunt_state, is_hunt
@@ -171,7 +171,20 @@ def _check_hunt(hunt: Path) -> Checked:
     if rows is not None:
         _compare(found, rows, bundles, settings)
     _find_leftovers(found, hunt)
+    if lines := unreadable_notes(hunt):
+        shown = f"lines {', '.join(map(str, lines[:_MAX_SHOWN]))}" if lines[0] else "the file"
+        found.findings.append(
+            CheckFinding(
+                where=str(hunt / layout.NOTES),
+                what=f"{shown} cannot be read as notes",
+                lost="those notes",
+                fix=_NOTES_FIX,
+            )
+        )
     return found
+
+
+_NOTES_FIX = "add the notes again with crashhunt note, and remove these lines"
 
 
 def _check_settings(found: Checked, hunt: Path) -> HuntSettings | None:
@@ -451,7 +464,7 @@ def _copy(found: Checked, settings: HuntSettings, building: Path, to: Path) -> i
         shutil.copytree(snapshot.path, building / layout.SNAPSHOTS / snapshot.digest)
     for name in found.crashes:
         shutil.copytree(found.dir / layout.CRASHES / name, building / layout.CRASHES / name)
-    for name in (layout.TRIALS, layout.REQUEST):
+    for name in (layout.TRIALS, layout.REQUEST, layout.NOTES):
         source = found.dir / name
         if source.is_dir():
             shutil.copytree(source, building / name)

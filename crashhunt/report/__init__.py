@@ -67,6 +67,10 @@ if TYPE_CHECKING:
         describe_hunt as describe_hunt,
         describe_replay as describe_replay,
     )
-    from ._words import describe_types_by_version as describe_types_by_version, describe_versions as describe_versions
+    from ._words import (
+        describe_note as describe_note,
+        describe_types_by_version as describe_types_by_version,
+        describe_versions as describe_versions,
+    )
 
 offer_lazily(__name__)

@@ -15,6 +15,8 @@ from crashhunt.crashes import (
     judgement_of,
     last_escape,
     most_dangerous,
+    read_notes,
+    subject_of,
 )
 from crashhunt.recording import describe_value, is_opaque
 from crashhunt.report._status_screen import format_inputs
@@ -35,6 +37,7 @@ from crashhunt.report._words import (
     about_why,
     danger_cells,
     danger_to_json,
+    describe_note,
     nearest_to_json,
     window_of,
 )
@@ -77,6 +80,7 @@ class Story:
         self._first, self._last = window_of(self.recording, last_s, near)
         self.encounter = Encounter(self.recording, self.agent, self.other) if self.other else None
         self.judgement = judgement_of(bundle)
+        self.notes = read_notes(bundle.hunt, subject_of(bundle))
         self.contact = contact_record(bundle, self.recording)
         self.fault = fault_of(bundle, self.recording, self.contact)
         tried = bundle.result.escape
@@ -122,6 +126,7 @@ class Story:
                 for moment in moments
                 if self._first <= moment.step <= self._last
             ],
+            **({"notes": [note.to_json() for note in self.notes]} if self.notes else {}),
         }
 
     def words(self) -> list[str]:
@@ -164,6 +169,7 @@ class Story:
         lines = [f"{self.bundle.id}  ({self.bundle.result.outcome.category})"]
         lines.append(f"  {format_inputs(self.bundle.result)}")
         lines += _shrunk(self.bundle)
+        lines += [f"  {describe_note(note)}" for note in self.notes]
         verdict = verdict_of(self)
         is_new = verdict != f"{self.bundle.result.summary}."  # the words begin with the summary
         lines += ["", verdict] if is_new else []

@@ -20,7 +20,7 @@ from crashhunt.base import layout
 from crashhunt.base.files import whole_file
 from crashhunt.base.progress import watched
 from crashhunt.base.version import __version__
-from crashhunt.crashes import closest_actors, signature_of
+from crashhunt.crashes import closest_actors, read_notes, signature_of
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import is_opaque, read_lanes
@@ -29,7 +29,7 @@ from crashhunt.report._rate_text import describe_running
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._step_table import argument_units
 from crashhunt.report._verdict import verdict_of
-from crashhunt.report._words import by_likelihood, describe_versions, may_be_disturbed, traffic_of
+from crashhunt.report._words import by_likelihood, describe_note, describe_versions, may_be_disturbed, traffic_of
 from crashhunt.results import CodeVersions, TrialRow, count_versions, find_crashes
 from crashhunt.trial import Outcome, steps_of
 from crashhunt.world import approaches, join_frames
@@ -272,6 +272,7 @@ def report_data(
         **_trials(directory, settings),
         **_crashes(bundles, found, watch),
         "nearMisses": near_misses,
+        "notes": [describe_note(note) for note in read_notes(directory, "")],
         "lineages": _lineages(directory, bundles),
     }
 
@@ -439,6 +440,7 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
         "verdict": verdict_of(story),
         "badges": _badges(story),
         "words": story.words(),
+        **({"notes": [describe_note(note) for note in story.notes]} if story.notes else {}),
         "table_lines": story.table(),
         "arguments": format_arguments(result),
         "facts": {

@@ -6,7 +6,7 @@ import math
 import statistics
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.base.text import command_line, count_of
+from crashhunt.base.text import command_line, count_of, one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         Factor,
         Judgement,
         Moment,
+        Note,
         Omission,
         Reference,
         Why,
@@ -546,6 +547,20 @@ def describe_versions(versions: Iterable[Mapping[str, Any]]) -> str:
         f"the code has changed: {each}; crash types are of version {newest['version']}, and its rate is of the trials "
         f"from {newest['first']} on"
     )
+
+
+_MAX_NOTE_CHARACTERS = 200  # of a note in one line
+
+
+def describe_note(note: Note, *, whole: bool = True) -> str:
+    """Return a note as one line; unless the whole note is wanted, the middle of a long text is omitted."""
+    about = f" on {note.crash}" if note.crash else ""
+    tags = "".join(f" #{tag}" for tag in note.tags)
+    text = one_line(note.text)
+    if not whole and len(text) > _MAX_NOTE_CHARACTERS:
+        half = _MAX_NOTE_CHARACTERS // 2
+        text = f"{text[:half]} … {text[-half:]}"
+    return one_line(f"note {note.number}{about} ({note.by}, {note.at}):{' ' if text else ''}{text}{tags}")
 
 
 def describe_types_by_version(versions: Mapping[str, Mapping[str, Mapping[int, int]]]) -> list[str]:

@@ -83,10 +83,17 @@ async function load(crash) {
   }
 }
 
+/* Shows the notes of users, one line each. */
+function showNotes(id, notes) {
+  $(id).hidden = !notes?.length;
+  $(id).replaceChildren(...(notes ?? []).map((note) => make("li", note)));
+}
+
 /* Shows what is said of a crash; the rows are names and values of facts of its trial. */
 function describe(crash, rows) {
   $("verdict").textContent = crash.verdict;
   $("badges").replaceChildren(...crash.badges.map((text) => make("span", text, "badge")));
+  showNotes("crash-notes", crash.notes);
   $("words").replaceChildren(...paragraphs(crash.words));
   $("steps").textContent = crash.table_lines.join("\n");
   $("facts").replaceChildren(...rows.flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));

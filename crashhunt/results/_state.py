@@ -28,7 +28,7 @@ from crashhunt.base.temporary import (
     this_process,
 )
 from crashhunt.base.text import command_line, near_path
-from crashhunt.crashes import crash_folders, files_of
+from crashhunt.crashes import Note, crash_folders, files_of, read_notes
 from crashhunt.ledger import KindData, Ledger, RunningRate, damaged, has_begun
 from crashhunt.plans import HuntSettings, read_settings, write_settings
 from crashhunt.results._code_versions import count_versions
@@ -208,6 +208,7 @@ class HuntState(Serializable):
         types_by_cause: number of crash types by cause; None without ``--by-cause``.
         code_versions: the trials of each version of the code, with the fields of `VersionCounts`; None if all trials
             ran with the same code. Crash types and rate are those of the newest version.
+        notes: notes and tags of users on the hunt and on its crashes; None if there are none.
     """
 
     dir: str
@@ -235,6 +236,7 @@ class HuntState(Serializable):
     branches: BranchSums | None = field(default=None, metadata=OMIT_DEFAULT)
     rate: RunningRate | None = field(default=None, metadata=OMIT_DEFAULT)
     code_versions: list[dict[str, Any]] | None = field(default=None, metadata=OMIT_DEFAULT)
+    notes: list[Note] | None = field(default=None, metadata=OMIT_DEFAULT)
 
     @property
     def failed(self) -> bool:
@@ -305,6 +307,10 @@ def hunt_state(directory: Path) -> HuntState:
     Raises:
         HuntDirectoryError: the directory contains no hunt.
     """
+    return replace(_hunt_state(directory), notes=list(read_notes(directory)) or None)
+
+
+def _hunt_state(directory: Path) -> HuntState:
     if not has_begun(directory / layout.LEDGER) and is_hunt(directory):
         if any((directory / layout.SNAPSHOTS).glob(layout.SHOWN)):  # which comes after the ledger
             gone = damaged(directory / layout.LEDGER, "it is missing, or empty")
@@ -492,6 +498,7 @@ _OWN_FILES = (
     layout.LEDGER,
     "ledger.sqlite-wal",
     "ledger.sqlite-shm",
+    layout.NOTES,
     layout.HUNT,
 )
 _PERMITTED_FILES = (".lock", layout.SCRATCH, ".hunt.")  # what may be there before: of a hunt that could not begin

@@ -104,7 +104,7 @@ def grouped(monkeypatch):
     def requests():
         yield asked["stops"]
 
-    monkeypatch.setattr("crashhunt.results.find_hunts", lambda directory: [f"{directory}/0", f"{directory}/1"])
+    monkeypatch.setattr("crashhunt.results.find_hunts", lambda directory: [directory / "0", directory / "1"])
     monkeypatch.setattr("crashhunt.crashes.list_bundles", lambda hunt: [f"{hunt} crash"])
     monkeypatch.setattr("crashhunt.results.dropped_crashes", lambda hunts: len(hunts))
     monkeypatch.setattr("crashhunt.results.crashes_by_version", lambda hunts, groups: {})

@@ -9,7 +9,7 @@ const byNumber = new Map(), brushes = new Map();
 
 /* The choices are in the address, so that a reload or a link shows the same. */
 const words = new URLSearchParams(location.search);
-const CHOICES = { over: "0", across: "", up: "", colour: "outcome", "crash-filter": "", near: "", density: "" };
+const CHOICES = { over: "0", across: "", up: "", colour: "outcome", "crash-filter": "", "crash-words": "", near: "", density: "" };
 const chosen = Object.fromEntries(Object.entries(CHOICES).map(([name, usual]) => [name, words.get(name) ?? usual]));
 function choose(name, value) {
   chosen[name] = value;
@@ -45,6 +45,8 @@ function renew(id, data, fill) {
   if (within) [...$(id).querySelectorAll("a, button")].find((node) => (node.getAttribute("href") ?? node.textContent) === key)?.focus();
 }
 
+const noteText = (note) => [note.text, ...note.tags.map((tag) => `#${tag}`), `(${note.by}, ${note.at})`].filter((part) => part).join(" ");
+const notesOn = (crash) => (hunt?.notes ?? []).filter((note) => note.crash === crash).map(noteText);
 const faultOf = (one) => (one.fault === NOT_DECIDED ? "not decided" : one.fault ?? "");
 
 function link(crash, text) { return make("a", text ?? crash, "", { href: `/hunts/${ID}/crashes/${encodeURIComponent(crash)}` }); }
@@ -62,6 +64,9 @@ function showHunt() {
   const notices = hunt.notices ?? [];
   $("notices").hidden = !notices.length;
   renew("notices", notices, () => $("notices").replaceChildren(...notices.map((notice) => make("li", notice))));
+  const notes = (hunt.notes ?? []).filter((note) => !note.crash);
+  $("hunt-notes").hidden = !notes.length;
+  renew("hunt-notes", notes, () => $("hunt-notes").replaceChildren(...notes.map((note) => make("li", noteText(note)))));
   $("progress").hidden = !(hunt.trials_planned >= hunt.trials_run && hunt.trials_planned) || hunt.state !== "running";
   $("progress").value = hunt.trials_planned ? hunt.trials_run / hunt.trials_planned : 0;
   const rate = hunt.rate, newest = sinceNewestKind(hunt);
@@ -114,6 +119,12 @@ function showKinds() {
   });
 }
 
+function withNotes(one) {
+  const cell = make("span", one.damaged || one.summary);
+  cell.append(...notesOn(one.id).map((note) => make("span", note, "sub note")));
+  return cell;
+}
+
 function showCrashes() {
   $("crashes-section").hidden = !crashes.length;
   const types = [...new Set(crashes.map((one) => one.type).filter((type) => type))].sort();
@@ -123,9 +134,11 @@ function showCrashes() {
     $("crash-filter").value = chosen["crash-filter"];
   });
   const filter = $("crash-filter").value;
-  const lines = crashes.filter((one) => !filter || (filter === "near misses" ? one.near_miss : one.type === filter));
-  renew("crashes", lines, () => $("crashes").replaceChildren(table([["Crash"], ["What happened"], ["Type"], ["At fault"], ["Steps", "number"], ["Confirmed"]], lines.map((one) => [
-    one.damaged && !one.summary ? one.id : link(one.id), one.damaged || one.summary, one.near_miss ? (one.disturbed ? "near miss, disturbed" : "near miss") : one.type ?? "", faultOf(one), one.steps === undefined ? "" : count(one.steps),
+  const wanted = $("crash-words").value.toLowerCase().split(/\s+/);
+  const isWanted = (one) => { const text = [one.id, one.summary, one.type, one.damaged, ...notesOn(one.id)].join(" ").toLowerCase(); return wanted.every((word) => text.includes(word)); };
+  const lines = crashes.filter((one) => (!filter || (filter === "near misses" ? one.near_miss : one.type === filter)) && isWanted(one));
+  renew("crashes", [lines, hunt?.notes], () => $("crashes").replaceChildren(table([["Crash"], ["What happened"], ["Type"], ["At fault"], ["Steps", "number"], ["Confirmed"]], lines.map((one) => [
+    one.damaged && !one.summary ? one.id : link(one.id), withNotes(one), one.near_miss ? (one.disturbed ? "near miss, disturbed" : "near miss") : one.type ?? "", faultOf(one), one.steps === undefined ? "" : count(one.steps),
     one.near_miss ? "" : one.confirmed === true ? "yes" : one.confirmed === false ? "no: flaky" : one.why_unconfirmed || "not yet",
   ]), "Crashes")));
 }
@@ -475,6 +488,7 @@ async function refresh() {
     hunt = data;
     showHunt();
     showKinds();
+    showCrashes();
   }
   if (!hunt) return;
   let changed = Boolean(data);
@@ -529,6 +543,8 @@ for (const id of ["density", "near"]) {
   $(id).checked = chosen[id] === "1";
   $(id).onchange = () => { choose(id, $(id).checked ? "1" : ""); drawMap(); };
 }
+$("crash-words").value = chosen["crash-words"];
+$("crash-words").oninput = () => { choose("crash-words", $("crash-words").value); showCrashes(); };
 $("pick").onsubmit = (event) => { event.preventDefault(); pick(Number($("trial-number").value)); };
 window.addEventListener("resize", () => { if (hunt && points.length) drawParallel(parallel.names); });
 onScheme(drawAll);

@@ -93,8 +93,9 @@ function fill(row) {
   setText(node.link, row.name);
   const agents = Object.entries(row.agents), several = agents.length > 1;
   const spelled = (shorten) => agents.map(([id, agent]) => (several ? `${id}: ` : "") + (shorten ? agent.split(":").pop() : agent)).join(", ");
-  setText(node.sub, spelled(true));
-  node.sub.title = spelled(false);
+  const tags = [...new Set((row.notes ?? []).flatMap((note) => note.tags))].map((tag) => `#${tag}`);
+  setText(node.sub, [spelled(true), ...tags].join(" "));
+  node.sub.title = [spelled(false), ...(row.notes ?? []).map((note) => note.text)].filter((part) => part).join("\n");
   node.box.setAttribute("aria-label", `Select ${row.name} to compare`);
   setText(node.state, row.exported ? "exported" : row.state);
   node.state.className = `state ${row.state}`;
@@ -125,7 +126,7 @@ function fillTimes() {
 
 function wanted(row) {
   if (choice.state && row.state !== choice.state) return false;
-  const text = [row.name, row.scenario, ...Object.values(row.agents), row.detail].join(" ").toLowerCase();
+  const text = [row.name, row.scenario, ...Object.values(row.agents), row.detail, ...(row.notes ?? []).flatMap((note) => [note.text, note.crash, ...note.tags])].join(" ").toLowerCase();
   return choice.text.toLowerCase().split(/\s+/).every((word) => text.includes(word));
 }
 
