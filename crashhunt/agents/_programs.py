@@ -1,12 +1,12 @@
 """Agents that are programs: ``exec:PROGRAM``, in lock-step over standard input and output (protocol 1).
 
-Each message is one JSON object on one line. crashhunt sends ``hello``, ``reset``, ``observe`` and ``close``. The
-program answers with ``ready``, ``ok`` and ``act``, and ends after ``close``. Anything else is an error of the agent.
+Each message is one JSON object on one line, or after ``ready`` MessagePack if the program asks for it. crashhunt
+sends ``hello``, ``reset``, ``observe`` and ``close``. The program answers with ``ready``, ``ok`` and ``act``, and ends
+after ``close``. Anything else is an error of the agent.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import resource
 import select
@@ -16,9 +16,10 @@ import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, Final
 
 import numpy as np
+from pydantic_core import from_json, to_json
 
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError, ProgramError
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 
 PROTOCOL: Final = 1
 _ANSWERS: Final = {"hello": "ready", "reset": "ok", "observe": "act"}
+_FORMATS: Final = ("json", "msgpack")
+_LENGTH_BYTES: Final = 4  # before each message of MessagePack
 _CHUNK_BYTES: Final = 1 << 16
 _MAX_MESSAGE_BYTES: Final = 16 << 20
 _MAX_FILE_BYTES: Final = 64 << 20  # of each file that the program writes, such as its log
@@ -75,10 +78,10 @@ class ProgramFactory:
         """
         command = command_of(self._locator)
         with tempfile.TemporaryDirectory(prefix="crashhunt-agent-") as folder, tempfile.TemporaryFile() as log:
-            program = _Process(command, Path(folder), log.fileno(), limit_s=_DESCRIPTION_S)
+            program = _Process(command, Path(folder), log.fileno())
             try:
                 program.start()
-                return _signature_in(program.ask(_hello(agent, simulator, {}), "hello"))
+                return _signature_in(program.ask(_hello(agent, simulator, {}), "hello", _DESCRIPTION_S))
             except ProgramError as error:
                 raise ProgramError(f"{error.message}{_last_line(log)}", fix=error.fix) from None
             finally:
@@ -170,17 +173,15 @@ class _Process:
         command: the program and its words.
         folder: the folder in which the program runs; it is created.
         log: file descriptor for its standard error; None for that of this process.
-        limit_s: time limit for each answer, in s; None if the time limit of the trial applies.
     """
 
-    def __init__(
-        self, command: Sequence[str], folder: Path, log: int | None = None, *, limit_s: float | None = None
-    ) -> None:
+    def __init__(self, command: Sequence[str], folder: Path, log: int | None = None) -> None:
         self._command = command
         self._folder = folder
         self._log = log
-        self._limit_s = limit_s
         self._received = bytearray()
+        self._packer: Any = None  # of MessagePack; None as long as messages are lines of JSON
+        self._unpack: Any = None
         self._process: subprocess.Popen[bytes] | None = None
 
     @property
@@ -203,41 +204,41 @@ class _Process:
         except OSError as error:
             fix = "make it executable here: with #! in its first line if it is a script, and for this machine"
             raise ProgramError(f"the program does not start: {error.strerror}: {self._command[0]}", fix=fix) from None
+        assert process.stdin is not None
+        os.set_blocking(process.stdin.fileno(), False)
         with suppress(OSError, ValueError, AttributeError):  # it has ended already, or the system has no such call
             soft, hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
             if soft == resource.RLIM_INFINITY or soft > _MAX_FILE_BYTES:
                 resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (_MAX_FILE_BYTES, hard))
 
-    def ask(self, message: Mapping[str, Any], shown: str) -> dict[str, Any]:
+    def ask(self, message: Mapping[str, Any], shown: str, limit_s: float | None = None) -> dict[str, Any]:
         """Send a message, and return the program's answer to it.
 
         Args:
             message: the message.
             shown: the message in errors, such as ``observe of step 3``.
+            limit_s: time limit for the answer, in s; None if the time limit of the trial applies.
 
         Raises:
             ProgramError: the program has ended, or its answer is not the one that the protocol defines.
         """
-        process = self._process
-        assert process is not None
-        assert process.stdin is not None
         if self._received:
             raise ProgramError(f"it has sent something before {shown}: {_shown(self._received)}", fix=_LOGS_FIX)
-        data = memoryview(json.dumps(message, separators=(",", ":")).encode() + b"\n")
+        deadline = None if limit_s is None else time.monotonic() + limit_s
         try:
-            while data:
-                data = data[os.write(process.stdin.fileno(), data) :]
-        except OSError:
-            raise self._ended(shown) from None
-        line = self._read_line(shown)
-        try:
-            answer = json.loads(line)
-        except (ValueError, RecursionError):
-            raise ProgramError(f"its answer to {shown} is not JSON: {_shown(line)}", fix=_LOGS_FIX) from None
+            self._write(self._encoded(message), shown, deadline)
+            data = self._read(shown, deadline)
+        except TimeoutError:
+            raise ProgramError(f"it has not answered {shown} within {limit_s:g} s") from None
+        answer = self._decoded(data, shown)
         expected = _ANSWERS[message["type"]]
         if not isinstance(answer, dict) or answer.get("type") != expected:
             fix = f'send {{"type": "{expected}", …}}'
-            raise ProgramError(f"its answer to {shown} is not of type {expected!r}: {_shown(line)}", fix=fix)
+            raise ProgramError(f"its answer to {shown} is not of type {expected!r}: {_shown(data)}", fix=fix)
+        if expected == "ready" and answer.get("format") == "msgpack":
+            import msgpack
+
+            self._packer, self._unpack = msgpack.Packer(), msgpack.unpackb
         return answer
 
     def close(self) -> None:
@@ -249,8 +250,7 @@ class _Process:
         assert process.stdout is not None
         below = descendants_of(process.pid)
         with suppress(OSError):
-            os.set_blocking(process.stdin.fileno(), False)
-            os.write(process.stdin.fileno(), b'{"type":"close"}\n')
+            os.write(process.stdin.fileno(), self._encoded({"type": "close"}))
         with suppress(OSError):
             process.stdin.close()
         if not self._ends_within(process, _CLOSING_S):
@@ -264,29 +264,62 @@ class _Process:
             process.wait()
         process.stdout.close()
 
-    def _read_line(self, shown: str) -> bytes:
-        process, received = self._process, self._received
+    def _encoded(self, message: Mapping[str, Any]) -> bytes:
+        if self._packer is None:
+            return to_json(message) + b"\n"
+        data: bytes = self._packer.pack(message)
+        return len(data).to_bytes(_LENGTH_BYTES, "little") + data
+
+    def _decoded(self, data: bytes, shown: str) -> Any:
+        try:
+            if self._unpack is not None:
+                return self._unpack(data, strict_map_key=False)
+            return from_json(data)
+        except ValueError:
+            form = "JSON" if self._unpack is None else "MessagePack"
+            raise ProgramError(f"its answer to {shown} is not {form}: {_shown(data)}", fix=_LOGS_FIX) from None
+
+    def _write(self, data: bytes, shown: str, deadline: float | None) -> None:
+        """Write a message, as fast as the program reads it."""
+        process = self._process
+        assert process is not None
+        assert process.stdin is not None
+        left = memoryview(data)
+        while left:
+            try:
+                left = left[os.write(process.stdin.fileno(), left) :]
+            except BlockingIOError:
+                _await(process.stdin, deadline, writing=True)
+            except OSError:
+                raise self._ended(shown) from None
+
+    def _read(self, shown: str, deadline: float | None) -> bytes:
+        """Return the next message of the program, without its frame."""
+        received = self._received
+        while True:
+            if self._packer is None:
+                begin, end = 0, received.find(b"\n")
+            else:
+                begin, end = _LENGTH_BYTES, _LENGTH_BYTES + int.from_bytes(received[:_LENGTH_BYTES], "little")
+            if max(len(received), end) > _MAX_MESSAGE_BYTES:
+                fix = "end each message with a line break" if self._packer is None else "send the length first"
+                raise ProgramError(f"its answer to {shown} is longer than {_MAX_MESSAGE_BYTES >> 20} MB", fix=fix)
+            if begin <= end <= len(received) and len(received) >= begin:
+                data = bytes(received[begin:end])
+                del received[: end + (self._packer is None)]
+                return data
+            self._receive(shown, deadline)
+
+    def _receive(self, shown: str, deadline: float | None) -> None:
+        process = self._process
         assert process is not None
         assert process.stdout is not None
-        output = process.stdout.fileno()
-        until = None if self._limit_s is None else time.monotonic() + self._limit_s
-        searched = 0
-        while (end := received.find(b"\n", searched)) < 0:
-            searched = len(received)
-            if searched > _MAX_MESSAGE_BYTES:
-                limit = f"{_MAX_MESSAGE_BYTES >> 20} MB"
-                raise ProgramError(
-                    f"its answer to {shown} is longer than {limit}", fix="end each message with a line break"
-                )
-            if until is not None and not select.select([output], [], [], max(0.0, until - time.monotonic()))[0]:
-                raise ProgramError(f"it has not answered {shown} within {self._limit_s:g} s")
-            data = os.read(output, _CHUNK_BYTES)
-            if not data:
-                raise self._ended(shown)
-            received += data
-        line = bytes(received[:end])
-        del received[: end + 1]
-        return line
+        if deadline is not None:
+            _await(process.stdout, deadline)
+        data = os.read(process.stdout.fileno(), _CHUNK_BYTES)
+        if not data:
+            raise self._ended(shown)
+        self._received += data
 
     def _ended(self, shown: str) -> ProgramError:
         """Return the error for a program that has closed one of its ends."""
@@ -317,6 +350,18 @@ class _Process:
         return True
 
 
+def _await(stream: IO[bytes], deadline: float | None, *, writing: bool = False) -> None:
+    """Return as soon as a stream can be read or written.
+
+    Raises:
+        TimeoutError: the deadline has passed.
+    """
+    left = None if deadline is None else max(0.0, deadline - time.monotonic())
+    ready = select.select([] if writing else [stream], [stream] if writing else [], [], left)
+    if not any(ready):
+        raise TimeoutError
+
+
 _LOGS_FIX = "write only messages to standard output, and logs to standard error"
 
 
@@ -344,8 +389,9 @@ def _check_ready(ready: Mapping[str, Any]) -> None:
         raise ProgramError(
             f"its protocol is {_shown(protocol)} (allowed: {PROTOCOL})", fix=f'send "protocol": {PROTOCOL}'
         )
-    if form != "json":
-        raise ProgramError(f"its format is {_shown(form)} (allowed: json)", fix='send "format": "json"')
+    if form not in _FORMATS:
+        allowed = " or ".join(_FORMATS)
+        raise ProgramError(f"its format is {_shown(form)} (allowed: {allowed})", fix='send "format": "json"')
 
 
 def _signature_in(ready: Mapping[str, Any]) -> Signature:
@@ -441,7 +487,7 @@ def _shown(value: object) -> str:
     text = (
         bytes(value[: 4 * _MAX_SHOWN_CHARACTERS]).decode("utf-8", "replace")
         if isinstance(value, bytes | bytearray)
-        else json.dumps(value)
+        else to_json(value, bytes_mode="base64", fallback=repr).decode()
     )
     text = one_line(text)
     return text if len(text) <= _MAX_SHOWN_CHARACTERS else f"{text[:_MAX_SHOWN_CHARACTERS]}…"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -100,6 +101,37 @@ for line in iter(sys.stdin.readline, ""):
         break
 """
 
+# The same driver with binary messages.
+BINARY = """\
+import json, struct, sys
+import msgpack
+
+speed = 12.0
+line = sys.stdin.buffer.readline()
+speed = json.loads(line)["arguments"].get("speed", speed)
+kind = [*sys.argv[1:], ""][0]
+print(json.dumps({"type": "ready", "format": "msgpack"}), flush=True)
+while True:
+    (length,) = struct.unpack("<I", sys.stdin.buffer.read(4))
+    message = msgpack.unpackb(sys.stdin.buffer.read(length))
+    if message["type"] == "close":
+        break
+    answer = {"type": "ok"}
+    if message["type"] == "observe":
+        ahead = [row[1] for row in message["observation"][1:] if row[0] and row[1] > 0 and abs(row[2]) < 1.5]
+        answer = {"type": "act", "action": [0.0 if ahead and min(ahead) < 12.0 else speed, 0]}
+    data = msgpack.packb(answer)
+    if message.get("step") == 3 and kind:
+        data = {"garbage": bytes([0xc1]), "number": bytes([5])}.get(kind, data)
+    frame = struct.pack("<I", len(data)) + data
+    if message.get("step") == 3 and kind:
+        frame = {"long": struct.pack("<I", 1 << 30), "half": frame[:9]}.get(kind, frame)
+    sys.stdout.buffer.write(frame)
+    sys.stdout.buffer.flush()
+    if message.get("step") == 3 and kind == "half":
+        break
+"""
+
 IN_C = r"""
 #include <math.h>
 #include <stdio.h>
@@ -141,6 +173,14 @@ def write_program(folder: Path, name: str = "planner") -> Path:
     """Write the program in Python into a folder, and return its path."""
     path = folder / name
     path.write_text(PROGRAM, encoding="utf-8")
+    path.chmod(0o755)
+    return path
+
+
+def write_binary_program(folder: Path, name: str = "binary") -> Path:
+    """Write the program with binary messages into a folder, and return its path."""
+    path = folder / name
+    path.write_text(f"#!{sys.executable}\n{BINARY}", encoding="utf-8")
     path.chmod(0o755)
     return path
 

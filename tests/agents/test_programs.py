@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from gymnasium import spaces
-from programs import COMPILER, DRIVER, compile_program, write_program
+from programs import COMPILER, DRIVER, compile_program, write_binary_program, write_program
 
 from crashhunt.agents import ProgramFactory
 from crashhunt.base.errors import ActionError, PluginError, ProgramError
@@ -44,6 +44,23 @@ def agent_of(locator, folder, *, form=None, **arguments):
     return ProgramFactory(locator).agent("ego", simulator, arguments, folder=folder, files={})
 
 
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    {
+        "garbage": "its answer to observe of step 3 is not MessagePack",
+        "number": "its answer to observe of step 3 is not of type 'act'",
+        "long": "its answer to observe of step 3 is longer than 16 MB; send the length first",
+        "half": "exited with 0 instead of answering observe of step 3, in the middle of a message",
+    }.items(),
+)
+def test_harm_in_binary_messages_is_an_error_of_the_agent(tmp_path, kind, message):
+    agent = agent_of(f"exec:{write_binary_program(tmp_path)} {kind}", tmp_path)
+    agent.reset(1)
+    with pytest.raises(ProgramError, match=f"^ego: .*{re.escape(message)}"):
+        drive(agent)
+    agent.close()
+
+
 def drive(agent):
     return [agent.act(seen) for seen in observations()]
 
@@ -53,11 +70,11 @@ def planner(tmp_path):
     return write_program(tmp_path)
 
 
-def test_a_program_in_python_and_one_in_c_act_like_the_agent_in_python(tmp_path, planner):
+def test_programs_in_python_and_c_and_one_with_binary_messages_act_like_the_agent_in_python(tmp_path, planner):
     names: dict = {}
     exec(DRIVER, names)
     expected = [names["Driver"](speed=9.125).act(seen) for seen in observations()]
-    programs = [planner, *([compile_program(tmp_path, "compiled")] if COMPILER else [])]
+    programs = [planner, write_binary_program(tmp_path), *([compile_program(tmp_path, "compiled")] if COMPILER else [])]
     for program in programs:
         agent = agent_of(f"exec:{program}", tmp_path / "scratch", speed=9.125)
         agent.reset(7)
@@ -123,7 +140,7 @@ def test_messages_are_those_of_the_protocol(tmp_path):
         ("SIGSEGV", "reset", "died of SIGSEGV instead of answering reset"),
         ("exits", "hello", "exited with 3 instead of answering hello"),
         ("protocol", "hello", "its protocol is 2 (allowed: 1)"),
-        ("format", "hello", 'its format is "xml" (allowed: json)'),
+        ("format", "hello", 'its format is "xml" (allowed: json or msgpack)'),
         ("other", "observe", "its answer to observe of step 3 is not of type 'act'"),
         ("without", "observe", "its answer to observe of step 3 has no action"),
         ("twice", "observe", "it has sent something before observe of step 4"),
@@ -215,7 +232,6 @@ def test_whole_numbers_of_a_declaration_leave_the_type_to_the_values(tmp_path):
         ('{"type": "ready", "arguments": {"speed": {"low": 5}}}', "speed has low (allowed: range, unit, default)"),
         ('{"type": "ready", "arguments": {"speed": 5}}', "its argument speed has 5 (allowed: range, unit, default)"),
         ('{"type": "ready", "arguments": [1]}', "its arguments are [1], not an object"),
-        ('{"type": "ready", "format": "msgpack"}', 'its format is "msgpack" (allowed: json)'),
         ("ready", "its answer to hello is not JSON: ready"),
     ],
 )
