@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from crashhunt.base.errors import PluginError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
 PREFIX: Final = "exec:"
 _INTERPRETERS = re.compile(r"(python|pypy|perl|ruby|node|java|julia|lua|env|sh|bash|dash|zsh)[\d.]*")
@@ -55,6 +55,20 @@ def command_of(locator: str, files: Mapping[str, str] | None = None) -> tuple[st
     first, *rest = words_of(locator)
     copies = files or {}
     return (copies.get(first) or str(_program(first, locator)), *(_absolute(word, copies) for word in rest))
+
+
+def relative_to(folder: Path, words: Sequence[str]) -> str:
+    """Return the locator of a command line whose relative paths begin in a folder.
+
+    The program is a path if it contains a slash. Another word is a path if the folder contains this file.
+    """
+    first, *rest = words
+    found = [str(folder / first) if os.sep in first else first]
+    for word in rest:
+        name = _value_in(word)
+        is_there = _is_path(name) and os.path.exists(folder / name)  # noqa: PTH110
+        found.append(f"{word[: len(word) - len(name)]}{folder / name}" if is_there else word)
+    return f"{PREFIX}{shlex.join(found)}"
 
 
 def files_of(locator: str) -> dict[str, Path]:

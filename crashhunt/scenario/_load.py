@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shlex
 import tomllib
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from crashhunt.base.files import cannot_write
 from crashhunt.base.integrity import read_bounded
 from crashhunt.base.layout import PACKAGE, SCENARIO
 from crashhunt.base.plugins import registered
-from crashhunt.base.programs import PREFIX
+from crashhunt.base.programs import is_program, relative_to, words_of
 from crashhunt.base.text import any_of, did_you_mean, listed, near_path, one_of
 from crashhunt.base.validation import validate
 from crashhunt.scenario._scenario import (
@@ -357,7 +356,8 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
         for name, table in data.items():
             if isinstance(table, dict) and (backend := backend_of(name)) is not None:
                 data[name] = {**backend.implied, **table}
-    _join_commands(data, str(path))
+    if not kept:
+        _join_commands(data, str(path), path.resolve().parent)
     scenario = scenario_from_dict(data, where=str(path), folder=path.resolve().parent, tolerant=kept)
     scenario = replace(scenario, file=path.name)
     check_arguments(scenario, kept=kept)
@@ -373,27 +373,27 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
     return replace(scenario, notes=(*scenario.notes, *notes))
 
 
-def _join_commands(data: Plain, where: str) -> None:
+def _join_commands(data: Plain, where: str, folder: Path) -> None:
     """Replace each ``agent = { exec = ["./planner", …] }`` in the contents of a file by the locator ``exec:…``.
+
+    Relative paths of such a command, and of an agent that is written as ``exec:…``, begin in the scenario's folder.
 
     Raises:
         ScenarioError: the command is not a list of texts.
+        PluginError: the text is not a command line.
     """
     agents = data.get("agents")
     for name, table in agents.items() if isinstance(agents, dict) else ():
         agent = table.get("agent") if isinstance(table, dict) else None
-        if not isinstance(agent, dict):
-            continue
-        words = agent.get("exec")
-        if (
-            list(agent) != ["exec"]
-            or not isinstance(words, list)
-            or not words
-            or not all(isinstance(w, str) for w in words)
-        ):
-            fix = 'write agent = { exec = ["./planner", "--mode", "test"] }'
-            refuse(where, f"agents.{name}.agent", agent, "is not a command", fix)
-        table["agent"] = f"{PREFIX}{shlex.join(words)}"
+        if isinstance(agent, str) and is_program(agent):
+            table["agent"] = relative_to(folder, words_of(agent))
+        elif isinstance(agent, dict):
+            words = agent.get("exec")
+            is_list = isinstance(words, list) and all(isinstance(word, str) for word in words)
+            if not isinstance(words, list) or not is_list or not any(words[:1]) or len(agent) > 1:
+                fix = 'write agent = { exec = ["./planner", "--mode", "test"] }'
+                refuse(where, f"agents.{name}.agent", agent, "is not a command", fix)
+            table["agent"] = relative_to(folder, words)
 
 
 def _resolve_default_path(setup: AgentSetup, folder: Path) -> AgentSetup:
