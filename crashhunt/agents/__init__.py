@@ -7,6 +7,7 @@ from crashhunt.base.doors import offer_lazily
 if TYPE_CHECKING:
     from ._car_following import CarFollowing as CarFollowing
     from ._lane_changing import IntelligentDriver as IntelligentDriver, LaneChanger as LaneChanger
+    from ._library_agents import LibraryAgent as LibraryAgent, LibraryFactory as LibraryFactory
     from ._policies import (
         NumpyPolicy as NumpyPolicy,
         OnnxPolicy as OnnxPolicy,

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base.errors import PluginError
 from crashhunt.base.exceptions import in_words, place_of
-from crashhunt.base.programs import is_program
+from crashhunt.base.programs import factory_of, is_program
 from crashhunt.base.text import did_you_mean, one_of
 
 if TYPE_CHECKING:
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from importlib.metadata import Distribution, EntryPoint
 
 _MAX_LINE_CHARACTERS = 1_000
-_PROGRAM_AGENT = "crashhunt.agents:ProgramFactory"
 Group = Literal["agents", "backends", "disturbances", "executors", "oracles", "samplers", "simulators"]
 
 
@@ -76,18 +75,19 @@ def _changed_at(place: str) -> int:
 def locate(group: Group, name: str) -> Any:
     """Return the object with a registered name or a ``module:attribute``.
 
-    The module of a ``module:attribute`` may lie in the current folder. An agent may also be a program (``exec:…``).
+    The module of a ``module:attribute`` may lie in the current folder. An agent may also be a program
+    (``exec:…``) or a library (``lib:…``).
 
     Raises:
         PluginError: the object does not exist, or its import failed.
     """
     if group == "agents" and is_program(name):
-        return load_object(_PROGRAM_AGENT, installed=True)(name)
+        return load_object(factory_of(name), installed=True)(name)
     points = registered(group)
     target = points[name].value if name in points else name
     module_name, colon, attribute = target.partition(":")
     if not colon or not module_name or not attribute:
-        more = "module:attribute, or exec:PROGRAM" if group == "agents" else "or module:attribute"
+        more = "module:attribute, exec:PROGRAM, or lib:FILE.so" if group == "agents" else "or module:attribute"
         fix = f"{one_of(name, points, none='(none)')}, {more}"
         raise PluginError(f"{name!r} is not a registered name of {group}", fix=fix)
     return load_object(target, shown=name, installed=name in points)

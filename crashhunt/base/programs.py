@@ -1,4 +1,7 @@
-"""Locators of agents that are programs: ``exec:PROGRAM [WORD…]``, split as a shell would, without a shell."""
+"""Locators of agents that are not Python: programs (``exec:PROGRAM [WORD…]``) and libraries (``lib:FILE.so``).
+
+The command line of a program is split as a shell would, without a shell.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +13,36 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from crashhunt.base import libraries
 from crashhunt.base.errors import PluginError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 PREFIX: Final = "exec:"
+FACTORIES: Final = {
+    PREFIX: "crashhunt.agents:ProgramFactory",
+    libraries.PREFIX: "crashhunt.agents:LibraryFactory",
+}
+"""The class that creates the agents of each kind of locator."""
 _INTERPRETERS = re.compile(r"(python|pypy|perl|ruby|node|java|julia|lua|env|sh|bash|dash|zsh)[\d.]*")
 _SYSTEM_FOLDERS = ("/bin", "/sbin", "/usr/bin", "/usr/sbin", "/usr/lib", "/usr/libexec")
 _PROGRAM_FIX = "give the path of an executable file, such as exec:./planner"
 
 
 def is_program(locator: str) -> bool:
-    """Return whether the locator of an agent is the command line of a program."""
-    return locator.startswith(PREFIX)
+    """Return whether the locator of an agent names a program or a library, and not Python code."""
+    return locator.startswith(tuple(FACTORIES))
+
+
+def can_fork(locator: str) -> bool:
+    """Return whether an agent lives in the process of the trial, so that a fork of the trial contains the agent."""
+    return not locator.startswith(PREFIX)
+
+
+def factory_of(locator: str) -> str:
+    """Return the place of the class that creates the agents of a program or library, as ``module:class``."""
+    return next(place for prefix, place in FACTORIES.items() if locator.startswith(prefix))
 
 
 def words_of(locator: str) -> tuple[str, ...]:
@@ -57,6 +76,18 @@ def command_of(locator: str, files: Mapping[str, str] | None = None) -> tuple[st
     return (copies.get(first) or str(_program(first, locator)), *(_absolute(word, copies) for word in rest))
 
 
+def anchored(locator: str, folder: Path) -> str:
+    """Return the locator of a program or library whose relative paths begin in a folder.
+
+    Raises:
+        PluginError: the locator is not a command line.
+    """
+    if locator.startswith(libraries.PREFIX):
+        path = locator.removeprefix(libraries.PREFIX)
+        return f"{libraries.PREFIX}{folder / path}" if path else locator
+    return relative_to(folder, words_of(locator))
+
+
 def relative_to(folder: Path, words: Sequence[str]) -> str:
     """Return the locator of a command line whose relative paths begin in a folder.
 
@@ -72,13 +103,15 @@ def relative_to(folder: Path, words: Sequence[str]) -> str:
 
 
 def files_of(locator: str) -> dict[str, Path]:
-    """Return the files that must travel with an agent's command line, by the text that names them in it.
+    """Return the files that must travel with an agent's program or library, by the text that names them.
 
     Programs of the operating system and interpreters are not among them, because a copy would not find its own files.
 
     Raises:
-        PluginError: the program does not exist or cannot be executed.
+        PluginError: the program or library cannot be used.
     """
+    if locator.startswith(libraries.PREFIX):
+        return libraries.files_of(locator)
     first, *rest = words_of(locator)
     program = _program(first, locator)
     found = {} if _is_of_system(program) else {first: program}

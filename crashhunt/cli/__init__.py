@@ -23,6 +23,7 @@ from crashhunt.base.signals import ended_by_signals, is_interrupt
 from crashhunt.base.temporary import remove_leftovers
 from crashhunt.base.text import one_line
 from crashhunt.base.version import __version__
+from crashhunt.cli._agent_header import add_agent_header
 from crashhunt.cli._bisect import add_bisect
 from crashhunt.cli._check import add_check
 from crashhunt.cli._common import Parser, unwritable_output
@@ -82,7 +83,7 @@ _COMMANDS = {
     "keep them fixed": (add_corpus, add_gate, add_split),
     "measure": (add_rate, add_compare, add_trials),
     "manage hunts": (add_status, add_logs, add_note_command, add_check, add_trust_command),
-    "look things up": (add_guide, add_list, add_completion),
+    "look things up": (add_guide, add_list, add_agent_header, add_completion),
 }
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crashhunt.agents import NeedsLibraries, ProgramFactory
+from crashhunt.agents import LibraryFactory, NeedsLibraries, ProgramFactory
 from crashhunt.base.boundaries import Boundary, Party, is_ours
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
@@ -251,7 +251,7 @@ class Parts:
         """
         try:
             factory, given = self._prepared(agent, simulator, arguments)
-            if isinstance(factory, ProgramFactory):
+            if isinstance(factory, ProgramFactory | LibraryFactory):
                 stage, files = stage_of(self._settings.scratch, os.getpid()), self._settings.argument_files
                 return factory.agent(agent, simulator, given, folder=stage, files=files)
         except CrashhuntError:
@@ -289,7 +289,9 @@ class Parts:
         found = self._factories.get(agent)
         if found is None:
             factory = locate("agents", self._settings.scenario.agents[agent].agent)
-            if isinstance(factory, ProgramFactory):  # which would have to run to tell its arguments
+            if isinstance(factory, LibraryFactory):
+                factory.load(self._settings.argument_files)
+            if isinstance(factory, ProgramFactory | LibraryFactory):  # which would have to run to tell its arguments
                 return self._factories.setdefault(agent, (factory, ()))
             if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
                 require_origin(factory.__module__, self._settings.code)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, UsageError
 from crashhunt.base.plugins import is_foreign, locate, registered
-from crashhunt.base.programs import is_program
+from crashhunt.base.programs import can_fork, is_program
 from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import ModelApart, disturber_of, locate_model, parse_fixed, parse_rates, word_of
 from crashhunt.native import HOW_TO_REBUILD, outdated_modules
@@ -505,7 +505,7 @@ def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
 
 def _check_programs(settings: HuntSettings) -> None:
     """Refuse forks of running trials in which a program drives: a fork of the trial has no copy of the program."""
-    agent = next((name for name, chosen in settings.agents.items() if is_program(chosen.agent)), None)
+    agent = next((name for name, chosen in settings.agents.items() if not can_fork(chosen.agent)), None)
     forking = {"--probe": settings.probe, "--branch": settings.branch, "--rare": settings.rare}
     option = next((flag for flag, value in forking.items() if value), None)
     if agent is not None and option is not None:

@@ -10,14 +10,14 @@ from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from crashhunt.base import layout
+from crashhunt.base import layout, libraries
 from crashhunt.base.codec import known_part
 from crashhunt.base.errors import ArgumentError, HuntDirectoryError, ScenarioError
 from crashhunt.base.files import cannot_write
 from crashhunt.base.integrity import read_bounded
 from crashhunt.base.layout import PACKAGE, SCENARIO
 from crashhunt.base.plugins import registered
-from crashhunt.base.programs import is_program, relative_to, words_of
+from crashhunt.base.programs import anchored, is_program, relative_to
 from crashhunt.base.text import any_of, did_you_mean, listed, near_path, one_of
 from crashhunt.base.validation import validate
 from crashhunt.scenario._scenario import (
@@ -374,26 +374,29 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
 
 
 def _join_commands(data: Plain, where: str, folder: Path) -> None:
-    """Replace each ``agent = { exec = ["./planner", …] }`` in the contents of a file by the locator ``exec:…``.
+    """Replace ``agent = { exec = ["./planner", …] }`` by the locator ``exec:…``, and ``{ lib = "…" }`` by ``lib:…``.
 
-    Relative paths of such a command, and of an agent that is written as ``exec:…``, begin in the scenario's folder.
+    Relative paths of such an agent, and of one that is written as such a locator, begin in the scenario's folder.
 
     Raises:
-        ScenarioError: the command is not a list of texts.
+        ScenarioError: the command is not a list of texts, or the path of the library is not a text.
         PluginError: the text is not a command line.
     """
     agents = data.get("agents")
     for name, table in agents.items() if isinstance(agents, dict) else ():
         agent = table.get("agent") if isinstance(table, dict) else None
         if isinstance(agent, str) and is_program(agent):
-            table["agent"] = relative_to(folder, words_of(agent))
+            table["agent"] = anchored(agent, folder)
         elif isinstance(agent, dict):
-            words = agent.get("exec")
+            words, library = agent.get("exec"), agent.get("lib")
             is_list = isinstance(words, list) and all(isinstance(word, str) for word in words)
-            if not isinstance(words, list) or not is_list or not any(words[:1]) or len(agent) > 1:
-                fix = 'write agent = { exec = ["./planner", "--mode", "test"] }'
-                refuse(where, f"agents.{name}.agent", agent, "is not a command", fix)
-            table["agent"] = relative_to(folder, words)
+            if isinstance(library, str) and library and len(agent) == 1:
+                table["agent"] = anchored(f"{libraries.PREFIX}{library}", folder)
+            elif isinstance(words, list) and is_list and any(words[:1]) and len(agent) == 1:
+                table["agent"] = relative_to(folder, words)
+            else:
+                fix = 'write agent = { exec = ["./planner", "--mode", "test"] } or agent = { lib = "./libplanner.so" }'
+                refuse(where, f"agents.{name}.agent", agent, "is neither a command nor a library", fix)
 
 
 def _resolve_default_path(setup: AgentSetup, folder: Path) -> AgentSetup:

@@ -1,0 +1,336 @@
+"""Agents that are shared libraries: what they receive, what they may return, and the harm that they do."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sqlite3
+import subprocess
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from compiled_libraries import IN_C, compile_library
+from gymnasium import spaces
+from programs import COMPILER, DRIVER
+
+from crashhunt.agents import LibraryFactory
+from crashhunt.base.errors import ActionError, CrashhuntError, PluginError, ProgramError
+from crashhunt.base.libraries import files_of
+from crashhunt.simulators import MetaAction, SpaceAction, SpeedAndLaneChange
+from crashhunt.trial import Range, signature_of
+
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
+
+COLUMNS = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
+SPACE = spaces.Box(-np.inf, np.inf, (8, 7), np.float32)
+
+# Returns what it has received as its action.
+ECHO = r"""
+#include <stdlib.h>
+#include "crashhunt_agent.h"
+CRASHHUNT_AGENT()
+static const struct crashhunt_setup *kept;
+CRASHHUNT_EXPORT const char *crashhunt_create(const struct crashhunt_setup *setup, void **agent) {
+    kept = setup; *agent = NULL; return NULL;
+}
+CRASHHUNT_EXPORT const char *crashhunt_reset(void *agent, uint64_t seed) {
+    (void)agent; return seed == UINT64_MAX ? NULL : "another seed";
+}
+CRASHHUNT_EXPORT const char *crashhunt_act(void *agent, const struct crashhunt_observation *seen, double *action) {
+    int64_t i, k, n = 0;
+    (void)agent;
+    for (i = 0; i < seen->part_count; i++)
+        for (k = 0; k < seen->parts[i].size && n < kept->action->size; k++)
+            action[n++] = seen->parts[i].bytes ? seen->parts[i].bytes[k] : seen->parts[i].values[k];
+    if (n < kept->action->size) action[n++] = (double)crashhunt_part(kept, "camera/image");
+    if (n < kept->action->size) action[n++] = (double)seen->step;
+    if (n < kept->action->size) action[n++] = seen->time_s;
+    if (n < kept->action->size) action[n++] = crashhunt_number(kept, "flag", 7.0);
+    if (n < kept->action->size) action[n++] = (double)strlen(crashhunt_text(kept, "word", ""));
+    if (n < kept->action->size) action[n++] = crashhunt_number(kept, "none", 3.0);
+    return NULL;
+}
+CRASHHUNT_EXPORT void crashhunt_destroy(void *agent) { (void)agent; }
+"""
+
+
+class Simulated:
+    """What a library is told of a simulator."""
+
+    step_length_s = 0.25
+    observation_names: ClassVar = COLUMNS
+
+    def __init__(self, form, space):
+        self.actions = {"ego": form}
+        self.observation_spaces = {"ego": space}
+        if space is not SPACE:
+            self.observation_names = ()
+
+
+def agent_of(library, *, form=None, space=SPACE, seed=2**64 - 1, **arguments):
+    simulator = Simulated(form or SpeedAndLaneChange(), space)
+    agent = LibraryFactory(f"lib:{library}").agent("ego", simulator, arguments, folder=library.parent, files={})
+    agent.reset(seed)
+    return agent
+
+
+def observations(count=20):
+    rng = np.random.default_rng(1)
+    return [rng.uniform(-30, 30, (8, 7)).astype(np.float32) for _ in range(count)]
+
+
+@pytest.fixture(scope="module")
+def planner(tmp_path_factory):
+    return compile_library(tmp_path_factory.mktemp("planner"))
+
+
+@pytest.fixture(scope="module")
+def echo(tmp_path_factory):
+    return compile_library(tmp_path_factory.mktemp("echo"), "libecho.so", ECHO)
+
+
+def test_a_library_acts_like_the_agent_in_python(planner):
+    names: dict = {}
+    exec(DRIVER, names)
+    driver, agent = names["Driver"](speed=9.125), agent_of(planner, speed=9.125)
+    answers = [agent.act(seen) for seen in observations()]
+    assert answers == [driver.act(seen) for seen in observations()]
+    assert {speed for speed, _ in answers} == {0.0, 9.125}
+    assert [type(part) for part in answers[0]] == [float, int]
+    agent.close()
+    agent.close()
+
+
+def test_two_agents_of_a_library_do_not_share_their_arguments(planner):
+    slow, fast = (agent_of(planner, speed=speed) for speed in (9.0, 19.0))
+    seen = np.zeros((8, 7), np.float32)
+    assert [agent.act(seen)[0] for agent in (slow, fast, slow)] == [9.0, 19.0, 9.0]
+
+
+def test_the_arguments_that_a_library_declares_are_its_signature_and_its_defaults(planner):
+    arguments = signature_of(LibraryFactory(f"lib:{planner}")).arguments
+    speed = arguments["speed"]
+    assert (speed.default, speed.unit, speed.distribution) == (12.0, "m/s", Range(8.0, 20.0))
+    assert (arguments["harm"].default, arguments["harm"].distribution, arguments["harm"].unit) == ("none", None, "")
+    assert agent_of(planner).act(np.zeros((8, 7), np.float32)) == (12.0, 0)
+
+
+def test_nested_observations_step_time_and_arguments_arrive_in_order(echo):
+    image = spaces.Box(0, 255, (2, 2), np.uint8)
+    camera = spaces.Dict({"gain": spaces.Discrete(5), "image": image})
+    space = spaces.Dict({"bits": spaces.MultiBinary(2), "camera": camera, "xy": spaces.Tuple((SPACE, SPACE))})
+    form = SpaceAction(spaces.Box(-np.inf, np.inf, (2 + 1 + 4 + 56 + 56 + 6,), np.float64))
+    agent = agent_of(echo, form=form, space=space, flag=True, word="é")
+    rows = observations(2)
+    seen = {
+        "bits": np.array([1, 0], np.int8),
+        "camera": {"gain": 3, "image": np.array([[1, 2], [3, 255]], np.uint8)},
+        "xy": (rows[0], rows[1]),
+    }
+    flat = [1, 0, 3, 1, 2, 3, 255, *rows[0].ravel(), *rows[1].ravel()]
+    assert form.encode(agent.act(seen)).tolist() == [*flat, 2, 0, 0.0, 1.0, 2, 3.0]
+    assert form.encode(agent.act(seen)).tolist() == [*flat, 2, 1, 0.25, 1.0, 2, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("space", "value"),
+    [
+        (spaces.Discrete(9), 4),
+        (spaces.MultiDiscrete([3, 9]), [2, 7]),
+        (spaces.Box(0, 9, (1, 2), np.float32), [[2.5, 7.0]]),
+        (spaces.Box(0, 9, (), np.float64), 2.5),
+        (spaces.MultiBinary(2), [1, 0]),
+    ],
+)
+def test_actions_have_the_type_and_the_shape_of_their_space(echo, space, value):
+    form = SpaceAction(space)
+    seen = spaces.Box(-np.inf, np.inf, np.shape(value), np.float64)
+    agent = agent_of(echo, form=form, space=seen)
+    assert form.encode(agent.act(np.array(value, np.float64))).tolist() == value
+    assert agent.act(np.full(np.shape(value), np.nan)) is not None
+    with pytest.raises(ActionError):
+        form.encode(agent.act(np.full(np.shape(value), np.nan)))
+
+
+def test_a_meta_action_that_is_no_whole_number_is_refused(echo):
+    agent = agent_of(echo, form=MetaAction(), space=spaces.Box(0, 9, (1,), np.float64))
+    with pytest.raises(ActionError):
+        MetaAction().encode(agent.act(np.array([1.5])))
+    assert MetaAction().encode(agent.act(np.array([3.0]))).tolist() == [3]
+
+
+def test_an_observation_cannot_be_changed_by_the_library(echo):
+    agent = agent_of(echo, form=SpaceAction(spaces.Box(-9, 9, (2,), np.float64)), space=spaces.Box(-9, 9, (2,)))
+    seen = np.array([1, 2], np.float32)
+    first = agent.act(seen)
+    agent.act(seen * 2)
+    assert (seen.tolist(), first.tolist()) == ([1, 2], [1, 2])
+
+
+@pytest.mark.parametrize(
+    ("harm", "message"),
+    [
+        ("fails", "ego: crashhunt_act failed in step 4: no path €"),
+        ("shape", "ego: crashhunt_act has written more than the 2 values of an action in step 4"),
+        ("create", "ego: crashhunt_create failed: (no reason given)"),
+        ("reset", "ego: crashhunt_reset failed: no map"),
+    ],
+)
+def test_a_failure_is_an_error_that_names_the_agent(planner, harm, message):
+    agent = agent_of(planner, harm=harm)
+    with pytest.raises(ProgramError, match=f"^{re.escape(message)}"):
+        [agent.act(seen) for seen in observations()]
+    agent.close()
+
+
+@pytest.mark.parametrize("harm", ["NaN", "unset", "part"])
+def test_an_action_outside_of_the_space_is_left_to_the_check_of_all_agents(planner, harm):
+    agent = agent_of(planner, harm=harm)
+    actions = [agent.act(seen) for seen in observations(4)]
+    with pytest.raises(ActionError):
+        SpeedAndLaneChange().encode(actions[3])
+
+
+@pytest.mark.parametrize("space", [spaces.Text(5), spaces.Dict({"a": spaces.Sequence(SPACE)})])
+def test_spaces_without_a_fixed_shape_are_refused(echo, space):
+    with pytest.raises(PluginError, match="cannot receive observations"):
+        agent_of(echo, space=space)
+    with pytest.raises(PluginError, match="cannot return actions"):
+        agent_of(echo, form=type("Form", (), {"space": space, "names": ()}))
+
+
+def test_a_needed_library_comes_from_the_snapshot_or_is_refused(tmp_path):
+    for folder, value in (("built", "0.5"), ("saved", "1.5")):
+        (tmp_path / folder).mkdir()
+        for words, name in ((("-Wl,-soname,libneeded.so.1",), "libneeded.so.1"), ((), "libnameless.so")):
+            source = f"double needed(void) {{ return {value}; }}"
+            compile_library(
+                tmp_path / folder, name, f'__attribute__((visibility("default"))) double needed(void);{source}', words
+            )
+    built = tmp_path / "built"
+    search = (f"-L{built}", f"-Wl,-rpath,{built}", "-DNEEDED")
+    named = compile_library(built, "libnamed.so", words=(*search, "-l:libneeded.so.1"))
+    nameless = compile_library(built, "libfirst.so", words=(*search, "-l:libnameless.so"))
+    assert files_of(f"lib:{named}") == {f"lib:{built}/libneeded.so.1": built / "libneeded.so.1", str(named): named}
+    simulator = Simulated(SpeedAndLaneChange(), SPACE)
+    files = {f"lib:{built}/libneeded.so.1": str(tmp_path / "saved" / "libneeded.so.1"), str(named): str(named)}
+    agent = LibraryFactory(f"lib:{named}").agent("ego", simulator, {}, folder=tmp_path, files=files)
+    agent.reset(1)
+    assert agent.act(np.zeros((8, 7), np.float32)) == (13.5, 0)
+    files = {f"lib:{built}/libnameless.so": str(tmp_path / "saved" / "libnameless.so"), str(nameless): str(nameless)}
+    with pytest.raises(CrashhuntError, match=r"libnameless.so, which was not loaded from the snapshot"):
+        LibraryFactory(f"lib:{nameless}").load(files)
+
+
+TOY = ("--scenario", "toy", "--seed", "5", "--set", "gap_m=5.0:25.0")
+
+
+def results(folder):
+    with sqlite3.connect(f"file:{folder / 'ledger.sqlite'}?mode=ro", uri=True) as database:
+        return [json.loads(row[0]) for row in database.execute("SELECT result FROM trials ORDER BY number")]
+
+
+def test_a_hunt_with_a_library_has_the_digests_of_one_with_the_same_driver_in_python(toy):
+    compile_library(toy.folder, words=("-DHARMLESS",))
+    (toy.folder / "planner.py").write_text(DRIVER, encoding="utf-8")
+    for name, agent in (("in_c", "lib:./libplanner.so"), ("in_python", "planner:Driver")):
+        words = ("--agent", agent, "--arg", "speed=8.0:20.0", "--keep-going")
+        toy.crashhunt("run", name, "1", "4", "60", *TOY, *words)
+    in_c, in_python = ([one["digest"] for one in results(toy.folder / name)] for name in ("in_c", "in_python"))
+    assert in_c == in_python
+    assert len(set(in_c)) == 4
+
+
+def hunted(toy, harm, *words):
+    words = ("--agent", "lib:./libplanner.so", "--arg", f"harm={harm}", *words)
+    toy.crashhunt("run", "h", "1", "1", "20", *TOY, *words)
+    (result,) = results(toy.folder / "h")
+    return result
+
+
+@pytest.mark.parametrize(
+    ("harm", "words", "outcome", "message"),
+    [
+        ("SIGSEGV", (), "process_died", "the process died of SIGSEGV in ego's act() of step 4"),
+        pytest.param(
+            "abort", (), "process_died", "the process died of SIGABRT in ego's act() of step 4",
+            marks=pytest.mark.nightly,
+        ),
+        ("exit", (), "process_died", "the process exited with 0 in ego's act() of step 4"),
+        pytest.param(
+            "deadlock", ("--timeout", "1"), "hang", "still running after 1 s in ego's act() of step 4",
+            marks=pytest.mark.nightly,
+        ),
+        pytest.param("shape", (), "agent_error", "ego: crashhunt_act has written more", marks=pytest.mark.nightly),
+    ],
+)  # fmt: skip
+def test_harm_has_the_right_outcome_and_names_the_agent(toy, harm, words, outcome, message):
+    compile_library(toy.folder)
+    result = hunted(toy, harm, *words)
+    assert (result["outcome"], result["failure"]["agent"]) == (outcome, "ego")
+    assert result["failure"]["message"].startswith(message)
+
+
+def test_a_replay_runs_the_saved_library_and_says_when_the_one_of_today_differs(toy):
+    compile_library(toy.folder)
+    hunted(toy, "fails")
+    compile_library(toy.folder, source=IN_C.replace('kind, "fails"', 'kind, "never"'))
+    assert "every observation, action and scene is bit-identical" in toy.crashhunt("replay", "h").out
+    assert (
+        "differs from the snapshot: ./libplanner.so has changed"
+        in toy.crashhunt("replay", "h", "--code", "current", "--expect", "fixed").out
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda file: None, "'./libplanner.so' is not a file"),
+        (lambda file: file.write_bytes(b""), "it is not a shared library (an ELF file)"),
+        (
+            lambda file: file.write_bytes(b"\x7fELF\2\1\1" + bytes(11) + b"\xb7\0" + bytes(99)),
+            "it is built for AArch64",
+        ),
+        (
+            lambda file: compile_library(file.parent, source=IN_C.replace("crashhunt_reset", "crashhunt_rest")),
+            "it does not export crashhunt_reset; include crashhunt_agent.h",
+        ),
+        (
+            lambda file: compile_library(file.parent, source=f'#define CRASHHUNT_PROTOCOL "2"\n{IN_C}'),
+            "its protocol is 2 (allowed: 1)",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line_before_the_hunt(toy, make, message):
+    make(toy.folder / "libplanner.so")
+    done = toy.crashhunt("run", "h", "1", "1", "20", *TOY, "--agent", "lib:./libplanner.so", expect=2)
+    assert message in done.err
+    assert len(done.err.strip().splitlines()) == 1
+    assert not (toy.folder / "h").exists()
+
+
+def test_a_scenario_names_a_library(toy):
+    file = toy.folder / "toy" / "scenario.toml"
+    text = file.read_text(encoding="utf-8")
+    assert text.count("\nagent = ") == 1
+    for agent, message in {
+        '{ lib = "./my libplanner.so" }': "/toy/my libplanner.so' is not a file",
+        "{ lib = 5 }": "is neither a command nor a library",
+        '{ lib = "a", exec = ["b"] }': "is neither a command nor a library",
+    }.items():
+        file.write_text(re.sub(r"(?m)^agent = .*$", f"agent = {agent}", text), encoding="utf-8")
+        assert message in toy.crashhunt("run", "h", "1", "1", "20", "--scenario", "toy", expect=2).err
+
+
+@pytest.mark.parametrize("standard", ["c++ -std=c++11", "c++ -std=c++17", "cc -std=c99"])
+def test_the_header_that_is_printed_compiles_without_warnings(toy, standard):
+    words = standard.split()
+    compiler = shutil.which(words[0])
+    if compiler is None:
+        pytest.skip(f"there is no {words[0]}")
+    (toy.folder / "crashhunt_agent.h").write_text(toy.crashhunt("agent-header").out, encoding="utf-8")
+    file = toy.folder / ("planner.c" if words[0] == "cc" else "planner.cpp")
+    file.write_text('#include "crashhunt_agent.h"\nCRASHHUNT_AGENT(CRASHHUNT_ARGUMENT("a", "1:2", "", "b"))\n', "utf-8")
+    subprocess.run([compiler, words[1], "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only", file], check=True)
