@@ -21,6 +21,12 @@ if TYPE_CHECKING:
         DrawsPanels as DrawsPanels,
         NeedsLibraries as NeedsLibraries,
     )
+    from ._reference_models import (
+        GRAVITY_MPS2 as GRAVITY_MPS2,
+        REFERENCE_MODELS as REFERENCE_MODELS,
+        ReferenceModel as ReferenceModel,
+        Situation as Situation,
+    )
     from ._simple import KeepLaneWithSpeed as KeepLaneWithSpeed, RandomAgent as RandomAgent, Recorded as Recorded
 
 offer_lazily(__name__)
