@@ -196,8 +196,14 @@ def _state(state: HuntState) -> str:
     from crashhunt.report import describe_phase
 
     if state.phase is None:
-        return state.state
+        return "finished" if state.state == "crashed" else state.state  # a column has the number of crashes
     return describe_phase(state.phase["name"], state.phase["done"], state.phase["total"], None)
+
+
+def state_words(state: HuntState) -> str:
+    """Return the state of a hunt as text; a hunt that has ended with crashes is finished, with their number."""
+    many = f"{state.crashes} {'crash' if state.crashes == 1 else 'crashes'}"
+    return f"finished, {many}" if state.state == "crashed" else state.state
 
 
 def fork_lines(state: HuntState) -> list[str]:

@@ -21,7 +21,7 @@ from crashhunt.cli._common import (
 )
 from crashhunt.cli._crashes import add_known, checked_cases, compare_with_corpus
 from crashhunt.cli._exit_codes import DONE, THE_ANSWER_IS_NO
-from crashhunt.cli._status import show_states, states_console, states_table
+from crashhunt.cli._status import show_states, state_words, states_console, states_table
 
 if TYPE_CHECKING:
     import argparse
@@ -205,7 +205,7 @@ def _watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Calla
     def tell(states: list[HuntState]) -> None:
         for state in states:
             if known.get(state.dir, "queued") != state.state:
-                console.print(f"{state.dir}: {state.state}", markup=False, soft_wrap=True)
+                console.print(f"{state.dir}: {state_words(state)}", markup=False, soft_wrap=True)
             known[state.dir] = state.state
 
     return tell, lambda: None

@@ -165,6 +165,7 @@ class HuntStatus:
         rate: the current crash rate; None if there is none.
         trials_left_s: time until the last trial ends, in s of wall time; None to estimate it from the mean rate.
         progress: progress of the work after the last trial; None before that.
+        steps: number of steps that the trials of this run of the hunt have simulated, without warm-up.
     """
 
     phase: str
@@ -190,6 +191,7 @@ class HuntStatus:
     rate: RunningRate | None = None
     trials_left_s: float | None = None
     progress: PhaseStatus | None = None
+    steps: int = 0
 
     @property
     def seconds_left(self) -> float:
@@ -220,6 +222,7 @@ class Progress:
     parallel: int = 1  # trials that run at a time
     ends_at: float | None = None  # of the trials, in s since the epoch
     ended_here: int = 0
+    steps_here: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     crashes: list[Bundle] = field(default_factory=list)
     earlier: list[Bundle] = field(default_factory=list)  # crashes of other versions of the code, which end no hunt
@@ -301,6 +304,7 @@ class Progress:
             planned: Planned number of trials of the hunt.
         """
         self.ended_here += 1
+        self.steps_here += result.steps
         self.outcomes[str(result.outcome)] += 1
         self.searching.take(result, crashed=crashed)
         self.remaining.ended(time.monotonic(), max(0, planned - sum(self.outcomes.values())), self.parallel)
@@ -440,6 +444,7 @@ class Progress:
             rate=self.running_rate(),
             trials_left_s=None if self.ends_at is None else max(0.0, self.ends_at - time.time()),
             progress=self.phase,
+            steps=self.steps_here,
         )
 
     def look_at(self, executor: Executor) -> None:

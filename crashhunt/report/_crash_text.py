@@ -25,6 +25,7 @@ from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import (
     COLUMNS,
     MAX_STANDING_SPEED_MPS,
+    NOT_DECIDED,
     about_changes,
     about_danger,
     about_disturbances,
@@ -220,7 +221,7 @@ class Story:
     def _mark(self, step: int, moment: Moment | None) -> str:
         """Return the remark at the end of a row of the table."""
         if step == self.escape:
-            return "<- the last step after which braking helps"
+            return "<- last avoidable step"
         if self.nearest is not None and step == self.nearest.step:
             return "<- nearest"
         hit = self.bundle.result.collision
@@ -268,7 +269,9 @@ class Story:
         """Return a sentence on the vehicle at fault, and the rule that blames it."""
         verdict, found = self.fault.verdict, self.fault.findings
         if verdict == "nobody can tell":
-            return [f"At fault: {verdict}{', as rules contradict each other' if found else ''}."]
+            return [
+                f"At fault: {NOT_DECIDED}, because {'rules contradict each other' if found else 'no rule applies'}."
+            ]
         who = {"ego": self.agent, "the other": self.other, "both": f"both {self.agent} and {self.other}"}[verdict]
         rules = "; and ".join(f"by the rule {one.rule!r}: {one.words} ({one.source})" for one in found)
         return [f"At fault: {who}, {rules}."]
@@ -301,7 +304,8 @@ class Story:
             return []
         why = about_why(self.judgement.why, self._at) if self.judgement.why is not None else []
         reference = self.judgement.reference
-        cause = about_reference(reference, self._ago, self.agent) if reference is not None else []
+        blamed = self.fault.verdict in ("ego", "both")
+        cause = about_reference(reference, self._ago, self.agent, had_to_yield=blamed) if reference is not None else []
         return [*cause, *about_judgement(self.judgement, self._ago, self.agent, self.other), *why]
 
     def _calculated(self, braking: float) -> str:

@@ -29,7 +29,15 @@ from crashhunt.report._rate_text import describe_running
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._step_table import argument_units
 from crashhunt.report._verdict import verdict_of
-from crashhunt.report._words import by_likelihood, describe_note, describe_versions, may_be_disturbed, traffic_of
+from crashhunt.report._words import (
+    NOT_DECIDED,
+    by_likelihood,
+    describe_note,
+    describe_versions,
+    fault_words,
+    may_be_disturbed,
+    traffic_of,
+)
 from crashhunt.results import CodeVersions, TrialRow, count_versions, find_crashes
 from crashhunt.trial import Outcome, steps_of
 from crashhunt.world import approaches, join_frames
@@ -300,7 +308,9 @@ def _crashes(bundles: Sequence[Bundle], found: FoundCrashes, watch: Watch | None
     shown = [*by_likelihood(crashed), *(bundle for bundle in bundles if bundle.is_near_miss)]
     for number, bundle in enumerate(watched(shown, len(shown), watch)):
         story = Story(bundle)
-        near = f"near miss at step {story.nearest.step}, danger {story.nearest.danger:.2f}" if story.nearest else ""
+        near = (
+            f"near miss at step {story.nearest.step}, criticality {story.nearest.danger:.2f}" if story.nearest else ""
+        )
         traffic = near if bundle.is_near_miss else traffic_of(bundle, found.tally.likeliest)
         crashes.append({**_crash(bundle, story), "traffic": traffic})
         if not bundle.is_near_miss:
@@ -448,8 +458,12 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
             "seed": str(result.spec.seed),
             "steps": str(result.steps),
             "simulation time": f"{result.sim_time_s:.1f} s",
-            **({"at fault": story.fault.verdict} if story.encounter is not None and story.nearest is None else {}),
-            **({"danger": f"{result.danger:.2f}"} if bundle.is_near_miss and result.danger is not None else {}),
+            **(
+                {"at fault": fault_words(story.fault.verdict)}
+                if story.encounter is not None and story.nearest is None
+                else {}
+            ),
+            **({"criticality": f"{result.danger:.2f}"} if bundle.is_near_miss and result.danger is not None else {}),
             "digest": result.digest,
             "snapshot": bundle.snapshot,
             **_disturbances(result),
@@ -484,7 +498,7 @@ def _badges(story: Story) -> list[str]:
         rules = " and ".join(finding.rule for finding in story.fault.findings)
         parties = {"ego": story.agent, "the other": story.other, "both": f"{story.agent} and {story.other}"}
         party = parties.get(story.fault.verdict)
-        found.append(f"at fault: {party} ({rules})" if party else "fault: not decided by any rule")
+        found.append(f"at fault: {party} ({rules})" if party else f"fault: {NOT_DECIDED}")
     if story.bundle.confirmed is not None:
         found.append("confirmed: bit-identical in a new process" if story.bundle.confirmed else "not confirmed: flaky")
     if may_be_disturbed(result):

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 _LINE_EVERY_S = 5.0  # where lines cannot be overwritten, such as in a CI log
 _MIN_SCREEN_LINES = 16  # lines; on a lower screen, workers need the space
+_LINES_BELOW_TYPES = 6  # lines; for the search, the nearest miss and the like
+_MIN_TYPE_LINES = 2  # lines
 _MIN_BAR_COLUMNS = 8  # columns; a shorter bar is unreadable, and the words need the space
 _STYLES = {
     "traffic crash": "bold red",
@@ -100,12 +102,13 @@ class Watcher:
         )
         if status.disturbed is not None and status.crashes:
             outcomes += Text(f"   {_disturbed(status)}")
+        if status.steps:
+            outcomes += Text(f"   {status.steps:,} steps simulated", style="dim")
         rows.append(outcomes or Text("no trial has finished", style="dim"))
         if status.rate is not None and status.done:
             rows.append(self._folded(Text(describe_running(status.rate))))
         if status.kinds:
-            each = "; ".join(f"{kind.signature} ({kind.count})" for kind in status.kinds)
-            rows.append(self._folded(Text(f"{describe_kinds(status)}: ") + Text(one_line(each), "dim")))
+            rows += self._types(status, height - 1 - len(rows) - len(status.workers) - _LINES_BELOW_TYPES)
         # A terminal shows nothing below its last line, and the cursor needs that line.
         left = height - 1 - len(self._console.render_lines(Group(*rows)))
         if status.search.strategies and len(status.workers) < left:
@@ -136,6 +139,16 @@ class Watcher:
             left -= 1
         nodes = _nodes(status, max(1, left // 2))
         return Group(*rows, *nodes, _workers(status, width, max(1, left - len(nodes))))
+
+    def _types(self, status: HuntStatus, room: int) -> list[RenderableType]:
+        """Return the crash types, one line each if there is room for more than one; otherwise together."""
+        each = [one_line(f"{kind.signature} ({kind.count})") for kind in status.kinds or ()]
+        if room <= _MIN_TYPE_LINES:
+            return [self._folded(Text(f"{describe_kinds(status)}: ") + Text("; ".join(each), "dim"))]
+        if len(each) > room - 1:
+            each = [*each[: room - 2], f"and {len(each) - room + 2} more types"]
+        lines: list[RenderableType] = [Text(f"  {line}", "dim", no_wrap=True, overflow="ellipsis") for line in each]
+        return [self._folded(Text(f"{describe_kinds(status)}:")), *lines]
 
     def _folded(self, text: Text) -> Text:
         """Return a text in at most two lines; on a low screen, or if it is longer, it is cut to one line."""
@@ -192,15 +205,15 @@ def _nodes(status: HuntStatus, lines: int) -> list[RenderableType]:
 def _workers(status: HuntStatus, width: int, lines: int) -> RenderableType:
     """Return the state of each worker, one line each; on a small screen, one line for several workers."""
     doing = [
-        (header.pid, number, {Phase.SETUP: "setting up", Phase.DONE: "done"}.get(header.phase, f"step {header.step}"))
+        (number, {Phase.SETUP: "setting up", Phase.DONE: "done"}.get(header.phase, f"step {header.step}"))
         for number, header in sorted(status.workers.items())
     ]
     workers = Table.grid(padding=(0, 3))
     if len(doing) <= lines:
-        for pid, number, what in doing:
-            workers.add_row(f"worker {pid}", f"trial {number}", what)
+        for number, what in doing:
+            workers.add_row(f"trial {number}", what)
         return workers
-    cells = [f"{number}: {what}" for _, number, what in doing]
+    cells = [f"{number}: {what}" for number, what in doing]
     columns = max(1, (width + 3) // (max(map(len, cells)) + 3))
     most = columns * lines
     if len(cells) > most:
@@ -347,7 +360,7 @@ def _strategies(search: SearchStatus) -> str:
     """Return the strategies of the search, with the mean criticality of the trials of each strategy."""
     parts = []
     for one in search.strategies:
-        came = [] if one.danger is None else [f"mean danger {one.danger:.2f}"]
+        came = [] if one.danger is None else [f"mean criticality {one.danger:.2f}"]
         came += [f"{one.crashes} {'crash' if one.crashes == 1 else 'crashes'}"] if one.crashes else []
         parts.append(f"{one.name} {one.share:.0%} of trials" + (f" ({', '.join(came)})" if came else ""))
     return f"search: {', '.join(parts)}"
@@ -367,5 +380,5 @@ def _nearest_words(result: TrialResult) -> str:
         how = f"least TTC {closest.time_to_collision_s:.2f} s"
     else:
         how = "never on a collision course"
-    danger = "" if result.danger is None else f"danger {result.danger:.2f}"
+    danger = "" if result.danger is None else f"criticality {result.danger:.2f}"
     return ", ".join(filter(None, (f"trial {result.spec.number}", danger, how, format_arguments(result))))

@@ -17,6 +17,7 @@ from crashhunt.report._words import (
     describe_disturbances,
     describe_probes,
     describe_versions,
+    fault_words,
     list_disturbances,
 )
 from crashhunt.world import event_counts
@@ -57,7 +58,7 @@ def describe_groups(
             [
                 str(group.count),
                 str(group.signature),
-                *([group.fault] if faults else []),
+                *([fault_words(group.fault)] if faults else []),
                 name,
                 *([known.get(group.signature, "new")] if known is not None else []),
                 str(shortest.result.steps),
@@ -109,6 +110,10 @@ def _lines(rows: list[list[str]]) -> list[str]:
 
 
 _MAX_SHOWN = 10
+_MAX_BLOCKS = 2  # crashes that are described in full, so that the text fits a screen of 24 lines
+_MAX_TYPES = 5
+_MAX_LISTED = 3  # crashes of which only the names are given
+_MAX_REASONS = 3
 _SOURCE_WORDS = {
     ("overlap", "reported"): "the simulator reports it, and the outlines overlap",
     ("overlap",): "the outlines overlap; the simulator does not report it",
@@ -117,12 +122,18 @@ _SOURCE_WORDS = {
 
 
 def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
-    """Return the result of a hunt as text: each crash, its cause, its directory, and the command that replays it."""
+    """Return the result of a hunt as text that fits a screen.
+
+    A single crash is described with its cause, its directory and the command that replays it. Of several crashes, the
+    text has each crash type with its shortest crash, and the counts of the hunt follow.
+    """
     ran = sum(report.outcomes.values())
     outcomes = ", ".join(f"{name} {count}" for name, count in report.outcomes.items()) or "none"
     total = f" ({report.steps_total} simulated in all)" if report.steps_total > report.trial_steps else ""
     count = f"{out_of(ran, report.settings.trials)} trials, {report.trial_steps} steps{total}"
-    lines = [f"{count}, {format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"]
+    counts = f"{count}, {format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"
+    has_types = report.kinds is not None and sum(group.count for group in report.kinds) > 1
+    lines = [] if has_types else [counts]
     if report.stopped_because == "no_valid_trial":
         lines.append(f"No trial was valid: {report.reason}")
     if report.code_versions:
@@ -162,36 +173,80 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
         all_of_them = report.tally.found
         what = "crash is" if all_of_them == 1 else "crashes are"
         lines.append(f"{len(report.at_fault)} of {all_of_them} {what} the agent's own fault.")
-    if report.kinds and sum(group.count for group in report.kinds) > 1:  # `--keep` leaves fewer bundles than crashes
-        lines += ["", *describe_groups(report.kinds, by_cause=report.types_by_cause).splitlines()]
     crashes = by_likelihood(report.crashes)
-    for bundle in crashes[:_MAX_SHOWN]:
-        lines += ["", *_describe_crash(bundle)]
-    if len(report.crashes) > _MAX_SHOWN:
-        shown = f"{_MAX_SHOWN} of {report.tally.found} crashes shown"
-        more = f"{len(report.crashes) - _MAX_SHOWN} more in {report.directory / 'crashes'}"
-        lines += ["", f"{shown}; {more}"]
+    if has_types:
+        lines += [*([""] if lines else []), *_describe_types(report)]
+    else:
+        for bundle in crashes[:_MAX_BLOCKS]:
+            lines += ["", *_describe_crash(bundle)]
+        if len(crashes) > _MAX_BLOCKS:
+            lines += ["", f"{_MAX_BLOCKS} of {report.tally.found} crashes shown; all are in {_crash_folder(report)}"]
     lines += _near_misses(report, program)
+    lines += ["", counts] if has_types else []
     if report.copied is not None:
         lines += ["", *_describe_crash(report.copied)]
         lines += ["", f"Replay it:  {command_line(program, 'replay', report.copied.path)}"]
     if report.crashes:
-        first = crashes[0]
-        command = [program, "replay", str(report.directory)]
-        if len(report.crashes) > 1:
-            command += ["--crash", first.id]
-        lines += ["", f"Replay it:  {command_line(*command)}"]
+        chosen = ["--crash", crashes[0].id] if len(crashes) > 1 else []
+        replay = command_line(program, "replay", report.directory, *chosen)
+        lines += [f"Replay one:  {replay}"] if has_types else ["", f"Replay it:  {replay}"]
+        lines += [f"Show one:    {command_line(program, 'show', report.directory, *chosen)}"] if has_types else []
+    if has_types:
+        lines.append(f"Show types:  {command_line(program, 'crashes', report.directory)}")
     return in_lines(lines)
+
+
+def _crash_folder(report: HuntReport) -> str:
+    return command_line(report.directory / layout.CRASHES)
+
+
+def _describe_types(report: HuntReport) -> list[str]:
+    """Return each crash type with its shortest crash, then which crashes are confirmed."""
+    groups, crashes = report.kinds or (), report.crashes
+    count = sum(group.count for group in groups)
+    lines = [f"{count} crashes of {describe_types(len(groups), report.types_by_cause)}:"]
+    if len(crashes) < count:
+        lines[0] = f"{lines[0].removesuffix(':')} ({len(crashes)} of {count} have a bundle):"
+    width = len(str(groups[0].count))
+    for group in groups[:_MAX_TYPES]:
+        fault = f" (at fault: {fault_words(group.fault)})" if group.fault else ""
+        shortest = group.shortest
+        lines.append(f"  {group.count:{width}}  {group.signature}{fault}")
+        lines.append(f"  {'':{width}}  shortest {shortest.id}: {shortest.result.summary}")
+    if len(groups) > _MAX_TYPES:
+        lines.append(f"  and {len(groups) - _MAX_TYPES} more types")
+    confirmed = sum(bundle.confirmed is True for bundle in crashes)
+    lines.append(f"{confirmed} of {len(crashes)} bundles confirmed: bit-identical when replayed in a new process")
+    flaky = [bundle.id for bundle in crashes if bundle.confirmed is False]
+    lines += [f"flaky, the replay deviates: {_listed(flaky)}"] if flaky else []
+    missing: dict[str, list[str]] = {}
+    for bundle in crashes:
+        if bundle.confirmed is None and bundle.why_unconfirmed:
+            missing.setdefault(f"not confirmed: {bundle.why_unconfirmed}", []).append(bundle.id)
+        if bundle.result.why_no_escape:
+            why = f"last avoidable step unknown: {bundle.result.why_no_escape}"
+            missing.setdefault(why, []).append(bundle.id)
+    lines += [f"{why}: {_listed(ids)}" for why, ids in list(missing.items())[:_MAX_REASONS]]
+    lines += ["Run the same command to try again."] if missing else []
+    return [*lines, f"saved in {_crash_folder(report)}"]
+
+
+def _listed(crashes: list[str]) -> str:
+    more = f" and {len(crashes) - _MAX_LISTED} more" if len(crashes) > _MAX_LISTED else ""
+    return f"{', '.join(crashes[:_MAX_LISTED])}{more}"
 
 
 def _near_misses(report: HuntReport, program: str) -> list[str]:
     """Return the saved near misses as text, one line each."""
     if not report.near_misses:
         return []
+    if report.crashes:
+        count = f"{len(report.near_misses)} near {'miss' if len(report.near_misses) == 1 else 'misses'}"
+        return [f"{count} saved in {command_line(report.directory / layout.NEAR_MISSES)}"]
     lines = ["", f"Near misses, saved in {command_line(report.directory / layout.NEAR_MISSES)}:"]
     for bundle in report.near_misses[:_MAX_SHOWN]:
         result = bundle.result
-        lines.append(f"  {bundle.id}  danger {result.danger or 0.0:.2f}  {format_arguments(result)}")
+        lines.append(f"  {bundle.id}  criticality {result.danger or 0.0:.2f}  {format_arguments(result)}")
     if len(report.near_misses) > _MAX_SHOWN:
         lines.append(f"  {_MAX_SHOWN} of {len(report.near_misses)} near misses shown")
     first = report.near_misses[0].id

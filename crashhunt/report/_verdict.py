@@ -15,7 +15,7 @@ from crashhunt.report._words import describe_instead
 from crashhunt.world import is_person, lane_jump
 
 if TYPE_CHECKING:
-    from crashhunt.crashes import Bundle, ContactRecord, Encounter, Judgement, Omission
+    from crashhunt.crashes import Bundle, ContactRecord, Encounter, Fault, Judgement, Omission
     from crashhunt.recording import Recording
     from crashhunt.world import DangerousMoment
 
@@ -44,6 +44,7 @@ class CrashFacts(Protocol):
         nearest: the moment of the greatest criticality; None for a crash.
         encounter: the motion of the agent and this actor, in all steps; None if there is no such actor.
         judgement: result of `judge`; None if `judge` has not run.
+        fault: the vehicle at fault.
     """
 
     bundle: Bundle
@@ -54,6 +55,7 @@ class CrashFacts(Protocol):
     nearest: DangerousMoment | None
     encounter: Encounter | None
     judgement: Judgement | None
+    fault: Fault
 
 
 def verdict_of(story: CrashFacts) -> str:
@@ -200,7 +202,10 @@ def _avoided(story: CrashFacts, omission: Omission | None) -> str:
     """Return which run avoided the crash, or that no run did; empty if this is unknown."""
     judgement, tried = story.judgement, story.bundle.result.escape
     if omission is not None:
-        return f"{_omitted(story.agent, omission)}with a reference driver this crash does not happen"
+        blamed = story.fault.verdict in ("ego", "both")
+        return (
+            f"{_omitted(story.agent, omission, had_to_yield=blamed)}with a reference driver this crash does not happen"
+        )
     if judgement is not None and judgement.runs:
         if judgement.verdict == "invalid":
             return "no run avoids it: the trial starts in an unavoidable situation"
@@ -225,8 +230,11 @@ def _if_it(story: CrashFacts, how: str, step: int, changed: tuple[str, ...]) -> 
     return f"if {story.agent} {how} {story.recording.ago(step)}{also}, this crash does not happen"
 
 
-def _omitted(agent: str, omission: Omission) -> str:
-    """Return the agent's omission as a clause that ends with a semicolon; empty for a lane change."""
+def _omitted(agent: str, omission: Omission, *, had_to_yield: bool) -> str:
+    """Return the agent's omission as a clause that ends with a semicolon; empty for a lane change.
+
+    Reason for the argument: the words "did not yield" blame the agent, so a rule of fault has to blame it as well.
+    """
     if omission.kind.startswith("no lane"):
         return f"{agent} changed to the {omission.kind.rpartition(' ')[2]}, where it has no lane; "
     if omission.instead == "changed lanes":
@@ -235,6 +243,6 @@ def _omitted(agent: str, omission: Omission) -> str:
         return f"{agent} did not stop for a red light; "
     if omission.instead == "braked too little":
         return f"{agent} braked too little; "
-    verb = "yield" if omission.kind == "crossing" else "brake"
+    verb = "yield" if omission.kind == "crossing" and had_to_yield else "brake"
     instead = describe_instead(omission)
     return f"{agent} did not {verb}{f' and {instead}' if instead else ''}; "

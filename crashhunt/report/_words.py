@@ -69,7 +69,16 @@ def _closing(speed: float) -> str:
     return f"{'closing' if speed > 0 else 'parting'} at {abs(speed):.1f} m/s"
 
 
-COLUMNS = ("danger", "from behind")
+NOT_DECIDED = "not decided"
+"""How texts name the verdict on the vehicle at fault if rules contradict each other, or if no rule applies."""
+
+
+def fault_words(fault: str) -> str:
+    """Return a verdict on the vehicle at fault as text."""
+    return NOT_DECIDED if fault == "nobody can tell" else fault
+
+
+COLUMNS = ("criticality", "rear")
 """The headings of the two numbers of a step."""
 
 
@@ -89,7 +98,7 @@ def about_nearest(encounter: Encounter, nearest: DangerousMoment) -> list[str]:
         return []
     when = f"at {moment.time_s:.1f} s, after step {nearest.step}"
     return [
-        f"It was nearest to a crash {when}: a danger of {nearest.danger:.2f}, to {nearest.other}.",
+        f"It was nearest to a crash {when}: a criticality of {nearest.danger:.2f}, to {nearest.other}.",
         f"At that time {about_gap(encounter, moment)}; {about_place(encounter, moment)}.",
     ]
 
@@ -107,8 +116,8 @@ def about_danger(course: DangerCourse, *, touched: bool = False) -> str:
     """
     parts = []
     for heading, moment, total, relation, absent in (
-        (f"Danger of {course.agent}", course.greatest, course.own_total, "towards", _no_danger(course)),
-        ("From behind", course.greatest_behind, course.behind_total, "by", "no vehicle closed in"),
+        (f"Criticality of {course.agent}", course.greatest, course.own_total, "towards", _no_danger(course)),
+        ("Rear criticality", course.greatest_behind, course.behind_total, "by", "no vehicle closed in"),
     ):
         if moment.danger > 0:
             most = f"at most {moment.danger:.2f}, after step {moment.step}, {relation} {moment.other}"
@@ -337,18 +346,21 @@ _FACULTY_WORDS = {
 _MIN_KEPT_S = 1.0  # over a shorter time, every driver keeps its speed
 
 
-def about_reference(reference: Reference, ago: Callable[[int], str], agent: str) -> list[str]:
+def about_reference(
+    reference: Reference, ago: Callable[[int], str], agent: str, *, had_to_yield: bool = True
+) -> list[str]:
     """Return sentences on what the agent failed to do; empty if no run with a reference driver shows an omission.
 
     Args:
         reference: results of the runs with a reference driver.
         ago: function that returns the time of a step as text, as in `about_judgement`.
         agent: identifier of the controlled vehicle.
+        had_to_yield: whether a rule blames the agent; otherwise, no sentence says that it did not yield.
     """
     if reference.omission is None:
         return []
     omission, runs = reference.omission, [run for run in reference.deciding if run.ending != "unclear"]
-    sentences = [f"Cause: {_omitted(omission, agent, ago)}."]
+    sentences = [f"Cause: {_omitted(omission, agent, ago, had_to_yield=had_to_yield)}."]
     count = "the run ends" if len(runs) == 1 else f"all {len(runs)} runs end"
     changed = sorted({each for run in runs for each in run.changed} if omission.faculty == "longitudinal" else ())
     more = f" In addition, {' and '.join(changed)} in these runs." if changed else ""
@@ -359,7 +371,7 @@ def about_reference(reference: Reference, ago: Callable[[int], str], agent: str)
     return sentences
 
 
-def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
+def _omitted(omission: Omission, agent: str, ago: Callable[[int], str], *, had_to_yield: bool) -> str:
     """Return what an agent failed to do, as a sentence without its period."""
     actor, kind = omission.actor, omission.kind
     seen = ""
@@ -380,7 +392,7 @@ def _omitted(omission: Omission, agent: str, ago: Callable[[int], str]) -> str:
             needs = f"; the safe gap is {omission.safe or 0:.1f} m"
         return f"{agent} changed to the {side} lane although {actor} was {where} ({speeds}{needs}){seen}"
     what = "stop for a red light" if kind == "red light" else f"brake for {actor}"
-    what = f"yield to {actor}" if kind == "crossing" else what
+    what = f"yield to {actor}" if kind == "crossing" and had_to_yield else what
     gap = f"{omission.gap_m:.1f} m ahead, " if omission.gap_m is not None else ""
     safe = f"{omission.speed_mps:.1f} m/s where {omission.safe or 0:.1f} m/s are safe"
     if omission.speed_mps <= (omission.safe or 0.0):  # not too fast yet, but its action would make it so

@@ -213,9 +213,9 @@ def test_states_of_a_suite_end_it_with_1_after_an_error(capsys):
 def test_change_of_a_state_has_a_line(capsys):
     watch, finish = _suite._watcher(as_json=False)
     for first, second in (("queued", "running"), ("running", "running"), ("crashed", "running"), ("crashed", "error")):
-        watch([HuntState(dir="a", state=first), HuntState(dir="b", state=second)])
+        watch([HuntState(dir="a", state=first, crashes=2), HuntState(dir="b", state=second)])
     finish()
-    assert capsys.readouterr().out.splitlines() == ["b: running", "a: running", "a: crashed", "b: error"]
+    assert capsys.readouterr().out.splitlines() == ["b: running", "a: running", "a: finished, 2 crashes", "b: error"]
 
 
 def test_each_hunt_of_a_suite_is_asked_for_once(monkeypatch):

@@ -175,7 +175,7 @@ def test_narrow_terminal_shows_fewer_columns_and_no_cut_number(columns, kept):
     )  # fmt: skip
     header, _, *rows = written(state, width=columns)
     assert set(header.split()) == {"hunt", "state", "trials", "crashes", *kept}
-    assert {"hunts/one", "crashed", "40/40", "28"} <= set(rows[0].split())
+    assert {"hunts/one", "finished", "40/40", "28"} <= set(rows[0].split())
     assert ("collision 28" in rows[0]) == ("outcomes" in kept)
     assert ("5.9 s/trial" in rows[0]) == ("pace" in kept)
     assert all(len(row) <= columns for row in rows)

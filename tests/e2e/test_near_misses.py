@@ -68,7 +68,7 @@ def test_it_is_reported_around_the_moment_when_it_was_nearest(hunt):
     assert steps == [moment["step"] for moment in told["moments"]] == list(around)
     assert danger["steps"][steps.index(nearest["step"])]["own"] == pytest.approx(nearest["danger"])
     text = hunt.crashhunt("show", *words, "--last-seconds", "1").out
-    assert f"after step {nearest['step']}: a danger of {nearest['danger']:.2f}, to {nearest['other']}." in text
+    assert f"after step {nearest['step']}: a criticality of {nearest['danger']:.2f}, to {nearest['other']}." in text
     (marked,) = (line for line in text.splitlines() if line.endswith("<- nearest"))
     assert int(marked.split()[0]) == nearest["step"]
     film = ("--from-log", "--frames", "f", "--size", "64x64", "--last-step-repeats", "0", "--no-panels")

@@ -91,18 +91,69 @@ def test_types_that_were_hunted_for_are_counted(monkeypatch, more, says):
     kinds = tuple(Group(signature, (bundle,)) for signature, bundle in zip((rear_end, swipe), bundles, strict=True))
     settings = replace(SETTINGS, run=RunSettings(keep_going=True, distinct=1))
     report = replace(REPORT, settings=settings, stopped_because="distinct", kinds=kinds, **more)
-    monkeypatch.setattr("crashhunt.report._summary.describe_groups", lambda *_, **__: "")
+    monkeypatch.setattr("crashhunt.report._summary._describe_types", lambda *_, **__: [])
     assert says in describe_hunt(report).splitlines()
+
+
+def found_types(types, each):
+    """A report of a hunt with some crashes of each of some types."""
+    kinds = []
+    for number in range(types):
+        bundles = tuple(
+            SimpleNamespace(
+                id=f"{100 * number + one:06d}-collision", path=Path(f"my hunt/{number}"), hunt=Path("my hunt"),
+                result=replace(CRASH, steps=30 + one), confirmed=True, why_unconfirmed="",
+            )
+            for one in range(each)
+        )  # fmt: skip
+        kinds.append(Group(Signature(outcome="collision", role="collider", manner=f"manner {number}"), bundles))
+    crashes = tuple(bundle for group in kinds for bundle in group.bundles)
+    return replace(
+        REPORT, kinds=tuple(kinds), crashes=crashes, tally=SimpleNamespace(found=len(crashes), likeliest=None)
+    )
+
+
+@pytest.mark.parametrize(("types", "each"), [(1, 2), (1, 40), (5, 9), (30, 3)])
+def test_end_of_a_hunt_fits_a_screen_with_the_counts_and_the_next_commands_last(types, each):
+    near = tuple(SimpleNamespace(id=f"{one}-survived", result=replace(FINE, danger=0.5)) for one in range(9))
+    report = replace(found_types(types, each), near_misses=near, notes=("SUMO omits x",))
+    found = describe_hunt(report).splitlines()
+    assert len(found) <= 22
+    assert "9 near misses saved in 'my hunt/near-misses'" in found
+    assert max(map(len, found)) <= 120
+    assert [line.strip() for line in found].count("shortest 000000-collision: ego drove into x at step 30") == 1
+    assert sum("shortest " in line for line in found) == min(types, 5)
+    assert ("  and 25 more types" in found) is (types == 30)
+    assert f"{types * each} of {types * each} bundles confirmed: bit-identical when replayed in a new process" in found
+    assert found[-4].startswith("30 of 30 trials, 1200 steps, 0:12 ")
+    assert found[-3:] == [
+        "Replay one:  crashhunt replay 'my hunt' --crash 000000-collision",
+        "Show one:    crashhunt show 'my hunt' --crash 000000-collision",
+        "Show types:  crashhunt crashes 'my hunt'",
+    ]
+
+
+def test_crashes_that_are_flaky_or_not_confirmed_are_named_among_many():
+    report = found_types(1, 9)
+    for number, bundle in enumerate(report.crashes):
+        bundle.confirmed = False if number < 4 else None if number == 5 else True
+        bundle.why_unconfirmed = "the processor is another" if number == 5 else ""
+    found = describe_hunt(report).splitlines()
+    assert "4 of 9 bundles confirmed: bit-identical when replayed in a new process" in found
+    assert "flaky, the replay deviates: 000000-collision, 000001-collision, 000002-collision and 1 more" in found
+    assert "not confirmed: the processor is another: 000005-collision" in found
+    assert "Run the same command to try again." in found
 
 
 def test_printed_paths_can_be_copied_into_a_shell():
     near = SimpleNamespace(id="7-near-miss", result=replace(FINE, danger=0.5))
     crash = SimpleNamespace(id="4", path=Path("my\nhunt/4"), result=CRASH, confirmed=None, why_unconfirmed="")
     report = replace(REPORT, directory=Path("my\nhunt"), near_misses=(near,), crashes=(crash,))
-    text = describe_hunt(report)
+    assert "1 near miss saved in $'my\\x0ahunt/near-misses'" in describe_hunt(report).splitlines()
+    text = f"{describe_hunt(report)}\n{describe_hunt(replace(report, crashes=()))}"
     assert "  saved in $'my\\x0ahunt/4'" in text.splitlines()
     assert "Near misses, saved in $'my\\x0ahunt/near-misses':" in text.splitlines()
-    spaced = describe_hunt(replace(report, directory=Path("my hunt")))
+    spaced = describe_hunt(replace(report, directory=Path("my hunt"), crashes=()))
     assert "Near misses, saved in 'my hunt/near-misses':" in spaced.splitlines()
 
 
@@ -202,7 +253,7 @@ def test_states_of_workers_fit_into_the_lines_that_there_are(count, width, rows)
     assert all(len(line) <= width for line in shown)
     text = " ".join(captured.get().split())
     if count == 3:
-        assert text == "worker 1000 trial 0 step 0 worker 1001 trial 1 step 7 worker 1002 trial 2 setting up"
+        assert text == "trial 0 step 0 trial 1 step 7 trial 2 setting up"
     else:
         there = [number for number in range(count) if f"{number}: " in text]
         hidden = re.search(r"and (\d+) more", text)

@@ -16,14 +16,14 @@ from crashhunt.report._page import _crash
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1"
 TABLE = """\
                                                        braking
-     time  ego target_  lane_ leader  gap closing  TTC  needed          from
-step    s  m/s   speed change    m/s    m     m/s    s    m/s² danger behind
-  32  3.2 14.5   14.45      0    6.7 14.8    +7.8  1.9     2.0   0.39      -
-  45  4.5 14.5   14.45      0    6.7  4.7    +7.8  0.6     6.3   0.76      -
-  46  4.6 14.5   14.45      0    6.7  4.0    +7.8  0.5     7.6   0.76      - <- the last step after which braking helps
-  47  4.7 14.5   14.45      0    6.7  3.2    +7.8  0.4     9.4   0.76      -
-  51  5.1 14.5   14.45      0    6.7  0.1    +7.8  0.0   334.0   0.99      -
-  52  5.2 14.5   14.45      0    6.7  0.0    +7.8  0.0       -      -      -"""
+     time  ego target_  lane_ leader  gap closing  TTC  needed
+step    s  m/s   speed change    m/s    m     m/s    s    m/s² criticality rear
+  32  3.2 14.5   14.45      0    6.7 14.8    +7.8  1.9     2.0        0.39    -
+  45  4.5 14.5   14.45      0    6.7  4.7    +7.8  0.6     6.3        0.76    -
+  46  4.6 14.5   14.45      0    6.7  4.0    +7.8  0.5     7.6        0.76    - <- last avoidable step
+  47  4.7 14.5   14.45      0    6.7  3.2    +7.8  0.4     9.4        0.76    -
+  51  5.1 14.5   14.45      0    6.7  0.1    +7.8  0.0   334.0        0.99    -
+  52  5.2 14.5   14.45      0    6.7  0.0    +7.8  0.0       -           -    -"""
 
 
 @pytest.fixture(scope="module")

@@ -63,7 +63,7 @@ def test_what_the_search_tries_and_when_danger_last_grew_is_shown_where_there_is
         with console.capture() as seen:
             console.print(Watcher(console, TITLE)._screen(found))
         assert (
-            "search: mutation 60% of trials (mean danger 0.31, 1 crash), random 40% of trials" in seen.get()
+            "search: mutation 60% of trials (mean criticality 0.31, 1 crash), random 40% of trials" in seen.get()
         ) is shown
         assert "nearest miss (1 trial / 1:05 ago): trial 123" in seen.get()
 

@@ -9,10 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from crashhunt.crashes import Attempt, Judgement, LaneMap, Omission, Reference, ReferenceRun
+from crashhunt.crashes import Attempt, Fault, Judgement, LaneMap, Omission, Reference, ReferenceRun
 from crashhunt.crashes._contact_record import record_in
 from crashhunt.report._crash_text import _cells
 from crashhunt.report._verdict import describe_contact, verdict_of
+from crashhunt.report._words import about_reference
 from crashhunt.trial import Collision, Escape
 from crashhunt.world import Actor, Roster, Scene
 
@@ -118,6 +119,7 @@ def story(judgement=None, escape=None, poses=None):
         agent="ego",
         other="x",
         encounter=None,
+        fault=Fault("ego"),
         recording=SimpleNamespace(ago=lambda step: f"{(40 - step) * DT:.1f} s before"),
     )
 
@@ -228,3 +230,16 @@ def test_needed_braking_is_shown_while_a_gap_is(gap_m, shown):
         other_speed=3.0, gap_m=gap_m, closing_speed=2.5, time_to_collision_s=0.0, required_deceleration=52.1
     )
     assert _cells(moment)[-1] == shown
+
+
+@pytest.mark.parametrize(
+    ("fault", "verb"), [("ego", "yield"), ("both", "yield"), ("the other", "brake"), ("nobody can tell", "brake")]
+)
+def test_agent_failed_to_yield_only_where_a_rule_blames_it(fault, verb):
+    judgement = omitted(kind="crossing")
+    found = story(judgement=judgement)
+    found.fault = Fault(fault)
+    assert f"; ego did not {verb} and sped up; with a reference driver" in verdict_of(found)
+    blamed = fault in ("ego", "both")
+    (cause, *_) = about_reference(judgement.reference, str, "ego", had_to_yield=blamed)
+    assert cause.startswith(f"Cause: ego did not {verb} {'to' if blamed else 'for'} x ")

@@ -103,6 +103,8 @@ export function ago(value) {
   const [size, unit] = units.find(([one]) => whole >= one) ?? [1, "s"];
   return `${Math.floor(whole / size)} ${unit} ago`;
 }
+/* The state in words: a hunt of the state `crashed` has finished, and its crashes are counted. */
+export const stateOf = (row) => (row.exported ? "exported" : row.state === "crashed" ? `finished, ${plural(row.crashes, "crash", "crashes")}` : row.state);
 export const plural = (number, one, many) => `${count(number)} ${number === 1 ? one : many}`;
 export const short = (value) => (typeof value === "number" ? String(Number(value.toPrecision(4))) : String(value));
 export const quoted = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);

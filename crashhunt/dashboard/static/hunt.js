@@ -1,5 +1,5 @@
 /* The page of one hunt. */
-import { $, PALETTE, Refused, between, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, sinceNewestKind, spelled, tell } from "/static/common.js";
+import { $, PALETTE, Refused, between, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, stateOf, sinceNewestKind, spelled, tell } from "/static/common.js";
 
 const ID = location.pathname.split("/")[2], API = `/api/hunts/${ID}`;
 const NOT_DECIDED = "nobody can tell"; // the verdict of the API
@@ -54,7 +54,7 @@ function link(crash, text) { return make("a", text ?? crash, "", { href: `/hunts
 function showHunt() {
   document.title = `${hunt.name} - crashhunt`;
   setText($("title"), hunt.name);
-  setText($("state"), hunt.exported ? "exported" : hunt.state);
+  setText($("state"), stateOf(hunt));
   $("state").className = `state ${hunt.state}`;
   const agents = Object.entries(hunt.agents).map(([id, agent]) => `${id}: ${agent}`).join(", ");
   setText($("subtitle"), [hunt.scenario && `scenario ${hunt.scenario}`, agents, hunt.sampler && `sampler ${hunt.sampler}`].filter((part) => part).join("; "));
@@ -72,12 +72,12 @@ function showHunt() {
   const rate = hunt.rate, newest = sinceNewestKind(hunt);
   const tiles = [
     ["trials", hunt.trials_planned >= hunt.trials_run && hunt.trials_planned ? `${count(hunt.trials_run)} of ${count(hunt.trials_planned)}` : count(hunt.trials_run)],
-    ["crashed trials", count(hunt.crashed_trials)],
+    ["crashes", count(hunt.crashed_trials)],
     ...(hunt.kinds_count === null ? [] : [["crash types", count(hunt.kinds_count)]]),
     ...(newest === null ? [] : [["since the last new type", seconds(newest)]]),
     ["trials/s", hunt.rate_per_s ? hunt.rate_per_s.toFixed(1) : "-"],
     ...(hunt.seconds_left === null ? [] : [["time left", seconds(hunt.seconds_left)]]),
-    ...(rate?.certain ? [["crash rate per trial, certain interval", between(rate)]] : []),
+    ...(rate?.certain ? [["crash rate per trial, 95 % interval", between(rate)]] : []),
     ...(rate && rate.estimate !== null && rate.estimate !== undefined ? [["crash rate per trial, estimate", rateOf(rate.estimate)]] : []),
     ...(hunt.until_rate ? [[`bar ${hunt.until_rate.bar}`, hunt.until_rate.verdict]] : []),
   ];

@@ -1,9 +1,9 @@
 /* The page of all hunts. */
-import { $, ago, between, count, get, make, now, plural, poll, seconds, setText, sinceNewestKind, sparkline } from "/static/common.js";
+import { $, ago, between, count, get, make, now, plural, poll, seconds, setText, sinceNewestKind, sparkline, stateOf } from "/static/common.js";
 
 const COLUMNS = [
   { key: "name", label: "Hunt", text: (row) => row.name },
-  { key: "state", label: "State", text: (row) => row.state },
+  { key: "state", label: "State", text: stateOf },
   { key: "scenario", label: "Scenario", text: (row) => row.scenario },
   { key: "trials", label: "Trials", number: true, value: (row) => row.trials_run },
   { key: "speed", label: "Trials/s", number: true, value: (row) => row.rate_per_s },
@@ -97,7 +97,7 @@ function fill(row) {
   setText(node.sub, [spelled(true), ...tags].join(" "));
   node.sub.title = [spelled(false), ...(row.notes ?? []).map((note) => note.text)].filter((part) => part).join("\n");
   node.box.setAttribute("aria-label", `Select ${row.name} to compare`);
-  setText(node.state, row.exported ? "exported" : row.state);
+  setText(node.state, stateOf(row));
   node.state.className = `state ${row.state}`;
   setText(node.why, row.damaged || row.state === "error" || row.state === "killed" ? row.detail : "");
   setText(cells.scenario, row.scenario);
@@ -162,7 +162,7 @@ function arrange() {
 function fillTotals() {
   const all = [...rows.values()], sum = (name) => all.reduce((total, row) => total + (row[name] || 0), 0);
   const running = all.filter((row) => row.state === "running");
-  const tiles = [["running", count(running.length)], ["hunts", count(all.length)], ["trials", count(sum("trials_run"))], ["trials/s", running.reduce((total, row) => total + row.rate_per_s, 0).toFixed(1)], ["crashed trials", count(sum("crashed_trials"))], ["crash types", count(sum("kinds_count"))]];
+  const tiles = [["running", count(running.length)], ["hunts", count(all.length)], ["trials", count(sum("trials_run"))], ["trials/s", running.reduce((total, row) => total + row.rate_per_s, 0).toFixed(1)], ["crashes", count(sum("crashed_trials"))], ["crash types", count(sum("kinds_count"))]];
   const there = $("tiles").children;
   tiles.forEach(([name, value], place) => {
     if (!there[place]) {
