@@ -87,6 +87,7 @@ HOMES = (
     "sumo/",
 )
 NAMED_ALL_THE_SAME = {
+    "scenario/_action_forms.py": "has the name of a form of actions, and says to people what forms mean",
     "scenario/_scenario.py": "knows where the descriptor of each is",
     "__init__.py": "tells Gymnasium of crashhunt/SUMO-v0, which is an id that people write",
     "envs/": "is that environment, which is SUMO and nothing else",

@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from crashhunt.agents._protocol import meta_actions, wanted_meta_action
+from crashhunt.agents._protocol import SPEED_OR_META, meta_actions, wanted_meta_action
 from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
@@ -175,6 +175,8 @@ class CarFollowing:
     Raises:
         ValueError: an argument is out of range, or the observation does not have the default columns.
     """
+
+    actions = SPEED_OR_META
 
     def __init__(
         self,

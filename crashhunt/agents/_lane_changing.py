@@ -18,7 +18,7 @@ from crashhunt.agents._car_following import (
     idm_acceleration,
     off_path,
 )
-from crashhunt.agents._protocol import meta_actions, wanted_meta_action
+from crashhunt.agents._protocol import SPEED_OR_META, meta_actions, wanted_meta_action
 from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
@@ -54,6 +54,8 @@ class LaneChanger:
     Raises:
         ValueError: an argument is out of range, or the observation does not have the default columns.
     """
+
+    actions = SPEED_OR_META
 
     def __init__(
         self,
@@ -172,6 +174,8 @@ class IntelligentDriver(LaneChanger):
     Raises:
         ValueError: an argument is out of range, or the observation does not have the default columns.
     """
+
+    actions = SPEED_OR_META
 
     def __init__(
         self,

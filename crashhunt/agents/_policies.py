@@ -13,7 +13,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from crashhunt.agents._car_following import VX, Y, check_layout
-from crashhunt.agents._protocol import meta_actions
+from crashhunt.agents._protocol import SPEED_OR_META, meta_actions
 from crashhunt.agents._trained_inputs import NOT_NORMALIZED, TrainedInputs, is_equal, read_statistics
 from crashhunt.trial import Argument
 
@@ -406,6 +406,8 @@ class NumpyPolicy:
     Raises:
         ValueError: the file does not contain such weights, or the observation does not have the default columns.
     """
+
+    actions = SPEED_OR_META
 
     def __init__(
         self,

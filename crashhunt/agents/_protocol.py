@@ -20,11 +20,13 @@ class Agent(Protocol):
     The user names the factory of an agent as ``package.module:attribute``. The factory is called with the agent's
     arguments as keywords, once per trial and vehicle. A parameter named ``observation_space`` or ``action_space``
     receives the Gymnasium space. A parameter named ``step_length_s`` receives the time from one step to the next, in s.
+    A parameter named ``agent_id`` receives the identifier of the vehicle.
     A parameter named ``action_masks`` receives a function that returns which discrete actions are possible in the next
     step, or None if the environment has no masks. If the simulator knows no masks, the parameter receives None.
 
-    Optional capabilities are separate protocols: `DrawsPanels` and `Closes`, and `NeedsLibraries` for the factory of an
-    agent. An object has a capability if it has the methods or attributes of the protocol.
+    Optional capabilities are separate protocols: `DrawsPanels` and `Closes`; `NeedsLibraries`, `PrefersAction` and
+    `ReturnsActions` for the factory of an agent. An object has a capability if it has the methods or attributes of the
+    protocol.
     """
 
     def reset(self, seed: int) -> None:
@@ -66,6 +68,9 @@ class NeedsLibraries(Protocol):
 
 # How agents that think in speeds and lanes say so in discrete meta-actions.
 
+SPEED_OR_META = ("speed_and_lane", "meta")
+"""The forms of actions that `meta_actions` serves, for the attribute ``actions`` of an agent's class."""
+
 _META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 _FASTER, _SLOWER = 0.5, -0.75  # m/s²
 
@@ -84,10 +89,14 @@ def meta_actions(space: Space[object] | None) -> Mapping[str, int] | None:
     """
     if space is None:
         return None
-    from gymnasium.spaces import Dict, Discrete, Tuple
+    from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
-    if isinstance(space, Tuple | Dict):
+    if isinstance(space, Dict):
         return None
+    if isinstance(space, Tuple):
+        first, *others = space.spaces
+        if not (isinstance(first, Box) and (first.low < 0).any()) and not any(isinstance(one, Box) for one in others):
+            return None  # an acceleration may be negative, and a lateral speed is not a choice
     meanings: Sequence[str] = ()
     if isinstance(space, Discrete):
         meanings = (

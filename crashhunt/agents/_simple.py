@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from crashhunt.agents._protocol import meta_actions
+from crashhunt.agents._protocol import SPEED_OR_META, meta_actions
 from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ class KeepLaneWithSpeed:
     Raises:
         ValueError: the actions are neither (target speed, lane change) nor meta-actions.
     """
+
+    actions = SPEED_OR_META
 
     def __init__(
         self,

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from crashhunt.report import ListingEntry
 
 _KINDS: dict[str, Callable[[], list[ListingEntry]]] = {
+    "actions": lambda: report.list_actions(),
     "agents": lambda: report.list_registered("agents"),
     "disturbances": lambda: report.list_registered("disturbances"),
     "oracles": lambda: report.list_registered("oracles"),

@@ -54,7 +54,7 @@ class Episodes:
     Args:
         scenario: Name of a shipped scenario, or a path.
         agent: The controlled vehicle; if empty, the first agent of the scenario.
-        action: The form of the actions, ``continuous`` or ``meta``; empty for the scenario's own choice.
+        action: The form of the actions, as ``crashhunt list actions`` names it; empty for the scenario's own choice.
         disturb: Rates of disturbances, such as ``brake=0.02``.
         max_steps: Maximum number of steps of an episode; 0 for no limit. Disturbances need a limit.
 

@@ -36,8 +36,8 @@ class SumoEnv(gymnasium.Env[Any, Any]):
     Args:
         scenario: Name of a shipped scenario, or a path.
         agent: The controlled vehicle; by default the first agent of the scenario. The other agents keep their lane.
-        action: The form of the actions. With ``continuous``, an action is (target speed in m/s, lane change). With
-            ``meta``, it is a number of highway-env's DiscreteMetaAction. The default is the scenario's own choice.
+        action: The form of the actions, as ``crashhunt list actions`` names it. The default is the scenario's own
+            choice, or else ``speed_and_lane``: (target speed in m/s, lane change).
         max_steps: Maximum number of steps of an episode; None for no limit.
         render_mode: None, or ``rgb_array``: `render` returns the scene from above, uint8, shape (540, 960, 3).
         process: Whether the environment runs in its own process, which costs up to a millisecond per step. libsumo has

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.agents import Closes, Recorded
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.simulators import NamesMetaActions, ReportsSurroundings, SupportsFullBraking, TranslatesMotion
+from crashhunt.scenario import ACTIONS
+from crashhunt.simulators import (
+    MAX_ACCELERATION,
+    NamesMetaActions,
+    ReportsSurroundings,
+    SupportsFullBraking,
+    TranslatesMotion,
+)
 from crashhunt.world import Neighbor, safe_distance, safe_speed, time_to_drive
 
 if TYPE_CHECKING:
@@ -25,6 +32,9 @@ if TYPE_CHECKING:
     from crashhunt.world import Crossing, Side, Surroundings
 
 
+_SPEED_AND_LANE, _ACCELERATION = ACTIONS["speed_and_lane"].names, ACTIONS["acceleration"].names
+_WITH_LANE_CHANGE = (_SPEED_AND_LANE, _ACCELERATION)
+_WITH_SPEED = (*_WITH_LANE_CHANGE, ACTIONS["speed_and_lateral"].names)
 _LANE_ACTIONS = ("LANE_LEFT", "LANE_RIGHT")
 _SPEED_ACTIONS = ("FASTER", "SLOWER")
 
@@ -112,7 +122,7 @@ class Keeping(_Overruling):
     def __init__(self, driver: Agent, simulator: Simulator, agent: str, after: int, keeps: str) -> None:
         form = simulator.actions[agent]
         self._idle = _idle(form)
-        if self._idle is None and tuple(form.names) != ("target_speed", "lane_change"):
+        if self._idle is None and tuple(form.names) not in _WITH_SPEED:
             raise InvalidEpisodeError(
                 f"the speed of {agent} cannot be held: it is unknown which lanes and speeds its actions choose"
             )
@@ -132,8 +142,10 @@ class Keeping(_Overruling):
     def _kept(self, action: object) -> object:
         encoded = self._form.encode(action)
         if self._idle is None:
-            speed, change = encoded.tolist()
-            return (speed, 0) if self._stays else (self._speed, int(change))
+            value, change = encoded.tolist()
+            kept = 0.0 if tuple(self._form.names) == _ACCELERATION else self._speed
+            change = int(change) if tuple(self._form.names) in _WITH_LANE_CHANGE else change
+            return (value, 0) if self._stays else (kept, change)
         space = self._form.space
         assert supports(space, NamesMetaActions)
         word = space.meanings[int(encoded[0])]
@@ -187,8 +199,10 @@ def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
         InvalidEpisodeError: the vehicle has no action for a lane change.
     """
     form = simulator.actions[agent]
-    if tuple(form.names) == ("target_speed", "lane_change"):
+    if tuple(form.names) == _SPEED_AND_LANE:
         return 0.0, 1 if side == "left" else -1
+    if tuple(form.names) == _ACCELERATION:
+        return -MAX_ACCELERATION, 1 if side == "left" else -1
     name = f"LANE_{side.upper()}"
     if supports(form.space, NamesMetaActions) and name in form.space.meanings:
         return tuple(form.space.meanings).index(name)
@@ -252,7 +266,7 @@ class ReferenceDriver(_Overruling):
             )
         form = simulator.actions[overruled.agent]
         self._meanings = tuple(form.space.meanings) if supports(form.space, NamesMetaActions) else ()
-        has_speeds = tuple(form.names) == ("target_speed", "lane_change") or {"IDLE", "SLOWER"} <= {*self._meanings}
+        has_speeds = tuple(form.names) in _WITH_LANE_CHANGE or {"IDLE", "SLOWER"} <= {*self._meanings}
         self._steers = (
             simulator if supports(simulator, TranslatesMotion) and simulator.is_steered(overruled.agent) else None
         )
@@ -293,16 +307,21 @@ class ReferenceDriver(_Overruling):
             return self._meta(step, action, self._meanings[int(encoded[0])], around)
         if self._steers is not None:
             return self._steered(step, action, encoded, self._steers, around)
-        target, change = encoded.tolist()
+        value, change = encoded.tolist()
+        accelerates = tuple(self._form.names) == _ACCELERATION
+        target = max(0.0, around.speed_mps + value * self._step_s) if accelerates else float(value)
         allowed = self._allowed_change(step, int(change), around)
-        limit = self._limit(step, float(target), self._reached(float(target), around), around)
+        limit = self._limit(step, target, self._reached(target, around), around)
         if self._lane and not allowed:
             change = 0
         if self._speed and limit is not None:
-            target = max(0.0, limit, around.speed_mps - around.braking_mps2 * self._step_s)
-        if (target, change) == tuple(encoded.tolist()):
+            value = target = max(0.0, limit, around.speed_mps - around.braking_mps2 * self._step_s)
+            if accelerates:
+                wanted = (target - around.speed_mps) / self._step_s
+                value = max(-MAX_ACCELERATION, min(MAX_ACCELERATION, wanted))
+        if (value, change) == tuple(encoded.tolist()):
             return action
-        return float(target), int(change)
+        return float(value), int(change)
 
     def _meta(self, step: int, action: object, word: str, around: Surroundings) -> object:
         speed = around.speed_mps

@@ -15,6 +15,7 @@ import numpy as np
 
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import NamesMetaActions, NamesObservations, SupportsDisturbances, SupportsHolds
 from crashhunt.trial import HOLD_KINDS, SENSOR_KINDS, Disturbance, in_effect, steps_of
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 
 _NOISE_STREAM = 0x6E6F6973  # apart from what else is drawn of a trial's seed
+_HELD_WITHOUT_CHANGE = [form.names for form in ACTIONS.values() if form.second_changes_lane]
 _NOISELESS_COLUMNS = (
     "presence",
     "kind",
@@ -286,7 +288,7 @@ class _Held:
     def __call__(self, first: Array) -> Array:
         form, space = self._form, self._form.space
         action = first if self._before is None else self._before
-        if tuple(form.names) == ("target_speed", "lane_change"):
+        if tuple(form.names) in _HELD_WITHOUT_CHANGE:
             return form.encode((float(action[0]), 0))
         if supports(space, NamesMetaActions) and "IDLE" in space.meanings:
             return form.encode(tuple(space.meanings).index("IDLE"))

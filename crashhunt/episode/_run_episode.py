@@ -27,8 +27,9 @@ from crashhunt.episode._failures import record_originals
 from crashhunt.episode._fast_path import FastEpisode
 from crashhunt.episode._observers import Nearness, Recorder
 from crashhunt.oracles import parse_oracle
+from crashhunt.scenario import check_action
 from crashhunt.simulators import FlattensObservations, MasksActions, ReportsNotices
-from crashhunt.trial import CRASHES, signature_of
+from crashhunt.trial import CRASHES, Signature, signature_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -185,7 +186,7 @@ class Parts:
 
     def __init__(self, settings: WorkerSettings) -> None:
         self._settings = settings
-        self._factories: dict[str, tuple[Any, tuple[str, ...]]] = {}
+        self._factories: dict[str, tuple[Any, Signature]] = {}
         sys.path[:0] = settings.code
         # What the snapshot does not have may come from where the hunt was started, as it did then.
         add_current_folder(always_last=bool(settings.code))
@@ -268,13 +269,19 @@ class Parts:
         self, agent: str, simulator: Simulator, arguments: Mapping[str, Value]
     ) -> tuple[Callable[..., Any], dict[str, object]]:
         """Return the constructor of an agent, and its keyword arguments."""
-        factory, wanted = self._factory(agent)
+        factory, signature = self._factory(agent)
+        wanted = signature.given
+        if self._settings.scenario.backend.actions:  # a counterfactual run may have another agent than the hunt
+            setup = self._settings.scenario.agents[agent]
+            check_action(setup.action, signature.actions, setup.agent)
         given: dict[str, object] = {}
         if "observation_space" in wanted:
             shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
             given["observation_space"] = shown.get(agent) or simulator.observation_spaces[agent]
         if "action_space" in wanted:
             given["action_space"] = simulator.actions[agent].space
+        if "agent_id" in wanted:
+            given["agent_id"] = agent
         if "step_length_s" in wanted:
             given["step_length_s"] = simulator.step_length_s
         if "action_masks" in wanted:
@@ -285,17 +292,17 @@ class Parts:
         }
         return factory, {**given, **values}
 
-    def _factory(self, agent: str) -> tuple[Any, tuple[str, ...]]:
+    def _factory(self, agent: str) -> tuple[Any, Signature]:
         found = self._factories.get(agent)
         if found is None:
             factory = locate("agents", self._settings.scenario.agents[agent].agent)
             if isinstance(factory, LibraryFactory):
                 factory.load(self._settings.argument_files)
             if isinstance(factory, ProgramFactory | LibraryFactory):  # which would have to run to tell its arguments
-                return self._factories.setdefault(agent, (factory, ()))
+                return self._factories.setdefault(agent, (factory, Signature({}, open=True, given=())))
             if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
                 require_origin(factory.__module__, self._settings.code)
-            found = self._factories[agent] = factory, signature_of(factory).given
+            found = self._factories[agent] = factory, signature_of(factory)
         return found
 
 

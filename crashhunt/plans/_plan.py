@@ -22,6 +22,7 @@ from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import ModelApart, disturber_of, locate_model, parse_fixed, parse_rates, word_of
 from crashhunt.native import HOW_TO_REBUILD, outdated_modules
 from crashhunt.oracles import ORACLES_OF_ACTORS, chosen_oracles, oracle_name, outcomes_brought
+from crashhunt.plans._chosen_actions import chosen_actions, notes_on_actions
 from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code
 from crashhunt.plans._run_options import TrialOptions
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
@@ -309,6 +310,8 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
         )  # fmt: skip
     hunted = not varies_only_asked(request.sampler)
     signatures = {agent: code.signatures[setup.agent] for agent, setup in scenario.agents.items()}
+    acting = chosen_actions(request.action, scenario, signatures)
+    scenario = _agents_in(scenario, acting)
     oracles = chosen_oracles(request.oracles, code.oracles)
     brought = outcomes_brought(oracles, code.oracles)
     crash_on, limits = parse_crash_on(request.crash_on, brought)
@@ -332,11 +335,12 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
         scenario_arguments=_scenario_arguments(request, scenario, hunted=hunted),
         run=request.run,
     )
-    if request.action:
-        acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
-        settings = replace(settings, agents=acting)
+    if acting:
+        chosen = {agent: replace(one, action=acting.get(agent)) for agent, one in settings.agents.items()}
+        settings = replace(settings, agents=chosen)
     scenario = _with_notes_on_crashes(_with_notes(scenario, request.run), settings, request, code.oracles)
-    scenario = replace(scenario, notes=(*scenario.notes, *code.notes, *_notes_on_statistics(settings, signatures)))
+    notes = (*code.notes, *_notes_on_statistics(settings, signatures), *notes_on_actions(scenario, signatures))
+    scenario = replace(scenario, notes=(*scenario.notes, *notes))
     find = partial(_model_apart, code, request.run.timeout_s)
     with _name_scenario_in_errors(request, scenario):
         disturber(scenario, settings.disturb, tuple(settings.agents), find=find)  # it refuses what cannot be meant

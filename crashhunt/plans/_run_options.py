@@ -73,10 +73,10 @@ class Subject(_Options):
         flag="--ego", metavar="VEHICLE", group="what",
     )  # fmt: skip
     action: str = option(
-        "", "form of the actions on SUMO, ``continuous`` or ``meta``",
-        help="the form of the agent's actions on SUMO: continuous (a target speed and a lane change) or meta "
-        "(highway-env's five actions)",
-        unset="as the scenario file says, and continuous for a .sumocfg",
+        "", "form of the actions on SUMO, a name that ``crashhunt list actions`` shows",
+        help="the form of the agent's actions on SUMO: speed_and_lane, meta, acceleration or another name that "
+        "crashhunt list actions shows",
+        unset="as the scenario file or the agent's class says, or else speed_and_lane",
         flag="--action", metavar="FORM", group="what",
     )  # fmt: skip
     agents: Mapping[str, Driver] | None = option(

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         ArgumentEntry as ArgumentEntry,
         ListingEntry as ListingEntry,
         describe as describe,
+        list_actions as list_actions,
         list_registered as list_registered,
         list_scenarios as list_scenarios,
     )

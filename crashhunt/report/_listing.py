@@ -1,4 +1,4 @@
-"""Lists of the registered agents, oracles, disturbances and scenarios, with their arguments, ranges and units."""
+"""Lists of registered agents, oracles and disturbances, of scenarios and of actions, with ranges and units."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import work_apart
 from crashhunt.base.plugins import is_foreign, locate, registered
-from crashhunt.scenario import load_scenario, shipped_scenarios
+from crashhunt.scenario import ACTIONS, load_scenario, shipped_scenarios
 from crashhunt.trial import signature_of, without_folder
 
 if TYPE_CHECKING:
@@ -33,8 +33,19 @@ class ArgumentEntry(TypedDict):
     help: str
 
 
+class ComponentEntry(TypedDict):
+    """A number of an action or a column of an observation; ``low`` and ``high`` are its bounds."""
+
+    name: str
+    unit: str
+    range: str
+    low: float
+    high: float
+    help: str
+
+
 class ListingEntry(TypedDict):
-    """An entry of ``list`` with ``--json``; only scenarios have the last two keys."""
+    """An entry of ``list`` with ``--json``; only scenarios have a simulator and agents, only actions components."""
 
     name: str
     locator: str
@@ -43,6 +54,7 @@ class ListingEntry(TypedDict):
     warning: NotRequired[str]
     simulator: NotRequired[str]
     agents: NotRequired[dict[str, list[ArgumentEntry]]]
+    components: NotRequired[list[ComponentEntry]]
 
 
 def list_registered(group: Group) -> list[ListingEntry]:
@@ -87,12 +99,35 @@ def list_scenarios() -> list[ListingEntry]:
     return found
 
 
+def list_actions() -> list[ListingEntry]:
+    """Return the forms of actions that a scenario, an agent's class or ``--action`` may name, with their components."""
+    return [
+        {
+            "name": name,
+            "locator": form.shape or ", ".join(form.names),
+            "title": form.title,
+            "arguments": [],
+            "components": [
+                {
+                    "name": one.name, "unit": one.unit, "range": one.range, "low": float(one.low),
+                    "high": float(one.high), "help": one.help,
+                }
+                for one in form.components
+            ],
+        }
+        for name, form in ACTIONS.items()
+    ]  # fmt: skip
+
+
 def describe(entries: Sequence[ListingEntry]) -> str:
-    """Return a list of agents, oracles or scenarios as text."""
+    """Return a list of agents, oracles, scenarios or actions as text."""
     blocks = []
     for entry in entries:
         lines = [f"{entry['name']}  ({entry['locator']})", f"    {entry['title']}"]
         lines += _table("    ", entry["arguments"])
+        lines += _columns(
+            "    ", [(one["name"], one["range"], one["unit"], one["help"]) for one in entry.get("components", ())]
+        )
         for agent, arguments in entry.get("agents", {}).items():
             if arguments:
                 lines += [f"    arguments of {agent}, as they are hunted here:", *_table("        ", arguments)]
@@ -129,7 +164,12 @@ def _table(indent: str, arguments: Sequence[ArgumentEntry]) -> list[str]:
         )
         for entry in arguments
     ]
-    widths = [max((len(row[column]) for row in rows), default=0) for column in range(4)]
+    return _columns(indent, rows)
+
+
+def _columns(indent: str, rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return the rows of a table as aligned lines; the last column is not padded."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
     return [
         (indent + "  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=True))).rstrip()
         for row in rows

@@ -5,6 +5,14 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
+    from ._action_forms import (
+        ACTIONS as ACTIONS,
+        ActionComponent as ActionComponent,
+        ActionDescription as ActionDescription,
+        canonical_action as canonical_action,
+        check_action as check_action,
+        is_action_name as is_action_name,
+    )
     from ._load import (
         copy_shipped_scenario as copy_shipped_scenario,
         endings as endings,

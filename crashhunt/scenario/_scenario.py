@@ -32,7 +32,8 @@ from crashhunt.base import layout
 from crashhunt.base.errors import PluginError, ScenarioError
 from crashhunt.base.integrity import digest_of_file
 from crashhunt.base.plugins import load_attribute, registered
-from crashhunt.base.text import listed
+from crashhunt.base.text import listed, one_of
+from crashhunt.scenario._action_forms import ACTIONS, ActionName, canonical_action, is_action_name
 from crashhunt.trial import Argument, Kind, kind_of, parse_spec
 
 if TYPE_CHECKING:
@@ -100,8 +101,8 @@ class AgentSetup:
         depart_lane: lane of departure, as in SUMO's departLane.
         depart_pos: position of departure, as in SUMO's departPos.
         depart_speed: speed at departure, as in SUMO's departSpeed.
-        action: form of the actions: ``continuous`` is (target speed, lane change); ``meta`` is highway-env's
-            DiscreteMetaAction.
+        action: form of the actions, a name that ``crashhunt list actions`` shows; by default the form that the class
+            of the agent declares, or else ``speed_and_lane``.
         target_speeds: the target speeds that the actions FASTER and SLOWER of ``meta`` select in order, in m/s.
         speed_mode: SUMO's speed mode bits; 6 keeps physical limits and ignores the safe speed.
         arguments: the arguments of the agent that the scenario describes.
@@ -117,10 +118,15 @@ class AgentSetup:
     depart_lane: str = "best"
     depart_pos: str = "base"
     depart_speed: str = "max"
-    action: Literal["continuous", "meta"] = "continuous"
+    action: ActionName | None = None
     target_speeds: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
     speed_mode: int = 6
     arguments: dict[str, ArgumentSetup] = field(default_factory=dict)
+
+    @property
+    def action_form(self) -> str:
+        """The name of the form of the actions."""
+        return canonical_action(self.action)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,8 +295,8 @@ def with_action(scenario: Scenario, agent: str, action: str) -> Scenario:
     Raises:
         ScenarioError: the form of actions does not exist.
     """
-    if action not in ("continuous", "meta"):
-        raise ScenarioError(f"{action!r} is not a form of actions", fix="give continuous or meta")
+    if not is_action_name(action):
+        raise ScenarioError(f"{action!r} is not a form of actions", fix=one_of(action, ACTIONS))
     setup = replace(scenario.agents[agent], action=action)  # type: ignore[arg-type]
     return replace(scenario, agents={**scenario.agents, agent: setup})
 
@@ -473,7 +479,8 @@ class Backend:
         step_length_s: function that returns the control step, in s, if it differs from the scenario's step length.
         reported_events: the types of traffic events that the simulator reports; None if they are unknown.
         disturbances: the types of traffic disturbances that the simulator supports; None if they are unknown.
-        actions: the forms of actions (``continuous``, ``meta``) that ``--action`` may select.
+        actions: the forms of actions that ``--action`` may select, as ``crashhunt list actions`` names them; empty if
+            the environment defines the form of its actions.
         accelerator: the accelerator of the simulator; None if there is none.
         core: the compiled core of the simulator; None if there is none.
         load_order: the order of objects at load on which results depend; None if there is none.

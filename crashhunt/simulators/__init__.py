@@ -6,8 +6,12 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._actions import (
+        MAX_ACCELERATION as MAX_ACCELERATION,
         META_ACTIONS as META_ACTIONS,
+        AccelerationAndLaneChange as AccelerationAndLaneChange,
         MetaAction as MetaAction,
+        NumbersAction as NumbersAction,
+        SimulatorDrives as SimulatorDrives,
         SpaceAction as SpaceAction,
         SpeedAndLaneChange as SpeedAndLaneChange,
     )

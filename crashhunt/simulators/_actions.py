@@ -1,4 +1,4 @@
-"""Action forms: speed and lane change, highway-env's meta-actions, and any Box or Discrete space of Gymnasium."""
+"""Action forms: a speed or an acceleration with a lane change, bounded numbers, meta-actions, and any simple space."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import numpy as np
 from crashhunt.base.boundaries import Boundary, Party
 from crashhunt.base.errors import ActionError
 from crashhunt.base.scalars import describe_value, is_masked
+from crashhunt.scenario import ACTIONS
 
 if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
 MAX_TARGET_SPEED = 100.0  # m/s; a Box space needs a finite bound, and no road vehicle is faster
+MAX_ACCELERATION = 10.0  # m/s²; no road vehicle brakes harder on dry asphalt
 _ACTION_BOUNDARY = Boundary(Party.ENVIRONMENT, "action conversion")
 META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 """The meta-actions in the order of highway-env's DiscreteMetaAction."""
@@ -27,35 +29,99 @@ class SpeedAndLaneChange:
     ``target_speed`` is in m/s, from 0 to 100. ``lane_change`` is -1 (right), 0 or 1 (left).
     """
 
-    names = ("target_speed", "lane_change")
+    names = ACTIONS["speed_and_lane"].names
+    _low, _high = 0.0, MAX_TARGET_SPEED
+    _fix = f"return a speed within 0 and {MAX_TARGET_SPEED:g} m/s, and -1, 0 or 1"
 
     def __init__(self) -> None:
         from gymnasium import spaces
 
-        speed = spaces.Box(0.0, MAX_TARGET_SPEED, (), np.float64)
-        self.space: Space[object] = spaces.Tuple((speed, spaces.Discrete(3, start=-1)))
+        value = spaces.Box(self._low, self._high, (), np.float64)
+        self.space: Space[object] = spaces.Tuple((value, spaces.Discrete(3, start=-1)))
 
     def encode(self, action: Any) -> NDArray[np.float64]:
         """Return the action as a float64 array of shape (2,)."""
         try:
-            speed, lane_change = action
+            value, lane_change = action
             # Most agents return this form in every step, so check it first.
-            usual = action.__class__ is tuple and speed.__class__ is float and lane_change.__class__ is int
-            if usual and 0.0 <= speed <= MAX_TARGET_SPEED and -1 <= lane_change <= 1:
+            usual = action.__class__ is tuple and value.__class__ is float and lane_change.__class__ is int
+            if usual and self._low <= value <= self._high and -1 <= lane_change <= 1:
                 return np.array(action)
             # NaN and masked values fail both comparisons. Unpacking a dictionary would have returned its keys.
             if (
                 not isinstance(action, dict | set | frozenset)
-                and 0.0 <= speed <= MAX_TARGET_SPEED
+                and self._low <= value <= self._high
                 and lane_change in (-1, 0, 1)
             ):
-                array = np.array((speed, lane_change))
+                array = np.array((value, lane_change))
                 if array.dtype.kind in "fiubO" and array.shape == (2,):  # refuses complex numbers
                     return array.astype(np.float64, copy=False)
         except Exception:  # the agent's object may raise anything when it is compared
             pass
-        fix = f"return a speed within 0 and {MAX_TARGET_SPEED:g} m/s, and -1, 0 or 1"
-        raise ActionError(f"the action {describe_value(action)} is not (target_speed, lane_change)", fix=fix)
+        raise ActionError(f"the action {describe_value(action)} is not ({', '.join(self.names)})", fix=self._fix)
+
+
+class AccelerationAndLaneChange(SpeedAndLaneChange):
+    """The action ``(acceleration, lane_change)``, as a tuple or an array.
+
+    ``acceleration`` is in m/s², from -10 to 10. ``lane_change`` is -1 (right), 0 or 1 (left).
+    """
+
+    names = ACTIONS["acceleration"].names
+    _low, _high = -MAX_ACCELERATION, MAX_ACCELERATION
+    _fix = f"return an acceleration within -{MAX_ACCELERATION:g} and {MAX_ACCELERATION:g} m/s², and -1, 0 or 1"
+
+
+class SimulatorDrives(SpeedAndLaneChange):
+    """The action of an agent that leaves the driving to the simulator: None, or what the agent overrides.
+
+    An override is ``(speed_override, lane_change_override)``, as a tuple or an array. A speed of -1 leaves the speed to
+    the simulator, and a lane change of 0 leaves the lane to it.
+    """
+
+    names = ("speed_override", "lane_change_override")
+    _low = -1.0
+    _fix = f"return None, or a speed within 0 and {MAX_TARGET_SPEED:g} m/s (or -1), and -1, 0 or 1"
+
+    def encode(self, action: Any) -> NDArray[np.float64]:
+        """Return the action as a float64 array of shape (2,)."""
+        encoded = super().encode((-1.0, 0) if action is None else action)
+        if -1.0 < encoded[0] < 0.0:
+            raise ActionError(f"the speed override {encoded[0]:g} is neither -1 nor a speed", fix=self._fix)
+        return encoded
+
+
+class NumbersAction:
+    """An action of one number for each component of a form, as a tuple, a list or an array.
+
+    Args:
+        form: name of the form, as ``crashhunt list actions`` shows it.
+    """
+
+    def __init__(self, form: str) -> None:
+        from gymnasium import spaces
+
+        self._description = ACTIONS[form]
+        self._components = self._description.components
+        self.names = self._description.names
+        low, high = np.transpose([(one.low, one.high) for one in self._components])
+        self.space: Space[object] = spaces.Box(low, high, dtype=np.float64)
+        self._count = len(self._components)
+
+    def encode(self, action: object) -> NDArray[np.float64]:
+        """Return the action as a float64 array with one number for each component."""
+        layout = self._description.layout
+        array: NDArray[np.generic] | None = None
+        with suppress(Exception):  # converting the agent's object runs the agent's code, which may raise anything
+            array = cast(action, np.dtype(np.float64))
+        if array is None or array.shape != (self._count,):
+            fix = f"return {self._count} numbers"
+            raise ActionError(f"the action {describe_value(action)} is not {layout}", fix=fix)
+        for value, component in zip(array.tolist(), self._components, strict=True):
+            if not component.low <= value <= component.high:  # NaN fails the comparison
+                allowed = f"within {component.low:g} and {component.high:g} {component.unit}".rstrip()
+                raise ActionError(f"{component.name} is {value:g} in the action {layout}", fix=f"return it {allowed}")
+        return array.astype(np.float64, copy=False)
 
 
 class SpaceAction:

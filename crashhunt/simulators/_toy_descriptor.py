@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
-from crashhunt.scenario import Backend
+from typing import TYPE_CHECKING
+
+from crashhunt.scenario import Backend, refuse
+
+if TYPE_CHECKING:
+    from crashhunt.scenario import Scenario
+
+
+def _check(scenario: Scenario, where: str) -> None:
+    for agent, setup in scenario.agents.items():
+        if setup.action_form not in ("speed_and_lane", "meta"):
+            refuse(
+                where, f"agents.{agent}.action", setup.action, "is no form of the toy", "give speed_and_lane or meta"
+            )
+
 
 BACKEND: Backend = Backend(
     title="the toy",
+    check=_check,
     reported_events=(),
     disturbances=("brake", "stop", "unseen"),
     side_effect=lambda *_: "",

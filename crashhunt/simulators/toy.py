@@ -60,7 +60,7 @@ class ToySimulator:
         self.observation_names = self._kinematics.features
         self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
         self.actions: dict[str, ActionForm] = {
-            agent: MetaAction() if setup.action == "meta" else SpeedAndLaneChange()
+            agent: MetaAction() if setup.action_form == "meta" else SpeedAndLaneChange()
             for agent, setup in scenario.agents.items()
         }
         self.agents: list[str] = []
@@ -135,7 +135,7 @@ class ToySimulator:
 
     def full_braking(self, agent: str) -> FullBraking:
         """Return the action with which a vehicle brakes as hard as it can."""
-        if self._setups[agent].action == "meta":
+        if self._setups[agent].action_form == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
         return FullBraking((0.0, 0), "the maximum of the vehicle", _BRAKING)
 
@@ -187,7 +187,7 @@ class ToySimulator:
             ctypes.PyDLL(None).sleep(3600)  # PyDLL holds the GIL, as a simulator's compiled code may
 
     def _target(self, agent: str, action: NDArray[np.generic]) -> float:
-        if self._setups[agent].action != "meta":
+        if self._setups[agent].action_form != "meta":
             return float(action[0])
         shift = {3: 5.0, 4: -5.0}.get(int(action[0]), 0.0)
         return max(0.0, self._v[agent] + shift)

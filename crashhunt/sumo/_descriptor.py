@@ -6,7 +6,7 @@ from dataclasses import replace
 from importlib import metadata
 from typing import TYPE_CHECKING
 
-from crashhunt.scenario import Backend, CompiledCore, Configuration, LoadOrder, TrafficSurvey
+from crashhunt.scenario import ACTIONS, Backend, CompiledCore, Configuration, LoadOrder, TrafficSurvey
 from crashhunt.sumo._options import INPUTS, SumoSetup, canonical, writes
 from crashhunt.world import EVENT_WORDS
 
@@ -175,7 +175,7 @@ BACKEND: Backend = Backend(
     variables=("SUMO_HOME",),
     reported_events=tuple(EVENT_WORDS),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "step_out", "ignore_priority", "unseen"),
-    actions=("continuous", "meta"),
+    actions=tuple(ACTIONS),
     configurations=(
         Configuration(
             endings=(".sumocfg", ".sumo.cfg"),

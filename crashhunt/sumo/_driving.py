@@ -11,7 +11,7 @@ from libsumo import _libsumo as sumo
 from crashhunt.simulators import META_ACTIONS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     import numpy as np
     from numpy.typing import NDArray
@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 
 
 # Calls go to libsumo's extension module, because the wrapper functions of the package cost twice as much.
+
+_NO_SPEED_CHECKS = 0  # speed mode: the vehicle drives the commanded speed
+_ALL_SPEED_CHECKS = 31  # speed mode: SUMO's default, with which a vehicle drives as its models decide
+_NO_LANE_CHANGES = 0  # lane change mode
+_OWN_LANE_CHANGES = 0b011001010101  # lane change mode: SUMO's default
 
 
 class Driving:
@@ -37,29 +42,98 @@ class Driving:
         self._closed_lanes: dict[tuple[str, str], bool] = {}
         self._targets: dict[str, int] = {}
         self._is_left_hand: bool | None = None
+        ways: dict[str, Callable[[str, NDArray[np.generic]], bool]] = {
+            "speed_and_lane": self._apply_speed,
+            "speed_and_lateral": self._apply_drift,
+            "meta": self._apply_meta,
+            "acceleration": self._apply_acceleration,
+            "sumo": self._apply_override,
+        }
+        self._ways = {agent: ways[setup.action_form] for agent, setup in setups.items()}
+        self._lateral_speeds: dict[str, float] = {}
+        self._overridden: set[str] = set()
 
     def begin(self, agents: Iterable[str]) -> None:
         """Reset the state of the last episode, but keep data that was read from the network."""
         self._targets = dict.fromkeys(agents, -1)
+        self._lateral_speeds.clear()
+        self._overridden.clear()
+        for agent in self._targets:
+            if self._setups[agent].action_form == "sumo":
+                self._leave_to_sumo(agent)
 
     def apply(self, agent: str, action: NDArray[np.generic]) -> bool:
         """Apply an encoded action; return whether the vehicle stays on the road."""
-        setup = self._setups[agent]
         try:
-            if setup.action == "meta":
-                self._apply_meta(agent, setup, META_ACTIONS[int(action[0])])
-                return True
-            speed, change = action.tolist()
-            sumo.vehicle_setSpeed(agent, speed)
-            return not change or self._change_lane(agent, int(change))
+            return self._ways[agent](agent, action)
         except libsumo.TraCIException:
             if agent in sumo.vehicle_getIDList():
                 raise
             return True  # the vehicle has left: the agent's own code may have removed it
 
-    def _apply_meta(self, agent: str, setup: AgentSetup, action: str) -> None:
+    def _apply_speed(self, agent: str, action: NDArray[np.generic]) -> bool:
+        speed, change = action.tolist()
+        sumo.vehicle_setSpeed(agent, speed)
+        return not change or self._change_lane(agent, int(change))
+
+    def _apply_acceleration(self, agent: str, action: NDArray[np.generic]) -> bool:
+        """Set the speed that the vehicle has after a step of this acceleration; SUMO applies the limits of its type."""
+        acceleration, change = action.tolist()
+        sumo.vehicle_setSpeed(agent, max(0.0, sumo.vehicle_getSpeed(agent) + acceleration * self._step_length_s))
+        return not change or self._change_lane(agent, int(change))
+
+    def _apply_drift(self, agent: str, action: NDArray[np.generic]) -> bool:
+        """Set the speed, and move the vehicle across its lane, or into the next lane when its centre is over the line.
+
+        SUMO without its sublane model moves no vehicle across a lane, but keeps a lateral position that is set. Inside
+        a junction, where lanes have no neighbours, the vehicle keeps its lateral position.
+        """
+        speed, left = action.tolist()
+        sumo.vehicle_setSpeed(agent, speed)
+        edge, lane = sumo.vehicle_getRoadID(agent), sumo.vehicle_getLaneIndex(agent)
+        inside = edge.startswith(":") or lane < 0
+        self._lateral_speeds[agent] = 0.0 if inside else left
+        if inside or not left:
+            return True
+        widths, sign = self._widths(edge), -1.0 if self.left_hand else 1.0  # SUMO mirrors left-hand traffic
+        offset = sign * sumo.vehicle_getLateralLanePosition(agent) + left * self._step_length_s
+        change = 0 if abs(offset) <= widths[lane] / 2 else 1 if offset > 0 else -1
+        if change:
+            found = self.neighboring_lane(agent, change)
+            if found is None or not found[0]:
+                return False
+            target = lane + found[1]
+            offset -= change * (widths[lane] + widths[target]) / 2
+            sumo.vehicle_moveTo(agent, f"{edge}_{target}", sumo.vehicle_getLanePosition(agent))
+        sumo.vehicle_setLateralLanePosition(agent, sign * offset)
+        return True
+
+    def _apply_override(self, agent: str, action: NDArray[np.generic]) -> bool:
+        """Let SUMO drive, except for what the agent overrides in this step."""
+        speed, change = action.tolist()
+        if speed < 0 and not change:
+            if agent in self._overridden:
+                self._leave_to_sumo(agent)
+            return True
+        self._leave_to_sumo(agent)
+        self._overridden.add(agent)
+        if speed >= 0:
+            sumo.vehicle_setSpeedMode(agent, self._setups[agent].speed_mode)
+            sumo.vehicle_setSpeed(agent, speed)
+        if change:
+            sumo.vehicle_setLaneChangeMode(agent, _NO_LANE_CHANGES)
+        return not change or self._change_lane(agent, int(change))
+
+    def _leave_to_sumo(self, agent: str) -> None:
+        """Give speed and lane changes of a vehicle back to SUMO's models."""
+        self._overridden.discard(agent)
+        sumo.vehicle_setSpeedMode(agent, _ALL_SPEED_CHECKS)
+        sumo.vehicle_setSpeed(agent, -1.0)
+        sumo.vehicle_setLaneChangeMode(agent, _OWN_LANE_CHANGES)
+
+    def _apply_meta(self, agent: str, encoded: NDArray[np.generic]) -> bool:
         """Apply a meta-action as highway-env does: FASTER and SLOWER select the next target speed."""
-        targets = setup.target_speeds
+        action, targets = META_ACTIONS[int(encoded[0])], self._setups[agent].target_speeds
         if self._targets[agent] < 0:
             speed = sumo.vehicle_getSpeed(agent)
             self._targets[agent] = min(range(len(targets)), key=lambda index: abs(targets[index] - speed))
@@ -69,6 +143,7 @@ class Driving:
         change = {"LANE_LEFT": 1, "LANE_RIGHT": -1}.get(action, 0)
         if change:
             self._change_lane(agent, change)  # a change without a neighbouring lane does nothing, as in highway-env
+        return True
 
     def _change_lane(self, agent: str, change: int) -> bool:
         """Change to a neighbouring lane at once; return False if there is no lane that the vehicle may use."""
@@ -131,7 +206,9 @@ class Driving:
     def aside(self, agent: str) -> tuple[float, float]:
         """Return how far a vehicle is right of its lane's centre line, in m, and its speed to the right, in m/s."""
         sign = 1.0 if self.left_hand else -1.0
-        return sign * sumo.vehicle_getLateralLanePosition(agent), sign * sumo.vehicle_getLateralSpeed(agent)
+        drift = self._lateral_speeds.get(agent)  # SUMO reports no speed of a vehicle whose lateral position is set
+        speed = sign * sumo.vehicle_getLateralSpeed(agent) if drift is None else -drift
+        return sign * sumo.vehicle_getLateralLanePosition(agent), speed
 
     def _is_closed(self, lane: str, vehicle_class: str) -> bool:
         found = self._closed_lanes.get((lane, vehicle_class))
@@ -150,9 +227,6 @@ def _is_right_of(lane: str, other: str) -> bool:
 
 
 # Holds for counterfactual runs: keep a vehicle's speed or lane, or remove the vehicle.
-
-_NO_SPEED_CHECKS = 0  # speed mode: the vehicle drives the commanded speed
-_NO_LANE_CHANGES = 0  # lane change mode
 
 
 def hold_vehicle(vehicle: str, what: str) -> ActiveDisturbance | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from functools import partial
 from types import MethodType
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
@@ -16,7 +17,18 @@ from crashhunt.base.boundaries import Party
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
 from crashhunt.native import core_for, reseed_generators, why_no_reseeding
 from crashhunt.scenario import ObservationSetup
-from crashhunt.simulators import META_ACTIONS, FullBraking, Kinematics, MetaAction, SpeedAndLaneChange, Unseen
+from crashhunt.simulators import (
+    MAX_ACCELERATION,
+    META_ACTIONS,
+    AccelerationAndLaneChange,
+    FullBraking,
+    Kinematics,
+    MetaAction,
+    NumbersAction,
+    SimulatorDrives,
+    SpeedAndLaneChange,
+    Unseen,
+)
 from crashhunt.sumo._descriptor import BACKEND
 from crashhunt.sumo._disturbances import SumoDisturbances
 from crashhunt.sumo._driving import Driving, hold_vehicle
@@ -47,6 +59,13 @@ if TYPE_CHECKING:
 
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
 _WINDOW_WIDTH_M = 150.0  # width of the visible part of the network when the window follows a vehicle
+_FORMS: dict[str, Callable[[], ActionForm]] = {
+    "speed_and_lane": SpeedAndLaneChange,
+    "speed_and_lateral": partial(NumbersAction, "speed_and_lateral"),
+    "meta": MetaAction,
+    "acceleration": AccelerationAndLaneChange,
+    "sumo": SimulatorDrives,
+}
 _DECELERATION_LIMIT_BIT = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
 _CORE_DISABLED_NOTICE = "the compiled core is disabled: its values differ from those of libsumo's getters"
 P = ParamSpec("P")
@@ -70,14 +89,13 @@ class SumoSimulator:
         self._kinematics = Kinematics(scenario.observation or ObservationSetup())
         self.observation_names = self._kinematics.features
         self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
-        self.actions: dict[str, ActionForm] = {
-            agent: MetaAction() if setup.action == "meta" else SpeedAndLaneChange()
-            for agent, setup in scenario.agents.items()
-        }
+        self._forms = {agent: setup.action_form for agent, setup in scenario.agents.items()}
+        self.actions: dict[str, ActionForm] = {agent: _FORMS[form]() for agent, form in self._forms.items()}
         self.agents: list[str] = []
-        # Only with these options of SUMO can a vehicle leave the centre line of its lane.
+        # Only with these options of SUMO, or by such an action, can a vehicle leave the centre line of its lane.
         options = scenario.table(SumoSetup).options
-        self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
+        self._drifts = "speed_and_lateral" in self._forms.values()
+        self._lateral = self._drifts or "lateral-resolution" in options or "lanechange.duration" in options
         self._driving = Driving(scenario.agents, scenario.step_length_s)
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s, self._driving)
         self._loading = Loading(fix_link_order=scenario.table(SumoSetup).fix_link_order is not False)
@@ -260,12 +278,13 @@ class SumoSimulator:
 
     def full_braking(self, agent: str) -> FullBraking:
         """Return the action for the hardest braking that the speed mode of the vehicle allows."""
-        setup = self._scenario.agents[agent]
-        if setup.action == "meta":
+        setup, form = self._scenario.agents[agent], self._forms[agent]
+        if form == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
+        action = (-MAX_ACCELERATION if form == "acceleration" else 0.0, 0)
         if setup.speed_mode & _DECELERATION_LIMIT_BIT:
-            return FullBraking((0.0, 0), "the maximum of its vehicle type", float(libsumo.vehicle.getDecel(agent)))
-        return FullBraking((0.0, 0), f"as hard as its speed mode {setup.speed_mode} allows")
+            return FullBraking(action, "the maximum of its vehicle type", float(libsumo.vehicle.getDecel(agent)))
+        return FullBraking(action, f"as hard as its speed mode {setup.speed_mode} allows")
 
     def surroundings(self, agent: str) -> Surroundings:
         """Return what a careful driver of the vehicle would consider after the last step."""
@@ -329,7 +348,7 @@ class SumoSimulator:
     def _usual_steps(self) -> UsualSteps | None:
         """Return the fast path of this episode; None if the core cannot run whole steps of it."""
         core, plain = self._sight.core, type(self) is SumoSimulator and not self.scripted and self._taking_part is None
-        if core is None or not plain or len(self.agents) != 1 or not self._kinematics.usual:
+        if core is None or not plain or len(self.agents) != 1 or not self._kinematics.usual or self._drifts:
             return None
         if self._lateral and self._driving.left_hand:
             return None  # the core computes lateral offsets for right-hand traffic only

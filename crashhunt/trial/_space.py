@@ -18,8 +18,9 @@ import types
 import typing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
+from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError
 from crashhunt.base.text import one_of
 
@@ -392,8 +393,8 @@ def describe(space: Mapping[str, Distribution]) -> str:
 # What the factory of an agent, sampler or oracle takes: read off its signature.
 
 _CONSTRUCTORS = ("__new__", "__init__")
-FILLED_BY_NAME: Final = ("observation_space", "action_space", "step_length_s", "action_masks")
-"""Parameters of an agent that crashhunt fills: the spaces of the vehicle, the step length in s, and the masks."""
+FILLED_BY_NAME: Final = ("observation_space", "action_space", "step_length_s", "action_masks", "agent_id")
+"""Parameters of an agent that crashhunt fills: the spaces of the vehicle, the step length in s, the masks, its id."""
 _KINDS: dict[object, Kind] = {float: "float", int: "int", bool: "bool", str: "str"}
 
 
@@ -404,15 +405,18 @@ class Signature:
     Args:
         arguments: arguments by name, in order.
         open: whether the factory accepts any other keyword (``**kwargs``).
-        given: those of the parameters ``observation_space``, ``action_space`` and ``step_length_s`` that the factory
-            has.
+        given: those of the parameters in `FILLED_BY_NAME` that the factory has.
         required: names of the arguments without a default.
+        action: name of the form of actions that the factory prefers; empty if it names none.
+        actions: names of all forms of actions that the factory's agents can return; empty if it names none.
     """
 
     arguments: dict[str, Argument]
     open: bool
     given: tuple[str, ...]
     required: tuple[str, ...] = ()
+    action: str = ""
+    actions: tuple[str, ...] = ()
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Signature:
@@ -429,8 +433,10 @@ class Signature:
             for one, text in zip(found, texts, strict=True)
         ]
         names = {argument.name: argument for argument in drawn}
-        given, required = tuple(data["given"]), tuple(data["required"])
-        return cls(names, open=bool(data["open"]), given=given, required=required)
+        given, required, actions = (tuple(data[key]) for key in ("given", "required", "actions"))
+        return cls(
+            names, open=bool(data["open"]), given=given, required=required, action=data["action"], actions=actions
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the signature as JSON-compatible data."""
@@ -441,7 +447,10 @@ class Signature:
             }
             for one in self.arguments.values()
         ]  # fmt: skip
-        return {"arguments": arguments, "open": self.open, "given": self.given, "required": self.required}
+        return {
+            "arguments": arguments, "open": self.open, "given": self.given, "required": self.required,
+            "action": self.action, "actions": self.actions,
+        }  # fmt: skip
 
     def check(self, names: Iterable[str], *, where: str) -> None:
         """Refuse arguments that the factory does not accept.
@@ -453,6 +462,25 @@ class Signature:
             if name not in self.arguments and not self.open:
                 fix = one_of(name, self.arguments, give="it takes", none="no arguments")
                 raise ArgumentError(f"{where} takes no argument {name!r}", fix=fix)
+
+
+class PrefersAction(Protocol):
+    """A class or function that creates agents, and that names the form of the agents' actions."""
+
+    @property
+    def action(self) -> str:
+        """The name of the form, as ``crashhunt list actions`` shows it.
+
+        A hunt uses this form if neither the command line nor the scenario names a form.
+        """
+
+
+class ReturnsActions(Protocol):
+    """A class or function that creates agents, and that names all forms of actions that the agents can return."""
+
+    @property
+    def actions(self) -> Sequence[str]:
+        """The names of the forms, as ``crashhunt list actions`` shows them; a hunt refuses all other forms."""
 
 
 @typing.runtime_checkable
@@ -476,12 +504,14 @@ def signature_of(factory: Callable[..., object]) -> Signature:
     """
     if isinstance(factory, DeclaresArguments) and not isinstance(factory, type):
         return factory.declared_signature()
+    action = factory.action if supports(factory, PrefersAction) and isinstance(factory.action, str) else ""
+    actions = _names_in(factory.actions) if supports(factory, ReturnsActions) else ()
     if _takes_nothing(factory):
-        return Signature({}, open=False, given=())
+        return Signature({}, open=False, given=(), action=action, actions=actions)
     try:
         parameters = inspect.signature(factory).parameters.values()
     except (TypeError, ValueError):
-        return Signature({}, open=True, given=())
+        return Signature({}, open=True, given=(), action=action, actions=actions)
     names = _names_seen_by(factory)
     arguments: dict[str, Argument] = {}
     given: list[str] = []
@@ -498,7 +528,15 @@ def signature_of(factory: Callable[..., object]) -> Signature:
             arguments[parameter.name] = _argument(parameter, _annotation(parameter, names))
             if parameter.default is parameter.empty:
                 required.append(parameter.name)
-    return Signature(arguments, open=is_open, given=tuple(given), required=tuple(required))
+    return Signature(
+        arguments, open=is_open, given=tuple(given), required=tuple(required), action=action, actions=actions
+    )
+
+
+def _names_in(value: object) -> tuple[str, ...]:
+    """Return the names in an attribute of a user's class; empty if the attribute serves another purpose."""
+    is_names = isinstance(value, list | tuple) and all(isinstance(name, str) for name in value)
+    return tuple(value) if is_names else ()  # type: ignore[arg-type]
 
 
 def _names_seen_by(factory: Callable[..., object]) -> dict[str, object]:

@@ -15,6 +15,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.plugins import CurrentFolder, locate
 from crashhunt.episode import Parts, WorkerSettings, _run_episode as _run, require_origin, seal
 from crashhunt.scenario import load_scenario
+from crashhunt.trial import Signature
 
 AGENT = """
 import random
@@ -83,7 +84,7 @@ def test_agents_are_given_what_they_ask_for(made):
 
 def test_agent_is_given_the_masks_of_its_simulator(made):
     parts = made()
-    parts._factories["ego"] = dict, ("action_masks",)
+    parts._factories["ego"] = dict, Signature({}, open=True, given=("action_masks",))
     simulator = parts.simulator()
     assert parts.agent("ego", simulator, {}) == {"action_masks": None}
     simulator.action_mask = lambda agent: f"mask of {agent}"
@@ -93,7 +94,10 @@ def test_agent_is_given_the_masks_of_its_simulator(made):
 def test_notices_are_read_from_agents_of_crashhunt_only(made):
     parts = made()
     for module in ("crashhunt.agents.some", "mine"):
-        parts._factories["ego"] = type("Policy", (), {"__module__": module, "notices": [module]}), ()
+        parts._factories["ego"] = (
+            type("Policy", (), {"__module__": module, "notices": [module]}),
+            Signature({}, open=False, given=()),
+        )
         parts.agent("ego", parts.simulator(), {})
     assert [agent.notices for agent in parts.reporting_agents] == [["crashhunt.agents.some"]]
 

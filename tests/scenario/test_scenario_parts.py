@@ -259,7 +259,8 @@ def test_arguments_of_a_scenario_know_their_place(town):
         broken.scenario_arguments()
     assert with_action(town, "ego", "meta").agents["ego"].action == "meta"
     assert refusal(with_action, town, "ego", "odd")[:2] == (
-        "'odd' is not a form of actions", "give continuous or meta",
+        "'odd' is not a form of actions",
+            "give one of speed_and_lane, speed_and_lateral, meta, acceleration, sumo",
     )  # fmt: skip
 
 

@@ -1,0 +1,52 @@
+"""Chooses the form of each agent's actions: the command line, the scenario or the agent's class names it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import UsageError
+from crashhunt.base.text import one_of
+from crashhunt.scenario import ACTIONS, canonical_action, check_action, is_action_name
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from crashhunt.scenario import Scenario
+    from crashhunt.trial import Signature
+
+
+def chosen_actions(asked: str, scenario: Scenario, signatures: Mapping[str, Signature]) -> dict[str, str]:
+    """Return the form of actions of each agent for which the command line or the agent's class chooses one.
+
+    The command line takes precedence over the scenario, and the scenario over the class.
+
+    Args:
+        asked: value of ``--action``; may be empty.
+        scenario: scenario with its agents.
+        signatures: signature of each agent.
+
+    Raises:
+        UsageError: an agent cannot return actions of the chosen form, or names a form that does not exist.
+    """
+    if not scenario.backend.actions:
+        return {}
+    found = {}
+    for agent, setup in scenario.agents.items():
+        signature = signatures[agent]
+        if signature.action and not is_action_name(signature.action):
+            fix = one_of(signature.action, ACTIONS, give="set it to one of")
+            raise UsageError(f"the attribute action of {setup.agent} is {signature.action!r}", fix=fix)
+        if asked:
+            found[agent] = asked
+        elif signature.action and setup.action is None:
+            found[agent] = signature.action
+        check_action(found.get(agent, setup.action), signature.actions, setup.agent)
+    return found
+
+
+def notes_on_actions(scenario: Scenario, signatures: Mapping[str, Signature]) -> Iterator[str]:
+    """Yield a note for each agent whose class names another form of actions than the hunt uses."""
+    for agent, setup in scenario.agents.items():
+        named = signatures[agent].action
+        if scenario.backend.actions and named and canonical_action(named) != setup.action_form:
+            yield f"the action of {agent} is {setup.action_form}, which takes precedence over {named} of {setup.agent}"

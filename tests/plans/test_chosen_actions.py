@@ -1,0 +1,76 @@
+"""Tests of the choice of a form of actions: command line, then scenario, then the agent's class."""
+
+import pytest
+
+from crashhunt.base.errors import UsageError
+from crashhunt.plans import Request, plan, with_settings
+from crashhunt.scenario import load_scenario
+
+AGENTS = """
+class Accelerates:
+    action = "acceleration"
+    def reset(self, seed): ...
+    def act(self, observation): return (0.0, 0)
+
+class Strict(Accelerates):
+    actions = ("acceleration", "sumo")
+
+class Other(Accelerates):
+    action = "teleport"
+
+class Busy(Accelerates):
+    action = {"its own": "purpose"}
+    def actions(self): ...
+"""
+
+
+@pytest.fixture(autouse=True)
+def _module(tmp_path, monkeypatch):
+    (tmp_path / "acting_agents.py").write_text(AGENTS)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def asked(agent, scenario="loop", **options):
+    agents = {"ego": f"acting_agents:{agent}"} if ":" not in agent else {"ego": agent}
+    return Request(trials=1, max_steps=1, scenario=scenario, agents=agents, seed=1, **options)
+
+
+def test_class_chooses_the_form_that_nothing_else_chooses():
+    scenario, settings = plan(asked("Accelerates"))
+    assert scenario.agents["ego"].action == settings.agents["ego"].action == "acceleration"
+    again = with_settings(load_scenario("loop"), settings)
+    assert again.agents["ego"].action_form == "acceleration"
+    assert not any("precedence" in note for note in scenario.notes)
+
+
+def test_scenario_takes_precedence_over_the_class_with_a_note():
+    scenario, settings = plan(asked("Accelerates", "motorway"))
+    assert (scenario.agents["ego"].action_form, settings.agents["ego"].action) == ("meta", None)
+    assert any(
+        "meta, which takes precedence over acceleration of acting_agents:Accel" in note for note in scenario.notes
+    )
+
+
+def test_command_line_takes_precedence_over_scenario_and_class():
+    scenario, settings = plan(asked("Accelerates", "motorway", action="speed_and_lane"))
+    assert scenario.agents["ego"].action_form == settings.agents["ego"].action == "speed_and_lane"
+
+
+def test_agent_without_a_declaration_leaves_the_settings_as_they_are():
+    scenario, settings = plan(asked("Busy"))
+    assert (scenario.agents["ego"].action, settings.agents["ego"].action) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("agent", "options", "message"),
+    [
+        ("Strict", {"action": "meta"}, "Strict returns actions of the form acceleration or sumo, not meta"),
+        ("Strict", {"scenario": "motorway"}, "acceleration or sumo, not meta"),
+        ("Other", {}, "the attribute action of acting_agents:Other is 'teleport'"),
+        ("crashhunt.agents:CarFollowing", {"action": "acceleration"}, "speed_and_lane or meta, not acceleration"),
+    ],
+)
+def test_form_that_an_agent_cannot_return_is_refused_before_the_first_trial(agent, options, message):
+    with pytest.raises(UsageError, match=message):
+        plan(asked(agent, **options))
