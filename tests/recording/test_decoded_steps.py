@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import gc
+import struct
 from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
 
 from crashhunt.crashes import Encounter, closest_actors, danger_course
 from crashhunt.recording import (
@@ -110,6 +112,34 @@ def test_steps_that_are_decoded_at_each_use_are_those_that_are_kept(records, req
     assert (long.steps, len(long.scenes()), len(long.all_steps)) == (STEPS - 1, STEPS, len(kept.all_steps))
     assert long.digest == kept.digest
     assert [scene.time_s for scene in reversed(long.scenes()[10:70:7])] == times
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    presences=st.lists(st.lists(st.integers(0, 7), unique=True, max_size=4), min_size=1, max_size=40),
+    size=st.integers(2, 9),
+)
+def test_parts_of_any_size_name_the_actors_that_come_and_go(presences, size):
+    numbers: dict[int, int] = {}
+    written = [Record(Tag.PROLOGUE, 0, PROLOGUE.encode())]
+    expected = []
+    for step, present in enumerate(presences):
+        new = [vehicle for vehicle in present if vehicle not in numbers]
+        if new:
+            numbers.update({vehicle: len(numbers) + place for place, vehicle in enumerate(new)})
+            written.append(Record(Tag.ACTORS, 0, encode_actors([Actor(f"v{one}", "car", 5.0, 2.0) for one in new])))
+        written.append(Record(Tag.ROSTER, 0, encode_roster([numbers[vehicle] for vehicle in present])))
+        values = [float(value) for one in present for value in (one, step)] + [0.0] * 2 * len(present)
+        written.append(Record(Tag.STEP, 0, struct.pack(f"<qd{len(values)}d", step, 0.1 * step, *values)))
+        expected.append([(f"v{one}", (one, step)) for one in present])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_decoded_steps, "_CHUNK_STEPS", size)
+        patch.setattr(_decoded_steps, "_MAX_DECODED_BYTES", 0)
+        recording = Recording(written)
+        for scenes in (recording.scenes(), [*reversed(recording.scenes())][::-1]):
+            named = [[(a.id, tuple(p)) for a, p in zip(one.roster.actors, one.points, strict=True)] for one in scenes]
+            assert named == expected
+    assert [actor.id for actor in recording.actors] == [f"v{one}" for one in numbers]
 
 
 def test_a_short_recording_is_decoded_once(records, decoded, monkeypatch):
