@@ -28,7 +28,7 @@ from crashhunt.episode._fast_path import FastEpisode
 from crashhunt.episode._observers import Nearness, Recorder
 from crashhunt.oracles import parse_oracle
 from crashhunt.scenario import check_action
-from crashhunt.simulators import FlattensObservations, MasksActions, ReportsNotices
+from crashhunt.simulators import FlattensObservations, MasksActions, ObservesParts, ReportsNotices
 from crashhunt.trial import CRASHES, Signature, signature_of
 
 if TYPE_CHECKING:
@@ -284,6 +284,9 @@ class Parts:
             given["agent_id"] = agent
         if "step_length_s" in wanted:
             given["step_length_s"] = simulator.step_length_s
+        if "columns" in wanted:
+            layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
+            given["columns"] = {} if (layout := layouts.get(agent)) is None else layout.columns
         if "action_masks" in wanted:
             given["action_masks"] = partial(simulator.action_mask, agent) if supports(simulator, MasksActions) else None
         files = self._settings.argument_files

@@ -104,6 +104,9 @@ class AgentSetup:
         action: form of the actions, a name that ``crashhunt list actions`` shows; by default the form that the class
             of the agent declares, or else ``speed_and_lane``.
         target_speeds: the target speeds that the actions FASTER and SLOWER of ``meta`` select in order, in m/s.
+        observation: parts that the agent observes, such as ``ego`` or ``actors:rows=8``, as `crashhunt list
+            observations` shows them; without them, the agent's class chooses the parts, or the agent observes the
+            table ``[observation]``.
         speed_mode: SUMO's speed mode bits; 6 keeps physical limits and ignores the safe speed.
         arguments: the arguments of the agent that the scenario describes.
     """
@@ -121,6 +124,7 @@ class AgentSetup:
     action: ActionName | None = None
     target_speeds: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
     speed_mode: int = 6
+    observation: tuple[str, ...] | None = None
     arguments: dict[str, ArgumentSetup] = field(default_factory=dict)
 
     @property

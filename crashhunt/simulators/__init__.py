@@ -27,7 +27,13 @@ if TYPE_CHECKING:
         reseed_in_place as reseed_in_place,
         time_limit_of as time_limit_of,
     )
-    from ._kinematics_observation import Kinematics as Kinematics, Unseen as Unseen
+    from ._kinematics_observation import Kinematics as Kinematics, Unseen as Unseen, kind_number as kind_number
+    from ._observation_parts import (
+        PARTS as PARTS,
+        ObservationLayout as ObservationLayout,
+        RequestedPart as RequestedPart,
+        parse_parts as parse_parts,
+    )
     from ._protocol import (
         FACULTIES as FACULTIES,
         ActionForm as ActionForm,
@@ -43,6 +49,7 @@ if TYPE_CHECKING:
         NamesMetaActions as NamesMetaActions,
         NamesObservations as NamesObservations,
         Observations as Observations,
+        ObservesParts as ObservesParts,
         OfAnyLength as OfAnyLength,
         Options as Options,
         PreparesProcess as PreparesProcess,

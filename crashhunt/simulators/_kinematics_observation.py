@@ -38,6 +38,11 @@ _KIND_NUMBERS = {
 }
 
 
+def kind_number(kind: str) -> float:
+    """Return the value of the column ``kind`` for the simulator's name of an actor's class."""
+    return _KIND_NUMBERS.get(kind, _MOTOR)
+
+
 class Kinematics:
     """Builds observations: float32, shape (vehicles, features).
 
@@ -96,6 +101,10 @@ class Kinematics:
         low = np.where([feature in ("presence", "kind") for feature in self.features], 0.0, -high).astype(np.float32)
         return spaces.Box(low, high, self.shape, np.float32)
 
+    def hidden_from(self, agent: str) -> frozenset[str]:
+        """Return the identifiers of the actors that an agent does not see."""
+        return frozenset(other for who, other in self.hidden if who == agent)
+
     def blank(self) -> NDArray[np.float32]:
         """Return the observation of an agent that has left the simulation, which contains only zeros."""
         return np.zeros(self.shape, np.float32)
@@ -125,7 +134,7 @@ class Kinematics:
         center_x, center_y = x - half * own_cos, y - half * own_sin
         own_vx, own_vy = speed * own_cos, speed * own_sin
         select = self._select if not self._normalize else self._normalized(lanes)
-        kind = _KIND_NUMBERS.get(actors[row].kind, _MOTOR)
+        kind = kind_number(actors[row].kind)
         own = (1.0, distance, from_left, speed, lateral_speed, atan2(-own_sin, own_cos), own_cos, -own_sin, kind)
         values = [*select(own)]
         usual = self._usual
@@ -151,7 +160,7 @@ class Kinematics:
                 values += (1.0, ahead, right, faster, drift, turn_cos, turn_sin)
             else:
                 turn = atan2(turn_sin, turn_cos)
-                kind = _KIND_NUMBERS.get(actors[other].kind, _MOTOR)
+                kind = kind_number(actors[other].kind)
                 values += select((1.0, ahead, right, faster, drift, turn, turn_cos, turn_sin, kind))
         values += self._blank * (self._others - len(nearest))
         return np.frombuffer(self._pack(*values), "<f4").reshape(self.shape)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.boundaries import Party
     from crashhunt.native import UsualSteps, Vehicles
+    from crashhunt.simulators._observation_parts import ObservationLayout
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Lane, Motion, Paths, Roster, Scene, Surroundings
 
@@ -91,7 +92,7 @@ class Simulator(Protocol):
     changes an array that it has returned.
 
     Each optional capability is its own protocol: `ReportsNotices`, `FlattensObservations`, `RestoresObservations`,
-    `NamesObservations`, `ReportsEvents`, `MasksActions`, `HasMap`, `HasWindow`, `SupportsFullBraking`,
+    `ObservesParts`, `NamesObservations`, `ReportsEvents`, `MasksActions`, `HasMap`, `HasWindow`, `SupportsFullBraking`,
     `ReportsSurroundings`, `SupportsDisturbances`, `SupportsHolds`, `SupportsExclusion`, `SupportsScripts`,
     `SupportsReseeding`, `CountsSetUp`, `RunsForeignCode`, `RestoresState` and `PreparesProcess`. A simulator supports a
     protocol if it has the methods and attributes of the protocol. Registration is not needed.
@@ -183,6 +184,14 @@ class RestoresObservations(Protocol):
             agent: The agent that receives the observation; it is in `shown_spaces`.
             array: An array that `Simulator.reset` or `Simulator.step` has returned in this episode.
         """
+
+
+class ObservesParts(Protocol):
+    """A simulator whose agents may observe parts of the table `PARTS` instead of the simulator's own observation."""
+
+    @property
+    def observation_layouts(self) -> Mapping[str, ObservationLayout]:
+        """The layout of the observation of each agent that observes parts."""
 
 
 class NamesObservations(Protocol):
@@ -506,6 +515,7 @@ FACULTIES: tuple[type, ...] = (
     RestoresObservations,
     ReportsCrashCell,
     ReportsDanger,
+    ObservesParts,
     NamesObservations,
     ReportsEvents,
     MasksActions,

@@ -31,7 +31,7 @@ _VEHICLE_KEYS = (
     "depart_pos",
     "depart_speed",
 )
-_DRIVING_KEYS = ("action", "target_speeds", "speed_mode")
+_DRIVING_KEYS = ("action", "observation", "target_speeds", "speed_mode")
 
 
 OSM_ENDINGS, OPENDRIVE_ENDINGS = (".osm", ".osm.gz", ".osm.xml", ".pbf"), (".xodr", ".xodr.gz")

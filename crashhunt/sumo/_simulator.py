@@ -36,9 +36,11 @@ from crashhunt.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.sumo._files import StagedFiles
 from crashhunt.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
 from crashhunt.sumo._loading import VERSION, Loading, keep_xml_ready
+from crashhunt.sumo._observing import ObservedParts
 from crashhunt.sumo._omitted_demand import OmittedDemand
 from crashhunt.sumo._options import SumoSetup
 from crashhunt.sumo._range_of_sight import Sight
+from crashhunt.sumo._reader_protocol import Moment
 from crashhunt.sumo._scripted import ScriptedSight, place_agents
 from crashhunt.sumo._surroundings import surroundings_of
 from crashhunt.sumo._traffic_events import SumoEvents
@@ -89,6 +91,11 @@ class SumoSimulator:
         self._kinematics = Kinematics(scenario.observation or ObservationSetup())
         self.observation_names = self._kinematics.features
         self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
+        self._parts = ObservedParts(scenario.agents, scenario.step_length_s)
+        self.observation_layouts = self._parts.layouts
+        self.observation_spaces |= {agent: layout.flat_space for agent, layout in self.observation_layouts.items()}
+        if self.observation_layouts:
+            self.shown_spaces = {agent: layout.space for agent, layout in self.observation_layouts.items()}
         self._forms = {agent: setup.action_form for agent, setup in scenario.agents.items()}
         self.actions: dict[str, ActionForm] = {agent: _FORMS[form]() for agent, form in self._forms.items()}
         self.agents: list[str] = []
@@ -187,6 +194,7 @@ class SumoSimulator:
         self._steps = 0
         self._kinematics.hidden.clear()
         self._off_road: list[str] = []
+        self._parts.begin(self._start, sumo.simulation_getTime())
         self._read_scene()
         observations = self._observe_all()
         usual = self._usual_steps()
@@ -249,7 +257,7 @@ class SumoSimulator:
         terminations: dict[str, bool] = {}
         for agent in actions:
             row = present.get(agent)
-            observations[agent] = self._kinematics.blank() if row is None else self._observe(agent, row)
+            observations[agent] = self._blank(agent) if row is None else self._observe(agent, row)
             rewards[agent] = 0.0 if row is None else scene.speed(row) * self.step_length_s
             terminations[agent] = row is None
         scene.events = self._events.look(scene, tuple(actions))
@@ -350,6 +358,8 @@ class SumoSimulator:
         core, plain = self._sight.core, type(self) is SumoSimulator and not self.scripted and self._taking_part is None
         if core is None or not plain or len(self.agents) != 1 or not self._kinematics.usual or self._drifts:
             return None
+        if self.observation_layouts:
+            return None
         if self._lateral and self._driving.left_hand:
             return None  # the core computes lateral offsets for right-hand traffic only
         (agent,) = self.agents
@@ -390,10 +400,19 @@ class SumoSimulator:
     def _is_core_wrong(self, observations: Observations, usual: UsualSteps | None) -> bool:
         """Return whether the compiled core returns other values than the Python code that it replaces."""
         core, self._scene.core = self._scene.core, None
-        plain = self._observe_all()
+        # Readers of parts keep state, so they read each step once; `reads_right` compares all values that they read.
+        plain = {} if self.observation_layouts else self._observe_all()
         self._scene.core = core
         same = all(plain[agent].tobytes() == observations[agent].tobytes() for agent in plain)
         return not (same and self._sight.reads_right() and (usual is None or usual.reads_right()))
+
+    def restore_observation(self, agent: str, array: NDArray[np.generic]) -> object:
+        """Return the parts that an agent observes, from their recorded array."""
+        return self.observation_layouts[agent].restore(array)
+
+    def _blank(self, agent: str) -> NDArray[np.generic]:
+        layout = self.observation_layouts.get(agent)
+        return self._kinematics.blank() if layout is None else layout.blank()
 
     def _observe_all(self) -> Observations:
         return {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}
@@ -406,14 +425,19 @@ class SumoSimulator:
             self._sight.look_around()  # an agent's own code has removed a vehicle, which SUMO does not report
             self._scene = self._look_with.look(self._steps, self._off_road)
 
-    def _observe(self, agent: str, row: int) -> NDArray[np.float32]:
+    def _observe(self, agent: str, row: int) -> NDArray[np.generic]:
         edge, lane = sumo.vehicle_getRoadID(agent), sumo.vehicle_getLaneIndex(agent)
         is_on_lane = lane >= 0
         if not is_on_lane:  # parked, or moved away by remote control: at its last lane
             edge, lane = self._last_lanes.get(agent) or (edge, 0)
         self._last_lanes[agent] = edge, lane
-        lanes = self._driving.lanes(edge)
         self._scene.agent_lanes[agent] = f"{edge}_{lane}"
+        if agent in self.observation_layouts:
+            moment = Moment(
+                scene=self._scene, row=row, lane=f"{edge}_{lane}", hidden=self._kinematics.hidden_from(agent)
+            )
+            return self._parts.observe(agent, moment)
+        lanes = self._driving.lanes(edge)
         from_left, lateral_speed = self._driving.from_left(edge, lane), 0.0
         if self._lateral and is_on_lane:
             aside, lateral_speed = self._driving.aside(agent)

@@ -393,8 +393,13 @@ def describe(space: Mapping[str, Distribution]) -> str:
 # What the factory of an agent, sampler or oracle takes: read off its signature.
 
 _CONSTRUCTORS = ("__new__", "__init__")
-FILLED_BY_NAME: Final = ("observation_space", "action_space", "step_length_s", "action_masks", "agent_id")
-"""Parameters of an agent that crashhunt fills: the spaces of the vehicle, the step length in s, the masks, its id."""
+FILLED_BY_NAME: Final = (
+    "observation_space", "action_space", "step_length_s", "action_masks", "agent_id", "columns",
+)  # fmt: skip
+"""Parameters of an agent that crashhunt fills.
+
+These are the spaces of the vehicle, the step length in s, the masks, the identifier of the agent, and the index of each
+column of the observed parts, by part and name."""
 _KINDS: dict[object, Kind] = {float: "float", int: "int", bool: "bool", str: "str"}
 
 

@@ -1,0 +1,496 @@
+"""The parts of observations: the only table of their names, columns, units, ranges and settings.
+
+An agent observes a `Dict` of arrays if the command line (``--observe``), the scenario (``observation``) or the agent's
+class (``observation``) names parts. The Gymnasium space, the agent's parameter ``columns``, ``crashhunt list
+observations`` and the reference page follow from this table.
+
+All parts use one frame: x to the east, y to the north, headings counter-clockwise from the x axis in rad. The reference
+point of ego and of actors is the centre of their rectangle. Rows without content are 0, including ``present``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from crashhunt.base.errors import UsageError
+from crashhunt.base.text import listed, one_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    import numpy as np
+    from gymnasium import spaces
+    from numpy.typing import NDArray
+
+
+class Column(NamedTuple):
+    """A column of a part, which is an entry of the last axis.
+
+    Args:
+        name: Name of the column.
+        unit: Unit of the values; empty for numbers without a unit.
+        low: Lower bound of the values.
+        high: Upper bound of the values.
+        meaning: Description of the values.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    meaning: str
+
+
+class Setting(NamedTuple):
+    """A setting of a part, such as its number of rows.
+
+    Args:
+        name: Name of the setting, as in ``actors:rows=8``.
+        default: The default value.
+        low: The smallest value.
+        high: The largest value.
+        unit: Unit of the value; empty for whole numbers.
+        meaning: Description of the setting.
+    """
+
+    name: str
+    default: float
+    low: float
+    high: float
+    unit: str
+    meaning: str
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether only whole numbers are allowed."""
+        return not self.unit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """A part of an observation.
+
+    Args:
+        name: Name of the part.
+        meaning: Description of the part.
+        axes: The axes before the columns, each a length or the name of the setting that contains it.
+        columns: The columns, which are the last axis; empty if the values of all axes have the same meaning.
+        values: Description of the values of a part without columns.
+        settings: The settings of the part.
+        dtype: Data type of the values.
+    """
+
+    name: str
+    meaning: str
+    axes: tuple[str | int, ...] = ()
+    columns: tuple[Column, ...] = ()
+    values: Column | None = None
+    settings: tuple[Setting, ...] = ()
+    dtype: str = "<f8"
+
+
+# Bounds that no simulation reaches: a Box needs finite bounds, because noise is clipped to them.
+_POSITION_M, _DISTANCE_M, _SPEED_MPS, _ACCELERATION_MPS2, _TIME_S = 1e8, 1e7, 1e3, 1e4, 1e9
+_PI = math.pi
+
+
+def _flag(name: str, meaning: str) -> Column:
+    return Column(name, "", 0.0, 1.0, meaning)
+
+
+def _position(name: str, meaning: str) -> Column:
+    return Column(name, "m", -_POSITION_M, _POSITION_M, meaning)
+
+
+def _distance(name: str, meaning: str) -> Column:
+    return Column(name, "m", -_DISTANCE_M, _DISTANCE_M, meaning)
+
+
+def _size(name: str, meaning: str) -> Column:
+    return Column(name, "m", 0.0, 1e3, meaning)
+
+
+def _heading(meaning: str) -> Column:
+    return Column("heading", "rad", -_PI, _PI, f"{meaning}, counter-clockwise from the x axis")
+
+
+def _speed(name: str, meaning: str) -> Column:
+    return Column(name, "m/s", -_SPEED_MPS, _SPEED_MPS, meaning)
+
+
+def _acceleration(meaning: str) -> Column:
+    return Column("acceleration", "m/s²", -_ACCELERATION_MPS2, _ACCELERATION_MPS2, meaning)
+
+
+def _time(name: str, meaning: str) -> Column:
+    return Column(name, "s", 0.0, _TIME_S, meaning)
+
+
+_PRESENT = _flag("present", "1 if the row has content; otherwise, all values of the row are 0")
+_LANE_INDEX = Column("lane_index", "", 0.0, 1e3, "index of the lane on its road, from 0 for the outer lane")
+_LANE_OFFSET = _distance(
+    "lane_offset", "distance of the front bumper's centre from the centre line of its lane, positive to the left"
+)
+
+PARTS: Mapping[str, Part] = {
+    part.name: part
+    for part in (
+        Part(
+            name="ego",
+            meaning="the controlled vehicle",
+            columns=(
+                _position("x", "x of the centre of the rectangle"),
+                _position("y", "y of the centre of the rectangle"),
+                _heading("direction of the vehicle"),
+                _speed("speed", "speed along the heading"),
+                _acceleration("change of the speed in the last step, divided by the step length"),
+                Column(
+                    "yaw_rate", "rad/s", -1e3, 1e3, "change of the heading in the last step, divided by the step length"
+                ),
+                Column(
+                    "steering", "rad", -_PI / 2, _PI / 2,
+                    "steering angle of the front wheel of a kinematic bicycle model, positive to the left",
+                ),
+                _size("length", "length of the vehicle"),
+                _size("width", "width of the vehicle"),
+                _LANE_INDEX,
+                _LANE_OFFSET,
+                Column("distance", "m", 0.0, _DISTANCE_M, "distance driven since the start of the episode"),
+                _time("time", "simulation time since the start of the episode"),
+            ),
+        ),
+        Part(
+            name="actors",
+            meaning="the actors within a radius around the controlled vehicle, the nearest first",
+            axes=("rows",),
+            columns=(
+                _PRESENT,
+                _position("x", "x of the centre of the rectangle"),
+                _position("y", "y of the centre of the rectangle"),
+                _heading("direction of the actor"),
+                _speed("vx", "velocity along the x axis"),
+                _speed("vy", "velocity along the y axis"),
+                _acceleration("change of the actor's speed in the last step, divided by the step length"),
+                _size("length", "length of the actor"),
+                _size("width", "width of the actor"),
+                Column(
+                    "kind", "", 0.0, 5.0,
+                    "1 motor vehicle, 2 bicycle or motorcycle, 3 person on foot, 4 rail vehicle, 5 obstacle",
+                ),
+                _flag("same_lane", "1 if the actor is on the lane of the controlled vehicle, or on a lane that its "
+                      "route continues to or that leads into its lane"),
+                _distance("ahead", "distance of the centres along the heading of the controlled vehicle, negative if "
+                          "the actor is behind"),
+                _LANE_OFFSET,
+                _flag("brake_light", "1 if the brake light is on"),
+                Column("indicator", "", -1.0, 2.0, "1 left, -1 right, 2 hazard lights, 0 off"),
+            ),
+            settings=(
+                Setting("rows", 32, 1, 1000, "", "number of rows"),
+                Setting("radius", 100.0, 1.0, 150.0, "m", "largest distance of the centres"),
+            ),
+        ),
+        Part(
+            name="lanes",
+            meaning="centre lines of the lanes around: the own lane, its left and its right neighbour, then others",
+            axes=("lanes", "points"),
+            columns=(
+                _PRESENT,
+                _position("x", "x of the point"),
+                _position("y", "y of the point"),
+                _heading("direction of the lane"),
+                _size("width", "width of the lane"),
+                Column("speed_limit", "m/s", 0.0, _SPEED_MPS, "speed limit of the lane"),
+            ),
+            settings=(
+                Setting("lanes", 8, 1, 200, "", "number of lanes"),
+                Setting("points", 40, 2, 1000, "", "number of points of each lane"),
+                Setting("spacing", 2.0, 0.1, 50.0, "m", "distance between two points"),
+                Setting("behind", 10.0, 0.0, 200.0, "m", "distance between the first point and the vehicle"),
+            ),
+        ),
+        Part(
+            name="route",
+            meaning="points along the route ahead, on the best lane",
+            axes=("points",),
+            columns=(
+                _PRESENT,
+                _position("x", "x of the point"),
+                _position("y", "y of the point"),
+                _heading("direction of the lane"),
+                Column("speed_limit", "m/s", 0.0, _SPEED_MPS, "speed limit of the lane"),
+                _LANE_INDEX,
+            ),
+            settings=(
+                Setting("points", 50, 2, 1000, "", "number of points"),
+                Setting("spacing", 2.0, 0.1, 50.0, "m", "distance between two points"),
+            ),
+        ),
+        Part(
+            name="route_state",
+            meaning="state of the controlled vehicle on its route",
+            columns=(
+                Column("distance_left", "m", 0.0, _DISTANCE_M, "distance to the end of the route along the route"),
+                Column(
+                    "lane_changes_needed", "", -1e3, 1e3,
+                    "number of lane changes to the best lane, positive to the left",
+                ),
+                Column(
+                    "distance_to_lane_change", "m", 0.0, _DISTANCE_M,
+                    "distance in which the lane changes must be complete; the distance to the end of the route if none "
+                    "is needed",
+                ),
+                _position("goal_x", "x of the end of the route"),
+                _position("goal_y", "y of the end of the route"),
+            ),
+        ),
+        Part(
+            name="signals",
+            meaning="the traffic lights ahead on the route, the next first",
+            axes=("rows",),
+            columns=(
+                _PRESENT,
+                Column("state", "", 0.0, 3.0, "0 green, 1 yellow, 2 red, 3 off or blinking"),
+                _distance("distance", "distance of the front bumper to the stop line"),
+                _time("time_in_state", "time since the light has this state"),
+            ),
+            settings=(Setting("rows", 3, 1, 50, "", "number of traffic lights"),),
+        ),
+        Part(
+            name="right_of_way",
+            meaning="actors on the streams that conflict with the route at the next junction, the earliest arrival "
+            "first",
+            axes=("rows",),
+            columns=(
+                _PRESENT,
+                _flag("must_yield", "1 if the controlled vehicle must yield to the actor"),
+                _distance("stop_line_distance", "distance of the front bumper to the stop line of the junction"),
+                _distance("conflict_distance", "distance of the front bumper to the conflict area"),
+                _distance("other_distance", "distance of the actor's front bumper to the conflict area"),
+                _speed("other_speed", "speed of the actor"),
+                _time("other_arrival", "time until the actor reaches the conflict area"),
+                _flag("stop_sign", "1 if the controlled vehicle must stop at the stop line"),
+            ),
+            settings=(Setting("rows", 8, 1, 100, "", "number of rows"),),
+        ),
+        Part(
+            name="speed_limit",
+            meaning="speed limit of the controlled vehicle's lane",
+            columns=(Column("speed_limit", "m/s", 0.0, _SPEED_MPS, "speed limit of the lane for this vehicle"),),
+        ),
+        Part(
+            name="predictions",
+            meaning="predicted positions of the actors in the rows of ``actors``, at constant velocity",
+            axes=("rows", "steps"),
+            columns=(
+                _position("x", "x of the centre of the rectangle"),
+                _position("y", "y of the centre of the rectangle"),
+                Column("yaw", "rad", -_PI, _PI, "direction of the actor, counter-clockwise from the x axis"),
+                _speed("speed", "speed along the heading"),
+            ),
+            settings=(
+                Setting("rows", 32, 1, 1000, "", "number of rows"),
+                Setting("steps", 30, 1, 1000, "", "number of times, the first one interval from now"),
+                Setting("radius", 100.0, 1.0, 150.0, "m", "largest distance of the centres"),
+                Setting("interval", 0.1, 0.01, 10.0, "s", "time between two positions"),
+            ),
+        ),
+        Part(
+            name="lidar2d",
+            meaning="distances from the centre of the controlled vehicle to the nearest outline, for directions "
+            "counter-clockwise from its heading; ``range`` if no outline is nearer",
+            axes=("rays",),
+            values=Column("distance", "m", 0.0, 150.0, "distance along the ray"),
+            settings=(
+                Setting("rays", 360, 1, 10_000, "", "number of rays, evenly distributed over the full circle"),
+                Setting("range", 100.0, 1.0, 150.0, "m", "largest distance"),
+            ),
+        ),
+        Part(
+            name="grid",
+            meaning="cells around the controlled vehicle: layer 0 is 1 where an actor is, layer 1 is 1 where a lane "
+            "is. The vehicle is in the middle, its heading points to smaller row numbers",
+            axes=(2, "rows", "columns"),
+            values=Column("cell", "", 0.0, 1.0, "1 if the centre of the cell is inside"),
+            settings=(
+                Setting("rows", 64, 2, 1000, "", "number of cells along the heading"),
+                Setting("columns", 64, 2, 1000, "", "number of cells across the heading"),
+                Setting("resolution", 1.0, 0.05, 20.0, "m", "edge length of a cell"),
+            ),
+            dtype="|u1",
+        ),
+        Part(
+            name="image",
+            meaning="picture of the surroundings from above, as ``grid``: red, green and blue",
+            axes=("rows", "columns", 3),
+            values=Column("value", "", 0.0, 255.0, "brightness"),
+            settings=(
+                Setting("rows", 96, 2, 1000, "", "number of pixels along the heading"),
+                Setting("columns", 96, 2, 1000, "", "number of pixels across the heading"),
+                Setting("resolution", 0.5, 0.05, 20.0, "m", "edge length of a pixel"),
+            ),
+            dtype="|u1",
+        ),
+    )
+}  # fmt: skip
+"""All parts by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class RequestedPart:
+    """A part with the values of its settings.
+
+    Args:
+        part: The part.
+        settings: The value of every setting, by name.
+    """
+
+    part: Part
+    settings: Mapping[str, float]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of the array."""
+        axes = [axis if isinstance(axis, int) else int(self.settings[axis]) for axis in self.part.axes]
+        return (*axes, len(self.part.columns)) if self.part.columns else tuple(axes)
+
+    @property
+    def space(self) -> spaces.Box:
+        """The Gymnasium space of the array."""
+        import numpy as np
+        from gymnasium import spaces
+
+        part = self.part
+        columns = part.columns or ((part.values,) if part.values is not None else ())
+        low, high = (np.array([column[side] for column in columns]) for side in (2, 3))
+        dtype = np.dtype(part.dtype)
+        return spaces.Box(
+            np.broadcast_to(low, self.shape).astype(dtype), np.broadcast_to(high, self.shape).astype(dtype), dtype=dtype
+        )
+
+
+def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where: str) -> tuple[RequestedPart, ...]:
+    """Return the parts that an agent observes.
+
+    Args:
+        words: One word per part: its name, and its settings as ``:NAME=VALUE``, such as ``actors:rows=8:radius=50``.
+        available: Names of the parts that the simulator has.
+        where: The option or key that contains the words, for messages.
+
+    Raises:
+        UsageError: A part or a setting does not exist, or a value is out of range.
+    """
+    known = tuple(available)
+    found: dict[str, RequestedPart] = {}
+    for word in words:
+        name, *given = str(word).split(":")
+        if name not in known:
+            fix = one_of(name, known) if known else "omit it, because the simulator defines its own observation"
+            raise UsageError(f"{where} has no part {name!r}", fix=fix)
+        if name in found:
+            raise UsageError(f"{where} names the part {name!r} twice", fix="name each part once")
+        part = PARTS[name]
+        settings = {setting.name: setting.default for setting in part.settings}
+        for text in given:
+            setting, value = _parse_setting(part, text, where)
+            settings[setting] = value
+        found[name] = RequestedPart(part, settings)
+    return tuple(found.values())
+
+
+def _parse_setting(part: Part, text: str, where: str) -> tuple[str, float]:
+    """Return the name and the value of a setting.
+
+    Raises:
+        UsageError: The setting does not exist, or its value is out of range.
+    """
+    name, _, digits = text.partition("=")
+    known = {setting.name: setting for setting in part.settings}
+    if name not in known:
+        fix = one_of(name, known, give="it has", none="no settings")
+        raise UsageError(f"{where}: {part.name} has no setting {name!r}", fix=fix)
+    setting = known[name]
+    try:
+        value = float(int(digits) if setting.is_whole else float(digits))
+    except ValueError:
+        value = math.nan
+    if not setting.low <= value <= setting.high:
+        kind = "a whole number" if setting.is_whole else f"a number in {setting.unit}"
+        fix = f"give {kind} within {setting.low:g} and {setting.high:g}"
+        raise UsageError(f"{where}: {part.name}:{name} is {digits!r}", fix=fix)
+    return name, value
+
+
+class ObservationLayout:
+    """The layout of an agent's observation: its parts, and their places in the recorded array.
+
+    The recorded array is one-dimensional: the parts in the order of their names, each row by row.
+
+    Args:
+        parts: The parts that the agent observes.
+
+    Attributes:
+        parts: The parts by name, in the order of the recorded array.
+        columns: The index of every column, by part and name of the column.
+        space: The space of the agent's observation.
+        flat_space: The space of the recorded array.
+    """
+
+    def __init__(self, parts: Sequence[RequestedPart]) -> None:
+        import numpy as np
+        from gymnasium import spaces
+
+        self.parts = {one.part.name: one for one in sorted(parts, key=lambda one: one.part.name)}
+        self.columns: dict[str, dict[str, int]] = {
+            name: {column.name: index for index, column in enumerate(one.part.columns)}
+            for name, one in self.parts.items()
+        }
+        self.space = spaces.Dict({name: one.space for name, one in self.parts.items()})
+        flat = spaces.flatten_space(self.space)
+        assert isinstance(flat, spaces.Box)
+        self.flat_space = flat
+        self._dtype = flat.dtype
+        self._places: list[tuple[str, slice, tuple[int, ...], np.dtype[np.generic]]] = []
+        begin = 0
+        for name, one in self.parts.items():
+            end = begin + math.prod(one.shape)
+            self._places.append((name, slice(begin, end), one.shape, np.dtype(one.part.dtype)))
+            begin = end
+
+    def flat(self, arrays: Mapping[str, NDArray[np.generic]]) -> NDArray[np.generic]:
+        """Return the recorded array of an observation."""
+        import numpy as np
+
+        found = np.concatenate([arrays[name].ravel() for name in self.parts]).astype(self._dtype, copy=False)
+        found.flags.writeable = False
+        return found
+
+    def blank(self) -> NDArray[np.generic]:
+        """Return the recorded array of an agent that has left the simulation, which contains only zeros."""
+        import numpy as np
+
+        return np.zeros(self.flat_space.shape, self._dtype)
+
+    def restore(self, array: NDArray[np.generic]) -> dict[str, NDArray[np.generic]]:
+        """Return the observation that the agent receives, from its recorded array."""
+        return {
+            name: array[place].reshape(shape).astype(dtype, copy=False) for name, place, shape, dtype in self._places
+        }
+
+    def describe(self) -> dict[str, dict[str, object]]:
+        """Return the shape, the columns and their units of every part as JSON-compatible data."""
+        return {
+            name: {
+                "shape": list(one.shape),
+                "columns": [column.name for column in one.part.columns],
+                "units": [column.unit for column in one.part.columns or filter(None, (one.part.values,))],
+            }
+            for name, one in self.parts.items()
+        }
+
+
+def words_of(parts: Iterable[str]) -> str:
+    """Return names of parts as text."""
+    return listed(parts)

@@ -1,0 +1,230 @@
+"""Readers of the parts ``ego`` and ``actors``: the controlled vehicle, and the actors around it."""
+
+from __future__ import annotations
+
+import math
+from math import cos, sin
+from typing import TYPE_CHECKING
+
+import libsumo
+import numpy as np
+from libsumo import _libsumo as sumo
+
+from crashhunt.simulators import kind_number
+from crashhunt.world import PERSON, is_person, on_one_level
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from crashhunt.sumo._observed_network import RoadNetwork
+    from crashhunt.sumo._reader_protocol import Moment, ReaderSetup
+    from crashhunt.world import Scene
+
+WHEELBASE_SHARE = 0.6
+"""Wheelbase of a vehicle as a share of its length, because SUMO has no wheelbase."""
+
+_BRAKE_LIGHT, _RIGHT, _LEFT, _HAZARD = 8, 1, 2, 4  # bits of SUMO's signals
+_NO_VALUE = -1073741824.0  # of SUMO's getters, as in `libsumo.INVALID_DOUBLE_VALUE`
+_UNKNOWN = ("", 0.0, 0.0, 0)  # lane, offset, acceleration and signals of an actor that SUMO does not have
+
+
+def wrapped(angle: float) -> float:
+    """Return an angle in rad within -π and π."""
+    return math.remainder(angle, math.tau)
+
+
+def center_of(scene: Scene, row: int) -> tuple[float, float]:
+    """Return the centre of an actor's rectangle."""
+    x, y = scene.points[row]
+    heading, half = scene.headings[row], scene.roster.actors[row].length / 2
+    return x - half * cos(heading), y - half * sin(heading)
+
+
+def _known(value: float) -> float:
+    return 0.0 if value == _NO_VALUE else value
+
+
+class EgoReader:
+    """Reads the controlled vehicle.
+
+    Args:
+        setup: The part, the vehicle and the start of the episode.
+    """
+
+    def __init__(self, setup: ReaderSetup) -> None:
+        self._setup = setup
+        self._heading: float | None = None
+
+    def observe(self, moment: Moment) -> NDArray[np.float64]:
+        """Return the columns of ``ego``."""
+        setup, scene, row = self._setup, moment.scene, moment.row
+        agent, actor = setup.agent, scene.roster.actors[row]
+        heading, speed = scene.headings[row], scene.speeds[row]
+        turned = 0.0 if self._heading is None else wrapped(heading - self._heading)
+        self._heading = heading
+        yaw_rate = turned / setup.step_length_s
+        if setup.steering is not None:
+            steering = setup.steering()
+        else:  # of a kinematic bicycle model, in which yaw rate = speed * tan(steering angle) / wheelbase
+            steering = math.atan2(yaw_rate * WHEELBASE_SHARE * actor.length, speed) if speed > 0.0 else 0.0
+        x, y = center_of(scene, row)
+        return np.array(
+            (
+                x, y, wrapped(heading), speed,
+                _known(sumo.vehicle_getAcceleration(agent)),
+                yaw_rate, steering, actor.length, actor.width,
+                float(moment.lane.rpartition("_")[2] or 0),
+                _known(sumo.vehicle_getLateralLanePosition(agent)),
+                sumo.vehicle_getDistance(agent) - setup.start_m,
+                scene.time_s - setup.start_s,
+            )
+        )  # fmt: skip
+
+
+class ActorsReader:
+    """Reads the actors around the controlled vehicle.
+
+    Args:
+        setup: The part and the vehicle.
+    """
+
+    def __init__(self, setup: ReaderSetup) -> None:
+        self._setup = setup
+        self._path = PathAhead(setup.agent, setup.network, setup.settings["radius"])
+        self._speeds: dict[str, float] = {}
+        self.ids: tuple[str, ...] = ()
+        """Identifiers of the actors in the rows, as in scenes."""
+
+    def observe(self, moment: Moment) -> NDArray[np.float64]:
+        """Return the columns of ``actors``."""
+        scene, row = moment.scene, moment.row
+        headings, speeds, actors = scene.headings, scene.speeds, scene.roster.actors
+        own_x, own_y = center_of(scene, row)
+        own_cos, own_sin = cos(headings[row]), sin(headings[row])
+        path = self._path.update(moment.lane)
+        found, last_speeds = [], self._speeds
+        self._speeds = {}
+        near = nearest_actors(moment, self._setup.settings["radius"], self._setup.shape[0])
+        for _, other, x, y in near:
+            actor, heading, speed = actors[other], headings[other], speeds[other]
+            lane, offset, acceleration, signals = _state_of(actor.id)
+            if not lane or actor.id.startswith(PERSON):
+                acceleration = (speed - last_speeds.get(actor.id, speed)) / self._setup.step_length_s
+            self._speeds[actor.id] = speed
+            ahead = (x - own_x) * own_cos + (y - own_y) * own_sin
+            indicator = _indicator(signals)
+            found.append(
+                (
+                    1.0, x, y, wrapped(heading), speed * cos(heading), speed * sin(heading), acceleration,
+                    actor.length, actor.width, kind_number(actor.kind),
+                    float(path.has(lane) or (ahead < 0.0 and path.is_entered_from(lane))),
+                    ahead, offset, float(bool(signals & _BRAKE_LIGHT)), indicator,
+                )
+            )  # fmt: skip
+        self.ids = tuple([actors[other].id for _, other, _, _ in near])
+        rows = np.zeros(self._setup.shape)
+        if found:
+            rows[: len(found)] = found
+        return rows
+
+
+def nearest_actors(moment: Moment, radius: float, limit: int) -> list[tuple[float, int, float, float]]:
+    """Return the actors that an agent sees, the nearest first: squared distance, row in the scene, and centre.
+
+    Actors on another level, such as a bridge above, are excluded, because they would look like obstacles.
+
+    Args:
+        moment: The state after the last step.
+        radius: Largest distance of the centres, in m.
+        limit: Largest number of actors.
+    """
+    scene, row = moment.scene, moment.row
+    own_x, own_y = center_of(scene, row)
+    actors = scene.roster.actors
+    found = []
+    for other, ((x, y), heading) in enumerate(zip(scene.points, scene.headings, strict=True)):
+        half = actors[other].length / 2
+        x, y = x - half * cos(heading), y - half * sin(heading)
+        squared = (x - own_x) * (x - own_x) + (y - own_y) * (y - own_y)
+        if squared <= radius * radius and other != row:
+            found.append((squared, other, x, y))
+    if scene.heights:
+        found = [one for one in found if on_one_level(scene, row, one[1])]
+    if moment.hidden:
+        found = [one for one in found if actors[one[1]].id not in moment.hidden]
+    found.sort()
+    return found[:limit]
+
+
+def _state_of(actor: str) -> tuple[str, float, float, int]:
+    """Return the lane, the lateral offset, the acceleration and the signals of an actor."""
+    try:
+        if is_person(actor):
+            return sumo.person_getLaneID(actor.removeprefix(PERSON)), 0.0, 0.0, 0
+        lane = sumo.vehicle_getLaneID(actor)
+        offset = _known(sumo.vehicle_getLateralLanePosition(actor))
+        return lane, offset, _known(sumo.vehicle_getAcceleration(actor)), sumo.vehicle_getSignals(actor)
+    except libsumo.TraCIException:  # an actor of a recording that is played back
+        return _UNKNOWN
+
+
+def _indicator(signals: int) -> float:
+    if signals & _HAZARD or (signals & _LEFT and signals & _RIGHT):
+        return 2.0
+    return 1.0 if signals & _LEFT else -1.0 if signals & _RIGHT else 0.0
+
+
+class PathAhead:
+    """The lanes that a vehicle's route continues to, and whether other lanes lead into the vehicle's lane.
+
+    Args:
+        vehicle: Identifier of the vehicle.
+        network: The lanes of the network.
+        reach_m: Length of the path, in m.
+    """
+
+    def __init__(self, vehicle: str, network: RoadNetwork, reach_m: float) -> None:
+        self._vehicle, self._network, self._reach_m = vehicle, network, reach_m
+        self._paths: dict[tuple[str, int, str], frozenset[str]] = {}
+        self._entered: dict[tuple[str, str], bool] = {}
+        self._lane = ""
+        self._lanes: frozenset[str] = frozenset()
+
+    def update(self, lane: str) -> PathAhead:
+        """Set the vehicle's lane after the last step."""
+        key = lane, sumo.vehicle_getRouteIndex(self._vehicle), sumo.vehicle_getRouteID(self._vehicle)
+        found = self._paths.get(key)
+        if found is None:
+            edges = sumo.vehicle_getRoute(self._vehicle)[max(key[1], 0) :]
+            found = self._paths[key] = frozenset(self._reached(lane, frozenset(edges)))
+        self._lane, self._lanes = lane, found
+        return self
+
+    def has(self, lane: str) -> bool:
+        """Return whether a lane is the vehicle's lane or a lane that its route continues to."""
+        return lane in self._lanes
+
+    def is_entered_from(self, lane: str) -> bool:
+        """Return whether a lane leads into the vehicle's lane within the reach."""
+        found = self._entered.get((lane, self._lane))
+        if found is None:
+            found = self._entered[lane, self._lane] = self._lane in self._reached(lane)
+        return found
+
+    def _reached(self, lane: str, edges: frozenset[str] | None = None) -> set[str]:
+        """Return the lanes that can be reached from a lane, within the reach and on the given edges."""
+        waiting, reached = [(lane, 0.0)], {lane}
+        while waiting:
+            current, done = waiting.pop()
+            for to in self._network.successors(current) if done <= self._reach_m else ():
+                if to in reached or (edges is not None and not self._stays_on(to, edges)):
+                    continue
+                reached.add(to)
+                waiting.append((to, done + self._network.length(to)))
+        return reached
+
+    def _stays_on(self, lane: str, edges: frozenset[str]) -> bool:
+        """Return whether a lane belongs to one of the edges, or leads to one of them inside a junction."""
+        if not lane.startswith(":"):
+            return lane.rpartition("_")[0] in edges
+        return any(self._stays_on(to, edges) for to in self._network.successors(lane))
