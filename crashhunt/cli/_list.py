@@ -27,6 +27,7 @@ _KINDS: dict[str, Callable[[], list[ListingEntry]]] = {
     "actions": lambda: report.list_actions(),
     "agents": lambda: report.list_registered("agents"),
     "disturbances": lambda: report.list_registered("disturbances"),
+    "observations": lambda: report.list_observations(),
     "oracles": lambda: report.list_registered("oracles"),
     "scenarios": lambda: report.list_scenarios(),
 }

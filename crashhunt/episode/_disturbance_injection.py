@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.scenario import ACTIONS
-from crashhunt.simulators import NamesMetaActions, NamesObservations, SupportsDisturbances, SupportsHolds
+from crashhunt.simulators import NamesMetaActions, NamesObservations, ObservesParts, SupportsDisturbances, SupportsHolds
 from crashhunt.trial import HOLD_KINDS, SENSOR_KINDS, Disturbance, in_effect, steps_of
 
 if TYPE_CHECKING:
@@ -24,7 +25,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.simulators import ActionForm, ActiveDisturbance, Observations, Simulator, StepResult
+    from crashhunt.simulators import (
+        ActionForm,
+        ActiveDisturbance,
+        ObservationLayout,
+        Observations,
+        Simulator,
+        StepResult,
+    )
     from crashhunt.trial import TrialResult, TrialSpec
 
     Array = NDArray[Any]
@@ -242,6 +250,7 @@ class DisturbanceInjector:
             return _Late(delay, _Held(simulator.actions[agent], self._before.get(agent)))
         if planned.what == "late_observation":
             return _Late(delay)
+        layout = simulator.observation_layouts.get(agent) if supports(simulator, ObservesParts) else None
         names = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()
         space: Any = simulator.observation_spaces[agent]
         if np.dtype(space.dtype).kind != "f":
@@ -249,6 +258,8 @@ class DisturbanceInjector:
         rng = np.random.default_rng(
             np.random.SeedSequence(self._seed, spawn_key=(_NOISE_STREAM, planned.step, *agent.encode()))
         )
+        if layout is not None:
+            return _NoisyParts(planned.how_strong, layout, partial(_center_of, simulator, agent), rng)
         return _Noisy(planned.how_strong, names, space.low, space.high, rng)
 
 
@@ -293,6 +304,38 @@ class _Held:
         if supports(space, NamesMetaActions) and "IDLE" in space.meanings:
             return form.encode(tuple(space.meanings).index("IDLE"))
         return action
+
+
+class _NoisyParts:
+    """Adds to every measured number of an observation with parts an error of up to a share of the number.
+
+    Args:
+        share: The largest relative error.
+        layout: The layout of the observation.
+        center: Function that returns the centre of the agent's vehicle, in m; None if it has left.
+        rng: The random generator of the disturbance.
+    """
+
+    def __init__(
+        self,
+        share: float,
+        layout: ObservationLayout,
+        center: Callable[[], tuple[float, float] | None],
+        rng: np.random.Generator,
+    ) -> None:
+        self._share, self._layout, self._center, self._rng = share, layout, center, rng
+
+    def __call__(self, array: Array) -> Array:
+        factors = 1.0 + self._share * self._rng.uniform(-1.0, 1.0, array.shape)
+        center = self._center()
+        return array if center is None else self._layout.with_errors(array, factors, center)
+
+
+def _center_of(simulator: Simulator, agent: str) -> tuple[float, float] | None:
+    """Return the centre of a vehicle, in m; None if it has left the simulation."""
+    scene = simulator.scene()
+    row = scene.roster.index.get(agent)
+    return None if row is None else (float(scene.centers[row, 0]), float(scene.centers[row, 1]))
 
 
 class _Noisy:

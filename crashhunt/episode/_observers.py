@@ -19,6 +19,7 @@ from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.recording import (
     AgentChannel,
     BlackBox,
+    ObservedPart,
     Phase,
     Prologue,
     Tag,
@@ -33,6 +34,7 @@ from crashhunt.recording import (
 from crashhunt.simulators import (
     FlattensObservations,
     NamesObservations,
+    ObservesParts,
     OfAnyLength,
     ReportsCrashCell,
     ReportsDanger,
@@ -288,11 +290,17 @@ class Recorder(Observer):
         """Record the actors of the episode."""
         simulator = episode.simulator
         columns = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()
+        layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
         channels = []
         for agent in episode.names:
             space, form = simulator.observation_spaces[agent], simulator.actions[agent]
             shown = np.dtype(space.dtype).str, tuple(space.shape or ())
-            channels.append(AgentChannel(agent, *shown, *_type_of(form), tuple(form.names), columns))
+            parts = tuple(
+                ObservedPart(name, one.shape, tuple(column.name for column in one.part.columns))
+                for name, one in (layouts[agent].parts.items() if agent in layouts else ())
+            )
+            names = () if parts else columns
+            channels.append(AgentChannel(agent, *shown, *_type_of(form), tuple(form.names), names, parts))
         self._box.set_up(episode.setup_steps or 0)
         self._box.prologue(Prologue(tuple(channels), simulator.step_length_s).encode(), len(channels))
 

@@ -216,6 +216,7 @@ SCHEMAS: dict[str, object] = {
     "list": {
         "agents?": list[ListingEntry],
         "disturbances?": list[ListingEntry],
+        "observations?": list[ListingEntry],
         "oracles?": list[ListingEntry],
         "scenarios?": list[ListingEntry],
     },

@@ -27,7 +27,16 @@ from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code
 from crashhunt.plans._run_options import TrialOptions
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
-from crashhunt.scenario import Scenario, backend_of, load_scenario, scenario_digest, titles, with_action
+from crashhunt.scenario import (
+    Scenario,
+    backend_of,
+    load_scenario,
+    scenario_digest,
+    titles,
+    with_action,
+    with_observations,
+)
+from crashhunt.simulators import parse_parts
 from crashhunt.trial import (
     CRASHES,
     EVENTS,
@@ -317,6 +326,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     crash_on, limits = parse_crash_on(request.crash_on, brought)
     if crash_on == CRASHES:  # the default
         crash_on += tuple(outcome for outcome in brought if outcome not in crash_on)
+    observations = _observations(request, scenario, signatures)
     options = {name: getattr(request, name) for name in fields_of(TrialOptions)}
     options |= {
         "seed": request.seed if request.seed is not None else secrets.randbits(32),
@@ -338,6 +348,11 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     if acting:
         chosen = {agent: replace(one, action=acting.get(agent)) for agent, one in settings.agents.items()}
         settings = replace(settings, agents=chosen)
+    if observations:
+        agents = {
+            agent: replace(chosen, observation=observations.get(agent)) for agent, chosen in settings.agents.items()
+        }
+        settings, scenario = replace(settings, agents=agents), with_observations(scenario, observations)
     scenario = _with_notes_on_crashes(_with_notes(scenario, request.run), settings, request, code.oracles)
     notes = (*code.notes, *_notes_on_statistics(settings, signatures), *notes_on_actions(scenario, signatures))
     scenario = replace(scenario, notes=(*scenario.notes, *notes))
@@ -400,7 +415,29 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
         scenario = replace(scenario, events={**scenario.events, **settings.events})
     if scenario.backend.actions:  # elsewhere than it was hunted, it may be another simulator's
         scenario = _agents_in(scenario, {agent: chosen.action or "" for agent, chosen in settings.agents.items()})
+    observations = {agent: chosen.observation for agent, chosen in settings.agents.items() if chosen.observation}
+    scenario = with_observations(scenario, observations) if scenario.backend.observations else scenario
     return scenario.with_agents({agent: chosen.agent for agent, chosen in settings.agents.items()})
+
+
+def _observations(
+    request: Request, scenario: Scenario, signatures: Mapping[str, Signature]
+) -> dict[str, tuple[str, ...]]:
+    """Return the parts that each agent observes: as the command line, the scenario or the agent's class names them.
+
+    Raises:
+        UsageError: a part does not exist, or the simulator does not have it.
+    """
+    found = {}
+    for agent, setup in scenario.agents.items():
+        asked, declared = request.observe, signatures[agent].observation
+        words, where = asked or setup.observation or declared, "--observe"
+        if not asked:
+            where = f"agents.{agent}.observation" if setup.observation else f"observation of {setup.agent}"
+        if words:
+            parse_parts(words, scenario.backend.observations, where=where)
+            found[agent] = tuple(words)
+    return found
 
 
 def _agents_in(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:

@@ -79,6 +79,14 @@ class Subject(_Options):
         unset="as the scenario file or the agent's class says, or else speed_and_lane",
         flag="--action", metavar="FORM", group="what",
     )  # fmt: skip
+    observe: Sequence[str] = option(
+        (), "parts that the agents observe, such as ``ego`` or ``actors:rows=8``; ``kinematics`` alone is the default "
+        "observation",
+        help="the parts that the agents observe, such as ego,actors:rows=8; crashhunt list observations shows parts "
+        "and their settings; kinematics: the default observation",
+        unset="as the scenario or the agent's class says, or else kinematics",
+        flag="--observe", metavar="PART,…", group="what", separator=",",
+    )  # fmt: skip
     agents: Mapping[str, Driver] | None = option(
         {}, "identifier of each controlled vehicle to its agent, if there are several",
         help="the agent that drives: a class or function, or a name that crashhunt list agents shows; if the scenario "

@@ -61,11 +61,19 @@ class ArgumentSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class AgentSettings:
-    """The table ``[agents.ID]``: the agent of a vehicle, its argument values, and its form of actions if requested."""
+    """The table ``[agents.ID]``: the agent of a vehicle and its argument values.
+
+    Args:
+        agent: the agent, as in ``--agent``.
+        arguments: the values that the hunt tries for the agent's arguments.
+        action: the form of the actions, if requested.
+        observation: the parts that the agent observes, if the command line or the agent's class names parts.
+    """
 
     agent: str
     arguments: dict[str, ArgumentSpec] = field(default_factory=dict)
     action: str | None = None
+    observation: tuple[str, ...] | None = None
 
 
 @clear_constructor

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ._reading import (
         AgentChannel as AgentChannel,
         Divergence as Divergence,
+        ObservedPart as ObservedPart,
         Prologue as Prologue,
         StepRecord as StepRecord,
     )

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
-from crashhunt.base.codec import Serializable
+from crashhunt.base.codec import OMIT_DEFAULT, Serializable
 from crashhunt.world import Roster
 
 if TYPE_CHECKING:
@@ -16,6 +17,26 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.world import Actor, Contact, Event, Scene, Spine
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedPart(Serializable):
+    """A part of an observation that consists of several arrays, which are recorded as one array.
+
+    Args:
+        name: name of the part.
+        shape: shape of the part.
+        columns: names of the entries of its last axis; empty if they have no names.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    columns: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """The number of values."""
+        return math.prod(self.shape)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +51,8 @@ class AgentChannel(Serializable):
         action_shape: shape of one action.
         action_names: names of the elements of an action.
         observation_names: names of the columns of an observation.
+        observation_parts: the parts of an observation, in their order in the recorded array; empty if the observation
+            has no parts.
     """
 
     id: str
@@ -39,6 +62,22 @@ class AgentChannel(Serializable):
     action_shape: tuple[int, ...]
     action_names: tuple[str, ...] = ()
     observation_names: tuple[str, ...] = ()
+    observation_parts: tuple[ObservedPart, ...] = field(default=(), metadata=OMIT_DEFAULT)
+
+    def values_by_name(self, observation: NDArray[Any]) -> dict[str, float]:
+        """Return the first values of an observation with their names: the agent's own row, as text for users.
+
+        If the observation has parts, these are the values of the part ``ego``, or of the first row of the first part.
+        """
+        if self.observation_parts:
+            parts = self.observation_parts
+            chosen = next((number for number, part in enumerate(parts) if part.name == "ego"), 0)
+            names = parts[chosen].columns or tuple(map(str, range(parts[chosen].size)))
+            values = observation[sum(part.size for part in parts[:chosen]) :][: len(names)].tolist()
+            return dict(zip(names, values, strict=False))
+        names = self.observation_names or tuple(map(str, range(observation.shape[-1] if observation.ndim else 1)))
+        values = observation.reshape(-1, observation.shape[-1])[:1] if observation.ndim else observation
+        return dict(zip(names, values.reshape(-1).tolist(), strict=False))
 
 
 @dataclass(frozen=True, slots=True)

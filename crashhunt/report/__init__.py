@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         ListingEntry as ListingEntry,
         describe as describe,
         list_actions as list_actions,
+        list_observations as list_observations,
         list_registered as list_registered,
         list_scenarios as list_scenarios,
     )

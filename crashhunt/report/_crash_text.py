@@ -348,11 +348,10 @@ class Story:
             last = self.recording.all_steps[-1]
             channel = next(agent for agent in self.recording.prologue.agents if agent.id == self.agent)
             seen = last.observations[self.agent]
-            names = channel.observation_names or tuple(map(str, range(seen.shape[-1] if seen.ndim else 1)))
-            own = seen.reshape(-1, seen.shape[-1])[:1].reshape(-1).tolist() if seen.ndim else [seen.item()]
-            facts = ", ".join(f"{name} {value:.3g}" for name, value in zip(names, own, strict=False))
             if is_opaque(channel.observation_shape):
                 facts = describe_value(seen)
+            else:
+                facts = ", ".join(f"{name} {value:.3g}" for name, value in channel.values_by_name(seen).items())
             sentences.append(f"Its last observation, in step {last.step}: {facts}.")
         frames = [line.strip() for line in failure.traceback.splitlines() if line.strip()]
         if frames:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import work_apart
 from crashhunt.base.plugins import is_foreign, locate, registered
-from crashhunt.scenario import ACTIONS, load_scenario, shipped_scenarios
+from crashhunt.scenario import ACTIONS, installed_backends, load_scenario, shipped_scenarios
+from crashhunt.simulators import PARTS, parse_parts
 from crashhunt.trial import signature_of, without_folder
 
 if TYPE_CHECKING:
@@ -45,7 +46,11 @@ class ComponentEntry(TypedDict):
 
 
 class ListingEntry(TypedDict):
-    """An entry of ``list`` with ``--json``; only scenarios have a simulator and agents, only actions components."""
+    """An entry of ``list`` with ``--json``; only scenarios have ``simulator`` and ``agents``.
+
+    Only actions and observations have ``components``. Only observations have the keys from ``shape`` on: the shape with
+    the default settings, and the name and the unit of each column. A part without columns has the unit of its values.
+    """
 
     name: str
     locator: str
@@ -55,6 +60,9 @@ class ListingEntry(TypedDict):
     simulator: NotRequired[str]
     agents: NotRequired[dict[str, list[ArgumentEntry]]]
     components: NotRequired[list[ComponentEntry]]
+    shape: NotRequired[list[int]]
+    columns: NotRequired[list[str]]
+    units: NotRequired[list[str]]
 
 
 def list_registered(group: Group) -> list[ListingEntry]:
@@ -119,15 +127,64 @@ def list_actions() -> list[ListingEntry]:
     ]  # fmt: skip
 
 
+def list_observations() -> list[ListingEntry]:
+    """Return the parts that agents may observe, with the titles of the simulators that have each part."""
+    found: list[ListingEntry] = []
+    for name, part in PARTS.items():
+        simulators = [backend.title for _, backend in installed_backends() if name in backend.observations]
+        if not simulators:
+            continue
+        (default,) = parse_parts([name], where="")
+        columns = part.values_of_last_axis
+        found.append(
+            {
+                "name": name,
+                "locator": ", ".join(simulators),
+                "title": part.meaning[0].upper() + part.meaning[1:] + ".",
+                "arguments": [
+                    {
+                        "name": setting.name,
+                        "kind": "int" if setting.is_whole else "float",
+                        "default": int(setting.default) if setting.is_whole else setting.default,
+                        "range": f"{setting.low:g}:{setting.high:g}",
+                        "unit": setting.unit,
+                        "help": setting.meaning,
+                    }
+                    for setting in part.settings
+                ],
+                "shape": list(default.shape),
+                "columns": [column.name for column in part.columns],
+                "units": [column.unit for column in columns],
+                "components": [
+                    {
+                        "name": column.name,
+                        "unit": column.unit,
+                        "range": column.range,
+                        "low": column.low,
+                        "high": column.high,
+                        "help": column.meaning,
+                    }
+                    for column in columns
+                ],
+            }
+        )
+    return found
+
+
 def describe(entries: Sequence[ListingEntry]) -> str:
     """Return a list of agents, oracles, scenarios or actions as text."""
     blocks = []
     for entry in entries:
         lines = [f"{entry['name']}  ({entry['locator']})", f"    {entry['title']}"]
-        lines += _table("    ", entry["arguments"])
+        if "shape" in entry:
+            lines.append(f"    shape {tuple(entry['shape'])}")
         lines += _columns(
             "    ", [(one["name"], one["range"], one["unit"], one["help"]) for one in entry.get("components", ())]
         )
+        if "shape" in entry and entry["arguments"]:
+            first = entry["arguments"][0]
+            lines.append(f"    settings, such as {entry['name']}:{first['name']}={first['default']}:")
+        lines += _table("    ", entry["arguments"])
         for agent, arguments in entry.get("agents", {}).items():
             if arguments:
                 lines += [f"    arguments of {agent}, as they are hunted here:", *_table("        ", arguments)]

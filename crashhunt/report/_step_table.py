@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 import re
 from contextlib import suppress
+from itertools import product
 from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
 
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.plugins import locate
@@ -163,6 +166,8 @@ def _observed(channel: AgentChannel) -> dict[str, tuple[int, ...]]:
     shape = tuple(channel.observation_shape)
     if is_opaque(shape):
         return {"observation": ()}
+    if channel.observation_parts:
+        return _observed_in_parts(channel)
     if len(shape) == 2:
         names = channel.observation_names or tuple(map(str, range(shape[1])))
         return {
@@ -171,6 +176,19 @@ def _observed(channel: AgentChannel) -> dict[str, tuple[int, ...]]:
     if len(shape) == 1:
         return {f"observation[{place}]": (place,) for place in range(shape[0])}
     return {}
+
+
+def _observed_in_parts(channel: AgentChannel) -> dict[str, tuple[int, ...]]:
+    """Return the place of each value of an observation with parts, by ``observation[PART,ROW,COLUMN]``."""
+    found: dict[str, tuple[int, ...]] = {}
+    begin = 0
+    for part in channel.observation_parts:
+        for number, place in enumerate(product(*map(range, part.shape))):
+            *rows, last = place
+            words = [part.name, *map(str, rows), part.columns[last] if part.columns else str(last)]
+            found[f"observation[{','.join(words)}]"] = (begin + number,)
+        begin += part.size
+    return found
 
 
 def _of_scene(step: StepRecord, agent: str, name: str) -> float | None:

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
         scenario_digest as scenario_digest,
         titles as titles,
         with_action as with_action,
+        with_observations as with_observations,
     )
 
 offer_lazily(__name__)

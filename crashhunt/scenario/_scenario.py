@@ -305,6 +305,15 @@ def with_action(scenario: Scenario, agent: str, action: str) -> Scenario:
     return replace(scenario, agents={**scenario.agents, agent: setup})
 
 
+def with_observations(scenario: Scenario, observations: Mapping[str, tuple[str, ...]]) -> Scenario:
+    """Return the scenario with the parts that agents observe, by agent; the other agents do not change."""
+    agents = {
+        agent: replace(setup, observation=observations[agent]) if agent in observations else setup
+        for agent, setup in scenario.agents.items()
+    }
+    return replace(scenario, agents=agents)
+
+
 def argument_values(scenario: Scenario) -> dict[str, Value]:
     """Return the default of every scenario argument."""
     return {name: setup.default for name, setup in scenario.arguments.items() if setup.default is not None}
@@ -485,6 +494,7 @@ class Backend:
         disturbances: the types of traffic disturbances that the simulator supports; None if they are unknown.
         actions: the forms of actions that ``--action`` may select, as ``crashhunt list actions`` names them; empty if
             the environment defines the form of its actions.
+        observations: the parts of observations that ``--observe`` may select.
         accelerator: the accelerator of the simulator; None if there is none.
         core: the compiled core of the simulator; None if there is none.
         load_order: the order of objects at load on which results depend; None if there is none.
@@ -527,6 +537,7 @@ class Backend:
     reported_events: tuple[str, ...] | None = None
     disturbances: tuple[str, ...] | None = None
     actions: tuple[str, ...] = ()
+    observations: tuple[str, ...] = ()
     accelerator: Accelerator | None = None
     core: CompiledCore | None = None
     load_order: LoadOrder | None = None

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         PARTS as PARTS,
         ObservationLayout as ObservationLayout,
         RequestedPart as RequestedPart,
+        layouts_of as layouts_of,
         parse_parts as parse_parts,
     )
     from ._protocol import (

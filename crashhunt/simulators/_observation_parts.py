@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from crashhunt.base.errors import UsageError
-from crashhunt.base.text import listed, one_of
+from crashhunt.base.text import one_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     import numpy as np
     from gymnasium import spaces
     from numpy.typing import NDArray
+
+    from crashhunt.scenario import AgentSetup
 
 
 class Column(NamedTuple):
@@ -41,6 +43,11 @@ class Column(NamedTuple):
     low: float
     high: float
     meaning: str
+
+    @property
+    def range(self) -> str:
+        """The range as text; empty if its bounds are only those that no simulation reaches."""
+        return f"{self.low:g}:{self.high:g}" if self.high <= _LARGEST_SHOWN else ""
 
 
 class Setting(NamedTuple):
@@ -79,6 +86,8 @@ class Part:
         columns: The columns, which are the last axis; empty if the values of all axes have the same meaning.
         values: Description of the values of a part without columns.
         settings: The settings of the part.
+        measured: Columns that the disturbance ``noisy_observation`` changes; ``x`` and ``y`` relative to the position
+            of the controlled vehicle.
         dtype: Data type of the values.
     """
 
@@ -88,8 +97,16 @@ class Part:
     columns: tuple[Column, ...] = ()
     values: Column | None = None
     settings: tuple[Setting, ...] = ()
+    measured: tuple[str, ...] = ()
     dtype: str = "<f8"
 
+    @property
+    def values_of_last_axis(self) -> tuple[Column, ...]:
+        """The columns, or the description of all values if the part has no columns."""
+        return self.columns or ((self.values,) if self.values is not None else ())
+
+
+_LARGEST_SHOWN = 360.0
 
 # Bounds that no simulation reaches: a Box needs finite bounds, because noise is clipped to them.
 _POSITION_M, _DISTANCE_M, _SPEED_MPS, _ACCELERATION_MPS2, _TIME_S = 1e8, 1e7, 1e3, 1e4, 1e9
@@ -128,6 +145,9 @@ def _time(name: str, meaning: str) -> Column:
     return Column(name, "s", 0.0, _TIME_S, meaning)
 
 
+KINEMATICS = "kinematics"
+"""The word for the default observation, which is no `Dict` of parts."""
+
 _PRESENT = _flag("present", "1 if the row has content; otherwise, all values of the row are 0")
 _LANE_INDEX = Column("lane_index", "", 0.0, 1e3, "index of the lane on its road, from 0 for the outer lane")
 _LANE_OFFSET = _distance(
@@ -160,6 +180,7 @@ PARTS: Mapping[str, Part] = {
                 Column("distance", "m", 0.0, _DISTANCE_M, "distance driven since the start of the episode"),
                 _time("time", "simulation time since the start of the episode"),
             ),
+            measured=("speed", "acceleration", "yaw_rate", "steering", "lane_offset", "distance"),
         ),
         Part(
             name="actors",
@@ -191,6 +212,7 @@ PARTS: Mapping[str, Part] = {
                 Setting("rows", 32, 1, 1000, "", "number of rows"),
                 Setting("radius", 100.0, 1.0, 150.0, "m", "largest distance of the centres"),
             ),
+            measured=("x", "y", "vx", "vy", "acceleration", "length", "width", "ahead", "lane_offset"),
         ),
         Part(
             name="lanes",
@@ -274,6 +296,7 @@ PARTS: Mapping[str, Part] = {
                 _flag("stop_sign", "1 if the controlled vehicle must stop at the stop line"),
             ),
             settings=(Setting("rows", 8, 1, 100, "", "number of rows"),),
+            measured=("other_distance", "other_speed", "other_arrival"),
         ),
         Part(
             name="speed_limit",
@@ -296,6 +319,7 @@ PARTS: Mapping[str, Part] = {
                 Setting("radius", 100.0, 1.0, 150.0, "m", "largest distance of the centres"),
                 Setting("interval", 0.1, 0.01, 10.0, "s", "time between two positions"),
             ),
+            measured=("x", "y", "speed"),
         ),
         Part(
             name="lidar2d",
@@ -307,6 +331,7 @@ PARTS: Mapping[str, Part] = {
                 Setting("rays", 360, 1, 10_000, "", "number of rays, evenly distributed over the full circle"),
                 Setting("range", 100.0, 1.0, 150.0, "m", "largest distance"),
             ),
+            measured=("distance",),
         ),
         Part(
             name="grid",
@@ -363,7 +388,7 @@ class RequestedPart:
         from gymnasium import spaces
 
         part = self.part
-        columns = part.columns or ((part.values,) if part.values is not None else ())
+        columns = part.values_of_last_axis
         low, high = (np.array([column[side] for column in columns]) for side in (2, 3))
         dtype = np.dtype(part.dtype)
         return spaces.Box(
@@ -372,23 +397,31 @@ class RequestedPart:
 
 
 def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where: str) -> tuple[RequestedPart, ...]:
-    """Return the parts that an agent observes.
+    """Return the parts that an agent observes; none for the default observation.
 
     Args:
-        words: One word per part: its name, and its settings as ``:NAME=VALUE``, such as ``actors:rows=8:radius=50``.
+        words: One word per part: its name, and its settings as ``:NAME=VALUE``, such as ``actors:rows=8:radius=50``;
+            or only `KINEMATICS`.
         available: Names of the parts that the simulator has.
         where: The option or key that contains the words, for messages.
 
     Raises:
         UsageError: A part or a setting does not exist, or a value is out of range.
     """
-    known = tuple(available)
-    found: dict[str, RequestedPart] = {}
-    for word in words:
-        name, *given = str(word).split(":")
+    known, found, given_words = tuple(available), dict[str, RequestedPart](), [str(word) for word in words]
+    if KINEMATICS in given_words and known:
+        if len(given_words) > 1:
+            fix = f"name {KINEMATICS} alone, or only parts"
+            raise UsageError(f"{where} names {KINEMATICS} and parts: {','.join(given_words)}", fix=fix)
+        return ()
+    for word in given_words:
+        name, *given = word.split(":")
         if name not in known:
-            fix = one_of(name, known) if known else "omit it, because the simulator defines its own observation"
-            raise UsageError(f"{where} has no part {name!r}", fix=fix)
+            fix = one_of(name, (*known, KINEMATICS)) if known else "omit it, because agents observe what it returns"
+            message = f"{where}: {name!r} is not a part of observations"
+            if name in PARTS or not known:
+                message = f"{where}: the simulator of this scenario has no part {name!r}"
+            raise UsageError(message, fix=fix)
         if name in found:
             raise UsageError(f"{where} names the part {name!r} twice", fix="name each part once")
         part = PARTS[name]
@@ -447,7 +480,8 @@ class ObservationLayout:
             name: {column.name: index for index, column in enumerate(one.part.columns)}
             for name, one in self.parts.items()
         }
-        self.space = spaces.Dict({name: one.space for name, one in self.parts.items()})
+        self._boxes = {name: one.space for name, one in self.parts.items()}
+        self.space = spaces.Dict(dict(self._boxes))
         flat = spaces.flatten_space(self.space)
         assert isinstance(flat, spaces.Box)
         self.flat_space = flat
@@ -479,18 +513,61 @@ class ObservationLayout:
             name: array[place].reshape(shape).astype(dtype, copy=False) for name, place, shape, dtype in self._places
         }
 
+    def with_errors(
+        self, array: NDArray[Any], factors: NDArray[np.float64], center: tuple[float, float]
+    ) -> NDArray[Any]:
+        """Return a recorded array whose measured values have errors.
+
+        Args:
+            array: The recorded array.
+            factors: The factor of each value.
+            center: The centre of the controlled vehicle, from which factors of positions are counted, in m.
+        """
+        import numpy as np
+
+        found = array.copy()
+        for name, place, shape, _ in self._places:
+            part, values = self.parts[name].part, found[place].reshape(shape)
+            wrong = factors[place].reshape(shape)
+            box = self._boxes[name]
+            if part.columns:
+                is_empty = ~values.any(axis=-1)
+                for column in part.measured:
+                    index = self.columns[name][column]
+                    origin = {"x": center[0], "y": center[1]}.get(column, 0.0)
+                    changed = origin + (values[..., index] - origin) * wrong[..., index]
+                    values[..., index] = np.where(is_empty, 0.0, changed)
+            elif part.measured:
+                values *= wrong
+            np.clip(values, box.low, box.high, out=values)
+        found.flags.writeable = False
+        return found
+
     def describe(self) -> dict[str, dict[str, object]]:
         """Return the shape, the columns and their units of every part as JSON-compatible data."""
         return {
             name: {
                 "shape": list(one.shape),
                 "columns": [column.name for column in one.part.columns],
-                "units": [column.unit for column in one.part.columns or filter(None, (one.part.values,))],
+                "units": [column.unit for column in one.part.values_of_last_axis],
             }
             for name, one in self.parts.items()
         }
 
 
-def words_of(parts: Iterable[str]) -> str:
-    """Return names of parts as text."""
-    return listed(parts)
+def layouts_of(setups: Mapping[str, AgentSetup], available: Iterable[str]) -> dict[str, ObservationLayout]:
+    """Return the layout of the observation of each agent that observes parts.
+
+    Args:
+        setups: The setups of all agents of a scenario, by agent.
+        available: Names of the parts that the simulator has.
+
+    Raises:
+        UsageError: A part or a setting does not exist, or a value is out of range.
+    """
+    known = tuple(available)
+    parts = {
+        agent: parse_parts(setup.observation or (), known, where=f"agents.{agent}.observation")
+        for agent, setup in setups.items()
+    }
+    return {agent: ObservationLayout(found) for agent, found in parts.items() if found}

@@ -120,6 +120,7 @@ def _request_of(settings: HuntSettings) -> Request:
         max_steps=settings.max_steps,
         scenario=settings.scenario,
         action=next((chosen.action for chosen in settings.agents.values() if chosen.action), ""),
+        observe=next((chosen.observation for chosen in settings.agents.values() if chosen.observation), ()),
         agents={agent: chosen.agent for agent, chosen in settings.agents.items()},
         arguments=arguments,
         scenario_arguments={name: spec.spec for name, spec in settings.scenario_arguments.items()},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from crashhunt.simulators import ObservationLayout, parse_parts
+from crashhunt.simulators import layouts_of
 from crashhunt.sumo._ego_and_actors import ActorsReader, EgoReader
 from crashhunt.sumo._observed_network import RoadNetwork
 from crashhunt.sumo._reader_protocol import ReaderSetup
@@ -37,11 +37,7 @@ class ObservedParts:
     """
 
     def __init__(self, setups: Mapping[str, AgentSetup], step_length_s: float) -> None:
-        self.layouts = {
-            agent: ObservationLayout(parse_parts(setup.observation, READERS, where=f"agents.{agent}.observation"))
-            for agent, setup in setups.items()
-            if setup.observation
-        }
+        self.layouts = layouts_of(setups, READERS)
         self._step_length_s = step_length_s
         self._network = RoadNetwork()
         self._readers: dict[str, dict[str, Reader]] = {}

@@ -403,6 +403,14 @@ column of the observed parts, by part and name."""
 _KINDS: dict[object, Kind] = {float: "float", int: "int", bool: "bool", str: "str"}
 
 
+class DeclaresObservation(Protocol):
+    """A class or function that creates agents, and that names the parts of the observation that they need."""
+
+    @property
+    def observation(self) -> str | Sequence[str]:
+        """The parts, such as ``("ego", "actors:rows=8")``; the command line and the scenario may name others."""
+
+
 @dataclass(frozen=True, slots=True)
 class Signature:
     """The signature of a factory: the arguments that it accepts.
@@ -414,6 +422,7 @@ class Signature:
         required: names of the arguments without a default.
         action: name of the form of actions that the factory prefers; empty if it names none.
         actions: names of all forms of actions that the factory's agents can return; empty if it names none.
+        observation: parts that the factory's agents observe, from its attribute ``observation``.
     """
 
     arguments: dict[str, Argument]
@@ -422,6 +431,7 @@ class Signature:
     required: tuple[str, ...] = ()
     action: str = ""
     actions: tuple[str, ...] = ()
+    observation: tuple[str, ...] = ()
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Signature:
@@ -440,8 +450,9 @@ class Signature:
         names = {argument.name: argument for argument in drawn}
         given, required, actions = (tuple(data[key]) for key in ("given", "required", "actions"))
         return cls(
-            names, open=bool(data["open"]), given=given, required=required, action=data["action"], actions=actions
-        )
+            names, open=bool(data["open"]), given=given, required=required, action=data["action"], actions=actions,
+            observation=tuple(data["observation"]),
+        )  # fmt: skip
 
     def to_json(self) -> dict[str, Any]:
         """Return the signature as JSON-compatible data."""
@@ -455,6 +466,7 @@ class Signature:
         return {
             "arguments": arguments, "open": self.open, "given": self.given, "required": self.required,
             "action": self.action, "actions": self.actions,
+            "observation": self.observation,
         }  # fmt: skip
 
     def check(self, names: Iterable[str], *, where: str) -> None:
@@ -511,12 +523,13 @@ def signature_of(factory: Callable[..., object]) -> Signature:
         return factory.declared_signature()
     action = factory.action if supports(factory, PrefersAction) and isinstance(factory.action, str) else ""
     actions = _names_in(factory.actions) if supports(factory, ReturnsActions) else ()
+    observation = _declared_parts(factory)
     if _takes_nothing(factory):
-        return Signature({}, open=False, given=(), action=action, actions=actions)
+        return Signature({}, open=False, given=(), action=action, actions=actions, observation=observation)
     try:
         parameters = inspect.signature(factory).parameters.values()
     except (TypeError, ValueError):
-        return Signature({}, open=True, given=(), action=action, actions=actions)
+        return Signature({}, open=True, given=(), action=action, actions=actions, observation=observation)
     names = _names_seen_by(factory)
     arguments: dict[str, Argument] = {}
     given: list[str] = []
@@ -534,14 +547,26 @@ def signature_of(factory: Callable[..., object]) -> Signature:
             if parameter.default is parameter.empty:
                 required.append(parameter.name)
     return Signature(
-        arguments, open=is_open, given=tuple(given), required=tuple(required), action=action, actions=actions
-    )
+        arguments, open=is_open, given=tuple(given), required=tuple(required), action=action, actions=actions,
+        observation=observation,
+    )  # fmt: skip
 
 
 def _names_in(value: object) -> tuple[str, ...]:
     """Return the names in an attribute of a user's class; empty if the attribute serves another purpose."""
     is_names = isinstance(value, list | tuple) and all(isinstance(name, str) for name in value)
     return tuple(value) if is_names else ()  # type: ignore[arg-type]
+
+
+def _declared_parts(factory: object) -> tuple[str, ...]:
+    """Return the parts in the attribute ``observation`` of a factory; an attribute of another type is not meant."""
+    if not supports(factory, DeclaresObservation):
+        return ()
+    parts = factory.observation
+    if isinstance(parts, str):
+        parts = parts.split(",")
+    is_meant = isinstance(parts, list | tuple) and all(isinstance(part, str) for part in parts)
+    return tuple([part.strip() for part in parts if part.strip()]) if is_meant else ()
 
 
 def _names_seen_by(factory: Callable[..., object]) -> dict[str, object]:
