@@ -17,12 +17,13 @@ from crashhunt.base.text import one_of
 from crashhunt.episode import Episode, Observer
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
 from crashhunt.plans import disturber
-from crashhunt.scenario import argument_values, load_scenario, with_action
+from crashhunt.scenario import argument_values, load_scenario, with_action, with_observations
+from crashhunt.simulators import parse_parts
 from crashhunt.sumo import SumoSimulator
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from gymnasium import Space
@@ -57,6 +58,7 @@ class Episodes:
         action: The form of the actions, as ``crashhunt list actions`` names it; empty for the scenario's own choice.
         disturb: Rates of disturbances, such as ``brake=0.02``.
         max_steps: Maximum number of steps of an episode; 0 for no limit. Disturbances need a limit.
+        observation: The parts that the vehicle observes; empty for the scenario's own choice.
 
     Attributes:
         observation_space: The observation space of the vehicle.
@@ -69,7 +71,13 @@ class Episodes:
     """
 
     def __init__(
-        self, scenario: str | Path, agent: str, action: str, disturb: Sequence[str] = (), max_steps: int = 0
+        self,
+        scenario: str | Path,
+        agent: str,
+        action: str,
+        disturb: Sequence[str] = (),
+        max_steps: int = 0,
+        observation: Sequence[str] = (),
     ) -> None:
         chosen = load_scenario(scenario)
         if agent and agent not in chosen.agents:
@@ -77,6 +85,9 @@ class Episodes:
         self.agent = agent or next(iter(chosen.agents))
         if action:
             chosen = with_action(chosen, self.agent, action)
+        if observation:
+            parse_parts(observation, chosen.backend.observations, where="observation")
+            chosen = with_observations(chosen, {self.agent: tuple(observation)})
         self._arguments, self._known = argument_values(chosen), chosen.scenario_arguments()
         self._disturber = _disturber(chosen, self.agent, disturb, max_steps)
         self._stage = TemporaryFolder("environment")
@@ -86,14 +97,18 @@ class Episodes:
         self._oracles = (ReportedCollision(), Overlap(), OffRoad())
         self._episode: Episode | None = None
         self._is_closed = False
-        self.observation_space: Space[object] = self._simulator.observation_spaces[self.agent]
+        layout = self._simulator.observation_layouts.get(self.agent)
+        self._restore: Callable[[NDArray[np.generic]], Any] = layout.restore if layout else lambda array: array
+        self.observation_space: Space[object] = (
+            layout.space if layout else self._simulator.observation_spaces[self.agent]
+        )
         self.action_space: Space[object] = self._form.space
         self.step_length_s = self._simulator.step_length_s
         self._trail = _Trail(round(_TRAIL_S / self.step_length_s) + 1)
         self._crash_step = -1
         self._borders: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] | None = None
 
-    def reset(self, seed: int, arguments: Mapping[str, Value]) -> tuple[NDArray[np.generic], dict[str, object]]:
+    def reset(self, seed: int, arguments: Mapping[str, Value]) -> tuple[Any, dict[str, object]]:
         """Begin an episode; return the observation and the info.
 
         Raises:
@@ -122,9 +137,9 @@ class Episodes:
         info: dict[str, object] = {"sim_time_s": self._trail.scenes[-1].time_s}
         if self._trail.disturbances:
             info["disturbances"] = [disturbance.words for disturbance in self._trail.disturbances]
-        return self._episode.observations[self.agent], info
+        return self._restore(self._episode.observations[self.agent]), info | self._identifiers()
 
-    def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, dict[str, object]]:
+    def step(self, action: object) -> tuple[Any, float, bool, dict[str, object]]:
         """Advance one control step; return observation, reward, whether the episode has ended, and the info."""
         self._require_open()
         encoded = self._form.encode(action)  # a wrong action is an error of the caller, so it does not end the episode
@@ -149,7 +164,13 @@ class Episodes:
             info["disturbances"] = [disturbance.words for disturbance in self._trail.disturbances[before:]]
         if terminated:
             info["outcome"] = str(finding.outcome) if finding is not None else "finished"
-        return episode.observations[self.agent], episode.rewards[self.agent], terminated, info
+        info |= self._identifiers()
+        return self._restore(episode.observations[self.agent]), episode.rewards[self.agent], terminated, info
+
+    def _identifiers(self) -> dict[str, object]:
+        """Return the entry of the info with the identifiers of the actors in the rows of ``actors``."""
+        found = self._simulator.identifiers(self.agent) if self._simulator.observation_layouts else None
+        return {} if found is None else {"actors": found}
 
     def require_branch(self, *, reseeded: bool) -> None:
         """Check that copies of the running episode are possible.

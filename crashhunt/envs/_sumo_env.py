@@ -18,6 +18,8 @@ from crashhunt.envs._env_episodes import Episodes
 from crashhunt.envs._process import RemoteEpisodes
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
 # The environment that owns this process's simulation, and the id of this process: a fork owns no simulation. The
@@ -29,7 +31,9 @@ _process: list[int] = []
 class SumoEnv(gymnasium.Env[Any, Any]):
     """The environment that ``gymnasium.make("crashhunt:crashhunt/SUMO-v0")`` returns.
 
-    The observation has the layout of highway-env's Kinematics: float32, shape (vehicles, features). The reward is the
+    The observation has the layout of highway-env's Kinematics: float32, shape (vehicles, features). If ``observation``
+    names parts, the observation is a dictionary of arrays, one per part, and ``info["actors"]`` contains the
+    identifiers of the actors in the rows of the part ``actors``. The reward is the
     distance driven in a step, in m. An episode terminates when the vehicle arrives or crashes, and ``info["outcome"]``
     is how it ended. An episode is truncated after ``max_steps``.
 
@@ -38,6 +42,9 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         agent: The controlled vehicle; by default the first agent of the scenario. The other agents keep their lane.
         action: The form of the actions, as ``crashhunt list actions`` names it. The default is the scenario's own
             choice, or else ``speed_and_lane``: (target speed in m/s, lane change).
+        observation: The parts that the vehicle observes, separated by commas or as a sequence, such as
+            ``"ego,actors:rows=8"``; ``crashhunt list observations`` shows all parts. The default is the scenario's own
+            choice.
         max_steps: Maximum number of steps of an episode; None for no limit.
         render_mode: None, or ``rgb_array``: `render` returns the scene from above, uint8, shape (540, 960, 3).
         process: Whether the environment runs in its own process, which costs up to a millisecond per step. libsumo has
@@ -60,6 +67,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         *,
         agent: str = "",
         action: str = "",
+        observation: str | Sequence[str] = "",
         max_steps: int | None = None,
         render_mode: str | None = None,
         process: bool | None = None,
@@ -76,15 +84,18 @@ class SumoEnv(gymnasium.Env[Any, Any]):
                 raise UsageError(f"{name} is {text!r}", fix=f"give {name} as text, or omit it")
         if max_steps is not None and (not isinstance(max_steps, Integral) or max_steps < 1):
             raise UsageError(f"max_steps is {max_steps!r}", fix="give at least 1, or None for no limit")
-        words = tuple(filter(None, (word.strip() for word in disturb.split(","))))
+        words = _words_in(disturb)
+        parts = _words_in(observation) if isinstance(observation, str) else tuple(observation)
+        if not all(isinstance(part, str) for part in parts):
+            raise UsageError(f"observation is {observation!r}", fix="give the names of parts as text, or omit it")
         self._max_steps = max_steps
         self._episodes: Episodes | RemoteEpisodes
         if process is None:
             process = _process == [os.getpid()] and len(_here) > 0
         if process:
-            self._episodes = RemoteEpisodes(str(scenario), agent, action, words, max_steps or 0)
+            self._episodes = RemoteEpisodes(str(scenario), agent, action, words, max_steps or 0, parts)
         else:
-            self._episodes = Episodes(scenario, agent, action, words, max_steps or 0)
+            self._episodes = Episodes(scenario, agent, action, words, max_steps or 0, parts)
             if _process != [os.getpid()]:
                 _here.clear()
                 _process[:] = [os.getpid()]
@@ -96,9 +107,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._episodes.step_length_s))}
         self._steps, self._is_copy = -1, False
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.generic], dict[str, object]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, object]]:
         """Begin an episode.
 
         Args:
@@ -120,7 +129,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         self._steps = 0
         return self._episodes.reset(drawn, arguments)
 
-    def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, bool, dict[str, object]]:
+    def step(self, action: object) -> tuple[Any, float, bool, bool, dict[str, object]]:
         """Advance one control step.
 
         Raises:
@@ -191,6 +200,11 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         self._episodes.close()
         if isinstance(self._episodes, Episodes):
             _here.discard(self._episodes)
+
+
+def _words_in(text: str) -> tuple[str, ...]:
+    """Return the words of a text that are separated by commas."""
+    return tuple(filter(None, (word.strip() for word in text.split(","))))
 
 
 def _arguments_in(options: object) -> dict[str, Any]:

@@ -145,6 +145,9 @@ def _time(name: str, meaning: str) -> Column:
     return Column(name, "s", 0.0, _TIME_S, meaning)
 
 
+REACH_M = 120.0
+"""Largest distance at which a part shows actors, because scenes contain the actors within 150 m at least."""
+
 KINEMATICS = "kinematics"
 """The word for the default observation, which is no `Dict` of parts."""
 
@@ -210,7 +213,7 @@ PARTS: Mapping[str, Part] = {
             ),
             settings=(
                 Setting("rows", 32, 1, 1000, "", "number of rows"),
-                Setting("radius", 100.0, 1.0, 150.0, "m", "largest distance of the centres"),
+                Setting("radius", 100.0, 1.0, REACH_M, "m", "largest distance of the centres"),
             ),
             measured=("x", "y", "vx", "vy", "acceleration", "length", "width", "ahead", "lane_offset"),
         ),
@@ -316,7 +319,7 @@ PARTS: Mapping[str, Part] = {
             settings=(
                 Setting("rows", 32, 1, 1000, "", "number of rows"),
                 Setting("steps", 30, 1, 1000, "", "number of times, the first one interval from now"),
-                Setting("radius", 100.0, 1.0, 150.0, "m", "largest distance of the centres"),
+                Setting("radius", 100.0, 1.0, REACH_M, "m", "largest distance of the centres"),
                 Setting("interval", 0.1, 0.01, 10.0, "s", "time between two positions"),
             ),
             measured=("x", "y", "speed"),
@@ -326,10 +329,10 @@ PARTS: Mapping[str, Part] = {
             meaning="distances from the centre of the controlled vehicle to the nearest outline, for directions "
             "counter-clockwise from its heading; ``range`` if no outline is nearer",
             axes=("rays",),
-            values=Column("distance", "m", 0.0, 150.0, "distance along the ray"),
+            values=Column("distance", "m", 0.0, REACH_M, "distance along the ray"),
             settings=(
                 Setting("rays", 360, 1, 10_000, "", "number of rays, evenly distributed over the full circle"),
-                Setting("range", 100.0, 1.0, 150.0, "m", "largest distance"),
+                Setting("range", 100.0, 1.0, REACH_M, "m", "largest distance"),
             ),
             measured=("distance",),
         ),
@@ -466,6 +469,7 @@ class ObservationLayout:
 
     Attributes:
         parts: The parts by name, in the order of the recorded array.
+        reach_m: Largest distance at which a part shows actors.
         columns: The index of every column, by part and name of the column.
         space: The space of the agent's observation.
         flat_space: The space of the recorded array.
@@ -475,6 +479,7 @@ class ObservationLayout:
         import numpy as np
         from gymnasium import spaces
 
+        self.reach_m = max((one.settings.get(name, 0.0) for one in parts for name in ("radius", "range")), default=0.0)
         self.parts = {one.part.name: one for one in sorted(parts, key=lambda one: one.part.name)}
         self.columns: dict[str, dict[str, int]] = {
             name: {column.name: index for index, column in enumerate(one.part.columns)}

@@ -34,10 +34,12 @@ class ObservedParts:
 
     Attributes:
         layouts: The layout of each such agent's observation.
+        reach_m: Largest distance at which a part shows actors, in m; 0 if no part shows actors.
     """
 
     def __init__(self, setups: Mapping[str, AgentSetup], step_length_s: float) -> None:
         self.layouts = layouts_of(setups, READERS)
+        self.reach_m = max((layout.reach_m for layout in self.layouts.values()), default=0.0)
         self._step_length_s = step_length_s
         self._network = RoadNetwork()
         self._readers: dict[str, dict[str, Reader]] = {}

@@ -32,6 +32,8 @@ With steps above 0.1 s, a look around happens every second. Every 10th scene con
 reading a string per vehicle is expensive."""
 
 _LOOK_AROUND_S = 1.0  # at a closing speed of 75 m/s, two vehicles approach by half of `SIGHT_M` in this time
+_MAX_CLOSING_SPEED_MPS = 75.0
+_CENTER_OFFSETS_M = 20.0  # by which two centres are nearer than the front bumpers, at which looks around measure
 _SIGHT_SQUARED = SIGHT_M**2
 _RAD_PER_DEGREE = math.pi / 180.0
 _HEIGHT_EVERY_M = 20.0  # distance between the points of a lane at which heights are read
@@ -54,6 +56,7 @@ class Sight:
         lateral: Whether vehicles may leave the centre line of a lane.
         speeds: Speeds in m/s of moved persons, by SUMO id, because SUMO reports 0 for them.
         core: The compiled core, which reads faster; None if it is not available.
+        reach_m: Distance within which each scene must contain all actors, in m; 0 for the usual distance.
 
     Attributes:
         leaving: SUMO ids of persons that SUMO still has, but that scenes must hide.
@@ -67,11 +70,15 @@ class Sight:
         lateral: bool,
         speeds: dict[str, float],
         core: Core | None = None,
+        reach_m: float = 0.0,
     ) -> None:
         self.core = core
         self._controlled = tuple(controlled)
         self._eyes: Vehicles | None = core.Vehicles(self._controlled, [], [], []) if core is not None else None
         self._every = max(1, min(LOOK_AROUND_INTERVAL_STEPS, round(_LOOK_AROUND_S / step_length_s)))
+        if reach_m:
+            before_it_enters_s = (SIGHT_M - _CENTER_OFFSETS_M - reach_m) / _MAX_CLOSING_SPEED_MPS
+            self._every = max(1, min(self._every, int(before_it_enters_s / step_length_s)))
         self._speeds = speeds
         self.leaving: set[str] = set()
         self._high: bool | None = None

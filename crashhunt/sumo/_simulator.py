@@ -47,7 +47,7 @@ from crashhunt.sumo._traffic_events import SumoEvents
 from crashhunt.world import PERSON, Lane, is_person
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     import numpy as np
@@ -114,6 +114,7 @@ class SumoSimulator:
             lateral=self._lateral,
             speeds=self._disturbances.speeds,
             core=core,
+            reach_m=self._parts.reach_m,
         )
         self._notices: list[str] = []
         self._demand = OmittedDemand(scenario)
@@ -267,7 +268,7 @@ class SumoSimulator:
             terminations |= dict.fromkeys(hit.union(self._off_road).intersection(actions), True)
         if True in terminations.values():
             self.agents = [agent for agent in self.agents if not terminations.get(agent, False)]
-        return observations, rewards, terminations, dict.fromkeys(actions, False), {agent: {} for agent in actions}
+        return observations, rewards, terminations, dict.fromkeys(actions, False), self._infos(actions)
 
     def scene(self) -> Scene:
         """Return the state of the vehicles in sight."""
@@ -388,6 +389,11 @@ class SumoSimulator:
             instead_of={"actions": self.actions, **own},
         )
 
+    def _infos(self, agents: Iterable[str]) -> dict[str, Info]:
+        """Return the info of each agent: the identifiers of the actors in the rows of ``actors``, if it has them."""
+        found = {agent: self._parts.identifiers(agent) for agent in agents}
+        return {agent: {} if names is None else {"actors": names} for agent, names in found.items()}
+
     def _arrive(self, present: PresentVehicles) -> None:
         """Set the simulator to the state of the core."""
         self._scene, self._shown, self._steps = present
@@ -409,6 +415,10 @@ class SumoSimulator:
     def restore_observation(self, agent: str, array: NDArray[np.generic]) -> object:
         """Return the parts that an agent observes, from their recorded array."""
         return self.observation_layouts[agent].restore(array)
+
+    def identifiers(self, agent: str) -> tuple[str, ...] | None:
+        """Return the identifiers of the actors in the rows of ``actors``; None if the agent does not observe them."""
+        return self._parts.identifiers(agent)
 
     def _blank(self, agent: str) -> NDArray[np.generic]:
         layout = self.observation_layouts.get(agent)

@@ -57,7 +57,7 @@ def test_copy_of_a_scenario_is_refused_with_the_fix(shell):
 
 def test_list_without_a_kind_names_the_entries_of_every_kind(shell):
     found = shell.crashhunt("list", "--json").json
-    assert [*found] == ["agents", "disturbances", "oracles", "scenarios"]
+    assert [*found] == ["agents", "disturbances", "observations", "oracles", "scenarios"]
     *lines, more = shell.crashhunt("list").out.splitlines()
     assert lines == [f"{kind}: {', '.join(entry['name'] for entry in entries)}" for kind, entries in found.items()]
     assert "crashhunt list agents" in more
@@ -66,7 +66,9 @@ def test_list_without_a_kind_names_the_entries_of_every_kind(shell):
 @pytest.mark.parametrize("kind", ["agents", "disturbances", "oracles", "scenarios"])
 def test_commands_of_earlier_versions_are_aliases_of_list(shell, kind):
     assert shell.crashhunt(kind, "--json").json == shell.crashhunt("list", kind, "--json").json
-    assert f"  {kind} " not in shell.crashhunt("--help").out
+    lines = shell.crashhunt("--help").out.splitlines()
+    indented = next(line for line in lines if line.split()[:1] == ["list"]).partition("list")[0]
+    assert not any(line.startswith(f"{indented}{kind} ") for line in lines)
 
 
 def test_list_refuses_an_unknown_kind_and_the_copy_of_anything_but_a_scenario(shell):

@@ -92,7 +92,7 @@ def parts(monkeypatch, tmp_path):
     )
     notes.simulator = SimpleNamespace(
         actions={"ego": form, "other": other}, observation_spaces={"ego": "observations", "other": "others"},
-        step_length_s=0.5, agents=["ego", "other"], why_no_reseeding="", lanes=lambda: "lanes",
+        observation_layouts={}, step_length_s=0.5, agents=["ego", "other"], why_no_reseeding="", lanes=lambda: "lanes",
         close=lambda: setattr(notes, "simulator_closed", notes.simulator_closed + 1),
     )  # fmt: skip
     sampler = SimpleNamespace(draw=lambda seed, steps: notes.drawn.append((seed, steps)) or ("drawn",))
@@ -489,10 +489,10 @@ def test_environment_passes_on_what_it_is_given(environments):
     here, remote = environments
     env = SumoEnv(Path("toy"), agent="ego", action="meta", max_steps=4, disturb=" brake=1 ,,stop=2 ")
     assert isinstance(env._episodes, here)
-    assert env._episodes.words == (Path("toy"), "ego", "meta", ("brake=1", "stop=2"), 4)
+    assert env._episodes.words == (Path("toy"), "ego", "meta", ("brake=1", "stop=2"), 4, ())
     other = SumoEnv(Path("toy"))
     assert isinstance(other._episodes, remote)  # the first one has this process's simulation
-    assert other._episodes.words == ("toy", "", "", (), 0)
+    assert other._episodes.words == ("toy", "", "", (), 0, ())
     assert isinstance(SumoEnv(process=False)._episodes, here)
     assert isinstance(SumoEnv(process=True)._episodes, remote)
     assert (env.agent, env.observation_space, env.action_space, env.render_mode) == ("ego", "observations", "actions",

@@ -5,8 +5,10 @@ from __future__ import annotations
 import weakref
 from types import SimpleNamespace
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 from crashhunt.envs import SumoEnv
 from crashhunt.errors import ActionError, ArgumentError, SimulatorError, UsageError
@@ -170,7 +172,7 @@ def test_only_the_first_environment_of_a_process_has_its_simulation(make, monkey
     monkeypatch.setattr("crashhunt.envs._sumo_env.RemoteEpisodes", lambda *words: asked.append(words) or Ended())
     first = SumoEnv("loop")
     assert SumoEnv("loop", action="meta", disturb="brake=1, stop=2,", max_steps=5).agent == "of another process"
-    assert asked == [("loop", "", "meta", ("brake=1", "stop=2"), 5)]
+    assert asked == [("loop", "", "meta", ("brake=1", "stop=2"), 5, ())]
     first.close()
     first.close()
     third = SumoEnv("loop")
@@ -235,3 +237,21 @@ def test_copies_get_a_seed_each_and_count_their_own_steps(monkeypatch):
     env.reset(seed=2)
     with pytest.raises(UsageError, match="n is 0; give the number of copies"):
         env.branch(0)
+
+
+def test_environment_with_parts_passes_the_checker_of_gymnasium_and_names_the_actors():
+    env = gymnasium.make(
+        "crashhunt:crashhunt/SUMO-v0", scenario="intersection", observation="ego, actors:rows=4", max_steps=20
+    )
+    try:
+        check_env(env.unwrapped, skip_render_check=True)
+        observation, info = env.reset(seed=3)
+        assert observation["actors"].shape == (4, 15)
+        assert len(info["actors"]) == observation["actors"][:, 0].sum()
+        assert env.observation_space.contains(observation)
+    finally:
+        env.close()
+    with pytest.raises(UsageError, match="observation: 'eggo' is not a part of observations; did you mean 'ego'"):
+        gymnasium.make("crashhunt:crashhunt/SUMO-v0", observation=["eggo"])
+    with pytest.raises(UsageError, match="give the names of parts as text"):
+        gymnasium.make("crashhunt:crashhunt/SUMO-v0", observation=[3])

@@ -24,6 +24,7 @@ from crashhunt.plans import (
 )  # fmt: skip
 from crashhunt.plans._plan import Owners, Takes, agent_of, takes_of
 from crashhunt.plans._settings import executor_of, parallel_here, sizes_itself
+from crashhunt.scenario import copy_shipped_scenario
 
 EXECUTORS = """
 class Cluster:
@@ -199,6 +200,38 @@ def test_what_cannot_be_resolved_is_refused(folder, options, says):
     with pytest.raises((ArgumentError, UsageError, ScenarioError)) as refused:
         plan(asked(**options))
     assert says in str(refused.value)
+
+
+def test_parts_are_those_of_the_command_line_then_of_the_scenario_then_of_the_class(folder):
+    (folder / "drives.py").write_text(AGENT.replace("class Agent:", "class Agent:\n    observation = 'ego, actors'", 1))
+    copy_shipped_scenario("loop", folder / "town")
+    text = (folder / "town" / "scenario.toml").read_text()
+
+    def parts(observe=(), scenario=()):
+        words = f"observation = {list(scenario)}" if scenario else ""
+        (folder / "town" / "scenario.toml").write_text(text.replace("[agents.ego]", f"[agents.ego]\n{words}"))
+        request = Request(
+            trials=3, max_steps=9, scenario="town", seed=1, agents={"ego": "drives:Agent"}, observe=observe,
+            scenario_arguments={}, arguments={"speed": "3"},
+        )  # fmt: skip
+        made, settings = plan(request)
+        assert made.agents["ego"].observation == settings.agents["ego"].observation
+        return settings.agents["ego"].observation
+
+    assert parts() == ("ego", "actors")
+    assert parts(scenario=["ego"]) == ("ego",)
+    assert parts(observe=["actors:rows=3"], scenario=["ego"]) == ("actors:rows=3",)
+    assert parts(observe=["kinematics"]) == ("kinematics",)
+    for words, where in (({"observe": ["eg"]}, "--observe"), ({"scenario": ["eg"]}, "agents.ego.observation")):
+        with pytest.raises(UsageError) as refused:
+            parts(**words)
+        assert str(refused.value).startswith(f"{where}: 'eg' is not a part of observations; did you mean 'ego'?")
+
+
+@pytest.mark.parametrize("text", ["None", "3", "property(lambda self: 1)", "()", "[1]"])
+def test_attribute_observation_that_names_no_parts_is_not_meant(folder, text):
+    (folder / "drives.py").write_text(AGENT.replace("class Agent:", f"class Agent:\n    observation = {text}", 1))
+    assert plan(asked())[1].agents["ego"].observation is None
 
 
 def test_disturbances_are_those_that_are_asked_for_or_those_of_the_scenario(folder):

@@ -1,0 +1,187 @@
+"""Parts of observations on SUMO, compared with libsumo's own getters and with finite differences of positions."""
+
+from __future__ import annotations
+
+import math
+from contextlib import closing
+from dataclasses import replace
+
+import libsumo
+import numpy as np
+import pytest
+
+from crashhunt.scenario import argument_values, load_scenario
+from crashhunt.simulators import PARTS
+from crashhunt.sumo import SumoSimulator
+from crashhunt.sumo._observing import READERS
+from crashhunt.trial import Disturbance
+
+STEPS = 90
+
+
+def simulator_of(name, stage, *parts, **changes):
+    """A simulator whose agents observe parts."""
+    scenario = load_scenario(name)
+    agents = {agent: replace(setup, observation=parts, action="continuous") for agent, setup in scenario.agents.items()}
+    stage.mkdir(exist_ok=True)
+    return SumoSimulator(replace(scenario, agents=agents, **changes), stage)
+
+
+def episode(simulator, seed, steps, speed=11.0, change=0):
+    """Yield the observation of the first agent after each step, and the agent."""
+    values = argument_values(simulator._scenario)
+    observations, _ = simulator.reset(seed=seed, options={"arguments": values})
+    agent = simulator.agents[0]
+    yield simulator.restore_observation(agent, observations[agent])
+    for step in range(steps):
+        actions = {one: simulator.actions[one].encode((speed, change if step == 20 else 0)) for one in simulator.agents}
+        if agent not in actions:
+            return
+        observations, *_ = simulator.step(actions)
+        if agent not in simulator.scene().roster.index:
+            return
+        yield simulator.restore_observation(agent, observations[agent])
+
+
+def center(vehicle):
+    """The centre of a vehicle's rectangle, from libsumo."""
+    x, y = libsumo.vehicle.getPosition(vehicle)
+    angle, length = math.radians(90.0 - libsumo.vehicle.getAngle(vehicle)), libsumo.vehicle.getLength(vehicle)
+    return np.array((x - length / 2 * math.cos(angle), y - length / 2 * math.sin(angle)))
+
+
+def test_sumo_has_a_reader_for_each_of_its_parts():
+    from crashhunt.sumo import BACKEND
+
+    assert set(BACKEND.observations) == set(READERS) <= set(PARTS)
+
+
+@pytest.mark.parametrize(("name", "speed"), [("loop", 9.0), ("intersection", 13.0), ("merge", 13.0), ("motorway", 9.0)])
+def test_ego_and_actors_are_what_libsumo_reports(name, speed, tmp_path):
+    with closing(simulator_of(name, tmp_path / "stage", "ego", "actors:rows=60:radius=90")) as simulator:
+        ego, actors = (
+            {column.name: index for index, column in enumerate(PARTS[part].columns)} for part in ("ego", "actors")
+        )
+        previous, leaders, seen = None, 0, 0
+        start = time = None
+        for shown in episode(simulator, 7, STEPS, speed=speed, change=name == "motorway"):
+            agent = next(iter(simulator.observation_layouts))
+            assert simulator.observation_layouts[agent].space.contains(shown)
+            own = {column: shown["ego"][index] for column, index in ego.items()}
+            place = np.array((own["x"], own["y"]))
+            assert place == pytest.approx(center(agent), abs=1e-9)
+            getters = libsumo.vehicle
+            if start is None:
+                start, time = getters.getDistance(agent), libsumo.simulation.getTime()
+            assert own["speed"] == getters.getSpeed(agent)
+            assert own["acceleration"] == getters.getAcceleration(agent)
+            assert (own["length"], own["width"]) == (getters.getLength(agent), getters.getWidth(agent))
+            assert own["lane_index"] == getters.getLaneIndex(agent)
+            assert own["lane_offset"] == getters.getLateralLanePosition(agent)
+            assert own["distance"] == getters.getDistance(agent) - start
+            assert own["time"] == libsumo.simulation.getTime() - time
+            turned = math.radians(90.0 - getters.getAngle(agent)) - own["heading"]
+            assert math.cos(turned) == pytest.approx(1.0)
+            assert -math.pi <= own["heading"] <= math.pi
+            others = [one for one in getters.getIDList() if one != agent]
+            away = {one: float(np.hypot(*(center(one) - place))) for one in others}
+            near = sorted((distance, one) for one, distance in away.items() if distance <= 90.0)
+            rows = shown["actors"]
+            assert rows[: len(near), 0].all()
+            assert not rows[len(near) :].any()
+            ids = simulator.identifiers(agent)
+            assert [away[one] for one in ids] == pytest.approx([distance for distance, _ in near])
+            for row, one in zip(rows, ids, strict=False):
+                actor = {column: row[index] for column, index in actors.items()}
+                assert (actor["x"], actor["y"]) == pytest.approx(tuple(center(one)), abs=1e-9)
+                assert math.hypot(actor["vx"], actor["vy"]) == pytest.approx(getters.getSpeed(one))
+                assert actor["acceleration"] == getters.getAcceleration(one)
+                assert (actor["length"], actor["width"]) == (getters.getLength(one), getters.getWidth(one))
+                assert actor["lane_offset"] == getters.getLateralLanePosition(one)
+                signals = getters.getSignals(one)
+                assert actor["brake_light"] == bool(signals & 8)
+                assert actor["indicator"] == {0: 0.0, 1: -1.0, 2: 1.0}[signals & 3]
+                offset = center(one) - place
+                ahead = offset @ (math.cos(own["heading"]), math.sin(own["heading"]))
+                assert actor["ahead"] == pytest.approx(ahead)
+                seen += 1
+                if getters.getLaneID(one) == getters.getLaneID(agent):
+                    assert actor["same_lane"]
+                if previous is not None and one in previous:
+                    # The centre moves along the heading, apart from turns and from changes of lane, which are jumps.
+                    moved = (center(one) - previous[one]) / simulator.step_length_s
+                    if abs(actor["lane_offset"]) < 0.01 and np.hypot(*moved) < 40.0 and abs(moved[1] * moved[0]) < 1.0:
+                        assert (actor["vx"], actor["vy"]) == pytest.approx(tuple(moved), abs=1.1)
+            leader = getters.getLeader(agent, 60.0)
+            if leader is not None and leader[0] in ids:
+                row = rows[ids.index(leader[0])]
+                assert row[actors["same_lane"]]
+                assert row[actors["ahead"]] > 0
+                leaders += 1
+            previous = {one: center(one) for one in others}
+        assert seen > 50
+        assert leaders > 10
+
+
+def test_yaw_rate_and_steering_are_those_of_a_circle(tmp_path):
+    with closing(simulator_of("loop", tmp_path / "stage", "ego")) as simulator:
+        columns = simulator.observation_layouts["ego"].columns["ego"]
+        rows = np.array([shown["ego"] for shown in episode(simulator, 1, 250, speed=9.0)])
+    heading, yaw_rate, speed = (rows[:, columns[name]] for name in ("heading", "yaw_rate", "speed"))
+    turned = np.angle(np.exp(1j * np.diff(heading)))
+    assert yaw_rate[1:] == pytest.approx(turned / 0.1)
+    assert yaw_rate[0] == 0
+    assert abs(yaw_rate).max() > 0.05
+    # A bicycle with this wheelbase and this steering angle turns as the vehicle does.
+    wheelbase = 0.6 * rows[:, columns["length"]]
+    assert speed * np.tan(rows[:, columns["steering"]]) / wheelbase == pytest.approx(yaw_rate, abs=1e-9)
+
+
+def test_hidden_vehicle_is_not_among_the_actors(tmp_path):
+    with closing(simulator_of("loop", tmp_path / "stage", "actors")) as simulator:
+        values = argument_values(simulator._scenario)
+        simulator.reset(seed=1, options={"arguments": values})
+        one, *_ = simulator.identifiers("ego")
+        hidden = simulator.disturb(one, Disturbance(1, "ahead", "unseen", 1.0, 1.0, agent="ego"))
+        action = {"ego": simulator.actions["ego"].encode((10.0, 0))}
+        *_, infos = simulator.step(action)
+        assert one not in infos["ego"]["actors"]
+        hidden.end()
+        *_, infos = simulator.step(action)
+        assert one in infos["ego"]["actors"]
+
+
+def test_observation_of_a_vehicle_that_has_left_is_zero(tmp_path):
+    with closing(simulator_of("loop", tmp_path / "stage", "ego", "actors")) as simulator:
+        simulator.reset(seed=1, options={"arguments": argument_values(simulator._scenario)})
+        libsumo.vehicle.remove("ego")
+        observations, *_ = simulator.step({"ego": simulator.actions["ego"].encode((10.0, 0))})
+        assert not observations["ego"].any()
+        assert observations["ego"].shape == simulator.observation_spaces["ego"].shape
+
+
+def test_all_actors_within_the_radius_are_shown_in_every_step(tmp_path):
+    """Also those that approach fast between two looks around of the scene."""
+    with closing(simulator_of("motorway", tmp_path / "stage", "actors:rows=200:radius=120")) as simulator:
+        for shown in episode(simulator, 2, 60, speed=0.0):
+            place = center("ego")
+            near = {
+                one for one in libsumo.vehicle.getIDList() if one != "ego" and np.hypot(*(center(one) - place)) <= 120.0
+            }
+            assert set(simulator.identifiers("ego")) == near
+            assert shown["actors"][:, 0].sum() == len(near)
+
+
+def test_default_observation_keeps_its_fast_path_and_other_agents_keep_theirs(tmp_path):
+    scenario = load_scenario("loop-two-agents")
+    first, second = scenario.agents
+    agents = {**scenario.agents, first: replace(scenario.agents[first], observation=("ego",))}
+    (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
+    values = argument_values(scenario)
+    with closing(SumoSimulator(scenario, tmp_path / "a")) as plain:
+        before, _ = plain.reset(seed=3, options={"arguments": values})
+    with closing(SumoSimulator(replace(scenario, agents=agents), tmp_path / "b")) as simulator:
+        after, _ = simulator.reset(seed=3, options={"arguments": values})
+        assert after[second].tobytes() == before[second].tobytes()
+        assert set(simulator.restore_observation(first, after[first])) == {"ego"}
+        assert set(simulator.shown_spaces) == {first}
