@@ -26,7 +26,7 @@ from crashhunt.base.errors import ArgumentError, ProgramError
 from crashhunt.base.processes import descendants_of, kill
 from crashhunt.base.programs import command_of, words_of
 from crashhunt.base.text import one_line
-from crashhunt.simulators import FlattensObservations, NamesMetaActions, NamesObservations
+from crashhunt.simulators import FlattensObservations, NamesMetaActions, NamesObservations, ObservesParts
 from crashhunt.trial import Argument, Signature, kind_of, parse_spec
 
 if TYPE_CHECKING:
@@ -370,8 +370,11 @@ def _hello(agent: str, simulator: Simulator | None, arguments: Mapping[str, Valu
     if simulator is not None:
         shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
         names = simulator.observation_names if supports(simulator, NamesObservations) else ()
+        layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
         described = {
-            "observation": _described_observation(shown.get(agent) or simulator.observation_spaces[agent], names),
+            "observation": layouts[agent].describe()
+            if agent in layouts
+            else _described_observation(shown.get(agent) or simulator.observation_spaces[agent], names),
             "action": _described_action(simulator.actions[agent]),
             "step_length_s": simulator.step_length_s,
         }
