@@ -23,6 +23,7 @@ from crashhunt.disturbances import ModelApart, disturber_of, locate_model, parse
 from crashhunt.native import HOW_TO_REBUILD, outdated_modules
 from crashhunt.oracles import ORACLES_OF_ACTORS, chosen_oracles, oracle_name, outcomes_brought
 from crashhunt.plans._chosen_actions import chosen_actions, notes_on_actions
+from crashhunt.plans._chosen_observations import chosen_observations
 from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code
 from crashhunt.plans._run_options import TrialOptions
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
@@ -36,7 +37,6 @@ from crashhunt.scenario import (
     with_action,
     with_observations,
 )
-from crashhunt.simulators import parse_parts
 from crashhunt.trial import (
     CRASHES,
     EVENTS,
@@ -326,7 +326,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     crash_on, limits = parse_crash_on(request.crash_on, brought)
     if crash_on == CRASHES:  # the default
         crash_on += tuple(outcome for outcome in brought if outcome not in crash_on)
-    observations = _observations(request, scenario, signatures)
+    observations = chosen_observations(request.observe, scenario, signatures)
     options = {name: getattr(request, name) for name in fields_of(TrialOptions)}
     options |= {
         "seed": request.seed if request.seed is not None else secrets.randbits(32),
@@ -418,26 +418,6 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
     observations = {agent: chosen.observation for agent, chosen in settings.agents.items() if chosen.observation}
     scenario = with_observations(scenario, observations) if scenario.backend.observations else scenario
     return scenario.with_agents({agent: chosen.agent for agent, chosen in settings.agents.items()})
-
-
-def _observations(
-    request: Request, scenario: Scenario, signatures: Mapping[str, Signature]
-) -> dict[str, tuple[str, ...]]:
-    """Return the parts that each agent observes: as the command line, the scenario or the agent's class names them.
-
-    Raises:
-        UsageError: a part does not exist, or the simulator does not have it.
-    """
-    found = {}
-    for agent, setup in scenario.agents.items():
-        asked, declared = request.observe, signatures[agent].observation
-        words, where = asked or setup.observation or declared, "--observe"
-        if not asked:
-            where = f"agents.{agent}.observation" if setup.observation else f"observation of {setup.agent}"
-        if words:
-            parse_parts(words, scenario.backend.observations, where=where)
-            found[agent] = tuple(words)
-    return found
 
 
 def _agents_in(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:

@@ -47,7 +47,7 @@ class Column(NamedTuple):
     @property
     def range(self) -> str:
         """The range as text; empty if its bounds are only those that no simulation reaches."""
-        return f"{self.low:g}:{self.high:g}" if self.high <= _LARGEST_SHOWN else ""
+        return f"{self.low:.3g}:{self.high:.3g}" if self.high <= _LARGEST_SHOWN else ""
 
 
 class Setting(NamedTuple):

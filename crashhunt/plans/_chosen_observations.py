@@ -1,0 +1,41 @@
+"""Chooses the parts that each agent observes: the command line, the scenario or the agent's class names them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from crashhunt.simulators import parse_parts
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from crashhunt.scenario import Scenario
+    from crashhunt.trial import Signature
+
+
+def chosen_observations(
+    asked: Sequence[str], scenario: Scenario, signatures: Mapping[str, Signature]
+) -> dict[str, tuple[str, ...]]:
+    """Return the parts of each agent for which the command line, the scenario or the agent's class names parts.
+
+    The command line takes precedence over the scenario, and the scenario over the class.
+
+    Args:
+        asked: value of ``--observe``; may be empty.
+        scenario: scenario with its agents.
+        signatures: signature of each agent.
+
+    Raises:
+        UsageError: a part does not exist, or the simulator does not have it.
+    """
+    found = {}
+    for agent, setup in scenario.agents.items():
+        words, where = tuple(asked), "--observe"
+        if not words and setup.observation:
+            words, where = setup.observation, f"agents.{agent}.observation"
+        elif not words:
+            words, where = signatures[agent].observation, f"observation of {setup.agent}"
+        if words:
+            parse_parts(words, scenario.backend.observations, where=where)
+            found[agent] = words
+    return found
