@@ -1,7 +1,8 @@
 """Builds the compiled parts into wheels and editable installations, where that can be done; crashhunt goes without.
 
-They are the compiled core, the kernel for highway-env, and the library that fixes the order of SUMO's links.
-CRASHHUNT_CORE=0 leaves all out; CRASHHUNT_CORE=1, for the wheels of a release, fails where one of them cannot be built.
+They are the compiled core, the kernel for highway-env, the library that fixes the order of SUMO's links, and the
+library that writes the native stack of a dying trial. CRASHHUNT_CORE=0 leaves all out; CRASHHUNT_CORE=1, for the wheels
+of a release, fails where one of them cannot be built.
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ FLAGS = ("-std=c++17", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-c
          "-fno-builtin-sin", "-fno-builtin-cos", "-Wall", "-Wextra")  # fmt: skip
 INTERFACE = re.compile(r"^_INTERFACE = (\d+)$", re.MULTILINE)
 LINK_ORDER = "_crashhunt_link_order.so"  # a library, not a module, and so of any version of Python
+NATIVE_STACK = "_crashhunt_native_stack.so"
 
 
 class CoreHook(BuildHookInterface):  # type: ignore[type-arg]  # older ones take none
-    """Adds the modules ``_crashhunt_core`` and ``_crashhunt_highway`` and the library ``_crashhunt_link_order``."""
+    """Adds the modules ``_crashhunt_core`` and ``_crashhunt_highway`` and two libraries."""
 
     PLUGIN_NAME = "custom"
 
@@ -42,6 +44,7 @@ class CoreHook(BuildHookInterface):  # type: ignore[type-arg]  # older ones take
             ("compiled core", build),
             ("kernel for highway-env", build_kernel),
             ("fixed order of SUMO's links", build_link_order),
+            ("native stacks of dying trials", build_native_stack),
         )
         for what, compile_part in parts:
             try:
@@ -94,6 +97,11 @@ def build_link_order(root: Path, folder: Path) -> Path:
         subprocess.SubprocessError: it fails.
     """
     return _compile(root / "crashhunt" / "native", "link_order.cpp", "_link_order.py", folder / LINK_ORDER)
+
+
+def build_native_stack(root: Path, folder: Path) -> Path:
+    """Compile the library that writes native stacks into a folder; return the file. Raises as `build_link_order`."""
+    return _compile(root / "crashhunt" / "executors", "native_stack.cpp", "_native_stack.py", folder / NATIVE_STACK)
 
 
 def _compile(folder: Path, source: str, interface: str, built: Path) -> Path:

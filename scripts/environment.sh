@@ -19,7 +19,7 @@ find_python() {
 environment() {
     extra=$1
     wanted=$(cat "$root/pyproject.toml" "$root/scripts/build_core.py" "$root"/crashhunt/native/{_build_id.py,_core.py,_link_order.py,*.?pp} \
-        "$root"/crashhunt/highway/accelerator/{_kernel.py,*.?pp} | cksum)
+        "$root"/crashhunt/highway/accelerator/{_kernel.py,*.?pp} "$root"/crashhunt/executors/{_native_stack.py,*.?pp} | cksum)
     # A development environment serves users too.
     for have in dev "$extra"; do
         if [ "$(cat "$venv/made-for-${have:-users}" 2>/dev/null)" = "$wanted" ]; then return; fi

@@ -19,6 +19,7 @@ from crashhunt.base.errors import CrashhuntError, InternalError
 from crashhunt.base.exceptions import is_users
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import scratch_of
+from crashhunt.executors._native_stack import split_native_calls
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, Tag, digest_of, read_black_box, read_header
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, in_effect
 from crashhunt.world import ClosestApproach, DangerMeter, DrivenMeter, Lane, closest_approach, join_frames
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 
 _TAIL_BYTES = 4000  # bytes
+_MAX_NATIVE_BYTES = 1 << 16
 _FRAME_LINE = re.compile(r'  File "(.*)", line (\d+) in (.*)')  # of a stack that faulthandler wrote
 _MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside
 
@@ -172,7 +174,7 @@ def _result(
 ) -> TrialResult:
     folder = scratch_of(scratch, spec.number)
     output = read_tail(folder / layout.RUN_LOG)
-    stack = read_tail(folder / layout.STACK)
+    stack = _read_stack(folder / layout.STACK)
     steps, sim_time_s, digest, closest = 0, 0.0, "", ClosestApproach()
     danger: float | None = None
     driven = DrivenMeter((), 1.0)
@@ -292,6 +294,17 @@ def read_tail(path: Path) -> str:
             return file.read().decode("utf-8", "replace")
     except OSError:
         return ""
+
+
+def _read_stack(path: Path) -> str:
+    """Return the stack of a dead process; after the native calls, if there are any, only the end of the rest."""
+    try:
+        with path.open("rb") as file:
+            text = file.read(_MAX_NATIVE_BYTES).decode("utf-8", "replace")
+    except OSError:
+        return ""
+    native, rest = split_native_calls(text)
+    return f"{native}{rest[-_TAIL_BYTES:]}" if native else read_tail(path)
 
 
 def signal_name(exit_code: int) -> str:

@@ -21,6 +21,7 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
 from crashhunt.base.exceptions import is_users
 from crashhunt.base.forks import copying, watchdog
+from crashhunt.base.libraries import is_library
 from crashhunt.base.opened_files import OpenedFiles
 from crashhunt.base.shared_state import SharedState
 from crashhunt.base.signals import block_signals
@@ -43,6 +44,7 @@ from crashhunt.episode import (
     ready_recorder,
     run_episode,
 )
+from crashhunt.executors._native_stack import record_native_stack
 from crashhunt.executors._postmortem import encode_report
 from crashhunt.recording import BlackBox
 from crashhunt.simulators import (
@@ -271,6 +273,8 @@ class TrialProcess:
         _close(stack)
         faulthandler.enable(self._stack)
         faulthandler.register(signal.SIGUSR1, self._stack)
+        if any(is_library(setup.agent) for setup in self._settings.scenario.agents.values()):
+            record_native_stack(self._stack.fileno())
 
     def _report(self, result: TrialResult, simulator: Simulator, job: Job) -> Report:
         settings = self._settings

@@ -19,6 +19,7 @@ _MODULES: Final = {
     "_crashhunt_core": "native",
     "_crashhunt_link_order": "native",
     "_crashhunt_highway": "highway/accelerator",
+    "_crashhunt_native_stack": "executors",
 }
 """Compiled module to the folder of its sources in crashhunt."""
 

@@ -354,7 +354,9 @@ class Story:
                 facts = ", ".join(f"{name} {value:.3g}" for name, value in channel.values_by_name(seen).items())
             sentences.append(f"Its last observation, in step {last.step}: {facts}.")
         frames = [line.strip() for line in failure.traceback.splitlines() if line.strip()]
-        if frames:
+        if frames and failure.kind in ("signal", "timeout"):  # the most recent call comes first
+            sentences += ["", *[frame for frame in frames if frame.startswith("File")][:6]]
+        elif frames:
             sentences += ["", *frames[-6:]]
         return sentences
 

@@ -7,6 +7,7 @@ import re
 import shutil
 import sqlite3
 import subprocess
+from importlib.util import find_spec
 from typing import ClassVar
 
 import numpy as np
@@ -271,6 +272,10 @@ def test_harm_has_the_right_outcome_and_names_the_agent(toy, harm, words, outcom
     result = hunted(toy, harm, *words)
     assert (result["outcome"], result["failure"]["agent"]) == (outcome, "ego")
     assert result["failure"]["message"].startswith(message)
+    if harm == "SIGSEGV" and find_spec("_crashhunt_native_stack") and shutil.which("addr2line"):
+        assert re.search(
+            r'libplanner.so.c", line \d+ in harm\n.*line \d+ in crashhunt_act\n', result["failure"]["traceback"]
+        )
 
 
 def test_a_replay_runs_the_saved_library_and_says_when_the_one_of_today_differs(toy):

@@ -41,10 +41,10 @@ def built(hook, version="standard"):
 @pytest.mark.parametrize(("version", "where"), [("standard", "force_include"), ("editable", "force_include_editable")])
 def test_it_goes_next_to_the_package(hook, version, where):
     data = built(hook, version)
-    core, kernel, link_order = data[where].values()
+    core, kernel, link_order, native_stack = data[where].values()
     assert core.startswith("_crashhunt_core.cpython-")
     assert kernel.startswith("_crashhunt_highway.cpython-")
-    assert link_order == "_crashhunt_link_order.so"
+    assert (link_order, native_stack) == ("_crashhunt_link_order.so", "_crashhunt_native_stack.so")
     assert (data["pure_python"], data["infer_tag"]) == (False, True)
 
 
@@ -55,6 +55,7 @@ def test_without_a_compiler_that_works_it_is_excluded(hook, monkeypatch, compile
     assert "goes without its compiled core" in hook.app.warnings[0]
     assert "goes without its kernel for highway-env" in hook.app.warnings[1]
     assert "goes without its fixed order of SUMO's links" in hook.app.warnings[2]
+    assert "goes without its native stacks of dying trials" in hook.app.warnings[3]
     monkeypatch.setenv("CRASHHUNT_CORE", "1")
     with pytest.raises((OSError, subprocess.SubprocessError)):
         built(hook)
@@ -66,7 +67,7 @@ def test_without_a_compiler_at_all_and_elsewhere_it_is_excluded(hook, monkeypatc
     assert built(hook)["pure_python"]
     monkeypatch.setattr(sys, "platform", "darwin")
     assert built(hook)["pure_python"]
-    assert "for CPython on Linux" in hook.app.warnings[3]
+    assert "for CPython on Linux" in hook.app.warnings[4]
 
 
 def test_it_can_be_excluded(hook, monkeypatch):
