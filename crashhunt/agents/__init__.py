@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         DrawsPanels as DrawsPanels,
         NeedsLibraries as NeedsLibraries,
     )
+    from ._reference_driver import ReferenceDriver as ReferenceDriver
     from ._reference_models import (
         GRAVITY_MPS2 as GRAVITY_MPS2,
         REFERENCE_MODELS as REFERENCE_MODELS,

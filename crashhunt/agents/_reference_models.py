@@ -40,6 +40,7 @@ BRAKING_JERK_MPS3 = 12.65
 REACTION_S = 0.75
 """Time from the end of the perception of a risk to the beginning of the deceleration. Source: R157, table 1."""
 _STEP_TOLERANCE = 1e-9  # of a step: a time that is a whole number of steps is not rounded up
+_SLOWING_MPS2 = 0.5  # a smaller deceleration of the vehicle ahead is not noticed
 _TIE_M = 1e-9  # rounding errors of lateral gaps are smaller
 
 
@@ -172,6 +173,15 @@ class CarefulHuman(_Model):
 
         TTC = gap / closing speed
 
+    R157 does not say when the driver reacts to a slower vehicle that is in the path already. It is perceived as a
+    risk if the time gap is at most `headway_s`, which is the boundary of the deceleration scenario, or `early_s` before
+    the last moment at which braking with `max_brake` equals the speeds in time:
+
+        gap <= headway_s · own speed, or gap <= early_s · closing speed + closing speed² / (2 · max_brake)
+
+    The driver brakes while the other vehicle is slower or slows down, and does not need another reaction time while the
+    time gap is at most `headway_s`.
+
     Args:
         count: number of situations.
         step_length_s: time from one step to the next, in s.
@@ -181,6 +191,8 @@ class CarefulHuman(_Model):
         lift: deceleration while the driver moves the foot, in m/s². Source: an assumption of the comparison.
         ttc_s: greatest TTC of a risk, in s. Source: R157, data sheets of cut-in.
         headway_s: time gap to a vehicle ahead, in s. Source: R157, data sheets of cut-out and deceleration.
+        early_s: time between the perception of a slower vehicle in the path and the last moment to brake, in s. Source:
+            ours, equal to the TTC of a risk.
     """
 
     def __init__(
@@ -194,11 +206,13 @@ class CarefulHuman(_Model):
         lift: float = 0.4,
         ttc_s: float = 2.0,
         headway_s: float = 2.0,
+        early_s: float = 2.0,
     ) -> None:
         super().__init__(count, step_length_s, reaction_s=reaction_s, max_brake=max_brake, jerk=jerk)
-        self._lift, self._ttc_s, self._headway_s = lift, ttc_s, headway_s
+        self._lift, self._ttc_s, self._headway_s, self._early_s = lift, ttc_s, headway_s, early_s
         self._dismissed = np.zeros(count, bool)
         self._entered = np.zeros(count, bool)
+        self._other_speed = np.zeros(count)
 
     @property
     def dismissed(self) -> Flags:
@@ -210,15 +224,18 @@ class CarefulHuman(_Model):
         in_path = situation.visible & (situation.lateral_gap <= _TIE_M)
         enters = in_path & ~self._entered
         self._entered = self._entered | in_path
-        closing = situation.closing_speed
+        closing, gap = situation.closing_speed, situation.gap
         # Without division: the TTC is above the limit if the gap is greater than the limit times the closing speed.
-        self._dismissed = self._dismissed | (
-            enters & (situation.lateral_speed > 0) & (situation.gap > self._ttc_s * closing)
-        )
-        brakes = self._delay.update(in_path & (situation.gap > 0))
-        lifted = np.where(self._delay.present, -self._lift, 0.0)
+        self._dismissed = self._dismissed | (enters & (situation.lateral_speed > 0) & (gap > self._ttc_s * closing))
+        follows = gap <= self._headway_s * situation.speed
+        near = follows | (gap <= self._early_s * closing + closing * closing / (2 * self._max_brake))
+        slows = situation.other_speed < self._other_speed - _SLOWING_MPS2 * self._step_length_s
+        self._other_speed = situation.other_speed
+        is_risk = np.where(closing > 0, near | self._delay.present, (follows | slows) & self._delay.present)
+        reacts = self._delay.update(in_path & (gap > 0) & is_risk)
         braked = np.maximum(self._acceleration - self._jerk * self._step_length_s, -self._max_brake)
-        self._acceleration = np.where(brakes, braked, lifted)
+        lifted = np.where(self._delay.present & ~reacts, -self._lift, 0.0)
+        self._acceleration = np.where(reacts & ((closing > 0) | slows), braked, lifted)
         return self._acceleration
 
     def following_distance(self, speed: Values) -> Values:

@@ -30,6 +30,8 @@ _TIE = 1e-9
 _KMH = 3.6
 # A contact of the vehicle ahead with the standing vehicle is one from this distance on.
 _FRONT_CONTACT_M = 0.5
+# In cut-outs, R157 has the careful human react when the standing vehicle becomes visible, at any distance.
+_REACTS_AT_ONCE = {"cc_human": {"early_s": 1000.0}}
 _SIDE_GAP_M = LANE_WIDTH_M - WIDTH_M  # between vehicles in the middles of neighbouring lanes
 # Middle of the own lane in the frame of the road; positions are sums of steps, and decide exact ties by their rounding.
 _OWN_LANE_M = 2 * LANE_WIDTH_M
@@ -99,7 +101,7 @@ def solve_cut_out(cases: Columns, model: str) -> dict[str, Values]:
     """
     speed, lateral = cases["ego_kmh"] / _KMH, np.abs(cases["lateral_mps"])
     count = len(speed)
-    driver = REFERENCE_MODELS[model](count, STEP_S)
+    driver = REFERENCE_MODELS[model](count, STEP_S, **_REACTS_AT_ONCE.get(model, {}))
     following = driver.following_distance(speed)
     gap, front, front_speed = following, cases["front_m"], speed
     distance = gap + LENGTH_M + front  # to the obstacle: the standing vehicle, or the vehicle ahead that has hit it
