@@ -296,7 +296,7 @@ class Recorder(Observer):
             space, form = simulator.observation_spaces[agent], simulator.actions[agent]
             shown = np.dtype(space.dtype).str, tuple(space.shape or ())
             parts = tuple(
-                ObservedPart(name, one.shape, tuple(column.name for column in one.part.columns))
+                ObservedPart(name, layouts[agent].shapes[name], tuple(column.name for column in one.part.columns))
                 for name, one in (layouts[agent].parts.items() if agent in layouts else ())
             )
             names = () if parts else columns

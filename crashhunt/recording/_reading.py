@@ -73,7 +73,9 @@ class AgentChannel(Serializable):
             parts = self.observation_parts
             chosen = next((number for number, part in enumerate(parts) if part.name == "ego"), 0)
             names = parts[chosen].columns or tuple(map(str, range(parts[chosen].size)))
-            values = observation[sum(part.size for part in parts[:chosen]) :][: len(names)].tolist()
+            begin = sum(part.size for part in parts[:chosen])
+            rows = observation[begin : begin + parts[chosen].size].reshape(-1, len(names))
+            values = rows[-1 if parts[chosen].name == "ego" else 0].tolist()  # the last row of a history is the present
             return dict(zip(names, values, strict=False))
         names = self.observation_names or tuple(map(str, range(observation.shape[-1] if observation.ndim else 1)))
         values = observation.reshape(-1, observation.shape[-1])[:1] if observation.ndim else observation

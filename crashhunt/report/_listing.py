@@ -10,7 +10,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import work_apart
 from crashhunt.base.plugins import is_foreign, locate, registered
 from crashhunt.scenario import ACTIONS, installed_backends, load_scenario, shipped_scenarios
-from crashhunt.simulators import PARTS, parse_parts
+from crashhunt.simulators import HISTORY, PARTS, parse_parts
 from crashhunt.trial import signature_of, without_folder
 
 if TYPE_CHECKING:
@@ -130,11 +130,12 @@ def list_actions() -> list[ListingEntry]:
 def list_observations() -> list[ListingEntry]:
     """Return the parts that agents may observe, with the titles of the simulators that have each part."""
     found: list[ListingEntry] = []
-    for name, part in PARTS.items():
-        simulators = [backend.title for _, backend in installed_backends() if name in backend.observations]
+    for name, part in {**PARTS, HISTORY.name: HISTORY}.items():
+        having = [backend for _, backend in installed_backends() if backend.observations]
+        simulators = [backend.title for backend in having if part is HISTORY or name in backend.observations]
         if not simulators:
             continue
-        (default,) = parse_parts([name], where="")
+        shape = [length for one in parse_parts([name], where="") for length in one.shape] if part is not HISTORY else []
         columns = part.values_of_last_axis
         found.append(
             {
@@ -152,7 +153,7 @@ def list_observations() -> list[ListingEntry]:
                     }
                     for setting in part.settings
                 ],
-                "shape": list(default.shape),
+                "shape": shape,
                 "columns": [column.name for column in part.columns],
                 "units": [column.unit for column in columns],
                 "components": [
@@ -176,7 +177,7 @@ def describe(entries: Sequence[ListingEntry]) -> str:
     blocks = []
     for entry in entries:
         lines = [f"{entry['name']}  ({entry['locator']})", f"    {entry['title']}"]
-        if "shape" in entry:
+        if entry.get("shape"):
             lines.append(f"    shape {tuple(entry['shape'])}")
         lines += _columns(
             "    ", [(one["name"], one["range"], one["unit"], one["help"]) for one in entry.get("components", ())]

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     )
     from ._kinematics_observation import Kinematics as Kinematics, Unseen as Unseen, kind_number as kind_number
     from ._observation_parts import (
+        HISTORY as HISTORY,
         PARTS as PARTS,
+        History as History,
         ObservationLayout as ObservationLayout,
         RequestedPart as RequestedPart,
         layouts_of as layouts_of,
@@ -73,6 +75,14 @@ if TYPE_CHECKING:
         SupportsReseeding as SupportsReseeding,
         SupportsScripts as SupportsScripts,
         TranslatesMotion as TranslatesMotion,
+    )
+    from ._scene_parts import (
+        NearActor as NearActor,
+        RayCaster as RayCaster,
+        center_of as center_of,
+        nearest_actors as nearest_actors,
+        predictions_of as predictions_of,
+        wrapped as wrapped,
     )
     from ._standstill import Standstill as Standstill
 

@@ -11,6 +11,7 @@ point of ego and of actors is the centre of their rectangle. Rows without conten
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -156,6 +157,14 @@ _LANE_INDEX = Column("lane_index", "", 0.0, 1e3, "index of the lane on its road,
 _LANE_OFFSET = _distance(
     "lane_offset", "distance of the front bumper's centre from the centre line of its lane, positive to the left"
 )
+
+HISTORY = Part(
+    name="history",
+    meaning="stacks the last observations: the arrays of all parts get a first axis, whose last entry is the present "
+    "observation; before the second step, the first observation is repeated",
+    settings=(Setting("steps", 4, 1, 100, "", "number of observations"),),
+)
+"""A word that names no array of its own."""
 
 PARTS: Mapping[str, Part] = {
     part.name: part
@@ -404,7 +413,7 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
 
     Args:
         words: One word per part: its name, and its settings as ``:NAME=VALUE``, such as ``actors:rows=8:radius=50``;
-            or only `KINEMATICS`.
+            or only `KINEMATICS`. The word `HISTORY` is checked and left out.
         available: Names of the parts that the simulator has.
         where: The option or key that contains the words, for messages.
 
@@ -419,21 +428,36 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
         return ()
     for word in given_words:
         name, *given = word.split(":")
-        if name not in known:
-            fix = one_of(name, (*known, KINEMATICS)) if known else "omit it, because agents observe what it returns"
+        if name not in known and not (name == HISTORY.name and known):
+            fix = (
+                one_of(name, (*known, HISTORY.name, KINEMATICS))
+                if known
+                else "omit it, because agents observe what it returns"
+            )
             message = f"{where}: {name!r} is not a part of observations"
             if name in PARTS or not known:
                 message = f"{where}: the simulator of this scenario has no part {name!r}"
             raise UsageError(message, fix=fix)
         if name in found:
             raise UsageError(f"{where} names the part {name!r} twice", fix="name each part once")
-        part = PARTS[name]
+        part = PARTS.get(name, HISTORY)
         settings = {setting.name: setting.default for setting in part.settings}
         for text in given:
             setting, value = _parse_setting(part, text, where)
             settings[setting] = value
         found[name] = RequestedPart(part, settings)
-    return tuple(found.values())
+    if HISTORY.name in found and len(found) == 1:
+        raise UsageError(f"{where} names {HISTORY.name} and no part", fix="name the parts to stack as well")
+    return tuple(one for one in found.values() if one.part is not HISTORY)
+
+
+def history_of(words: Iterable[str]) -> int:
+    """Return the number of observations that checked words stack; 0 for observations without a history."""
+    for word in words:
+        name, *given = word.split(":")
+        if name == HISTORY.name:
+            return int(_parse_setting(HISTORY, given[-1], "")[1] if given else HISTORY.settings[0].default)
+    return 0
 
 
 def _parse_setting(part: Part, text: str, where: str) -> tuple[str, float]:
@@ -466,16 +490,19 @@ class ObservationLayout:
 
     Args:
         parts: The parts that the agent observes.
+        history: Number of observations that are stacked; 0 to stack none.
 
     Attributes:
+        history: Number of observations that are stacked; 0 if none are.
         parts: The parts by name, in the order of the recorded array.
         reach_m: Largest distance at which a part shows actors.
         columns: The index of every column, by part and name of the column.
+        shapes: The shape of every part, including the axis of the history.
         space: The space of the agent's observation.
         flat_space: The space of the recorded array.
     """
 
-    def __init__(self, parts: Sequence[RequestedPart]) -> None:
+    def __init__(self, parts: Sequence[RequestedPart], history: int = 0) -> None:
         import numpy as np
         from gymnasium import spaces
 
@@ -485,7 +512,9 @@ class ObservationLayout:
             name: {column.name: index for index, column in enumerate(one.part.columns)}
             for name, one in self.parts.items()
         }
-        self._boxes = {name: one.space for name, one in self.parts.items()}
+        self.history = history
+        self._boxes = {name: _stacked(one.space, history) for name, one in self.parts.items()}
+        self.shapes = {name: box.shape for name, box in self._boxes.items()}
         self.space = spaces.Dict(dict(self._boxes))
         flat = spaces.flatten_space(self.space)
         assert isinstance(flat, spaces.Box)
@@ -494,8 +523,9 @@ class ObservationLayout:
         self._places: list[tuple[str, slice, tuple[int, ...], np.dtype[np.generic]]] = []
         begin = 0
         for name, one in self.parts.items():
-            end = begin + math.prod(one.shape)
-            self._places.append((name, slice(begin, end), one.shape, np.dtype(one.part.dtype)))
+            shape = self._boxes[name].shape
+            end = begin + math.prod(shape)
+            self._places.append((name, slice(begin, end), shape, np.dtype(one.part.dtype)))
             begin = end
 
     def flat(self, arrays: Mapping[str, NDArray[np.generic]]) -> NDArray[np.generic]:
@@ -552,12 +582,46 @@ class ObservationLayout:
         """Return the shape, the columns and their units of every part as JSON-compatible data."""
         return {
             name: {
-                "shape": list(one.shape),
+                "shape": list(self._boxes[name].shape),
                 "columns": [column.name for column in one.part.columns],
                 "units": [column.unit for column in one.part.values_of_last_axis],
             }
             for name, one in self.parts.items()
         }
+
+
+def _stacked(box: spaces.Box, history: int) -> spaces.Box:
+    """Return the space of several arrays of a space, stacked along a new first axis."""
+    import numpy as np
+    from gymnasium import spaces
+
+    if not history:
+        return box
+    low, high = (np.repeat(bound[None], history, axis=0) for bound in (box.low, box.high))
+    return spaces.Box(low, high, dtype=box.dtype.type)
+
+
+class History:
+    """The last observations of an agent in an episode, if its layout stacks them.
+
+    Args:
+        layout: The layout of the observation.
+    """
+
+    def __init__(self, layout: ObservationLayout) -> None:
+        self._last: dict[str, deque[NDArray[Any]]] = {name: deque(maxlen=layout.history) for name in layout.parts}
+        self._length = layout.history
+
+    def add(self, arrays: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
+        """Add the present observation; return the observation that the agent receives."""
+        if not self._length:
+            return arrays
+        import numpy as np
+
+        for name, array in arrays.items():
+            last = self._last[name]
+            last.extend([array] * (1 if last else self._length))
+        return {name: np.stack(last) for name, last in self._last.items()}
 
 
 def layouts_of(setups: Mapping[str, AgentSetup], available: Iterable[str]) -> dict[str, ObservationLayout]:
@@ -575,4 +639,8 @@ def layouts_of(setups: Mapping[str, AgentSetup], available: Iterable[str]) -> di
         agent: parse_parts(setup.observation or (), known, where=f"agents.{agent}.observation")
         for agent, setup in setups.items()
     }
-    return {agent: ObservationLayout(found) for agent, found in parts.items() if found}
+    return {
+        agent: ObservationLayout(found, history_of(setups[agent].observation or ()))
+        for agent, found in parts.items()
+        if found
+    }

@@ -176,7 +176,7 @@ BACKEND: Backend = Backend(
     reported_events=tuple(EVENT_WORDS),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "step_out", "ignore_priority", "unseen"),
     actions=tuple(ACTIONS),
-    observations=("ego", "actors"),
+    observations=("ego", "actors", "predictions", "lidar2d"),
     configurations=(
         Configuration(
             endings=(".sumocfg", ".sumo.cfg"),

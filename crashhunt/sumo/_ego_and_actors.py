@@ -10,15 +10,14 @@ import libsumo
 import numpy as np
 from libsumo import _libsumo as sumo
 
-from crashhunt.simulators import kind_number
-from crashhunt.world import PERSON, is_person, on_one_level
+from crashhunt.simulators import center_of, kind_number, nearest_actors, wrapped
+from crashhunt.world import PERSON, is_person
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.sumo._observed_network import RoadNetwork
     from crashhunt.sumo._reader_protocol import Moment, ReaderSetup
-    from crashhunt.world import Scene
 
 WHEELBASE_SHARE = 0.6
 """Wheelbase of a vehicle as a share of its length, because SUMO has no wheelbase."""
@@ -26,18 +25,6 @@ WHEELBASE_SHARE = 0.6
 _BRAKE_LIGHT, _RIGHT, _LEFT, _HAZARD = 8, 1, 2, 4  # bits of SUMO's signals
 _NO_VALUE = -1073741824.0  # of SUMO's getters, as in `libsumo.INVALID_DOUBLE_VALUE`
 _UNKNOWN = ("", 0.0, 0.0, 0)  # lane, offset, acceleration and signals of an actor that SUMO does not have
-
-
-def wrapped(angle: float) -> float:
-    """Return an angle in rad within -π and π."""
-    return math.remainder(angle, math.tau)
-
-
-def center_of(scene: Scene, row: int) -> tuple[float, float]:
-    """Return the centre of an actor's rectangle."""
-    x, y = scene.points[row]
-    heading, half = scene.headings[row], scene.roster.actors[row].length / 2
-    return x - half * cos(heading), y - half * sin(heading)
 
 
 def _known(value: float) -> float:
@@ -104,7 +91,9 @@ class ActorsReader:
         path = self._path.update(moment.lane)
         found, last_speeds = [], self._speeds
         self._speeds = {}
-        near = nearest_actors(moment, self._setup.settings["radius"], self._setup.shape[0])
+        near = nearest_actors(
+            scene, row, hidden=moment.hidden, radius=self._setup.settings["radius"], limit=self._setup.limit
+        )
         for _, other, x, y in near:
             actor, heading, speed = actors[other], headings[other], speeds[other]
             lane, offset, acceleration, signals = _state_of(actor.id)
@@ -126,34 +115,6 @@ class ActorsReader:
         if found:
             rows[: len(found)] = found
         return rows
-
-
-def nearest_actors(moment: Moment, radius: float, limit: int) -> list[tuple[float, int, float, float]]:
-    """Return the actors that an agent sees, the nearest first: squared distance, row in the scene, and centre.
-
-    Actors on another level, such as a bridge above, are excluded, because they would look like obstacles.
-
-    Args:
-        moment: The state after the last step.
-        radius: Largest distance of the centres, in m.
-        limit: Largest number of actors.
-    """
-    scene, row = moment.scene, moment.row
-    own_x, own_y = center_of(scene, row)
-    actors = scene.roster.actors
-    found = []
-    for other, ((x, y), heading) in enumerate(zip(scene.points, scene.headings, strict=True)):
-        half = actors[other].length / 2
-        x, y = x - half * cos(heading), y - half * sin(heading)
-        squared = (x - own_x) * (x - own_x) + (y - own_y) * (y - own_y)
-        if squared <= radius * radius and other != row:
-            found.append((squared, other, x, y))
-    if scene.heights:
-        found = [one for one in found if on_one_level(scene, row, one[1])]
-    if moment.hidden:
-        found = [one for one in found if actors[one[1]].id not in moment.hidden]
-    found.sort()
-    return found[:limit]
 
 
 def _state_of(actor: str) -> tuple[str, float, float, int]:

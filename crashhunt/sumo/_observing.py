@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from crashhunt.simulators import layouts_of
+from crashhunt.simulators import History, layouts_of
 from crashhunt.sumo._ego_and_actors import ActorsReader, EgoReader
 from crashhunt.sumo._observed_network import RoadNetwork
 from crashhunt.sumo._reader_protocol import ReaderSetup
+from crashhunt.sumo._scene_readers import PredictionsReader, RangesReader
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 READERS: Mapping[str, type[Reader]] = {
     "actors": ActorsReader,
     "ego": EgoReader,
+    "lidar2d": RangesReader,
+    "predictions": PredictionsReader,
 }
 """The reader of each part, by name of the part; these are the parts that SUMO has."""
 
@@ -43,6 +46,7 @@ class ObservedParts:
         self._step_length_s = step_length_s
         self._network = RoadNetwork()
         self._readers: dict[str, dict[str, Reader]] = {}
+        self._histories: dict[str, History] = {}
 
     def begin(
         self, starts: Mapping[str, float], time_s: float, steering: Mapping[str, Callable[[], float]] | None = None
@@ -55,6 +59,7 @@ class ObservedParts:
             steering: Functions that return the steering angle of vehicles whose actions contain one.
         """
         known = steering or {}
+        self._histories = {agent: History(layout) for agent, layout in self.layouts.items()}
         self._readers = {
             agent: {
                 name: READERS[name](
@@ -76,8 +81,8 @@ class ObservedParts:
 
     def observe(self, agent: str, moment: Moment) -> NDArray[np.generic]:
         """Return the recorded array of an agent's observation."""
-        readers = self._readers[agent]
-        return self.layouts[agent].flat({name: reader.observe(moment) for name, reader in readers.items()})
+        arrays = {name: reader.observe(moment) for name, reader in self._readers[agent].items()}
+        return self.layouts[agent].flat(self._histories[agent].add(arrays))
 
     def identifiers(self, agent: str) -> tuple[str, ...] | None:
         """Return the identifiers of the actors in the rows of ``actors``; None if the agent does not observe them."""

@@ -45,6 +45,11 @@ class ReaderSetup:
         return self.request.settings
 
     @property
+    def limit(self) -> int:
+        """The number of rows of a part with one row per actor."""
+        return int(self.request.settings["rows"])
+
+    @property
     def shape(self) -> tuple[int, ...]:
         """The shape of the part."""
         return self.request.shape

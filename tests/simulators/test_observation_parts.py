@@ -8,7 +8,8 @@ from gymnasium import spaces
 from hypothesis import given, strategies as st
 
 from crashhunt.base.errors import UsageError
-from crashhunt.simulators import PARTS, ObservationForm, ObservationLayout, parse_parts
+from crashhunt.simulators import PARTS, History, ObservationForm, ObservationLayout, parse_parts
+from crashhunt.simulators._observation_parts import history_of
 
 
 def layout_of(*words):
@@ -108,7 +109,7 @@ def test_wrong_words_are_refused_in_one_line(words, message, fix):
 def test_part_that_a_simulator_lacks_is_refused():
     with pytest.raises(UsageError, match="has no part 'lanes'") as refused:
         parse_parts(["lanes"], ["ego"], where="--observe")
-    assert refused.value.fix == "give one of ego, kinematics"
+    assert refused.value.fix == "give one of ego, history, kinematics"
     with pytest.raises(UsageError, match="has no part 'ego'") as refused:
         parse_parts(["ego"], [], where="--observe")
     assert "omit it" in refused.value.fix
@@ -132,3 +133,25 @@ def test_errors_change_what_is_measured_and_nothing_else():
     assert row[[actors["x"], actors["vx"]]] == pytest.approx([1011.0, 8.8])
     assert not wrong["actors"][1].any()  # an absent row stays 0
     assert wrong["lidar2d"] == pytest.approx([55.0, 66.0, 120.0])  # within the space
+
+
+def test_history_stacks_the_last_observations_with_the_present_one_last():
+    words = ["ego", "history:steps=3", "lidar2d:rays=2"]
+    layout = ObservationLayout(parse_parts(words, where=""), history_of(words))
+    assert {name: box.shape for name, box in layout.space.spaces.items()} == {"ego": (3, 13), "lidar2d": (3, 2)}
+    assert layout.describe()["ego"]["shape"] == [3, 13]
+    history, seen = History(layout), []
+    for step in range(4):
+        shown = layout.restore(layout.flat(history.add({"ego": np.full(13, step), "lidar2d": np.full(2, 10.0 + step)})))
+        seen.append(shown["ego"][:, 0].tolist())
+    assert seen == [[0, 0, 0], [0, 0, 1], [0, 1, 2], [1, 2, 3]]
+    assert shown["lidar2d"].tolist() == [[11, 11], [12, 12], [13, 13]]
+    assert layout.columns["ego"]["y"] == 1  # of the last axis, as without a history
+    assert history_of(["ego"]) == 0
+    assert history_of(["ego", "history"]) == 4
+    for wrong, message in (
+        (["history"], "names history and no part"),
+        (["ego", "history:steps=0"], "history:steps is '0'"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            parse_parts(wrong, where="--observe")

@@ -1,0 +1,172 @@
+"""Parts of observations that follow from a scene alone, whatever the simulator: nearest actors, predictions, ranges.
+
+Sine and cosine come from the C library, because NumPy's results differ between processors in the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+from math import cos, sin
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from crashhunt.world import on_one_level, outlines
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from crashhunt.world import Scene
+
+
+class NearActor(NamedTuple):
+    """An actor near the controlled vehicle.
+
+    Args:
+        squared: Squared distance of the centres, in m².
+        row: Row of the actor in the scene.
+        x: x of the centre of the rectangle, in m.
+        y: y of the centre of the rectangle, in m.
+    """
+
+    squared: float
+    row: int
+    x: float
+    y: float
+
+
+def wrapped(angle: float) -> float:
+    """Return an angle in rad within -π and π."""
+    return math.remainder(angle, math.tau)
+
+
+def center_of(scene: Scene, row: int) -> tuple[float, float]:
+    """Return the centre of an actor's rectangle."""
+    x, y = scene.points[row]
+    heading, half = scene.headings[row], scene.roster.actors[row].length / 2
+    return x - half * cos(heading), y - half * sin(heading)
+
+
+def nearest_actors(
+    scene: Scene, row: int, *, hidden: frozenset[str], radius: float, limit: int | None = None
+) -> list[NearActor]:
+    """Return the actors that an agent sees, the nearest first.
+
+    Actors on another level, such as a bridge above, are excluded, because they would look like obstacles.
+
+    Args:
+        scene: The scene after the last step.
+        row: Row of the agent's vehicle in the scene.
+        hidden: Identifiers of the actors that the agent does not see.
+        radius: Largest distance of the centres, in m.
+        limit: Largest number of actors; None for no limit.
+    """
+    own_x, own_y = center_of(scene, row)
+    actors = scene.roster.actors
+    found = []
+    for other, ((x, y), heading) in enumerate(zip(scene.points, scene.headings, strict=True)):
+        half = actors[other].length / 2
+        x, y = x - half * cos(heading), y - half * sin(heading)
+        squared = (x - own_x) * (x - own_x) + (y - own_y) * (y - own_y)
+        if squared <= radius * radius and other != row:
+            found.append(NearActor(squared, other, x, y))
+    if scene.heights:
+        found = [one for one in found if on_one_level(scene, row, one.row)]
+    if hidden:
+        found = [one for one in found if actors[one.row].id not in hidden]
+    found.sort()
+    return found[:limit]
+
+
+def predictions_of(
+    scene: Scene, near: Sequence[NearActor], *, shape: tuple[int, ...], interval: float
+) -> NDArray[np.float64]:
+    """Return the positions of actors at constant velocity: the columns of the part ``predictions``.
+
+    Args:
+        scene: The scene after the last step.
+        near: The actors, one per row.
+        shape: Numbers of rows, times and columns.
+        interval: Time between two positions, in s; the first position is one interval from now.
+    """
+    found = np.zeros(shape)
+    times = interval * np.arange(1, shape[1] + 1)
+    for place, one in enumerate(near):
+        heading, speed = scene.headings[one.row], scene.speeds[one.row]
+        found[place, :, 0] = one.x + speed * cos(heading) * times
+        found[place, :, 1] = one.y + speed * sin(heading) * times
+        found[place, :, 2:] = wrapped(heading), speed
+    return found
+
+
+class RayCaster:
+    """Casts rays from the centre of a vehicle to the outlines of actors.
+
+    Args:
+        rays: Number of rays, evenly distributed over the full circle; the first one points along the heading.
+        reach_m: Largest distance, in m.
+    """
+
+    def __init__(self, rays: int, reach_m: float) -> None:
+        self._rays, self._reach_m = rays, reach_m
+        angles = [math.tau * number / rays for number in range(rays)]
+        self._cos, self._sin = np.array([*map(cos, angles)]), np.array([*map(sin, angles)])
+
+    def cast(self, scene: Scene, row: int, others: Sequence[int]) -> NDArray[np.float64]:
+        """Return the distance along each ray to the nearest outline, in m; the largest distance if there is none.
+
+        Args:
+            scene: The scene after the last step.
+            row: Row of the vehicle in the scene.
+            others: Rows of the actors whose outlines the rays hit.
+        """
+        found = np.full(self._rays, self._reach_m)
+        rectangles = [one for other in others for one in outlines(scene, other)]
+        if not rectangles:
+            return found
+        (own_x, own_y), heading = center_of(scene, row), scene.headings[row]
+        own_cos, own_sin = cos(heading), sin(heading)
+        facts = []
+        for x, y, turn, length, width in rectangles:
+            c, s = cos(turn), sin(turn)
+            # The centre of the vehicle in the frame of the rectangle, and the direction of its first ray there.
+            dx, dy = own_x - (x - length / 2 * c), own_y - (y - length / 2 * s)
+            facts.append(
+                (
+                    dx * c + dy * s, dy * c - dx * s, own_cos * c + own_sin * s, own_sin * c - own_cos * s,
+                    length / 2, width / 2,
+                )
+            )  # fmt: skip
+        table = np.array(facts)
+        which, ray = self._candidates(table)
+        along, across, first_cos, first_sin, half_length, half_width = table[which].T
+        ray_cos, ray_sin = self._cos[ray], self._sin[ray]
+        towards = first_cos * ray_cos - first_sin * ray_sin, first_sin * ray_cos + first_cos * ray_sin
+        enters, leaves = np.zeros(len(ray)), np.full(len(ray), self._reach_m)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for offset, step, half in ((along, towards[0], half_length), (across, towards[1], half_width)):
+                one, two = (-half - offset) / step, (half - offset) / step
+                # A ray along an edge gives 0 / 0, which is within the rectangle for every distance.
+                enters = np.fmax(enters, np.minimum(one, two))
+                leaves = np.fmin(leaves, np.maximum(one, two))
+        hit = enters <= leaves
+        np.minimum.at(found, ray[hit], enters[hit])
+        return found
+
+    def _candidates(self, table: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return pairs of a rectangle and a ray: at least all pairs in which the ray hits the rectangle."""
+        along, across, first_cos, first_sin, half_length, half_width = table.T
+        distance, radius = np.hypot(along, across), np.hypot(half_length, half_width)
+        # The direction to the rectangle's centre, and half the angle of the circle around the rectangle.
+        direction = np.arctan2(-across, -along) - np.arctan2(first_sin, first_cos)
+        inside = distance <= radius
+        half = np.where(inside, math.pi, np.arcsin(np.minimum(1.0, radius / np.where(inside, 1.0, distance))))
+        step = math.tau / self._rays
+        first = np.floor((direction - half) / step).astype(np.intp)  # one ray more on each side than is hit
+        last = np.ceil((direction + half) / step).astype(np.intp)
+        counts = np.where(distance - radius > self._reach_m, 0, np.minimum(last - first + 1, self._rays))
+        which = np.repeat(np.arange(len(table)), counts)
+        offset = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+        return which, (first[which] + offset) % self._rays

@@ -1,0 +1,109 @@
+"""Parts of observations that follow from a scene: rays against a brute-force caster, predictions, nearest actors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+
+from crashhunt.simulators import RayCaster, center_of, nearest_actors, predictions_of, wrapped
+from crashhunt.world import Actor, Roster, Scene, corners
+
+number = st.floats(-40.0, 40.0).map(lambda value: round(value, 3))
+poses = st.tuples(number, number, st.floats(-4.0, 4.0), st.floats(0.3, 18.0), st.floats(0.3, 3.0), st.floats(0.0, 30.0))
+
+
+def scene_of(*actors, heights=(), spines=None):
+    """A scene with actors given as x, y and heading of the front, length, width and speed."""
+    roster = Roster(tuple(Actor(f"a{number}", "passenger", one[3], one[4]) for number, one in enumerate(actors)))
+    points, headings, speeds = [one[:2] for one in actors], [one[2] for one in actors], [one[5] for one in actors]
+    return Scene(
+        0.0, roster, points, headings, speeds, heights=heights, grades=[0.0] * len(heights), spines=spines or {}
+    )
+
+
+def slow_range(outline, x, y, angle):
+    """The distance of a ray to an outline by its edges: where the ray crosses one, or 0 from the inside."""
+    dx, dy = math.cos(angle), math.sin(angle)
+    best, sides = math.inf, []
+    for (px, py), (qx, qy) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        ex, ey = qx - px, qy - py
+        sides.append(ex * (y - py) - ey * (x - px))
+        turn = dx * ey - dy * ex
+        if abs(turn) > 1e-12:
+            along = ((px - x) * ey - (py - y) * ex) / turn
+            on_edge = ((px - x) * dy - (py - y) * dx) / turn
+            if along >= 0 and -1e-12 <= on_edge <= 1 + 1e-12:
+                best = min(best, along)
+    return 0.0 if min(sides) >= 0 or max(sides) <= 0 else best
+
+
+@given(st.lists(poses, min_size=1, max_size=7), st.sampled_from([1, 2, 7, 72, 361]))
+def test_rays_end_where_a_slow_caster_finds_the_first_edge(actors, rays):
+    scene = scene_of(*actors)
+    found = RayCaster(rays, 50.0).cast(scene, 0, range(1, len(actors)))
+    x, y = center_of(scene, 0)
+    for ray, distance in enumerate(found):
+        angle = scene.headings[0] + math.tau * ray / rays
+        slow = [slow_range(corners(scene, other), x, y, angle) for other in range(1, len(actors))]
+        nearest = min([50.0, *slow])
+        if distance == pytest.approx(nearest, abs=1e-6):
+            continue
+        # A ray along an edge or through a corner may hit or miss it by rounding.
+        beside = [
+            min([50.0, *(slow_range(corners(scene, other), x, y, angle + turn) for other in range(1, len(actors)))])
+            for turn in (-1e-7, 1e-7)
+        ]
+        assert any(distance == pytest.approx(one, abs=1e-3) for one in beside)
+
+
+def test_first_ray_points_ahead_and_the_next_ones_to_the_left():
+    # Ego drives to the north; another car is 10 m ahead, one to the left.
+    scene = scene_of((0, 2, math.pi / 2, 4, 2, 0), (0, 14, math.pi / 2, 4, 2, 0), (-8, 2, math.pi / 2, 4, 2, 0))
+    found = RayCaster(4, 30.0).cast(scene, 0, [1, 2])
+    assert found == pytest.approx([10.0, 7.0, 30.0, 30.0])
+
+
+def test_rays_hit_the_pieces_of_a_bent_vehicle():
+    spine = ((10.0, 5.0, 0.0), (10.0, 0.0, 0.0), (20.0, 0.0, 0.0))
+    scene = scene_of((1, 0, 0.0, 2, 2, 0), (10, 5, math.pi / 2, 15, 2, 0), spines={1: spine})
+    found = RayCaster(4, 30.0).cast(scene, 0, [1])
+    assert found[0] == pytest.approx(9.0)
+
+
+@given(st.lists(poses, min_size=1, max_size=9), st.floats(1.0, 60.0), st.integers(1, 9))
+def test_nearest_actors_are_all_within_the_radius_in_order(actors, radius, limit):
+    scene = scene_of(*actors)
+    found = nearest_actors(scene, 0, hidden=frozenset(["a1"]), radius=radius, limit=limit)
+    away = np.hypot(*(scene.centers - scene.centers[0]).T)
+    near = [(away[row], row) for row in range(2, len(actors)) if away[row] <= radius - 1e-9]
+    assert len(found) >= min(len(near), limit)
+    assert [math.sqrt(one.squared) for one in found] == pytest.approx(sorted(away[[one.row for one in found]]))
+    assert all((one.x, one.y) == pytest.approx(tuple(scene.centers[one.row])) for one in found)
+    if len(near) > limit:
+        assert math.sqrt(found[-1].squared) <= sorted(near)[limit - 1][0] + 1e-9
+
+
+def test_actor_on_a_bridge_above_is_not_seen():
+    scene = scene_of((0, 0, 0, 4, 2, 9), (5, 0, 0, 4, 2, 9), (9, 0, 0, 4, 2, 9), heights=[0.0, 7.0, 0.1])
+    assert [one.row for one in nearest_actors(scene, 0, hidden=frozenset(), radius=50.0)] == [2]
+
+
+def test_predictions_go_straight_on_at_constant_speed():
+    scene = scene_of((0, 0, 0, 4, 2, 0), (10, 0, 7.0, 4, 2, 5.0))
+    near = nearest_actors(scene, 0, hidden=frozenset(), radius=50.0)
+    found = predictions_of(scene, near, shape=(3, 4, 4), interval=0.5)
+    x, y = scene.centers[1]
+    for step in range(4):
+        ahead = 5.0 * 0.5 * (step + 1)
+        expected = x + ahead * math.cos(7.0), y + ahead * math.sin(7.0), 7.0 - math.tau, 5.0
+        assert found[0, step] == pytest.approx(expected)
+    assert not found[1:].any()
+
+
+def test_angles_are_wrapped_to_half_a_turn():
+    assert [wrapped(angle) for angle in (0.0, 4.0, -4.0, 20.0)] == pytest.approx(
+        [0.0, 4.0 - math.tau, math.tau - 4.0, 20.0 - 3 * math.tau]
+    )
