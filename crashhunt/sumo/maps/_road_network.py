@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import ScenarioError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
 Point = tuple[float, float]
 CAR, TRUCK, BICYCLE, PERSON = "passenger", "truck", "bicycle", "pedestrian"
+DEFAULT_WIDTH_M = 3.2  # SUMO's, of a lane without a width
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,6 +29,9 @@ class NetworkLane:
         allowed: the vehicle classes that may use the lane; None for all.
         disallowed: the vehicle classes that may not use the lane.
         shape: centre line of the lane, in m.
+        width_m: width of the lane, in m.
+        change_up: the vehicle classes that may change to the lane with the next index; None for all.
+        change_down: the vehicle classes that may change to the lane with the previous index; None for all.
     """
 
     length_m: float
@@ -35,6 +39,9 @@ class NetworkLane:
     allowed: frozenset[str] | None
     disallowed: frozenset[str]
     shape: tuple[Point, ...]
+    width_m: float = DEFAULT_WIDTH_M
+    change_up: frozenset[str] | None = None
+    change_down: frozenset[str] | None = None
 
     def admits(self, vehicle_class: str) -> bool:
         """Return whether vehicles of a class may use the lane."""
@@ -71,9 +78,52 @@ class Edge:
         return self.lanes[0].length_m
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Connection:
+    """A connection from a lane to a following lane.
+
+    Args:
+        source: the lane from which the connection starts; it may be inside a junction.
+        target: the lane to which the connection leads; it is never inside a junction.
+        via: the next lane inside the junction; empty if there is none.
+        signal: id of the traffic light that controls the connection; empty if there is none.
+        signal_index: index of the connection in the state of the traffic light; -1 if there is none.
+        direction: direction of the turn: ``s`` straight, ``l`` left, ``r`` right, ``t`` turnaround and so on.
+        state: state of the connection, as in SUMO: ``M`` major, ``m`` minor, ``=`` equal, ``s`` stop, ``w`` all-way
+            stop.
+    """
+
+    source: str
+    target: str
+    via: str
+    signal: str
+    signal_index: int
+    direction: str
+    state: str
+
+
+@dataclass(frozen=True, slots=True)
+class Junction:
+    """The rules of a junction.
+
+    Args:
+        id: id of the junction.
+        type: type of the junction, such as ``priority`` or ``traffic_light``.
+        inside: the last lane inside the junction of each path across it, in the order of the rules.
+        yields: for each path, the indices of the paths that it has to yield to.
+        foes: for each path, the indices of the paths that it conflicts with.
+    """
+
+    id: str
+    type: str
+    inside: tuple[str, ...]
+    yields: Mapping[int, frozenset[int]]
+    foes: Mapping[int, frozenset[int]]
+
+
 @dataclass(slots=True)
 class RoadNetwork:
-    """A road network, without the lanes inside junctions.
+    """A road network. Roads and the lanes inside junctions are apart.
 
     Args:
         edges: edges by id, in the order of the file.
@@ -81,6 +131,9 @@ class RoadNetwork:
         crossings: number of pedestrian crossings.
         left_hand: whether traffic drives on the left.
         areas: the outlines of junctions, in m.
+        inside: paths across junctions and crossings as edges, by id; empty if they were not read.
+        connections: the connections of all lanes; empty if they were not read.
+        rules: the junctions by id; empty if they were not read.
     """
 
     edges: dict[str, Edge] = field(default_factory=dict)
@@ -88,6 +141,9 @@ class RoadNetwork:
     crossings: int = 0
     left_hand: bool = False
     areas: list[tuple[Point, ...]] = field(default_factory=list)
+    inside: dict[str, Edge] = field(default_factory=dict)
+    connections: list[Connection] = field(default_factory=list)
+    rules: dict[str, Junction] = field(default_factory=dict)
 
     def drivable(self) -> list[Edge]:
         """Return the roads that cars may use."""
@@ -97,8 +153,12 @@ class RoadNetwork:
 _DEAD_END_TYPES = {"dead_end", "unregulated", "district"}
 
 
-def read_network(path: Path) -> RoadNetwork:
+def read_network(path: Path, *, with_junctions: bool = False) -> RoadNetwork:
     """Return the contents of a network file.
+
+    Args:
+        path: path of the file, which may be compressed.
+        with_junctions: whether to read the lanes inside junctions, the connections and the rules of junctions, too.
 
     Raises:
         ScenarioError: the file is not a network of SUMO.
@@ -108,14 +168,14 @@ def read_network(path: Path) -> RoadNetwork:
         with path.open("rb") as file:
             packed = file.read(2) == b"\x1f\x8b"
         with gzip.open(path) if packed else path.open("rb") as file:
-            _read(ET.iterparse(file, events=("start", "end")), found)
+            _read(ET.iterparse(file, events=("start", "end")), found, with_junctions=with_junctions)
     except (ET.ParseError, UnicodeDecodeError, LookupError, ValueError) as error:
         fix = "make the network again with netconvert"
         raise ScenarioError(f"not a valid network: {error}", fix=fix, where=str(path)) from None
     return found
 
 
-def _read(events: Iterator[tuple[str, ET.Element]], found: RoadNetwork) -> None:
+def _read(events: Iterator[tuple[str, ET.Element]], found: RoadNetwork, *, with_junctions: bool) -> None:
     root: ET.Element | None = None
     for event, element in events:
         if event == "start":
@@ -127,6 +187,9 @@ def _read(events: Iterator[tuple[str, ET.Element]], found: RoadNetwork) -> None:
             function = element.get("function", "normal")
             if function == "crossing":
                 found.crossings += 1
+            if element.get("id", "").startswith(":"):
+                if with_junctions and function != "walkingarea":
+                    found.inside[element.get("id", "")] = _edge(element)
             elif function == "normal":
                 edge = _edge(element)
                 if edge.lanes:
@@ -136,6 +199,11 @@ def _read(events: Iterator[tuple[str, ET.Element]], found: RoadNetwork) -> None:
                 found.junctions[element.get("type", "")] += 1
             area = tuple(_point(word) for word in element.get("shape", "").split())
             found.areas += [area] if len(area) > 2 else []
+            if with_junctions:
+                junction = _junction(element)
+                found.rules[junction.id] = junction
+        elif element.tag == "connection" and with_junctions:
+            found.connections.append(_connection(element))
         if element.tag in ("edge", "junction", "connection", "tlLogic") and root is not None:
             root.clear()  # a network may have hundreds of megabytes
 
@@ -143,18 +211,57 @@ def _read(events: Iterator[tuple[str, ET.Element]], found: RoadNetwork) -> None:
 def _edge(element: ET.Element) -> Edge:
     lanes = []
     for lane in element.iter("lane"):
-        allow = lane.get("allow")
         shape = tuple(_point(word) for word in lane.get("shape", "").split())
         lanes.append(
             NetworkLane(
                 length_m=float(lane.get("length", "0")),
                 speed_mps=float(lane.get("speed", "13.89")),
-                allowed=frozenset(allow.split()) if allow is not None else None,
-                disallowed=frozenset(lane.get("disallow", "").split()),
+                allowed=_classes(lane, "allow"),
+                disallowed=_classes(lane, "disallow") or frozenset(),
                 shape=shape,
+                width_m=float(lane.get("width", DEFAULT_WIDTH_M)),
+                change_up=_classes(lane, "changeLeft"),
+                change_down=_classes(lane, "changeRight"),
             )
         )
     return Edge(element.get("id", ""), element.get("name", ""), tuple(lanes))
+
+
+def _classes(element: ET.Element, attribute: str) -> frozenset[str] | None:
+    text = element.get(attribute)
+    return None if text is None else frozenset(text.split())
+
+
+def _connection(element: ET.Element) -> Connection:
+    source, target = (f"{element.attrib[end]}_{element.attrib[f'{end}Lane']}" for end in ("from", "to"))
+    return Connection(
+        source=source,
+        target=target,
+        via=element.get("via", ""),
+        signal=element.get("tl", ""),
+        signal_index=int(element.get("linkIndex", "-1")),
+        direction=element.get("dir", ""),
+        state=element.get("state", ""),
+    )
+
+
+def _junction(element: ET.Element) -> Junction:
+    yields, foes = (
+        {int(request.attrib["index"]): _indices(request.get(bits, "")) for request in element.iter("request")}
+        for bits in ("response", "foes")
+    )
+    return Junction(
+        id=element.get("id", ""),
+        type=element.get("type", ""),
+        inside=tuple(element.get("intLanes", "").split()),
+        yields=yields,
+        foes=foes,
+    )
+
+
+def _indices(bits: str) -> frozenset[int]:
+    """Return the indices of a bit set; SUMO writes the bit with index 0 last."""
+    return frozenset(index for index, bit in enumerate(reversed(bits)) if bit == "1")
 
 
 def _point(word: str) -> Point:
