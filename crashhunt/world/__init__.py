@@ -47,6 +47,15 @@ if TYPE_CHECKING:
         rectangle_gap as rectangle_gap,
         time_to_contact as time_to_contact,
     )
+    from ._road_map import (
+        LaneLines as LaneLines,
+        MapLane as MapLane,
+        RoadMap as RoadMap,
+        StopLine as StopLine,
+        VehicleData as VehicleData,
+        lane_lines as lane_lines,
+        spaced_line as spaced_line,
+    )
     from ._safe_distances import (
         Crossing as Crossing,
         Motion as Motion,
