@@ -28,7 +28,7 @@ from crashhunt.episode._fast_path import FastEpisode
 from crashhunt.episode._observers import Nearness, Recorder
 from crashhunt.oracles import parse_oracle
 from crashhunt.scenario import check_action
-from crashhunt.simulators import FlattensObservations, MasksActions, ObservesParts, ReportsNotices
+from crashhunt.simulators import FlattensObservations, MasksActions, ObservesParts, ProvidesRoadMaps, ReportsNotices
 from crashhunt.trial import CRASHES, Signature, signature_of
 
 if TYPE_CHECKING:
@@ -240,6 +240,10 @@ class Parts:
         stage.mkdir(parents=True, exist_ok=True)
         scenario = self._settings.scenario
         made: Simulator = locate("simulators", scenario.simulator)(scenario, stage)
+        if supports(made, ProvidesRoadMaps) and any(
+            "map" in self._factory(agent)[1].given for agent in scenario.agents
+        ):
+            made.prepare_road_maps()
         return made
 
     def agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Value]) -> Agent:
@@ -287,6 +291,10 @@ class Parts:
         if "columns" in wanted:
             layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
             given["columns"] = {} if (layout := layouts.get(agent)) is None else layout.columns
+        if "map" in wanted:
+            given["map"] = simulator.road_map(agent) if supports(simulator, ProvidesRoadMaps) else None
+        if "vehicle" in wanted:
+            given["vehicle"] = simulator.vehicle_data(agent) if supports(simulator, ProvidesRoadMaps) else None
         if "action_masks" in wanted:
             given["action_masks"] = partial(simulator.action_mask, agent) if supports(simulator, MasksActions) else None
         files = self._settings.argument_files

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
         OfAnyLength as OfAnyLength,
         Options as Options,
         PreparesProcess as PreparesProcess,
+        ProvidesRoadMaps as ProvidesRoadMaps,
         ReportsCrashCell as ReportsCrashCell,
         ReportsDanger as ReportsDanger,
         ReportsEvents as ReportsEvents,

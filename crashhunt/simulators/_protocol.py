@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.native import UsualSteps, Vehicles
     from crashhunt.simulators._observation_parts import ObservationLayout
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Lane, Motion, Paths, Roster, Scene, Surroundings
+    from crashhunt.world import Lane, Motion, Paths, RoadMap, Roster, Scene, Surroundings, VehicleData
 
 
 class Options(TypedDict, total=False):
@@ -254,6 +254,19 @@ class HasMap(Protocol):
 
         A simulator whose map never changes returns the same object each time, so that callers read the map once.
         """
+
+
+class ProvidesRoadMaps(Protocol):
+    """A simulator that gives its agents the map of the roads, and the data of their vehicles."""
+
+    def prepare_road_maps(self) -> None:
+        """Read the map; crashhunt calls this method before the first trial if an agent has the parameter ``map``."""
+
+    def road_map(self, agent: str) -> RoadMap:
+        """Return the map of the roads, with the route of a vehicle that has entered."""
+
+    def vehicle_data(self, agent: str) -> VehicleData:
+        """Return the size and the limits of a vehicle that has entered."""
 
 
 class HasWindow(Protocol):
@@ -520,6 +533,7 @@ FACULTIES: tuple[type, ...] = (
     ReportsEvents,
     MasksActions,
     HasMap,
+    ProvidesRoadMaps,
     HasWindow,
     SupportsFullBraking,
     ReportsSurroundings,

@@ -176,7 +176,18 @@ BACKEND: Backend = Backend(
     reported_events=tuple(EVENT_WORDS),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "step_out", "ignore_priority", "unseen"),
     actions=tuple(ACTIONS),
-    observations=("ego", "actors", "predictions", "lidar2d"),
+    observations=(
+        "ego",
+        "actors",
+        "lanes",
+        "route",
+        "route_state",
+        "signals",
+        "right_of_way",
+        "speed_limit",
+        "predictions",
+        "lidar2d",
+    ),
     configurations=(
         Configuration(
             endings=(".sumocfg", ".sumo.cfg"),

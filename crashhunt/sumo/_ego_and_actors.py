@@ -11,12 +11,12 @@ import numpy as np
 from libsumo import _libsumo as sumo
 
 from crashhunt.simulators import center_of, kind_number, nearest_actors, wrapped
-from crashhunt.world import PERSON, is_person
+from crashhunt.world import PERSON, VehicleData, is_person
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from crashhunt.sumo._observed_network import RoadNetwork
+    from crashhunt.sumo._lane_graph import LaneGraph
     from crashhunt.sumo._reader_protocol import Moment, ReaderSetup
 
 WHEELBASE_SHARE = 0.6
@@ -25,6 +25,23 @@ WHEELBASE_SHARE = 0.6
 _BRAKE_LIGHT, _RIGHT, _LEFT, _HAZARD = 8, 1, 2, 4  # bits of SUMO's signals
 _NO_VALUE = -1073741824.0  # of SUMO's getters, as in `libsumo.INVALID_DOUBLE_VALUE`
 _UNKNOWN = ("", 0.0, 0.0, 0)  # lane, offset, acceleration and signals of an actor that SUMO does not have
+
+
+def vehicle_data_of(vehicle: str) -> VehicleData:
+    """Return the size and the limits of a vehicle."""
+    length = float(sumo.vehicle_getLength(vehicle))
+    wheelbase = WHEELBASE_SHARE * length
+    return VehicleData(
+        length=length,
+        width=float(sumo.vehicle_getWidth(vehicle)),
+        wheelbase=wheelbase,
+        rear_axle_offset=wheelbase / 2,
+        max_speed=float(sumo.vehicle_getMaxSpeed(vehicle)),
+        max_acceleration=float(sumo.vehicle_getAccel(vehicle)),
+        max_deceleration=float(sumo.vehicle_getDecel(vehicle)),
+        emergency_deceleration=float(sumo.vehicle_getEmergencyDecel(vehicle)),
+        kind=str(sumo.vehicle_getVehicleClass(vehicle)),
+    )
 
 
 def _known(value: float) -> float:
@@ -77,7 +94,7 @@ class ActorsReader:
 
     def __init__(self, setup: ReaderSetup) -> None:
         self._setup = setup
-        self._path = PathAhead(setup.agent, setup.network, setup.settings["radius"])
+        self._path = PathAhead(setup.agent, setup.graph, setup.settings["radius"])
         self._speeds: dict[str, float] = {}
         self.ids: tuple[str, ...] = ()
         """Identifiers of the actors in the rows, as in scenes."""
@@ -140,12 +157,12 @@ class PathAhead:
 
     Args:
         vehicle: Identifier of the vehicle.
-        network: The lanes of the network.
+        graph: The lanes of the network.
         reach_m: Length of the path, in m.
     """
 
-    def __init__(self, vehicle: str, network: RoadNetwork, reach_m: float) -> None:
-        self._vehicle, self._network, self._reach_m = vehicle, network, reach_m
+    def __init__(self, vehicle: str, graph: LaneGraph, reach_m: float) -> None:
+        self._vehicle, self._graph, self._reach_m = vehicle, graph, reach_m
         self._paths: dict[tuple[str, int, str], frozenset[str]] = {}
         self._entered: dict[tuple[str, str], bool] = {}
         self._lane = ""
@@ -177,15 +194,15 @@ class PathAhead:
         waiting, reached = [(lane, 0.0)], {lane}
         while waiting:
             current, done = waiting.pop()
-            for to in self._network.successors(current) if done <= self._reach_m else ():
+            for to in self._graph.successors(current) if done <= self._reach_m else ():
                 if to in reached or (edges is not None and not self._stays_on(to, edges)):
                     continue
                 reached.add(to)
-                waiting.append((to, done + self._network.length(to)))
+                waiting.append((to, done + self._graph.length(to)))
         return reached
 
     def _stays_on(self, lane: str, edges: frozenset[str]) -> bool:
         """Return whether a lane belongs to one of the edges, or leads to one of them inside a junction."""
         if not lane.startswith(":"):
             return lane.rpartition("_")[0] in edges
-        return any(self._stays_on(to, edges) for to in self._network.successors(lane))
+        return any(self._stays_on(to, edges) for to in self._graph.successors(lane))

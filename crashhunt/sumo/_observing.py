@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 from crashhunt.simulators import History, layouts_of
+from crashhunt.sumo._conflicts import Conflicts
 from crashhunt.sumo._ego_and_actors import ActorsReader, EgoReader
-from crashhunt.sumo._observed_network import RoadNetwork
-from crashhunt.sumo._reader_protocol import ReaderSetup
+from crashhunt.sumo._lane_graph import lane_graph
+from crashhunt.sumo._reader_protocol import Places, ReaderSetup
+from crashhunt.sumo._road_readers import (
+    LanesReader,
+    RightOfWayReader,
+    RouteReader,
+    RouteStateReader,
+    SignalsReader,
+    SpeedLimitReader,
+)
 from crashhunt.sumo._scene_readers import PredictionsReader, RangesReader
 
 if TYPE_CHECKING:
@@ -16,14 +26,21 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from crashhunt.scenario import AgentSetup
+    from crashhunt.scenario import Scenario
+    from crashhunt.sumo._lane_graph import LaneGraph
     from crashhunt.sumo._reader_protocol import Moment, Reader
 
 READERS: Mapping[str, type[Reader]] = {
     "actors": ActorsReader,
     "ego": EgoReader,
+    "lanes": LanesReader,
     "lidar2d": RangesReader,
     "predictions": PredictionsReader,
+    "right_of_way": RightOfWayReader,
+    "route": RouteReader,
+    "route_state": RouteStateReader,
+    "signals": SignalsReader,
+    "speed_limit": SpeedLimitReader,
 }
 """The reader of each part, by name of the part; these are the parts that SUMO has."""
 
@@ -32,21 +49,40 @@ class ObservedParts:
     """Builds the observations of all agents that observe parts.
 
     Args:
-        setups: The setups of all agents of the scenario, by agent.
-        step_length_s: Length of a step, in s.
+        scenario: The scenario.
 
     Attributes:
         layouts: The layout of each such agent's observation.
         reach_m: Largest distance at which a part shows actors, in m; 0 if no part shows actors.
     """
 
-    def __init__(self, setups: Mapping[str, AgentSetup], step_length_s: float) -> None:
-        self.layouts = layouts_of(setups, READERS)
+    def __init__(self, scenario: Scenario) -> None:
+        self.layouts = layouts_of(scenario.agents, READERS)
         self.reach_m = max((layout.reach_m for layout in self.layouts.values()), default=0.0)
-        self._step_length_s = step_length_s
-        self._network = RoadNetwork()
+        self._step_length_s = scenario.step_length_s
+        self._scenario = scenario
+        self._places: dict[str, Places] = {}
+        if self.layouts:
+            self.graph  # noqa: B018 - the zygote makes the simulator, so the processes of all trials share the graph
         self._readers: dict[str, dict[str, Reader]] = {}
         self._histories: dict[str, History] = {}
+
+    @cached_property
+    def graph(self) -> LaneGraph:
+        """The lanes of the network."""
+        return lane_graph(self._scenario)
+
+    @cached_property
+    def conflicts(self) -> Conflicts:
+        """The conflicts at the junctions."""
+        return Conflicts(self.graph)
+
+    def places(self, agent: str) -> Places:
+        """Return what finds the vehicle of an agent on the network."""
+        found = self._places.get(agent)
+        if found is None:
+            found = self._places[agent] = Places(self.graph, agent)
+        return found
 
     def begin(
         self, starts: Mapping[str, float], time_s: float, steering: Mapping[str, Callable[[], float]] | None = None
@@ -60,13 +96,16 @@ class ObservedParts:
         """
         known = steering or {}
         self._histories = {agent: History(layout) for agent, layout in self.layouts.items()}
+        self._places = {}
         self._readers = {
             agent: {
                 name: READERS[name](
                     ReaderSetup(
                         agent=agent,
                         request=request,
-                        network=self._network,
+                        graph=self.graph,
+                        conflicts=self.conflicts,
+                        places=self.places(agent),
                         step_length_s=self._step_length_s,
                         start_m=starts[agent],
                         start_s=time_s,

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from math import cos, sin
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+from libsumo import _libsumo as sumo
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.simulators import RequestedPart
-    from crashhunt.sumo._observed_network import RoadNetwork
-    from crashhunt.world import Scene
+    from crashhunt.sumo._conflicts import Conflicts
+    from crashhunt.sumo._lane_graph import GraphLane, LaneGraph, RouteGuide
+    from crashhunt.world import RoadMap, Scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +27,9 @@ class ReaderSetup:
     Args:
         agent: Identifier of the agent, which is also the identifier of its vehicle.
         request: The part with the values of its settings.
-        network: Data of the network. One object is shared by all readers of the simulator, in all episodes.
+        graph: The lanes of the network. One object is shared by all readers of the simulator, in all episodes.
+        conflicts: The conflicts at the junctions, shared like the lanes.
+        places: Finds the vehicle on the network. One object is shared by all readers of the agent.
         step_length_s: Length of a step, in s.
         start_m: The vehicle's odometer (`vehicle.getDistance`) at the start of the episode, in m.
         start_s: Simulation time at the start of the episode, in s.
@@ -33,7 +39,9 @@ class ReaderSetup:
 
     agent: str
     request: RequestedPart
-    network: RoadNetwork
+    graph: LaneGraph
+    conflicts: Conflicts
+    places: Places
     step_length_s: float
     start_m: float
     start_s: float
@@ -70,6 +78,91 @@ class Moment:
     row: int
     lane: str
     hidden: frozenset[str]
+
+
+class Place(NamedTuple):
+    """Where a vehicle is on the network.
+
+    Args:
+        lane: its lane, or its last lane if it is off every lane.
+        position_m: distance of the front bumper from the start of the lane, in m, as SUMO measures it.
+        guide: its route.
+        number: index of the lane's edge on the route; of the edge before, inside a junction; -1 off the route.
+        x: x of the centre of the vehicle, in m.
+        y: y of the centre of the vehicle, in m.
+    """
+
+    lane: GraphLane
+    position_m: float
+    guide: RouteGuide
+    number: int
+    x: float
+    y: float
+
+
+class Places:
+    """Finds a vehicle on the network, once per step for all readers of an agent.
+
+    Args:
+        graph: the lanes of the network.
+        agent: identifier of the vehicle.
+    """
+
+    def __init__(self, graph: LaneGraph, agent: str) -> None:
+        self._graph, self._agent = graph, agent
+        self._class = sumo.vehicle_getVehicleClass(agent)
+        self._moment: Moment | None = None
+        self._place: Place | None = None
+        self._route = ""
+        self._guide = graph.guide((), self._class)
+
+    @property
+    def vehicle_class(self) -> str:
+        """The class of the vehicle."""
+        return str(self._class)
+
+    def find(self, moment: Moment) -> Place | None:
+        """Return where the vehicle is; None if its lane is not in the network file."""
+        if moment is not self._moment:
+            self._moment, self._place = moment, self._found(moment)
+        return self._place
+
+    def road_map(self) -> RoadMap:
+        """Return the map of the roads with the vehicle's route, from its present lane on."""
+        name, number = sumo.vehicle_getLaneID(self._agent), max(0, sumo.vehicle_getRouteIndex(self._agent))
+        guide = self._graph.guide(tuple(sumo.vehicle_getRoute(self._agent)), self._class)
+        return guide.road_map(number, self._graph.lanes.get(name))
+
+    def _found(self, moment: Moment) -> Place | None:
+        agent, scene, row = self._agent, moment.scene, moment.row
+        lane = self._graph.lanes.get(moment.lane)
+        if lane is None:
+            return None
+        route = sumo.vehicle_getRouteID(agent)
+        if route != self._route:
+            self._route = route
+            self._guide = self._graph.guide(tuple(sumo.vehicle_getRoute(agent)), self._class)
+        number = sumo.vehicle_getRouteIndex(agent)
+        if not self._guide.follows(number, lane):
+            number = -1
+        (x, y), heading = scene.points[row], scene.headings[row]
+        position = sumo.vehicle_getLanePosition(agent)
+        if position < 0.0:  # off every lane
+            position = _position_on(self._graph, lane, x, y)
+        half = scene.roster.actors[row].length / 2
+        return Place(lane, position, self._guide, number, x - half * cos(heading), y - half * sin(heading))
+
+
+def _position_on(graph: LaneGraph, lane: GraphLane, x: float, y: float) -> float:
+    """Return the distance along a lane, as SUMO measures it, of the point of its centre line nearest to a point."""
+    center = graph.lines(lane).center
+    start, step = center[:-1], np.diff(center, axis=0)
+    length = np.hypot(step[:, 0], step[:, 1])
+    share = np.clip((((x, y) - start) * step).sum(axis=1) / length**2, 0.0, 1.0)
+    away = ((start + share[:, None] * step - (x, y)) ** 2).sum(axis=1)
+    row = int(np.argmin(away))
+    along = float(length[:row].sum() + share[row] * length[row])
+    return along / float(length.sum()) * lane.data.length_m
 
 
 class Reader(Protocol):

@@ -32,6 +32,7 @@ from crashhunt.simulators import (
 from crashhunt.sumo._descriptor import BACKEND
 from crashhunt.sumo._disturbances import SumoDisturbances
 from crashhunt.sumo._driving import Driving, hold_vehicle
+from crashhunt.sumo._ego_and_actors import vehicle_data_of
 from crashhunt.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.sumo._files import StagedFiles
 from crashhunt.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
@@ -57,9 +58,10 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.simulators import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Paths, Scene, Surroundings
+    from crashhunt.world import Paths, RoadMap, Scene, Surroundings, VehicleData
 
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
+_USUAL_CLASS = "passenger"  # of vehicles whose type names no class
 _WINDOW_WIDTH_M = 150.0  # width of the visible part of the network when the window follows a vehicle
 _FORMS: dict[str, Callable[[], ActionForm]] = {
     "speed_and_lane": SpeedAndLaneChange,
@@ -91,7 +93,7 @@ class SumoSimulator:
         self._kinematics = Kinematics(scenario.observation or ObservationSetup())
         self.observation_names = self._kinematics.features
         self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
-        self._parts = ObservedParts(scenario.agents, scenario.step_length_s)
+        self._parts = ObservedParts(scenario)
         self.observation_layouts = self._parts.layouts
         self.observation_spaces |= {agent: layout.flat_space for agent, layout in self.observation_layouts.items()}
         if self.observation_layouts:
@@ -284,6 +286,18 @@ class SumoSimulator:
                 for lane in sumo.lane_getIDList()
             ]
         return self._lanes
+
+    def prepare_road_maps(self) -> None:
+        """Read the network."""
+        self._parts.graph.lanes_for(_USUAL_CLASS)
+
+    def road_map(self, agent: str) -> RoadMap:
+        """Return the map of the roads, with the route of a vehicle that has entered."""
+        return self._parts.places(agent).road_map()
+
+    def vehicle_data(self, agent: str) -> VehicleData:
+        """Return the size and the limits of a vehicle that has entered."""
+        return vehicle_data_of(agent)
 
     def full_braking(self, agent: str) -> FullBraking:
         """Return the action for the hardest braking that the speed mode of the vehicle allows."""

@@ -394,12 +394,13 @@ def describe(space: Mapping[str, Distribution]) -> str:
 
 _CONSTRUCTORS = ("__new__", "__init__")
 FILLED_BY_NAME: Final = (
-    "observation_space", "action_space", "step_length_s", "action_masks", "agent_id", "columns",
+    "observation_space", "action_space", "step_length_s", "action_masks", "agent_id", "columns", "map", "vehicle",
 )  # fmt: skip
 """Parameters of an agent that crashhunt fills.
 
-These are the spaces of the vehicle, the step length in s, the masks, the identifier of the agent, and the index of each
-column of the observed parts, by part and name."""
+These are the spaces of the vehicle, the step length in s, the masks, the identifier of the agent, the index of each
+column of the observed parts by part and name, the map of the roads with the vehicle's route, and the size and limits of
+the vehicle."""
 _KINDS: dict[object, Kind] = {float: "float", int: "int", bool: "bool", str: "str"}
 
 

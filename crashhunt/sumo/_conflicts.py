@@ -1,0 +1,163 @@
+"""Where paths across a junction conflict, and which vehicle has to yield there."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from crashhunt.sumo._lane_graph import GraphLane, LaneGraph, LaneLink
+
+    Line = NDArray[np.float64]
+
+_UPSTREAM_M = 150.0  # actors further away are out of sight
+_CLOSE_SHARE = 0.8  # of the mean width of two lanes, which lets neighbouring lanes pass
+_STEP_M = 0.25  # resolution of conflict areas
+
+
+class Conflict(NamedTuple):
+    """A path across a junction that conflicts with the vehicle's path.
+
+    The conflict area is where the two centre lines are closer than 80 % of the mean width of the lanes.
+
+    Args:
+        must_yield: whether the rules of the junction make the vehicle yield to the path.
+        begin_m: distance on the vehicle's path from the stop line to the conflict area, in m.
+        end_m: distance on the vehicle's path from the stop line to the end of the conflict area, in m.
+        other_begin_m: distance on the other path from its stop line to the conflict area, in m.
+        other_end_m: distance on the other path to the end of the conflict area, in m.
+        source: the lane before the other path; empty for a crossing.
+        link: the other path; None for a crossing, which persons use in both directions.
+    """
+
+    must_yield: bool
+    begin_m: float
+    end_m: float
+    other_begin_m: float
+    other_end_m: float
+    source: str
+    link: LaneLink | None
+
+
+class Approach(NamedTuple):
+    """A lane on which an actor can be that takes a conflicting path.
+
+    Args:
+        conflict: the conflict.
+        offset_m: distance from the stop line of the path to the start of the lane, in m; negative before the line.
+        edges: the edges that must follow each other in the actor's route.
+        back: how many places the edge of the lane is behind the first of these edges; -1 inside the junction.
+    """
+
+    conflict: Conflict
+    offset_m: float
+    edges: tuple[str, str]
+    back: int
+
+
+class Conflicts:
+    """The conflicts at all junctions of a network, computed when they are used for the first time.
+
+    Args:
+        graph: the lanes.
+    """
+
+    def __init__(self, graph: LaneGraph) -> None:
+        self._graph = graph
+        self._rules = {lane: (one, index) for one in graph.rules.values() for index, lane in enumerate(one.inside)}
+        self._found: dict[str, dict[str, list[Approach]]] = {}
+
+    def around(self, link: LaneLink) -> dict[str, list[Approach]]:
+        """Return the lanes from which actors come into conflict with a path, by id; the path begins at its stop line.
+
+        Args:
+            link: the path; not the rest of a path.
+        """
+        last = link.inside[-1] if link.inside else ""
+        found = self._found.get(last)
+        if found is None:
+            found = self._found[last] = self._made(link, last)
+        return found
+
+    def _made(self, link: LaneLink, last: str) -> dict[str, list[Approach]]:
+        graph = self._graph
+        rule = next((self._rules[lane] for lane in reversed(link.inside) if lane in self._rules), None)
+        found: dict[str, list[Approach]] = {}
+        if rule is None:
+            return found
+        junction, own = rule
+        source = graph.lanes[last].entries[0][0]
+        for other in sorted(junction.foes.get(own, ())):
+            lane = graph.lanes.get(junction.inside[other]) if other < len(junction.inside) else None
+            if lane is None or (lane.entries and lane.entries[0][0] == source):
+                continue
+            path = lane.entries[0][1] if lane.entries else None
+            area = self._area(link.inside, path.inside if path is not None else (lane.id,))
+            if area is None:
+                continue
+            must_yield = other in junction.yields.get(own, ())
+            before = lane.entries[0][0] if path is not None else ""
+            conflict = Conflict(must_yield, *area, before, path)
+            for name, approach in self._approaches(conflict, lane):
+                found.setdefault(name, []).append(approach)
+        return found
+
+    def _approaches(self, conflict: Conflict, lane: GraphLane) -> Iterator[tuple[str, Approach]]:
+        graph, link = self._graph, conflict.link
+        if link is None:
+            yield lane.id, Approach(conflict, 0.0, ("", ""), -1)
+            return
+        source = graph.lanes[conflict.source]
+        edges = source.edge, graph.lanes[link.target].edge
+        offset = 0.0
+        for inside in link.inside:
+            yield inside, Approach(conflict, offset, edges, -1)
+            offset += graph.length(inside)
+        for beside in graph.edges[source.edge]:
+            if beside is source or not any(graph.lanes[one.target].edge == edges[1] for one in beside.links):
+                yield beside.id, Approach(conflict, -beside.data.length_m, edges, 0)
+        # Edges further upstream, each with the shortest distance.
+        waiting, known = [(source, -source.data.length_m, 0)], {source.edge}
+        while waiting:
+            current, offset, back = waiting.pop(0)
+            for name, entry in current.entries if offset > -_UPSTREAM_M else ():
+                before = graph.lanes[name]
+                place = offset
+                for inside in reversed(entry.inside):
+                    place -= graph.length(inside)
+                    yield inside, Approach(conflict, place, edges, back + 1)
+                if before.edge not in known:
+                    known.add(before.edge)
+                    for beside in graph.edges[before.edge]:
+                        yield beside.id, Approach(conflict, place - beside.data.length_m, edges, back + 1)
+                    waiting.append((before, place - before.data.length_m, back + 1))
+
+    def _area(self, own: tuple[str, ...], other: tuple[str, ...]) -> tuple[float, float, float, float] | None:
+        """Return begin and end of the conflict area on two paths, in m; None if the paths are nowhere close."""
+        graph = self._graph
+        mine, theirs = (_sampled([graph.lines(graph.lanes[lane]).center for lane in path]) for path in (own, other))
+        limit = _CLOSE_SHARE * (graph.lanes[own[-1]].data.width_m + graph.lanes[other[-1]].data.width_m) / 2
+        squared = ((mine[0][:, None] - theirs[0][None]) ** 2).sum(axis=2)
+        close = squared < limit * limit
+        if not close.any():
+            return None
+        found = []
+        for (_, along), rows, path in ((mine, close.any(axis=1), own), (theirs, close.any(axis=0), other)):
+            scale = sum(graph.length(lane) for lane in path) / float(along[-1])
+            where = along[np.flatnonzero(rows)[[0, -1]]] * scale
+            found += where.tolist()
+        begin, end, other_begin, other_end = found
+        return begin, end, other_begin, other_end
+
+
+def _sampled(lines: list[Line]) -> tuple[Line, Line]:
+    """Return points along consecutive lines, and their distances from the start in m."""
+    points = np.concatenate(lines)
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+    at = np.linspace(0.0, along[-1], max(2, int(along[-1] / _STEP_M) + 2))
+    return np.column_stack([np.interp(at, along, points[:, axis]) for axis in (0, 1)]), at

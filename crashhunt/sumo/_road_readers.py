@@ -1,0 +1,449 @@
+"""Readers of the road around the controlled vehicle: lanes, route, traffic lights, right of way and speed limit."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from math import cos, sin
+from typing import TYPE_CHECKING, NamedTuple
+
+import libsumo
+import numpy as np
+from libsumo import _libsumo as sumo
+
+from crashhunt.sumo._lane_graph import is_open
+from crashhunt.sumo._lane_paths import LanePaths, Sampling, straight_ahead, straight_behind
+from crashhunt.world import PERSON, is_person
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from numpy.typing import NDArray
+
+    from crashhunt.sumo._conflicts import Approach, Conflict
+    from crashhunt.sumo._lane_graph import GraphLane, LaneLink, RouteGuide, Signal
+    from crashhunt.sumo._lane_paths import LanePath
+    from crashhunt.sumo._reader_protocol import Moment, Place, ReaderSetup
+
+    Array = NDArray[np.float64]
+
+_NEAR_M = 50.0  # lanes are shown within this distance
+_SQUARE_M = 8.0  # within squares of this size, the same lanes are candidates
+_WINDOW_M = 16.0  # within a square, the nearest point of a lane moves less along the lane
+_STANDING_MPS, NEVER_S = 0.1, 1000.0  # an actor that stands arrives after this time
+_STATES = {"G": 0.0, "g": 0.0, "y": 1.0, "Y": 1.0, "r": 2.0, "R": 2.0, "u": 2.0, "s": 2.0, "o": 3.0, "O": 3.0}
+_OFF = 3.0
+_RED_STATES = frozenset("rRus")
+_STOP_STATES = frozenset("sw")
+_ALLWAY_STOP = "w"
+_FIXED_TIMES = 0  # type of a traffic light program
+
+
+class LanesReader:
+    """Reads the lanes around the controlled vehicle.
+
+    Args:
+        setup: The part and the vehicle.
+    """
+
+    def __init__(self, setup: ReaderSetup) -> None:
+        self._setup, self._graph = setup, setup.graph
+        self._lanes, points, self._columns = setup.shape
+        spacing = setup.settings["spacing"]
+        self._sampling = Sampling(
+            spacing, points, min(points - 1, math.floor(setup.settings["behind"] / spacing + 1e-9))
+        )
+        self._steps = (np.arange(points) - self._sampling.before) * self._sampling.stride
+        self._window = np.arange(2 * math.ceil(_WINDOW_M / self._sampling.grid_m) + 1)
+        self._paths: dict[tuple[int, int], LanePaths] = {}
+        self._others: LanePaths | None = None
+        self._key: tuple[object, ...] = ()
+        self._block: _Block
+
+    def observe(self, moment: Moment) -> Array:
+        """Return the columns of ``lanes``."""
+        place = self._setup.places.find(moment)
+        if place is None:
+            return np.zeros(self._setup.shape)
+        square = math.floor(place.x / _SQUARE_M), math.floor(place.y / _SQUARE_M)
+        key = place.lane, id(place.guide), place.number, square
+        if key != self._key:
+            self._key, self._block = key, self._made(place, square)
+        block = self._block
+        squared = (block.x - place.x) ** 2 + (block.y - place.y) ** 2
+        nearest = squared.argmin(axis=1)
+        chosen = block.fixed
+        if len(nearest) > 3 and self._lanes > 3:
+            best = squared[3:].min(axis=1)
+            order = np.argsort(best, kind="stable")[: self._lanes - 3]
+            chosen = np.append(chosen, 3 + order[best[order] <= _NEAR_M * _NEAR_M])
+        rows = (block.begin + nearest)[chosen][:, None] + self._steps
+        rows = np.where((rows >= block.low[chosen][:, None]) & (rows < block.high[chosen][:, None]), rows, 0)
+        found = np.zeros(self._setup.shape)
+        found[: len(chosen)] = block.rows[rows]
+        return found
+
+    def _made(self, place: Place, square: tuple[int, int]) -> _Block:
+        graph, places, lane = self._graph, self._setup.places, place.lane
+        own = self._own_paths(place)
+        around: list[LanePath | None] = [own.path(lane)]
+        beside = []
+        for change in (1, -1):
+            other = graph.beside(lane, change)
+            is_usable = other is not None and is_open(other.data, places.vehicle_class)
+            beside.append(other if is_usable else None)
+            around.append(own.path(other) if other is not None and is_usable else None)
+        if self._others is None:
+            vehicle_class = places.vehicle_class
+            self._others = LanePaths(
+                graph,
+                self._sampling,
+                partial(straight_ahead, graph, vehicle_class=vehicle_class),
+                partial(straight_behind, graph, vehicle_class=vehicle_class),
+            )
+        x, y = ((number + 0.5) * _SQUARE_M for number in square)
+        reach = _NEAR_M + _SQUARE_M
+        near = graph.near(x, y, reach, places.vehicle_class) if self._lanes > 3 else []
+        taken = {one.id for one in (lane, *beside) if one is not None}
+        near = [one for one in near if one[1] not in taken]
+        limit = near[min(len(near), self._lanes - 3) - 1][0] + 2 * _SQUARE_M if near else 0.0
+        around += [self._others.path(graph.lanes[name]) for distance, name in near if distance <= limit]
+        return _block_of(around, x, y, self._window)
+
+    def _own_paths(self, place: Place) -> LanePaths:
+        """Return the paths of the lanes on the vehicle's own road, which follow its route if they can."""
+        key = id(place.guide), place.number
+        found = self._paths.get(key)
+        if found is None:
+            guide, number = place.guide, place.number
+            before = guide.edges[number - 1] if number > 0 and not place.lane.is_internal else ""
+            vehicle_class = self._setup.places.vehicle_class
+            found = self._paths[key] = LanePaths(
+                self._graph,
+                self._sampling,
+                partial(_along_route, guide, number),
+                partial(straight_behind, self._graph, vehicle_class=vehicle_class, preferred=before),
+            )
+        return found
+
+
+def _along_route(guide: RouteGuide, number: int, lane: GraphLane) -> Iterator[GraphLane]:
+    """Yield a lane and the lanes that follow it, on the route as long as the lane leads there, then straight ahead."""
+    graph, current = guide.graph, lane
+    while (link := guide.link(number, current)) is not None:
+        yield current
+        yield from (graph.lanes[inside] for inside in link.inside)
+        number, current = number + 1, graph.lanes[link.target]
+    yield from straight_ahead(graph, current, guide.vehicle_class)
+
+
+class _Block(NamedTuple):
+    """The candidates of the lanes around a square, with the own lane, the left and the right lane first.
+
+    Args:
+        rows: points of all lanes; row 0 is empty.
+        low: first row of each lane.
+        high: row behind the last row of each lane.
+        begin: first row of the window of each lane, in which the nearest point is.
+        x: x of the points in the windows, shape (lanes, points).
+        y: y of the points in the windows.
+        fixed: indices of the first three lanes.
+    """
+
+    rows: Array
+    low: NDArray[np.intp]
+    high: NDArray[np.intp]
+    begin: NDArray[np.intp]
+    x: Array
+    y: Array
+    fixed: NDArray[np.intp]
+
+
+def _block_of(paths: list[LanePath | None], x: float, y: float, window: NDArray[np.intp]) -> _Block:
+    parts: list[Array] = [np.zeros((1, 6))]
+    low: list[int] = []
+    high: list[int] = []
+    begin: list[int] = []
+    total = 1
+    for number, path in enumerate(paths):
+        if path is None:
+            for empty in (low, high, begin):
+                empty.append(0)
+            continue
+        start = path.first if number > 2 else path.begin
+        own = path.rows[start : path.last + 1]
+        nearest = start + int(np.argmin((own[:, 1] - x) ** 2 + (own[:, 2] - y) ** 2))
+        low.append(total)
+        parts.append(path.rows[:, :6])
+        total += len(path.rows)
+        high.append(total)
+        first = max(start, min(nearest - len(window) // 2, path.last + 1 - len(window)))
+        begin.append(low[-1] + first)
+    rows = np.concatenate(parts)
+    index = np.array(begin)[:, None] + window
+    last = [0 if path is None else start + path.last for path, start in zip(paths, low, strict=True)]
+    index = np.minimum(index, np.array(last)[:, None])
+    return _Block(rows, np.array(low), np.array(high), np.array(begin), rows[index, 1], rows[index, 2], np.arange(3))
+
+
+class RouteReader:
+    """Reads points along the route.
+
+    Args:
+        setup: The part and the vehicle.
+    """
+
+    def __init__(self, setup: ReaderSetup) -> None:
+        self._setup = setup
+        self._sampling = Sampling(setup.settings["spacing"], setup.shape[0], 0)
+        self._steps = np.arange(setup.shape[0]) * self._sampling.stride
+        self._paths: dict[tuple[int, int], LanePaths] = {}
+
+    def observe(self, moment: Moment) -> Array:
+        """Return the columns of ``route``."""
+        found = np.zeros(self._setup.shape)
+        place = self._setup.places.find(moment)
+        if place is None or place.number < 0:
+            return found
+        key = id(place.guide), place.number
+        paths = self._paths.get(key)
+        if paths is None:
+            paths = self._paths[key] = self._made(place)
+        path = paths.path(place.lane)
+        part = path.rows[path.begin : path.last + 1]
+        nearest = path.begin + int(((part[:, 1] - place.x) ** 2 + (part[:, 2] - place.y) ** 2).argmin())
+        rows = path.rows[nearest + self._steps[self._steps < len(path.rows) - nearest]]
+        found[: len(rows)] = rows[:, _ROUTE_COLUMNS]
+        return found
+
+    def _made(self, place: Place) -> LanePaths:
+        guide, number = place.guide, place.number
+        before = guide.edges[number - 1] if number > 0 and not place.lane.is_internal else ""
+        graph, vehicle_class = guide.graph, guide.vehicle_class
+
+        def ahead(lane: GraphLane) -> Iterator[GraphLane]:
+            return (one for one, _, _ in guide.walk(number, lane, is_best=True))
+
+        behind = partial(straight_behind, graph, vehicle_class=vehicle_class, preferred=before)
+        return LanePaths(graph, self._sampling, ahead, behind)
+
+
+_ROUTE_COLUMNS = (0, 1, 2, 3, 5, 6)
+
+
+class RouteStateReader:
+    """Reads the state of the controlled vehicle on its route.
+
+    Args:
+        setup: The part and the vehicle.
+    """
+
+    def __init__(self, setup: ReaderSetup) -> None:
+        self._setup = setup
+
+    def observe(self, moment: Moment) -> Array:
+        """Return the columns of ``route_state``."""
+        place = self._setup.places.find(moment)
+        if place is None or place.number < 0:
+            return np.zeros(self._setup.shape)
+        guide, lane = place.guide, place.lane
+        changes, number, left = 0, place.number, -place.position_m
+        if lane.is_internal:
+            link = guide.link(number, lane)
+            assert link is not None
+            left += lane.data.length_m + link.length_m
+            number, lane = number + 1, guide.graph.lanes[link.target]
+        else:
+            changes = guide.lane_changes(number, lane)
+        step = guide.step(number, lane.id)
+        if step is None:  # a lane that the vehicle may not use
+            best = guide.best(number, lane)
+            rest, run = (guide.rest_m(number, best) if best is not None else 0.0), 0.0
+        else:
+            rest, run = step.rest_m, step.run_m
+        return np.array((max(0.0, rest + left), changes, max(0.0, run + left), *guide.goal))
+
+
+class SignalsReader:
+    """Reads the next traffic lights on the route.
+
+    Args:
+        setup: The part and the vehicle.
+    """
+
+    def __init__(self, setup: ReaderSetup) -> None:
+        self._setup = setup
+        self._ahead: dict[tuple[int, int, str], list[Signal]] = {}
+        self._seen: dict[tuple[str, int], tuple[float, float]] = {}  # state of the lights ahead, and since when
+
+    def observe(self, moment: Moment) -> Array:
+        """Return the columns of ``signals``."""
+        found = np.zeros(self._setup.shape)
+        seen, self._seen = self._seen, {}
+        place = self._setup.places.find(moment)
+        if place is None or place.number < 0:
+            return found
+        key = id(place.guide), place.number, place.lane.id
+        ahead = self._ahead.get(key)
+        if ahead is None:
+            ahead = self._ahead[key] = place.guide.signals(place.number, place.lane, len(found))
+        time_s = moment.scene.time_s
+        for row, (distance, light, link) in enumerate(ahead):
+            state = _STATES.get(sumo.trafficlight_getRedYellowGreenState(light)[link], _OFF)
+            last = seen.get((light, link))
+            if last is None:
+                last = state, time_s - _time_in_state(light, link, state)
+            elif last[0] != state:  # it changed when the step began
+                last = state, time_s - self._setup.step_length_s
+            self._seen[light, link] = last
+            found[row] = 1.0, state, distance - place.position_m, time_s - last[1]
+        return found
+
+
+def _time_in_state(light: str, link: int, state: float) -> float:
+    """Return how long a traffic light shows a state at least, in s: exactly, if its program has fixed times."""
+    found = float(sumo.trafficlight_getSpentDuration(light))
+    name = sumo.trafficlight_getProgram(light)
+    for program in sumo.trafficlight_getAllProgramLogics(light):
+        if program.programID != name or program.type != _FIXED_TIMES:
+            continue
+        phases, current = program.phases, program.currentPhaseIndex
+        for back in range(1, len(phases)):
+            phase = phases[(current - back) % len(phases)]
+            if _STATES.get(phase.state[link], _OFF) != state:
+                break
+            found += phase.duration
+    return found
+
+
+class RightOfWayReader:
+    """Reads the actors on streams that conflict with the route at the next junction.
+
+    Args:
+        setup: The part and the vehicle.
+    """
+
+    def __init__(self, setup: ReaderSetup) -> None:
+        self._setup, self._graph = setup, setup.graph
+        self._routes: dict[str, tuple[str, tuple[str, ...]]] = {}
+
+    def observe(self, moment: Moment) -> Array:
+        """Return the columns of ``right_of_way``."""
+        found = np.zeros(self._setup.shape)
+        place = self._setup.places.find(moment)
+        path = path_across(place) if place is not None else None
+        if place is None or path is None:
+            return found
+        link, line = path
+        approaches = self._setup.conflicts.around(link)
+        if not approaches:
+            return found
+        scene, row = moment.scene, moment.row
+        actors = scene.roster.actors
+        front = -line
+        rear = front - actors[row].length
+        stop_sign = float(link.state in _STOP_STATES)
+        rows = []
+        for other, actor in enumerate(actors):
+            if other == row or actor.id in moment.hidden:
+                continue
+            speed = max(0.0, scene.speeds[other])
+            best = None
+            for conflict, place_m in self._taken(actor.id, scene.headings[other], approaches):
+                if rear > conflict.end_m or place_m - actor.length > conflict.other_end_m:
+                    continue  # one of them has passed
+                away = conflict.other_begin_m - place_m
+                arrival = max(0.0, away) / speed if speed > _STANDING_MPS else NEVER_S if away > 0.0 else 0.0
+                must_yield = conflict.must_yield and self._goes_first(link, line, actor.id, conflict, place_m, arrival)
+                values = (min(arrival, NEVER_S), away, actor.id, must_yield, conflict.begin_m - front, speed)
+                best = values if best is None else min(best, values)
+            if best is not None:
+                rows.append(best)
+        rows.sort()
+        for number, (arrival, away, _, must_yield, distance, speed) in enumerate(rows[: len(found)]):
+            found[number] = 1.0, must_yield, line, distance, away, speed, arrival, stop_sign
+        return found
+
+    def _on_crossing(self, conflict: Conflict, lane: str, position: float, heading: float) -> tuple[Conflict, float]:
+        """Return the conflict with a person on a crossing and its position, both in the direction of the person."""
+        center, length = self._graph.lines(self._graph.lanes[lane]).center, self._graph.length(lane)
+        along = (center[-1] - center[0]) @ (cos(heading), sin(heading))
+        if along >= 0.0:
+            return conflict, position
+        begin, end = length - conflict.other_end_m, length - conflict.other_begin_m
+        return conflict._replace(other_begin_m=begin, other_end_m=end), length - position
+
+    def _taken(
+        self, name: str, heading: float, approaches: Mapping[str, list[Approach]]
+    ) -> Iterator[tuple[Conflict, float]]:
+        """Yield the conflicting paths that an actor takes, and its front's distance behind their stop lines, in m."""
+        try:
+            if is_person(name):
+                person = name.removeprefix(PERSON)
+                lane = sumo.person_getLaneID(person)
+                for one in approaches.get(lane, ()):
+                    yield self._on_crossing(one.conflict, lane, sumo.person_getLanePosition(person), heading)
+                return
+            found = approaches.get(sumo.vehicle_getLaneID(name))
+            if found is None:
+                return
+            number, position = sumo.vehicle_getRouteIndex(name), sumo.vehicle_getLanePosition(name)
+            route = sumo.vehicle_getRouteID(name)
+            known = self._routes.get(name)
+            if known is None or known[0] != route:
+                known = self._routes[name] = route, tuple(sumo.vehicle_getRoute(name))
+        except libsumo.TraCIException:  # an actor of a recording that is played back
+            return
+        for one in found:
+            first = number + one.back
+            if one.back < 0 or known[1][first : first + 2] == one.edges:
+                yield one.conflict, one.offset_m + position
+
+    def _goes_first(
+        self, link: LaneLink, line: float, name: str, conflict: Conflict, place_m: float, arrival: float
+    ) -> bool:
+        """Return whether an actor that has priority by the rules also has it in this moment."""
+        other = conflict.link
+        if other is None or place_m > 0.0:
+            return True
+        if other.signal:
+            state = sumo.trafficlight_getRedYellowGreenState(other.signal)[other.signal_index]
+            return state not in _RED_STATES
+        if link.state == _ALLWAY_STOP:  # the vehicle that has waited longest goes first
+            agent = self._setup.agent
+            own_speed = max(_STANDING_MPS, float(sumo.vehicle_getSpeed(agent)))
+            own = -float(sumo.vehicle_getWaitingTime(agent)), max(0.0, line) / own_speed
+            return (-float(sumo.vehicle_getWaitingTime(name)), arrival) < own
+        return True
+
+
+def path_across(place: Place) -> tuple[LaneLink, float] | None:
+    """Return the path across the next junction, or the present one, and the distance to its stop line, in m.
+
+    The distance is negative behind the stop line. The result is None if the lane does not lead along the route.
+    """
+    lane = place.lane
+    link = place.guide.link(place.number, lane) if place.number >= 0 else None
+    if link is None:
+        return None
+    if not lane.is_internal:
+        return link, lane.data.length_m - place.position_m
+    entry = next((one for _, one in lane.entries if one.target == link.target), None)
+    if entry is None:
+        return None
+    return entry, -(entry.length_m - link.length_m - lane.data.length_m) - place.position_m
+
+
+class SpeedLimitReader:
+    """Reads the speed limit of the controlled vehicle's lane.
+
+    Args:
+        setup: The part and the vehicle.
+    """
+
+    def __init__(self, setup: ReaderSetup) -> None:
+        self._setup = setup
+
+    def observe(self, moment: Moment) -> Array:
+        """Return the speed limit, which can differ from that of the network file while a sign changes it."""
+        return np.array((float(sumo.lane_getMaxSpeed(moment.lane)),))
