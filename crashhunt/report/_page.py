@@ -28,7 +28,7 @@ from crashhunt.report._crash_text import Story
 from crashhunt.report._rate_text import describe_running
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._step_table import argument_units
-from crashhunt.report._verdict import verdict_of
+from crashhunt.report._verdict import last_avoidable, verdict_of
 from crashhunt.report._words import (
     NOT_DECIDED,
     by_likelihood,
@@ -474,6 +474,7 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
             }[bundle.confirmed],
         },
         "escape": story.escape,
+        "avoidable": last_avoidable(story),
         "nearest": story.nearest.step if story.nearest is not None else None,
         **_danger(story),
         "agent": story.agent,

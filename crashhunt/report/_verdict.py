@@ -224,6 +224,25 @@ def _avoided(story: CrashFacts, omission: Omission | None) -> str:
     return _if_it(story, "brakes", tried.step, tried.changed)
 
 
+def last_avoidable(story: CrashFacts) -> tuple[int, str, float | None] | None:
+    """Return the last step from which a run avoided the crash, how, and its greatest deceleration in m/s².
+
+    The deceleration is None if the run did not only brake. The result is None if no run avoided the crash, or if that
+    is unknown.
+    """
+    judgement, tried = story.judgement, story.bundle.result.escape
+    if judgement is not None and judgement.runs:
+        best = judgement.best
+        if best is None or best.last_step is None:
+            return None
+        how = _MANEUVER_WORDS.get(best.manoeuvre, best.manoeuvre)
+        only_brakes = best.manoeuvre == "brake" and not best.changed
+        return best.last_step, how, best.deceleration if only_brakes else None
+    if tried is None or tried.why_not or tried.step is None:
+        return None
+    return tried.step, "brakes", None if tried.changed else tried.braking
+
+
 def _if_it(story: CrashFacts, how: str, step: int, changed: tuple[str, ...]) -> str:
     """Return that a run with changes from a step on avoids the crash, and the agent's other changes in that run."""
     also = "".join(f" and {each.removeprefix(f'{story.agent} ')}" for each in changed)

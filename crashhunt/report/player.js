@@ -60,7 +60,7 @@ function showTip(x, y, text) {
 function hideTip() { $("tip").hidden = true; }
 
 /* What is shown of the crash */
-const view = { crash: null, step: 0, playing: false, follow: true, scale: 6, x: 0, y: 0, last: 0, clock: 0, frames: 0 };
+const view = { crash: null, step: 0, playing: false, follow: true, ids: false, scale: 6, x: 0, y: 0, last: 0, clock: 0, frames: 0 };
 window.crashhuntView = view;
 
 /* Unpacks what a crash came with; once. */
@@ -83,6 +83,9 @@ async function load(crash) {
   }
 }
 
+/* The last steps are those that matter. */
+$("steps").closest("details").addEventListener("toggle", () => { $("steps").scrollTop = $("steps").scrollHeight; });
+
 /* Shows the notes of users, one line each. */
 function showNotes(id, notes) {
   $(id).hidden = !notes?.length;
@@ -102,8 +105,6 @@ function describe(crash, rows) {
 /* Puts a crash that is loaded into the page; the rows are names and values of facts of its trial. */
 function show(crash, rows) {
   describe(crash, rows);
-  /* Without an animation of what went wrong, the traceback is the answer. */
-  $("evidence").open = crash.category === "software fault";
   $("key-agent").textContent = crash.agent;
   $("key-other").textContent = crash.other;
   $("key-other-box").hidden = !crash.other;
@@ -111,8 +112,14 @@ function show(crash, rows) {
   $("scrub").max = Math.max(0, crash.steps - 1);
   view.crash = crash;
   view.agent = crash.actors.findIndex((actor) => actor[0] === crash.agent);
+  view.other = crash.actors.findIndex((actor) => actor[0] === crash.other);
   view.follow = true;
-  $("danger").hidden = !crash.dangers;
+  view.step = begin(crash);
+  crash.rows ??= rowsOf(crash);
+  $("plot").style.height = `${crash.rows.length * ROW + BELOW}px`;
+  $("avoidable").hidden = $("avoidable-words").hidden = !crash.avoidable;
+  $("avoidable-words").textContent = crash.avoidable ? `Last avoidable step: ${crash.avoidable[0]}. A run from this step avoids the crash, in which ${crash.agent} ${crash.avoidable[1]}.` : "";
+  fitEncounter();
   go(begin(crash));
   pause();
 }
@@ -130,6 +137,17 @@ function end(crash) {
   return crash.nearest === null ? crash.steps - 1 : Math.min(crash.steps - 1, crash.nearest + Math.round(2.5 / crash.dt));
 }
 
+/* The scale at which the agent and its collision partner are both in sight, half a second before the end. */
+function fitEncounter() {
+  const crash = view.crash, at = Math.max(0, end(crash) - Math.round(1.5 / crash.dt)), canvas = $("scene");
+  const own = view.agent < 0 ? null : state(at, view.agent), its = view.other < 0 ? null : state(at, view.other);
+  view.follow = true;
+  view.scale = 6;
+  if (!own || !its) return;
+  const across = Math.abs(own[0] - its[0]) + 12, up = Math.abs(own[1] - its[1]) + 12;
+  view.scale = Math.min(16, Math.max(2.5, Math.min(canvas.clientWidth / 2 / across, canvas.clientHeight / 2 / up)));
+}
+
 function state(step, actor) {
   const crash = view.crash, at = 4 * (step * crash.actors.length + actor);
   const x = crash.values[at];
@@ -139,8 +157,26 @@ function state(step, actor) {
 function colorOf(actor) {
   const crash = view.crash, id = crash.actors[actor][0];
   if (id === crash.agent) return css("--ego");
-  if (id === crash.other) return css("--crash");
+  if (id === crash.other) return css("--partner");
   return crash.agents.includes(id) ? css("--agent") : css("--other");
+}
+
+/* The acceleration of an actor over the last step, in m/s². */
+function accelerationOf(step, actor) {
+  const now = actor < 0 ? null : state(step, actor), before = actor < 0 || step < 1 ? null : state(step - 1, actor);
+  return now && before ? (now[3] - before[3]) / view.crash.dt : NaN;
+}
+const SLOWS_DOWN = -0.5;  // m/s²
+
+/* Words with a halo, which can be read on any ground. */
+function label(context, text, x, y) {
+  context.font = "12px system-ui";
+  context.lineJoin = "round";
+  context.lineWidth = 3;
+  context.strokeStyle = css("--page");
+  context.strokeText(text, x, y);
+  context.fillStyle = css("--text");
+  context.fillText(text, x, y);
 }
 
 function drawScene() {
@@ -201,9 +237,30 @@ function drawScene() {
     context.fillRect(-length, -breadth / 2, length, breadth);
     context.fillStyle = "rgba(0,0,0,0.35)";
     context.fillRect(-length * 0.38, -breadth * 0.4, length * 0.12, breadth * 0.8);
+    if (id === crash.agent || id === crash.other) {
+      context.strokeStyle = css("--text");
+      context.lineWidth = Math.max(0.12, 1.2 / view.scale);
+      context.strokeRect(-length, -breadth / 2, length, breadth);
+    }
+    if (accelerationOf(view.step, actor) < SLOWS_DOWN) {
+      context.fillStyle = css("--brake");
+      for (const side of [-0.5, 0.2]) context.fillRect(-length, side * breadth, Math.max(0.5, 3 / view.scale), 0.3 * breadth);
+    }
     context.restore();
   }
+  drawGhost(context);
   context.restore();
+  context.textAlign = "center";
+  for (let actor = 0; actor < crash.actors.length; actor++) {
+    const pose = state(view.step, actor), [id, , length, breadth] = crash.actors[actor];
+    if (!pose || !(view.ids || id === crash.agent || id === crash.other)) continue;
+    const x = width / 2 + (pose[0] - length / 2 * Math.cos(pose[2]) - view.x) * view.scale, y = height / 2 - (pose[1] - length / 2 * Math.sin(pose[2]) - view.y) * view.scale;
+    if (x < 0 || x > width || y < 0 || y > height) continue;
+    const reach = (Math.abs(length * Math.sin(pose[2])) + Math.abs(breadth * Math.cos(pose[2]))) / 2 * view.scale;
+    /* The two may touch, so that the label of one is above it and that of the other below. */
+    label(context, id, x, id === crash.other ? y + reach + 15 : y - reach - 5);
+  }
+  context.textAlign = "start";
   const since = view.step - crash.nearest;
   if ((crash.nearest === null ? view.step === crash.steps - 1 : since >= 0 && since <= 1 / crash.dt) && own) {
     context.strokeStyle = css("--crash");
@@ -247,63 +304,174 @@ function drawScene() {
   view.frames++;
 }
 
+/* Where the agent would be if it had braked from the last avoidable step on, along its recorded way; others as recorded.
+   This is a calculation: the run of `judge` itself is not recorded. */
+function ghostOf(step) {
+  const crash = view.crash, [from, , braking] = crash.avoidable ?? [Infinity, "", null];
+  if (!braking || step <= from || view.agent < 0) return null;
+  const first = state(from, view.agent), time = Math.min((step - from) * crash.dt, first ? first[3] / braking : 0);
+  if (!first) return null;
+  let left = first[3] * time - braking * time ** 2 / 2, at = first;
+  for (let number = from + 1; number < crash.steps; number++) {
+    const next = state(number, view.agent);
+    if (!next) return null;
+    const apart = Math.hypot(next[0] - at[0], next[1] - at[1]);
+    if (apart >= left) {
+      const part = apart ? left / apart : 0;
+      return [at[0] + part * (next[0] - at[0]), at[1] + part * (next[1] - at[1]), at[2]];
+    }
+    left -= apart;
+    at = next;
+  }
+  return null;
+}
+function drawGhost(context) {
+  const pose = ghostOf(view.step);
+  if (!pose) return;
+  const [, , length, breadth] = view.crash.actors[view.agent];
+  context.save();
+  context.translate(pose[0], pose[1]);
+  context.rotate(pose[2]);
+  context.strokeStyle = css("--text");
+  context.lineWidth = 1.5 / view.scale;
+  context.setLineDash([4 / view.scale, 3 / view.scale]);
+  context.strokeRect(-length, -breadth / 2, length, breadth);
+  context.restore();
+}
+
+/* The curves: one above the other, each with its own axis. */
+const ROW = 66, TITLE = 16, BELOW = 22, LEFT = 46, RIGHT = 12, TTC_CUT_S = 10, GAP_CUT_M = 100;
+const ROUND = [1, 2, 3, 5, 10, 15, 20, 30, 40, 50, 60, 80, 100, 150, 200];
+function rowsOf(crash) {
+  const whole = (count, value) => Float32Array.from({ length: count }, (_, step) => value(step));
+  const speedOf = (actor) => whole(crash.steps, (step) => (actor < 0 ? NaN : state(step, actor)?.[3] ?? NaN));
+  const most = (...series) => series.reduce((all, one) => one.reduce((top, value) => (value > top ? value : top), all), 0);
+  const above = (value) => ROUND.find((limit) => limit >= value) ?? Math.ceil(value / 100) * 100;
+  crash.speeds = speedOf(view.agent);
+  crash.otherSpeeds = speedOf(view.other);
+  crash.pulls = whole(crash.steps, (step) => accelerationOf(step, view.agent));
+  crash.otherPulls = whole(crash.steps, (step) => accelerationOf(step, view.other));
+  const own = (values, more = {}) => ({ name: crash.agent, color: "--ego-line", values, ...more });
+  const its = (values) => (view.other < 0 ? [] : [{ name: crash.other, color: "--partner", dash: [5, 3], values }]);
+  const widest = above(Math.min(GAP_CUT_M, most(crash.gaps)));
+  const pulls = [...crash.pulls, ...crash.otherPulls].filter(Number.isFinite);
+  const strongest = Math.min(12, above(Math.max(1, -Math.min(0, ...pulls)))), quickest = Math.min(12, above(Math.max(1, Math.max(0, ...pulls))));
+  const rows = [
+    { title: `time to collision${crash.other ? ` with ${crash.other}` : " with any actor"}`, unit: "s", low: 0, high: TTC_CUT_S, series: [{ name: "", color: "--accent", values: crash.ttcs }] },
+    { title: `gap${crash.other ? ` to ${crash.other}` : " to the closest actor"}`, unit: "m", low: 0, high: widest, series: [{ name: "", color: "--accent", values: crash.gaps }] },
+    { title: "speed", unit: "m/s", low: 0, high: above(most(crash.speeds, crash.otherSpeeds)), series: [own(crash.speeds), ...its(crash.otherSpeeds)] },
+    { title: "acceleration", unit: "m/s²", low: -strongest, high: quickest, series: [own(crash.pulls), ...its(crash.otherPulls)] },
+  ];
+  if (crash.dangers) rows.push({ title: "criticality", unit: "", low: 0, high: 1, series: [own(crash.dangers, { name: "own" }), { name: "rear", color: "--faint", dash: [2, 3], values: crash.behinds }] });
+  const size = crash.actionNames.length;
+  crash.actionNames.slice(0, 4).forEach((name, place) => {
+    const values = whole(crash.steps, (step) => crash.acts[step * size + place]), finite = values.filter(Number.isFinite);
+    if (!finite.length) return;
+    const [low, high] = [Math.min(...finite), Math.max(...finite)];
+    rows.push({ title: `action: ${name}`, unit: "", low: low === high ? low - 1 : low, high: low === high ? high + 1 : high, isStep: true, series: [own(values, { name: "" })] });
+  });
+  return rows;
+}
+const shortNumber = (value) => String(Number(value.toPrecision(3)));
+
 function drawPlot() {
   const crash = view.crash, [context, width, height] = fit($("plot"));
   if (!crash) return;
-  const left = 34, right = width - 54, top = 16, bottom = height - 18, last = Math.max(1, crash.steps - 1);
-  const x = (step) => left + ((right - left) * step) / last;
-  if (!crash.speeds) crash.speeds = Array.from({ length: crash.steps }, (_, step) => (view.agent >= 0 && state(step, view.agent) ? state(step, view.agent)[3] : NaN));
+  const right = width - RIGHT, last = Math.max(1, crash.steps - 1), x = (step) => LEFT + ((right - LEFT) * step) / last;
+  const bottom = crash.rows.length * ROW;
   copied("plot", crash, context, width, height, (context) => {
-    const speeds = crash.speeds, fastest = speeds.reduce((most, speed) => Math.max(most, Math.ceil(speed) || 0), 10);
-    const widest = [10, 20, 50, 100].find((limit) => crash.gaps.every((gap) => !(gap > limit))) ?? 100;
-    const curves = [["--s3", crash.gaps, widest], ["--crash", crash.ttcs, 10], ["--accent", speeds, fastest]];
-    context.strokeStyle = css("--line");
-    context.strokeRect(left + 0.5, top + 0.5, right - left, bottom - top);
     context.font = "11px system-ui";
-    for (const [color, series, limit] of curves) {
-      context.strokeStyle = css(color);
-      context.lineWidth = 1.5;
-      context.beginPath();
-      let down = false;
-      for (let step = 0; step < crash.steps; step++) {
-        const value = series[step];
-        const there = Number.isFinite(value);
-        if (there) context[down ? "lineTo" : "moveTo"](x(step), bottom - ((bottom - top) * Math.min(value, limit)) / limit);
-        down = there;
-      }
-      context.stroke();
-    }
-    context.fillStyle = css("--crash");
-    context.textAlign = "right";
-    context.fillText("10 s", left - 4, top + 9);
-    context.fillText("TTC", left - 4, bottom);
-    context.textAlign = "left";
-    context.fillText(crash.other ? `time to collision with ${crash.other}` : "least time to collision with any actor", left, top - 5, right - left - 90);
-    context.fillStyle = css("--s3");
-    context.textAlign = "right";
-    context.fillText(`gap, 0 to ${widest} m`, right, top - 5, 86);
-    context.fillStyle = css("--accent");
-    context.textAlign = "left";
-    context.fillText(`${fastest} m/s`, right + 4, top + 9);
-    context.fillText("speed", right + 4, bottom);
+    crash.rows.forEach((row, place) => drawRow(context, row, place * ROW + TITLE, (place + 1) * ROW - 4, x, right));
     context.fillStyle = css("--faint");
     context.textAlign = "center";
-    const ticks = right - left < 300 ? 2 : 4;
-    for (let part = 0; part <= ticks; part++) context.fillText(`${(crash.time0 + (part * last * crash.dt) / ticks).toFixed(1)} s`, Math.min(right - 14, Math.max(left + 14, left + ((right - left) * part) / ticks)), height - 4);
-    if (crash.escape !== null) {
-      context.strokeStyle = css("--faint");
-      context.setLineDash([3, 3]);
-      context.beginPath();
-      context.moveTo(x(crash.escape), top);
-      context.lineTo(x(crash.escape), bottom);
-      context.stroke();
-      context.setLineDash([]);
-    }
+    const ticks = right - LEFT < 300 ? 2 : 4;
+    for (let part = 0; part <= ticks; part++) context.fillText(`${(crash.time0 + (part * last * crash.dt) / ticks).toFixed(1)} s`, Math.min(right - 14, Math.max(LEFT + 14, LEFT + ((right - LEFT) * part) / ticks)), bottom + 12);
+    if (crash.avoidable) mark(context, x(crash.avoidable[0]), "last avoidable step", "--faint", [3, 3], bottom, right);
+    if (crash.nearest !== null || COLORS[crash.category] === "--crash") mark(context, x(crash.nearest ?? last), crash.nearest === null ? "crash" : "nearest", "--crash", [], bottom, right);
     /* when others erred, or the agent saw or acted late; the scene of a step is what has come of it */
     context.fillStyle = css("--fault");
     for (const [from, to] of crash.disturbances) context.fillRect(x(Math.min(from, last)), bottom - 3, Math.max(2, x(Math.min(to, last)) - x(Math.min(from, last))), 3);
   });
-  drawCursor(context, x(view.step), top, bottom);
+  drawCursor(context, x(view.step), TITLE, bottom - 4);
+}
+
+/* A vertical line through all rows, with its label above the first one. */
+function mark(context, x, words, color, dashes, bottom, right) {
+  context.strokeStyle = context.fillStyle = css(color);
+  context.lineWidth = 1.5;
+  context.setLineDash(dashes);
+  context.beginPath();
+  context.moveTo(x, TITLE);
+  context.lineTo(x, bottom - 4);
+  context.stroke();
+  context.setLineDash([]);
+  context.textAlign = x > right - 120 ? "right" : "left";
+  const away = words === "crash" ? 0 : context.textAlign === "right" ? -44 : 0;
+  context.fillText(words, x + away, TITLE - 4);
+}
+
+function drawRow(context, row, top, bottom, x, right) {
+  const { low, high } = row, y = (value) => bottom - ((bottom - top) * (Math.min(high, Math.max(low, value)) - low)) / (high - low);
+  context.lineWidth = 1;
+  context.strokeStyle = css("--line");
+  context.strokeRect(LEFT + 0.5, top + 0.5, right - LEFT, bottom - top);
+  if (low < 0 && high > 0 && !row.isStep) {
+    context.beginPath();
+    context.moveTo(LEFT, y(0));
+    context.lineTo(right, y(0));
+    context.stroke();
+  }
+  context.fillStyle = css("--faint");
+  context.textAlign = "right";
+  const middle = low < 0 && high > 0 ? 0 : (low + high) / 2, ticks = [high, ...(Math.abs(y(middle) - top) > 11 && Math.abs(y(middle) - bottom) > 11 ? [middle] : []), low];
+  for (const tick of ticks) context.fillText(shortNumber(tick), LEFT - 5, Math.min(bottom, Math.max(top + 8, y(tick) + 4)));
+  context.textAlign = "left";
+  context.fillStyle = css("--text");
+  const title = `${row.title}${row.unit ? ` (${row.unit})` : ""}`, isCut = row.series.some((one) => one.values.some((value) => value > high || value < low));
+  context.fillText(title, LEFT, top - 4, right - LEFT);
+  let at = LEFT + context.measureText(title).width + 14;
+  const told = [...row.series.filter((one) => one.name).map((one) => [one.name, one.color, one.dash ?? []]), ...(isCut ? [["cut at the axis", "--faint", [1, 3]]] : [])];
+  for (const [name, color, dash] of told) {
+    context.strokeStyle = css(color);
+    context.lineWidth = 1.8;
+    context.setLineDash(dash);
+    context.beginPath();
+    context.moveTo(at, top - 8);
+    context.lineTo(at + 18, top - 8);
+    context.stroke();
+    context.setLineDash([]);
+    context.fillStyle = css("--faint");
+    context.fillText(name, at + 22, top - 4);
+    at += 36 + context.measureText(name).width;
+  }
+  for (const { color, dash, values } of row.series) {
+    context.strokeStyle = css(color);
+    let down = false, wasCut = false;
+    const begin = (isOut) => { context.lineWidth = isOut ? 1.2 : 1.6; context.setLineDash(isOut ? [1, 3] : dash ?? []); context.beginPath(); };
+    begin(false);
+    for (let step = 0; step < values.length; step++) {
+      const value = values[step], there = Number.isFinite(value), isOut = there && (value > high || value < low);
+      if (there && down && isOut !== wasCut) {
+        context.lineTo(x(step), y(value));
+        context.stroke();
+        begin(isOut);
+        context.moveTo(x(step), y(value));
+      } else if (there && !down) {
+        context.stroke();
+        begin(isOut);
+        context.moveTo(x(step), y(value));
+        /* A step between two without a value, such as that of a lane change, would be no line. */
+        if (!Number.isFinite(values[step + 1])) context.rect(x(step) - 1, y(value) - 1, 2, 2);
+      } else if (there) {
+        if (row.isStep) context.lineTo(x(step), y(values[step - 1]));
+        context.lineTo(x(step), y(value));
+      }
+      down = there;
+      wasCut = isOut;
+    }
+    context.stroke();
+  }
+  context.setLineDash([]);
 }
 
 function drawCursor(context, x, top, bottom) {
@@ -315,59 +483,6 @@ function drawCursor(context, x, top, bottom) {
   context.stroke();
 }
 
-function drawDanger() {
-  const crash = view.crash;
-  if (!crash || !crash.dangers) return;
-  const [context, width, height] = fit($("danger"));
-  const left = 34, right = width - 54, top = 16, bottom = height - 6, last = Math.max(1, crash.steps - 1);
-  const x = (step) => left + ((right - left) * step) / last;
-  copied("danger", crash, context, width, height, (context) => {
-    context.strokeStyle = css("--line");
-    context.strokeRect(left + 0.5, top + 0.5, right - left, bottom - top);
-    for (const [color, series, dashes] of [["--accent", crash.behinds, [4, 3]], ["--ego", crash.dangers, []]]) {
-      context.strokeStyle = css(color);
-      context.lineWidth = 1.5;
-      context.setLineDash(dashes);
-      context.beginPath();
-      let down = false;
-      for (let step = 0; step < crash.steps; step++) {
-        const there = Number.isFinite(series[step]);
-        const y = bottom - (bottom - top) * series[step];
-        if (there) context[down ? "lineTo" : "moveTo"](x(step), y);
-        /* A step between two without a value, such as that of a lane change, would be no line. */
-        if (there && !down && !Number.isFinite(series[step + 1])) context.rect(x(step) - 1, y - 1, 2, 2);
-        down = there;
-      }
-      context.stroke();
-    }
-    context.setLineDash([]);
-    context.font = "11px system-ui";
-    context.fillStyle = css("--faint");
-    context.textAlign = "right";
-    context.fillText("1", left - 4, top + 9);
-    context.fillText("0", left - 4, bottom);
-    context.textAlign = "left";
-    context.fillText("criticality (all actors)", left, top - 5);
-    const free = left + context.measureText("criticality (all actors)").width + 8;
-    context.fillStyle = css("--ego");
-    context.fillText("own", right + 4, top + 9);
-    context.fillStyle = css("--accent");
-    context.fillText("rear", right + 4, bottom);
-    if (crash.nearest !== null || COLORS[crash.category] === "--crash") {
-      const at = crash.nearest === null ? last : crash.nearest;
-      context.strokeStyle = context.fillStyle = css("--crash");
-      context.lineWidth = 2;
-      context.beginPath();
-      context.moveTo(x(at), top);
-      context.lineTo(x(at), bottom);
-      context.stroke();
-      context.textAlign = x(at) > (left + right) / 2 ? "right" : "left";
-      context.fillText(crash.nearest === null ? "crash" : "nearest", Math.max(free, x(at)), top - 5);
-    }
-  });
-  drawCursor(context, x(view.step), top, bottom);
-}
-
 const share = (value) => (Number.isFinite(value) ? value.toFixed(2) : "-");
 
 /* The actors to which time to collision and gap of a step belong: the collision partner, or the closest ones. */
@@ -376,16 +491,24 @@ function partners(crash, step) {
   return crash.closest[step] ?? ["", ""];
 }
 
-function showNow() {
-  const crash = view.crash, own = view.agent >= 0 ? state(view.step, view.agent) : null;
+/* What the rows of curves say at a step, and its actions: for the line below the scene and for the tip on the curves. */
+function valuesAt(crash, step) {
   const number = (value, unit) => (Number.isFinite(value) ? `${value.toFixed(1)} ${unit}` : "-");
-  const [ttcWith, gapTo] = partners(crash, view.step);
-  const parts = [["step", `${view.step} of ${crash.steps - 1}`], ["time", number(crash.time0 + view.step * crash.dt, "s")], ["speed", number(own ? own[3] : NaN, "m/s")], [`TTC${ttcWith && ` with ${ttcWith}`}`, number(crash.ttcs[view.step], "s")], [`gap${gapTo && ` to ${gapTo}`}`, number(crash.gaps[view.step], "m")]];
-  if (crash.dangers) parts.push(["criticality", share(crash.dangers[view.step])], ["rear criticality", share(crash.behinds[view.step])]);
+  const [ttcWith, gapTo] = partners(crash, step), other = crash.other ? [[`speed of ${crash.other}`, number(crash.otherSpeeds[step], "m/s")]] : [];
+  const parts = [["time", `${(crash.time0 + step * crash.dt).toFixed(Math.abs(10 * crash.dt - Math.round(10 * crash.dt)) < 1e-6 ? 1 : 2)} s`], ["speed", number(crash.speeds[step], "m/s")], ...other, ["acceleration", number(crash.pulls[step], "m/s²")]];
+  if (crash.other) parts.push([`acceleration of ${crash.other}`, number(crash.otherPulls[step], "m/s²")]);
+  parts.push([`TTC${ttcWith && ` with ${ttcWith}`}`, number(crash.ttcs[step], "s")], [`gap${gapTo && ` to ${gapTo}`}`, number(crash.gaps[step], "m")]);
+  if (crash.dangers) parts.push(["criticality", share(crash.dangers[step])], ["rear criticality", share(crash.behinds[step])]);
   crash.actionNames.forEach((name, place) => {
-    const value = crash.acts[view.step * crash.actionNames.length + place];
+    const value = crash.acts[step * crash.actionNames.length + place];
     parts.push([name, Number.isNaN(value) ? "-" : String(Number(value.toPrecision(4)))]);
   });
+  return parts;
+}
+
+function showNow() {
+  const crash = view.crash, parts = [["step", `${view.step} of ${crash.steps - 1}`], ...valuesAt(crash, view.step)];
+  if (ghostOf(view.step)) parts.push(["dashed", `calculated: ${crash.agent} brakes at ${crash.avoidable[2].toFixed(1)} m/s² from step ${crash.avoidable[0]} on`]);
   $("now").replaceChildren(...parts.map(([name, value]) => {
     const span = make("span", `${name} `, "faint");
     span.append(make("b", value));
@@ -401,7 +524,7 @@ function go(step) {
   $("scrub").setAttribute("aria-valuetext", `step ${view.step}`);
   draw();
 }
-function draw() { if (view.crash) { drawScene(); drawPlot(); drawDanger(); showNow(); $("follow").setAttribute("aria-pressed", String(view.follow)); } }
+function draw() { if (view.crash) { drawScene(); drawPlot(); showNow(); $("ids").setAttribute("aria-pressed", String(view.ids)); $("follow").setAttribute("aria-pressed", String(view.follow)); } }
 function pause() { view.playing = false; $("play").textContent = "Play"; }
 function play() {
   if (view.step >= view.crash.steps - 1) go(view.crash.nearest === null ? 0 : begin(view.crash));
@@ -430,6 +553,13 @@ $("forth").onclick = () => step(1);
 $("in").onclick = () => zoom(1.4);
 $("out").onclick = () => zoom(1 / 1.4);
 $("follow").onclick = () => { view.follow = !view.follow; draw(); };
+$("fit").onclick = () => { fitEncounter(); draw(); };
+$("ids").onclick = () => { view.ids = !view.ids; draw(); };
+$("avoidable").onclick = () => { pause(); go(view.crash.avoidable[0]); };
+/* A page with several crashes sets this: 1 shows the next crash, -1 the previous one. */
+window.anotherCrash = () => {};
+$("previous").onclick = () => window.anotherCrash(-1);
+$("next").onclick = () => window.anotherCrash(1);
 $("scrub").oninput = (event) => { pause(); go(Number(event.target.value)); };
 $("scene").addEventListener("wheel", (event) => { event.preventDefault(); zoom(event.deltaY < 0 ? 1.15 : 1 / 1.15); }, { passive: false });
 let drag = null;
@@ -443,24 +573,19 @@ $("scene").onpointermove = (event) => {
   draw();
 };
 $("scene").onpointerup = $("scene").onpointercancel = () => { drag = null; };
-for (const id of ["plot", "danger"]) {
-  const seek = (event) => {
-    const box = $(id).getBoundingClientRect();
-    pause();
-    go(Math.round(((event.clientX - box.left - 34) / (box.width - 88)) * (view.crash.steps - 1)));
+{
+  const stepAt = (event) => {
+    const box = $("plot").getBoundingClientRect(), last = view.crash.steps - 1;
+    return Math.min(Math.max(0, Math.round(((event.clientX - box.left - LEFT) / (box.width - LEFT - RIGHT)) * last)), last);
   };
-  $(id).onpointerdown = (event) => { seek(event); $(id).setPointerCapture(event.pointerId); };
-  $(id).onpointermove = (event) => { if (event.buttons) seek(event); else tellStep(event); };
-  $(id).onpointerleave = hideTip;
-}
-function tellStep(event) {
-  const crash = view.crash, box = $("plot").getBoundingClientRect();
-  const at = Math.min(Math.max(0, Math.round(((event.clientX - box.left - 34) / (box.width - 88)) * (crash.steps - 1))), crash.steps - 1);
-  const number = (value, unit) => (Number.isFinite(value) ? `${value.toFixed(1)} ${unit}` : "-");
-  const [ttcWith, gapTo] = partners(crash, at);
-  const parts = [`step ${at}, ${(crash.time0 + at * crash.dt).toFixed(Math.abs(10 * crash.dt - Math.round(10 * crash.dt)) < 1e-6 ? 1 : 2)} s`, `speed ${number(crash.speeds[at], "m/s")}`, `time to collision${ttcWith && ` with ${ttcWith}`} ${number(crash.ttcs[at], "s")}`, `gap${gapTo && ` to ${gapTo}`} ${number(crash.gaps[at], "m")}`];
-  if (crash.dangers) parts.push(`criticality ${share(crash.dangers[at])}, rear criticality ${share(crash.behinds[at])}`);
-  showTip(event.clientX, event.clientY, parts.join("\n"));
+  const seek = (event) => { pause(); go(stepAt(event)); };
+  $("plot").onpointerdown = (event) => { seek(event); $("plot").setPointerCapture(event.pointerId); };
+  $("plot").onpointermove = (event) => {
+    if (event.buttons) return seek(event);
+    const step = stepAt(event);
+    return showTip(event.clientX, event.clientY, [`step ${step}`, ...valuesAt(view.crash, step).map(([name, value]) => `${name} ${value}`)].join("\n"));
+  };
+  $("plot").onpointerleave = hideTip;
 }
 /* Whoever clicks does not want the keys to go to what was clicked; whoever presses a key there does. */
 let pointed = false;
@@ -475,6 +600,6 @@ document.addEventListener("keydown", (event) => {
   if (!view.crash || event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
   if (event.target.tagName === "BUTTON" && [" ", "Enter"].includes(event.key)) return;
   const count = event.shiftKey ? 10 : 1;
-  const actions = { " ": toggle, ArrowLeft: () => step(-count), ArrowRight: () => step(count), Home: () => step(-Infinity), End: () => step(Infinity), "+": () => zoom(1.4), "=": () => zoom(1.4), "-": () => zoom(1 / 1.4), f: $("follow").onclick };
+  const actions = { " ": toggle, ArrowLeft: () => step(-count), ArrowRight: () => step(count), Home: () => step(-Infinity), End: () => step(Infinity), "+": () => zoom(1.4), "=": () => zoom(1.4), "-": () => zoom(1 / 1.4), f: $("follow").onclick, i: $("ids").onclick, "[": () => window.anotherCrash(-1), "]": () => window.anotherCrash(1) };
   if (actions[event.key]) { event.preventDefault(); actions[event.key](); }
 });

@@ -96,8 +96,91 @@ def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
             "c.height / 2 + 1.0 * p * Math.sin(arguments[0]) * r, 1, 1).data]",
             float(scene.headings[row]),
         )
-        assert pixel[:3] == [0xE0, 0x8A, 0x00]
+        assert pixel[:3] == [0xFF, 0xB3, 0x1A]
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def test_report_opens_with_the_animation(hunt, browser):
+    opened(browser, hunt.folder / hunt.crashhunt("report", "<b>bold&", "--json").json["file"])
+    box = browser.execute_script("return document.getElementById('scene').getBoundingClientRect()")
+    assert box["top"] < 400
+    assert text(browser, "subtitle").startswith("2 crashes in 3 trials; scenario loop")
+    order = browser.execute_script("return [...document.querySelectorAll('h2')].map((one) => one.textContent)")
+    assert [order.index(one) for one in ("Crashes", "Crash types", "The hunt in numbers", "Crash rate")] == [0, 1, 2, 4]
+
+
+def test_curves_are_those_of_the_recording_for_both_vehicles(hunt, browser):
+    done = hunt.crashhunt("report", "<b>bold&", "--json").json
+    opened(browser, hunt.folder / done["file"])
+    (bundle,) = (one for one in list_bundles(hunt.folder / "<b>bold&") if one.id == done["crashes"][0])
+    recording, other = bundle.recording(), bundle.result.collision.other
+    dt = recording.prologue.step_length_s
+    for name, speeds, pulls in (("ego", "speeds", "pulls"), (other, "otherSpeeds", "otherPulls")):
+        scenes = recording.scenes()
+        rows = [scene.roster.index.get(name) for scene in scenes]
+        truth = np.array(
+            [np.nan if row is None else scene.speeds[row] for row, scene in zip(rows, scenes, strict=True)]
+        )
+        shown = [
+            browser.execute_script(f"return [...crashhuntView.crash.{key}].map(String)") for key in (speeds, pulls)
+        ]
+        assert np.array(shown[0], dtype=float) == pytest.approx(truth, rel=1e-5, nan_ok=True)
+        assert np.array(shown[1], dtype=float)[1:] == pytest.approx(np.diff(truth) / dt, abs=1e-3, nan_ok=True)
+    titles = browser.execute_script("return crashhuntView.crash.rows.map((row) => `${row.title} ${row.unit}`.trim())")
+    assert titles[:5] == [
+        f"time to collision with {other} s", f"gap to {other} m", "speed m/s", "acceleration m/s²", "criticality",
+    ]  # fmt: skip
+    assert "action: target_speed" in titles
+    # Each row has room for its title, its axis and its curve, and the tip has the values of all.
+    assert browser.execute_script("return document.getElementById('plot').clientHeight") >= 60 * len(titles)
+    browser.execute_script(
+        "const plot = document.getElementById('plot'), box = plot.getBoundingClientRect();"
+        "plot.dispatchEvent(new PointerEvent('pointermove', { clientX: box.right - 13, clientY: box.top + 30 }))"
+    )
+    told = browser.execute_script("return document.getElementById('tip').textContent")
+    for word in (f"step {recording.steps}", "speed ", f"speed of {other} ", "acceleration ", "criticality", "gap to "):
+        assert word in told
+
+
+def test_last_avoidable_step_is_one_click_away_and_shows_where_braking_leads(hunt, browser):
+    done = hunt.crashhunt("report", "<b>bold&", "--json").json
+    opened(browser, hunt.folder / done["file"])
+    avoidable = next((number for number, crash in enumerate(page_data(browser)["crashes"]) if crash["avoidable"]), None)
+    assert avoidable is not None
+    browser.find_elements(By.CSS_SELECTOR, "#list button")[avoidable].click()
+    crash = page_data(browser)["crashes"][avoidable]
+    wait_until(lambda: text(browser, "summary").startswith(crash["id"]))
+    bundle = next(one for one in list_bundles(hunt.folder / "<b>bold&") if one.id == crash["id"])
+    from_step, how, braking = crash["avoidable"]
+    assert (from_step, how, braking) == (bundle.result.escape.step, "brakes", bundle.result.escape.braking)
+    browser.find_element(By.ID, "avoidable").click()
+    assert step(browser) == from_step
+    assert text(browser, "avoidable-words").startswith(f"Last avoidable step: {from_step}. ")
+    assert browser.execute_script("return ghostOf(crashhuntView.step)") is None
+    # The way that braking takes, along the recorded one.
+    recording = bundle.recording()
+    ways = [scene.points[scene.roster.index["ego"]] for scene in recording.scenes()[from_step:]]
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(np.array(ways), axis=0).T))])
+    speed = recording.scene(from_step).speeds[recording.scene(from_step).roster.index["ego"]]
+    later = recording.steps - from_step
+    time_s = min(later * recording.prologue.step_length_s, speed / braking)
+    driven = speed * time_s - braking * time_s**2 / 2
+    expected = [np.interp(driven, along, np.array(ways)[:, axis]) for axis in (0, 1)]
+    ghost = browser.execute_script(f"return ghostOf({recording.steps})")
+    origin = browser.execute_script("return crashhuntView.crash.origin")
+    assert np.array(ghost[:2]) + origin == pytest.approx(expected, abs=0.02)
+    assert driven < along[-1]
+
+
+def test_keys_lead_to_the_next_crash_and_show_all_names(hunt, browser):
+    done = hunt.crashhunt("report", "<b>bold&", "--json").json
+    opened(browser, hunt.folder / done["file"])
+    for key, number in (("]", 1), ("]", 0), ("[", 1)):
+        browser.find_element(By.TAG_NAME, "body").send_keys(key)
+        wait_until(lambda number=number: text(browser, "summary") == done["crashes"][number])
+    assert browser.find_element(By.ID, "ids").get_attribute("aria-pressed") == "false"
+    browser.find_element(By.TAG_NAME, "body").send_keys("i")
+    assert browser.find_element(By.ID, "ids").get_attribute("aria-pressed") == "true"
 
 
 def page_data(browser):
