@@ -354,7 +354,12 @@ def _assets() -> dict[str, bytes]:
     player = player_parts()
     folder = resources.files("crashhunt.dashboard").joinpath("static")
     found = {name: folder.joinpath(name).read_bytes() for name in _SCRIPTS}
-    return {**found, "player.js": player.script.encode(), "player.css": player.style.encode()}
+    return {
+        **found,
+        "player.js": player.script.encode(),
+        "bars.js": player.bars.encode(),
+        "player.css": player.style.encode(),
+    }
 
 
 @cache

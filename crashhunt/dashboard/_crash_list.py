@@ -172,10 +172,14 @@ class CrashList:
         bundle = self._read(folder)
         story = Story(bundle)
         small = self._minimized(folder)
+        names = sorted(self._folders())
+        at = names.index(crash.removesuffix(layout.SMALL))
         result, root = bundle.result, self._found.path
         return {
             **player_data(bundle, story),
             "near_miss": bundle.is_near_miss,
+            "previous": names[at - 1] if at else "",
+            "next": names[at + 1] if at + 1 < len(names) else "",
             "minimized": small.name if small is not None else "",
             "minimized_from": crash.removesuffix(layout.SMALL) if crash.endswith(layout.SMALL) else "",
             "parameters": {agent: dict(given) for agent, given in result.spec.arguments.items()},

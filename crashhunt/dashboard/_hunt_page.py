@@ -12,12 +12,20 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.base.text import command_line
-from crashhunt.crashes import crash_folders, read_notes
+from crashhunt.crashes import read_notes
 from crashhunt.dashboard._catalog import unreadable, unreadable_below
 from crashhunt.dashboard._trial_counts import Sample, TrialCounts
 from crashhunt.ledger import Ledger, damaged, has_begun
 from crashhunt.plans import read_settings
-from crashhunt.results import HuntState, count_versions, hunt_state, state_of_facts, sums_of_branches, sums_of_probes
+from crashhunt.results import (
+    HuntState,
+    count_versions,
+    hunt_state,
+    state_of_facts,
+    sums_of_branches,
+    sums_of_probes,
+    with_crash_counts,
+)
 from crashhunt.statistics import counts_suffice, rate_of_counts, rate_of_trials
 from crashhunt.training import held_out_traffics
 
@@ -123,14 +131,8 @@ class HuntView:
             self._key = key
         assert self.counts is not None
         state = state_of_facts(self.path, self.facts, dict(self.counts.outcomes), self._last)
-        saved = len(crash_folders(self.path))
-        dropped = sum(len(numbers) for numbers in (self.facts.get("dropped") or {}).values())
-        found = max(saved + dropped, self.counts.crashes)  # a bundle is written before its row
         return replace(
-            state,
-            state="crashed" if state.state == "finished" and found else state.state,
-            crashes=found,
-            crashes_saved=saved if saved < found else None,
+            with_crash_counts(state, self.facts, self.counts.crashes),
             code_versions=self._versions or None,
             notes=self._read_notes() or None,
             **self._copies,

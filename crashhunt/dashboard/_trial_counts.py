@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.report import values_of
+from crashhunt.report import trial_point
 from crashhunt.results import TrialRow
 from crashhunt.trial import Outcome
 
@@ -366,21 +366,9 @@ def _is_drawn(number: int, share: float) -> bool:
 
 def _point(data: JsonObject, crash_on: Collection[str]) -> Point:
     row = TrialRow(data)
-    outcome = row.outcome
     return {
-        "number": row.number,
-        "outcome": str(outcome),
-        "category": outcome.category,
-        "crash": str(outcome) in crash_on,
+        **trial_point(row),
+        "crash": str(row.outcome) in crash_on,
         "steps": data["steps"],
-        "danger": _rounded(row.danger),
-        "ttc": _rounded(row.time_to_collision_s),
-        "origin": row.origin,
-        "parent": row.parent,
         "disturbances": len(data.get("disturbances", ())),
-        "values": values_of(row),
     }
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else round(value, 4)

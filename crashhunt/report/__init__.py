@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         player_data as player_data,
         player_parts as player_parts,
         report_data as report_data,
+        trial_point as trial_point,
         values_of as values_of,
         write_report as write_report,
     )

@@ -89,6 +89,24 @@ def values_of(row: TrialRow) -> dict[str, Value]:
     return {**values, **row.scenario_arguments}
 
 
+def trial_point(row: TrialRow) -> dict[str, object]:
+    """Return a trial as a point of the plots of the report and of the dashboard."""
+    return {
+        "number": row.number,
+        "outcome": str(row.outcome),
+        "category": row.outcome.category,
+        "danger": _rounded(row.danger),
+        "ttc": _rounded(row.time_to_collision_s),
+        "origin": row.origin,
+        "parent": row.parent,
+        "values": values_of(row),
+    }
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(value, 4)
+
+
 def importance_of(trials: Sequence[tuple[Mapping[str, Value], float]]) -> list[Importance]:
     """Return the contribution of each argument to the criticality, the most important argument first.
 
@@ -207,7 +225,7 @@ def write_report(
     )
     player = player_parts()
     page = _read("page.html").replace("/*STYLE*/", player.style).replace("<!--PLAYER-->\n", player.controls)
-    page = page.replace("/*PLAYER*/\n", player.script)
+    page = page.replace("/*BARS*/\n", player.bars).replace("/*PLAYER*/\n", player.script)
     # Inside a script element, only "</" and "<!--" mean something to HTML.
     text = page.replace("/*DATA*/", json.dumps(data, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c"))
     with whole_file(target) as temporary:
@@ -216,23 +234,25 @@ def write_report(
 
 
 class PlayerParts(NamedTuple):
-    """The player of a crash, split into the parts that a page needs.
+    """The parts of pages that the report and the dashboard share.
 
     Args:
         style: CSS: the colours of both colour schemes, and the style of the controls.
         controls: HTML of the scene, the controls and the curves.
         script: JavaScript for the end of the page; its functions ``load`` and ``show`` take the data that `player_data`
             returns.
+        bars: JavaScript with the function ``importanceBars``, which returns the nodes of a chart.
     """
 
     style: str
     controls: str
     script: str
+    bars: str
 
 
 def player_parts() -> PlayerParts:
     """Return the player that the report and the dashboard use."""
-    return PlayerParts(_read("page.css"), _read("player.html"), _read("player.js"))
+    return PlayerParts(*map(_read, ("page.css", "player.html", "player.js", "bars.js")))
 
 
 def _read(name: str) -> str:
@@ -375,19 +395,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
                 if _is_drawn(number, 2 * _MOST / max(total, 1)):
                     unchosen.append((values_of(row), danger))
             if _is_drawn(number, share_of_crashes if counts else share):
-                time_s = row.time_to_collision_s
-                trials.append(
-                    {
-                        "number": row.number,
-                        "outcome": str(outcome),
-                        "category": outcome.category,
-                        "values": values_of(row),
-                        "ttc": round(time_s, 3) if time_s is not None else None,
-                        "danger": round(row.danger, 4) if row.danger is not None else None,
-                        "origin": row.origin,
-                        "parent": row.parent,
-                    }
-                )
+                trials.append(trial_point(row))
         return {
             "outcomes": outcomes,
             "categories": {name: Outcome(name).category for name in outcomes},

@@ -448,7 +448,9 @@ _MANEUVER_NOUNS = {"braked": "braking", "sped up": "speeding up", "changed lanes
 
 
 def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
-    """Return the causes of a crash, one sentence each, then the factors without influence.
+    """Return the causes of a crash, one sentence each, the strongest first, then the factors without influence.
+
+    A cause is the stronger, the fewer of the runs without it end in the same crash.
 
     Args:
         why: the results of the runs.
@@ -458,7 +460,8 @@ def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
     drawn = {
         factor.name for factor in why.factors if (factor.kind, factor.what) == ("argument", "drawn") and factor.clear
     }
-    sentences, alike = [], []
+    causes: list[tuple[float, str]] = []
+    alike = []
     for factor in why.factors:
         default = defaults.get(factor.name) if factor.kind == "argument" else None
         if not factor.clear or (factor is default and factor.name in drawn):
@@ -467,7 +470,9 @@ def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
         if all(one.same == one.clear for one in each):
             alike.append(_short(factor, sum(one.clear for one in each), when))
         else:
-            sentences.append(f"- {'; '.join(_sentence(one, when) for one in each if one.clear)}.")
+            words = f"- {'; '.join(_sentence(one, when) for one in each if one.clear)}."
+            causes.append((sum(one.same for one in each) / sum(one.clear for one in each), words))
+    sentences = [words for _, words in sorted(causes, key=lambda cause: cause[0])]
     if sentences:
         sentences = [f"Causes, from {why.runs} runs that each remove or change one element:", *sentences]
     if alike:

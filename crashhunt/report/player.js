@@ -116,7 +116,7 @@ function show(crash, rows) {
   view.follow = true;
   view.step = begin(crash);
   crash.rows ??= rowsOf(crash);
-  $("plot").style.height = `${crash.rows.length * ROW + BELOW}px`;
+  $("plot").style.height = `${HEAD + crash.rows.length * ROW + BELOW}px`;
   $("avoidable").hidden = $("avoidable-words").hidden = !crash.avoidable;
   $("avoidable-words").textContent = crash.avoidable ? `Last avoidable step: ${crash.avoidable[0]}. A run from this step avoids the crash, in which ${crash.agent} ${crash.avoidable[1]}.` : "";
   fitEncounter();
@@ -340,7 +340,7 @@ function drawGhost(context) {
 }
 
 /* The curves: one above the other, each with its own axis. */
-const ROW = 66, TITLE = 16, BELOW = 22, LEFT = 46, RIGHT = 12, TTC_CUT_S = 10, GAP_CUT_M = 100;
+const HEAD = 14, ROW = 66, TITLE = 16, BELOW = 22, LEFT = 46, RIGHT = 12, TTC_CUT_S = 10, GAP_CUT_M = 100;
 const ROUND = [1, 2, 3, 5, 10, 15, 20, 30, 40, 50, 60, 80, 100, 150, 200];
 function rowsOf(crash) {
   const whole = (count, value) => Float32Array.from({ length: count }, (_, step) => value(step));
@@ -378,10 +378,10 @@ function drawPlot() {
   const crash = view.crash, [context, width, height] = fit($("plot"));
   if (!crash) return;
   const right = width - RIGHT, last = Math.max(1, crash.steps - 1), x = (step) => LEFT + ((right - LEFT) * step) / last;
-  const bottom = crash.rows.length * ROW;
+  const bottom = HEAD + crash.rows.length * ROW;
   copied("plot", crash, context, width, height, (context) => {
     context.font = "11px system-ui";
-    crash.rows.forEach((row, place) => drawRow(context, row, place * ROW + TITLE, (place + 1) * ROW - 4, x, right));
+    crash.rows.forEach((row, place) => drawRow(context, row, HEAD + place * ROW + TITLE, HEAD + (place + 1) * ROW - 4, x, right));
     context.fillStyle = css("--faint");
     context.textAlign = "center";
     const ticks = right - LEFT < 300 ? 2 : 4;
@@ -392,7 +392,7 @@ function drawPlot() {
     context.fillStyle = css("--fault");
     for (const [from, to] of crash.disturbances) context.fillRect(x(Math.min(from, last)), bottom - 3, Math.max(2, x(Math.min(to, last)) - x(Math.min(from, last))), 3);
   });
-  drawCursor(context, x(view.step), TITLE, bottom - 4);
+  drawCursor(context, x(view.step), HEAD, bottom - 4);
 }
 
 /* A vertical line through all rows, with its label above the first one. */
@@ -401,13 +401,13 @@ function mark(context, x, words, color, dashes, bottom, right) {
   context.lineWidth = 1.5;
   context.setLineDash(dashes);
   context.beginPath();
-  context.moveTo(x, TITLE);
+  context.moveTo(x, HEAD);
   context.lineTo(x, bottom - 4);
   context.stroke();
   context.setLineDash([]);
   context.textAlign = x > right - 120 ? "right" : "left";
   const away = words === "crash" ? 0 : context.textAlign === "right" ? -44 : 0;
-  context.fillText(words, x + away, TITLE - 4);
+  context.fillText(words, x + away, HEAD - 4);
 }
 
 function drawRow(context, row, top, bottom, x, right) {

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
         sums_of_branches as sums_of_branches,
         sums_of_probes as sums_of_probes,
         trials_of_running as trials_of_running,
+        with_crash_counts as with_crash_counts,
     )
 
 offer_lazily(__name__)

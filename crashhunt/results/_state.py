@@ -416,19 +416,33 @@ def _seconds_left(facts: Facts, trials: int, rate: float) -> float | None:
 def _with_crashes(state: HuntState, ledger: Ledger, facts: Facts) -> HuntState:
     """Return the state with the counts of crashes over all trials."""
     directory = Path(state.dir)
-    saved, disturbs = len(crash_folders(directory)), bool(facts.get("disturb"))
+    disturbs = bool(facts.get("disturb"))
     outcomes = outcomes_of_crashes(directory, facts)
     tally = None if outcomes is None else tally_crashes(ledger, outcomes, disturbed=disturbs)
-    dropped = sum(len(numbers) for numbers in (facts.get("dropped") or {}).values())
-    # A bundle is written before its row.
-    found = max(saved + dropped, 0 if tally is None else tally.found)
     return replace(
-        state,
-        state="crashed" if state.state == "finished" and found else state.state,
-        crashes=found,
-        crashes_saved=saved if saved < found else None,
+        with_crash_counts(state, facts, 0 if tally is None else tally.found),
         disturbed=tally.disturbed if tally is not None and disturbs else None,
         code_versions=[asdict(one) for one in count_versions(ledger, facts, outcomes or ())] or None,
+    )
+
+
+def with_crash_counts(state: HuntState, facts: Facts, counted: int) -> HuntState:
+    """Return a state with the numbers of crashes and of their bundles.
+
+    Args:
+        state: state of the hunt.
+        facts: facts from the hunt's ledger.
+        counted: number of trials in the ledger that crashed.
+    """
+    saved = len(crash_folders(Path(state.dir)))
+    dropped = sum(len(numbers) for numbers in (facts.get("dropped") or {}).values())
+    found = max(saved + dropped, counted)  # a bundle is written before its row
+    is_crashed = state.state == "finished" and found > 0
+    return replace(
+        state,
+        state="crashed" if is_crashed else state.state,
+        crashes=found,
+        crashes_saved=saved if saved < found else None,
     )
 
 

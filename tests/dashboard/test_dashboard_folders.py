@@ -407,13 +407,19 @@ def test_page_of_a_crash_has_the_data_of_its_bundle(tmp_path, monkeypatch):
         "player": (bundle, story), "near_miss": False, "minimized": "", "minimized_from": "",
         "parameters": {"ego": {"speed": 2}}, "scenario_parameters": {"cars": 3}, "judged": None,
         "fault": {"verdict": "ego"}, "run_log": "out\n", "error_log": "err\n", "lineage": [[3, "", None]],
-        "path": str(folder),
+        "path": str(folder), "previous": "", "next": "",
     }  # fmt: skip
     small.mkdir()
     story.judgement = SimpleNamespace(to_json=lambda: {"cause": "late"})
     found = made.detail(folder.name)
     assert (found["minimized"], found["judged"]) == (small.name, {"cause": "late"})
     assert made.detail(small.name)["minimized_from"] == folder.name
+    for name in ("000001-collision", "000009-hang"):
+        folder.with_name(name).mkdir()
+    for name in (folder.name, small.name):
+        found = made.detail(name)
+        assert (found["previous"], found["next"]) == ("000001-collision", "000009-hang")
+    assert made.detail("000001-collision")["previous"] == made.detail("000009-hang")["next"] == ""
 
 
 # Where it listens.

@@ -10,7 +10,8 @@ import pytest
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.dashboard import _trial_counts as _trials
-from crashhunt.dashboard._trial_counts import Sample, TrialCounts, _is_drawn, _point, _rounded
+from crashhunt.dashboard._trial_counts import Sample, TrialCounts, _is_drawn, _point
+from crashhunt.report._page import _rounded
 from crashhunt.results import TrialRow
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 

@@ -48,3 +48,16 @@ def test_factor_is_named_by_its_kind(factor, words):
 )  # fmt: skip
 def test_rates_have_two_significant_digits(rate, text):
     assert format_rate(rate) == text
+
+
+def test_strongest_cause_comes_first():
+    def factor(name, *endings):
+        return Factor("argument", name, "drawn", was=9.0, runs=tuple(LeftOut(5.0, one) for one in endings))
+
+    weak, strong, middle = (
+        factor("a", "same", "same", "none"),
+        factor("b", "none", "none"),
+        factor("c", "same", "other"),
+    )
+    found = about_why(Why((weak, strong, middle), 100), str)[1:]
+    assert [line.split()[4] for line in found] == ["b", "c", "a"]

@@ -114,6 +114,25 @@ export function setText(node, text) {
   if (node.textContent !== wanted) node.textContent = wanted;
 }
 
+/* A table with a hidden name; on a narrow screen, each cell shows the label of its column. */
+export function table(columns, lines, name) {
+  const made = make("table"), head = make("thead"), body = make("tbody"), top = make("tr");
+  made.append(make("caption", name, "sr"));
+  for (const [label, kind] of columns) top.append(make("th", label, kind === "number" ? "number" : "", { scope: "col" }));
+  head.append(top);
+  for (const cells of lines) {
+    const line = make("tr");
+    cells.forEach((cell, place) => {
+      const [label, kind] = columns[place], data = make("td", undefined, kind === "number" ? "number" : "", { "data-label": label });
+      data.append(cell instanceof Node ? cell : String(cell ?? ""));
+      line.append(data);
+    });
+    body.append(line);
+  }
+  made.append(head, body);
+  return made;
+}
+
 /* A button that copies a command. */
 export function copyButton(text, what) {
   const button = make("button", "Copy", "", { "aria-label": `Copy the command: ${what}` });

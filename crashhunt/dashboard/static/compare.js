@@ -1,28 +1,21 @@
 /* Several hunts next to each other: the numbers of `crashhunt compare`, and their curves in one plot. */
-import { $, PALETTE, count, css, draw, get, make, onScheme, poll, rateOf, spelled } from "/static/common.js";
+import { $, PALETTE, count, css, draw, get, make, onScheme, poll, rateOf, spelled, table } from "/static/common.js";
 
 let data = null;
 const loaded = window.Plotly ? Promise.resolve() : new Promise((resolve) => { document.querySelector('script[src^="/static/plotly.js"]').addEventListener("load", resolve); });
 
 function showTable() {
   const columns = [["Hunt"], ["Trials", "number"], ["Crashes", "number"], ["Crash rate", "number"], ["95 % interval", "number"], ["Median step", "number"], ["Median time to collision", "number"]];
-  const made = make("table"), top = make("tr"), head = make("thead"), body = make("tbody");
-  made.append(make("caption", "Hunts next to each other", "sr"));
-  for (const [label, kind] of columns) top.append(make("th", label, kind ?? "", { scope: "col" }));
-  for (const [place, hunt] of data.hunts.entries()) {
-    const figures = hunt.figures, line = make("tr"), key = make("span", "", "key"), first = make("td", undefined, "", { "data-label": "Hunt" });
+  const lines = data.hunts.map((hunt, place) => {
+    const figures = hunt.figures, key = make("span", "", "key"), name = make("span");
     key.style.background = css(PALETTE[place % PALETTE.length]);
-    const name = make("span");
     name.append(key, make("a", hunt.name, "", { href: `/hunts/${hunt.id}` }));
     if (figures?.why_not || hunt.problem) name.append(make("span", hunt.problem || `no interval: ${figures.why_not}`, "sub"));
-    first.append(name);
-    const cells = figures ? [count(figures.trials), count(figures.crashes), figures.trials ? rateOf(figures.crash_rate) : "-", figures.interval ? `${rateOf(figures.interval[0])} to ${rateOf(figures.interval[1])}` : "-", figures.median_steps_to_crash ?? "-", figures.median_time_to_collision_s === null ? "-" : `${figures.median_time_to_collision_s.toFixed(2)} s`] : [count(hunt.trials_run), count(hunt.crashed_trials), "-", "-", "-", "-"];
-    line.append(first, ...cells.map((text, index) => make("td", text, "number", { "data-label": columns[index + 1][0] })));
-    body.append(line);
-  }
-  head.append(top);
-  made.append(head, body);
-  $("table").replaceChildren(made);
+    if (!figures) return [name, count(hunt.trials_run), count(hunt.crashed_trials), "-", "-", "-", "-"];
+    const time_s = figures.median_time_to_collision_s;
+    return [name, count(figures.trials), count(figures.crashes), figures.trials ? rateOf(figures.crash_rate) : "-", figures.interval ? `${rateOf(figures.interval[0])} to ${rateOf(figures.interval[1])}` : "-", figures.median_steps_to_crash ?? "-", time_s === null ? "-" : `${time_s.toFixed(2)} s`];
+  });
+  $("table").replaceChildren(table(columns, lines, "Hunts next to each other"));
   $("verdicts").replaceChildren(...data.pairs.flatMap((pair) => [make("p", pair.verdict), ...(pair.caution ? [make("p", `But ${pair.caution}.`, "faint")] : [])]));
 }
 

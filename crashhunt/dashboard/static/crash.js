@@ -38,6 +38,9 @@ async function begin() {
   setText($("output"), output);
   relate(crash);
   window.show(crash, facts(crash));
+  const neighbours = { "-1": crash.previous, 1: crash.next };
+  for (const [id, by] of [["previous", -1], ["next", 1]]) $(id).hidden = !neighbours[by];
+  window.anotherCrash = (by) => { if (neighbours[by]) location.href = encodeURIComponent(neighbours[by]); };
   window.addEventListener("resize", window.draw);
   onScheme(window.draw);
   document.body.dataset.complete = "true";

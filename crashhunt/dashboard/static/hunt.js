@@ -1,5 +1,5 @@
 /* The page of one hunt. */
-import { $, PALETTE, Refused, between, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, stateOf, sinceNewestKind, spelled, tell } from "/static/common.js";
+import { $, PALETTE, Refused, between, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, stateOf, sinceNewestKind, spelled, table, tell } from "/static/common.js";
 
 const ID = location.pathname.split("/")[2], API = `/api/hunts/${ID}`;
 const NOT_DECIDED = "nobody can tell"; // the verdict of the API
@@ -17,23 +17,6 @@ function choose(name, value) {
   history.replaceState(null, "", kept.size ? `?${kept}` : location.pathname);
 }
 
-function table(columns, lines, name) {
-  const made = make("table"), head = make("thead"), body = make("tbody"), top = make("tr");
-  made.append(make("caption", name, "sr"));
-  for (const [label, kind] of columns) top.append(make("th", label, kind === "number" ? "number" : "", { scope: "col" }));
-  head.append(top);
-  for (const cells of lines) {
-    const line = make("tr");
-    cells.forEach((cell, place) => {
-      const [label, kind] = columns[place], data = make("td", undefined, kind === "number" ? "number" : "", { "data-label": label });
-      data.append(cell instanceof Node ? cell : String(cell ?? ""));
-      line.append(data);
-    });
-    body.append(line);
-  }
-  made.append(head, body);
-  return made;
-}
 /* A part of the page is made again only where what it shows is another. */
 const shown = new Map();
 function renew(id, data, fill) {
@@ -412,10 +395,19 @@ function drawMap() {
   const isDense = $("density").checked && crashed.length > 1;
   const traces = [{ type: "scatter", mode: "lines", x, y, fill: "toself", fillcolor: css("--road") + (isDense ? "55" : ""), line: { color: css("--mark"), width: 1 }, hoverinfo: "skip", showlegend: false }];
   if (isDense) traces.push({ type: "heatmap", ...densityOf(crashed), colorscale: [[0, "rgba(0,0,0,0)"], [1, css("--crash")]], opacity: 0.7, showscale: false, hoverinfo: "skip", zsmooth: "best" });
+  /* One dot for each place and type, with its number of crashes. */
+  const places = (own) => [...Map.groupBy(own, (one) => `${Math.round(one.x)} ${Math.round(one.y)}`).values()];
   const dots = (own, more) => ({ type: "scatter", mode: "markers", x: own.map((one) => one.x), y: own.map((one) => one.y), customdata: own.map((one) => one.id), text: own.map((one) => spelled(`${one.id}: ${one.type ?? one.outcome}`)), hovertemplate: "%{text}<extra></extra>", ...more });
-  types.forEach((type, place) => traces.push(dots(crashed.filter((one) => (one.type ?? one.outcome) === type), { name: wrapped(spelled(type)), marker: { color: place ? css(PALETTE[place % PALETTE.length]) : css("--crash"), size: 10, symbol: ["circle", "square", "diamond", "triangle-up", "cross"][place % 5], line: { color: css("--card"), width: 1 } } })));
+  types.forEach((type, place) => {
+    const groups = places(crashed.filter((one) => (one.type ?? one.outcome) === type));
+    const words = (group) => spelled(group.length === 1 ? `${group[0].id}: ${type}` : `${group.length} crashes: ${type}; first ${group[0].id}`);
+    traces.push(dots(groups.map((group) => group[0]), { mode: "markers+text", text: groups.map((group) => (group.length > 1 ? String(group.length) : "")), textposition: "top center", hovertext: groups.map(words), hovertemplate: "%{hovertext}<extra></extra>", name: wrapped(spelled(type)), marker: { color: place ? css(PALETTE[place % PALETTE.length]) : css("--crash"), size: groups.map((group) => Math.min(24, 8 + 3 * Math.sqrt(group.length))), symbol: ["circle", "square", "diamond", "triangle-up", "cross"][place % 5], line: { color: css("--card"), width: 1 } } }));
+  });
   if ($("near").checked && near.length) traces.push(dots(near, { name: "near misses", marker: { color: css("--faint"), size: 8, symbol: "circle-open" } }));
-  draw($("map"), traces, { xaxis: { title: "x in m", showgrid: false, zeroline: false }, yaxis: { title: "y in m", scaleanchor: "x", showgrid: false, zeroline: false }, dragmode: "pan" }, `Map of ${plural(crashed.length, "crash", "crashes")}`, (clicked) => {
+  /* The chart begins with the crashes, not with all roads of the map. */
+  const span = (values) => { const low = Math.min(...values), high = Math.max(...values), half = Math.max(40, 0.6 * (high - low)); return [(low + high) / 2 - half, (low + high) / 2 + half]; };
+  const [across, up] = [span(road.points.map((one) => one.x)), span(road.points.map((one) => one.y))];
+  draw($("map"), traces, { xaxis: { title: "x in m", range: across, showgrid: false, zeroline: false }, yaxis: { title: "y in m", range: up, scaleanchor: "x", showgrid: false, zeroline: false }, dragmode: "pan" }, `Map of ${plural(crashed.length, "crash", "crashes")}`, (clicked) => {
     const crash = clicked.find((one) => one.customdata)?.customdata;
     if (crash) location.href = link(crash).href;
   });
@@ -463,14 +455,7 @@ async function showWeights() {
     drawArguments();
   }
   $("weights-figure").hidden = !found.importance.length;
-  $("weights").replaceChildren(...found.importance.flatMap(({ name, share, low, high }) => {
-    const box = make("div", undefined, "weight"), bar = make("div", undefined, "bar"), span = make("div", undefined, "span"), percent = (value) => (100 * value).toFixed(0);
-    bar.style.width = `${100 * share}%`;
-    span.style.left = `${100 * low}%`;
-    span.style.width = `${100 * (high - low)}%`;
-    box.append(bar, span);
-    return [make("span", name), box, make("span", `${percent(share)} % (${percent(low)} to ${percent(high)} %)`)];
-  }));
+  $("weights").replaceChildren(...window.importanceBars(found.importance));
 }
 let trialsSeen = -1, crashesSeen = "", mapSeen = "";
 const getTrials = () => get(`${API}/trials?since=${cursor}`, { always: true }), getCrashes = () => get(`${API}/crashes`);

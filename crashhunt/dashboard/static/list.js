@@ -97,7 +97,7 @@ function fill(row) {
   setText(node.sub, [spelled(true), ...tags].join(" "));
   node.sub.title = [spelled(false), ...(row.notes ?? []).map((note) => note.text)].filter((part) => part).join("\n");
   node.box.setAttribute("aria-label", `Select ${row.name} to compare`);
-  setText(node.state, stateOf(row));
+  setText(node.state, stateOf(row).split(",")[0]); // a column has the number of crashes
   node.state.className = `state ${row.state}`;
   setText(node.why, row.damaged || row.state === "error" || row.state === "killed" ? row.detail : "");
   setText(cells.scenario, row.scenario);
