@@ -27,8 +27,8 @@ SECTIONS = {
 
 _PAGE_ORDER = [
     "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed", "how-often-does-it-crash",
-    "which-version-is-better", "cluster", "your-town", "highway-env", "gymnasium", "ci",
-    "agent", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
+    "which-version-is-better", "cluster", "your-town", "highway-env", "gymnasium", "planner-in-cpp", "ci",
+    "agent", "lib", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
     "kinds-of-crashes", "notes", "fault", "judge", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
     "criticality", "determinism", "search", "counterfactuals", "crash-rates",

@@ -233,12 +233,20 @@ def results(folder):
         return [json.loads(row[0]) for row in database.execute("SELECT result FROM trials ORDER BY number")]
 
 
-def test_a_hunt_with_a_library_has_the_digests_of_one_with_the_same_driver_in_python(toy):
+@pytest.mark.parametrize(
+    ("scenario", "steps"),
+    [
+        ("toy", "60"),
+        pytest.param("merge", "200", marks=pytest.mark.nightly),
+        pytest.param("roundabout", "60", marks=pytest.mark.nightly),
+    ],
+)
+def test_a_hunt_with_a_library_has_the_digests_of_one_with_the_same_driver_in_python(toy, scenario, steps):
     compile_library(toy.folder, words=("-DHARMLESS",))
     (toy.folder / "planner.py").write_text(DRIVER, encoding="utf-8")
     for name, agent in (("in_c", "lib:./libplanner.so"), ("in_python", "planner:Driver")):
         words = ("--agent", agent, "--arg", "speed=8.0:20.0", "--keep-going")
-        toy.crashhunt("run", name, "1", "4", "60", *TOY, *words)
+        toy.crashhunt("run", name, "1", "4", steps, "--scenario", scenario, "--seed", "5", *words)
     in_c, in_python = ([one["digest"] for one in results(toy.folder / name)] for name in ("in_c", "in_python"))
     assert in_c == in_python
     assert len(set(in_c)) == 4
@@ -278,7 +286,7 @@ def test_harm_has_the_right_outcome_and_names_the_agent(toy, harm, words, outcom
         )
 
 
-def test_a_replay_runs_the_saved_library_and_says_when_the_one_of_today_differs(toy):
+def test_a_replay_runs_the_saved_library_and_reports_that_the_current_one_differs(toy):
     compile_library(toy.folder)
     hunted(toy, "fails")
     compile_library(toy.folder, source=IN_C.replace('kind, "fails"', 'kind, "never"'))

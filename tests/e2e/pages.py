@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 GUIDE = ROOT / "crashhunt" / "guide"
 PAGES = {"README": ROOT / "README.md", **{file.stem: file for file in sorted(GUIDE.rglob("*.md"))}}
 BLOCK = re.compile(r"(?:^<!-- ([\w ]+): ([^\n]*) -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-NAMED = re.compile(r"(?:# |<!-- )([\w/-]+\.[\w.]+)(?: -->)?$", re.MULTILINE)
+NAMED = re.compile(r"(?:# |// |<!-- )([\w/-]+\.[\w.]+)(?: -->)?$", re.MULTILINE)
 PROMPT = re.compile(r"^\$ ((?:.*\\\n)*.*)\n((?:(?!\$ ).*\n)*)", re.MULTILINE)
 
 

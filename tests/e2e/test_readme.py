@@ -15,7 +15,7 @@ ROOTS = [topic for topic in PAGES if not Page(topic).before and Page(topic).comm
 # The dearest pages; what they show is asked by day elsewhere, without their words.
 AT_NIGHT = (
     "agent", "api", "ci", "compare", "disturbances", "executor", "film", "files", "find-a-crash", "gymnasium",
-    "hand-over", "highway-env", "how-often-does-it-crash", "look-into-a-crash", "oracle",
+    "hand-over", "highway-env", "how-often-does-it-crash", "lib", "look-into-a-crash", "oracle", "planner-in-cpp",
     "prove-that-it-is-fixed", "sampler", "scenario", "simulator", "suites", "train", "watch-and-see-why",
     "which-version-is-better", "your-town",
 )  # fmt: skip
@@ -53,6 +53,10 @@ class Reader:
 
     def _run(self, command) -> str:
         program, *words = command.words
+        if words[-2:-1] == [">"]:
+            text = self.shell.crashhunt(*words[:-2], expect=command.code).out
+            (self.shell.folder / words[-1]).write_text(text, encoding="utf-8")
+            return ""
         if program in ("crashhunt", "scripts/crashhunt"):
             done = self.shell.crashhunt(*words, *self._same_again(command), expect=command.code)
             return f"{done.err}\n{done.out}"
