@@ -33,6 +33,7 @@ from crashhunt.recording import (
 )
 from crashhunt.simulators import (
     FlattensObservations,
+    KnowsEncodedType,
     NamesObservations,
     ObservesParts,
     OfAnyLength,
@@ -378,7 +379,7 @@ def ready_recorder(simulator: Simulator) -> None:
     simulators whose `reset` does not use these generators.
     """
     for form in simulator.actions.values():
-        if supports(form, OfAnyLength):
+        if supports(form, OfAnyLength) or supports(form, KnowsEncodedType):
             continue
         _ready[id(form)] = form, _encode_any(form)
 
@@ -387,6 +388,8 @@ def _type_of(form: ActionForm) -> tuple[str, tuple[int, ...]]:
     """Return the type and the shape of encoded actions, as in `AgentChannel`."""
     if supports(form, OfAnyLength):
         return "|u1", tuple(form.encoded_shape)
+    if supports(form, KnowsEncodedType):
+        return form.encoded_type
     sample = _sample_of(form)
     return sample.dtype.str, sample.shape
 

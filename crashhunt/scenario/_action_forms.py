@@ -15,7 +15,10 @@ from crashhunt.base.text import any_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-ActionName = Literal["speed_and_lane", "speed_and_lateral", "meta", "acceleration", "sumo", "continuous"]
+ActionName = Literal[
+    "speed_and_lane", "speed_and_lateral", "meta", "acceleration", "acceleration_steering", "throttle_brake_steering",
+    "trajectory", "target_pose", "sumo", "continuous",
+]  # fmt: skip
 """What a scenario, ``--action`` and an agent's class may name; ``continuous`` is an older name of speed_and_lane."""
 
 DEFAULT_ACTION = "speed_and_lane"
@@ -59,12 +62,14 @@ class ActionDescription:
         components: the numbers of an action, in order.
         shape: shape of an action; empty for a tuple of the components.
         second_changes_lane: whether the second number moves the vehicle to another lane, and 0 does not.
+        moves_freely: whether the vehicle moves in the plane, and not along lanes.
     """
 
     title: str
     components: tuple[ActionComponent, ...]
     shape: str = ""
     second_changes_lane: bool = False
+    moves_freely: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -92,6 +97,24 @@ _META_ACTION = ActionComponent(
 _ACCELERATION = ActionComponent(
     name="acceleration", low=-10.0, high=10.0, unit="m/s²", help="the limits of the vehicle's type also apply"
 )
+_MAX_STEERING_RAD = 0.6
+_STEERING_ANGLE = ActionComponent(
+    name="steering_angle",
+    low=-_MAX_STEERING_RAD,
+    high=_MAX_STEERING_RAD,
+    unit="rad",
+    help="angle of the front wheels, positive to the left",
+)
+_THROTTLE = ActionComponent(name="throttle", low=0.0, high=1.0, help="share of the largest acceleration of the type")
+_BRAKE = ActionComponent(name="brake", low=0.0, high=1.0, help="share of the largest deceleration of the type")
+_STEERING = ActionComponent(name="steering", low=-1.0, high=1.0, help="share of 0.6 rad, positive to the left")
+_TIME = ActionComponent(name="time", low=0.0, high=10.0, unit="s", help="from the step of the answer on")
+_X = ActionComponent(name="x", low=-1e7, high=1e7, unit="m", help="centre of the rectangle, to the east")
+_Y = ActionComponent(name="y", low=-1e7, high=1e7, unit="m", help="centre of the rectangle, to the north")
+_HEADING = ActionComponent(
+    name="heading", low=-1e3, high=1e3, unit="rad", help="counter-clockwise from east; turns by 2 pi are equal"
+)
+_SPEED = ActionComponent(name="speed", low=0.0, high=100.0, unit="m/s", help="of the centre")
 _SPEED_OVERRIDE = ActionComponent(
     name="speed_override", low=-1.0, high=100.0, unit="m/s", help="speed to reach; -1 leaves the speed to SUMO"
 )
@@ -115,6 +138,27 @@ ACTIONS: dict[str, ActionDescription] = {
         title="Acceleration, and a lane change that takes one step.",
         components=(_ACCELERATION, _LANE_CHANGE),
         second_changes_lane=True,
+    ),
+    "acceleration_steering": ActionDescription(
+        title="Acceleration and steering angle of a kinematic bicycle model; the vehicle moves freely.",
+        components=(_ACCELERATION, _STEERING_ANGLE),
+        moves_freely=True,
+    ),
+    "throttle_brake_steering": ActionDescription(
+        title="Pedals and steering of a kinematic bicycle model; the vehicle moves freely.",
+        components=(_THROTTLE, _BRAKE, _STEERING),
+        moves_freely=True,
+    ),
+    "trajectory": ActionDescription(
+        title="Points with time, pose and speed, followed by interpolation; the vehicle moves freely.",
+        components=(_TIME, _X, _Y, _HEADING, _SPEED),
+        shape="(K, 5) time x y heading speed, K up to 64",
+        moves_freely=True,
+    ),
+    "target_pose": ActionDescription(
+        title="A pose to reach at a time, on a smooth curve; the vehicle moves freely.",
+        components=(_X, _Y, _HEADING, _TIME),
+        moves_freely=True,
     ),
     "sumo": ActionDescription(
         title="SUMO's driver model drives. None leaves the whole step to it; a speed or lane change overrides it.",

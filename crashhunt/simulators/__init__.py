@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         SimulatorDrives as SimulatorDrives,
         SpaceAction as SpaceAction,
         SpeedAndLaneChange as SpeedAndLaneChange,
+        TrajectoryAction as TrajectoryAction,
     )
     from ._any_space import (
         ObservationForm as ObservationForm,
@@ -26,6 +27,12 @@ if TYPE_CHECKING:
         native as native,
         reseed_in_place as reseed_in_place,
         time_limit_of as time_limit_of,
+    )
+    from ._bicycle_model import (
+        MAX_STEERING_RAD as MAX_STEERING_RAD,
+        WHEELBASE_SHARE as WHEELBASE_SHARE,
+        BicycleModel as BicycleModel,
+        MotionState as MotionState,
     )
     from ._kinematics_observation import Kinematics as Kinematics, Unseen as Unseen, kind_number as kind_number
     from ._observation_parts import (
@@ -48,6 +55,7 @@ if TYPE_CHECKING:
         HasMap as HasMap,
         HasWindow as HasWindow,
         Info as Info,
+        KnowsEncodedType as KnowsEncodedType,
         MasksActions as MasksActions,
         NamesMetaActions as NamesMetaActions,
         NamesObservations as NamesObservations,

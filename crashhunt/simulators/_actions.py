@@ -13,6 +13,8 @@ from crashhunt.base.scalars import describe_value, is_masked
 from crashhunt.scenario import ACTIONS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from gymnasium import Space
     from numpy.typing import NDArray
 
@@ -96,10 +98,16 @@ class NumbersAction:
 
     Args:
         form: name of the form, as ``crashhunt list actions`` shows it.
+
+    Attributes:
+        check: function that raises an `ActionError` for an encoded action that the vehicle cannot follow; None if every
+            action within the bounds is possible.
     """
 
     def __init__(self, form: str) -> None:
         from gymnasium import spaces
+
+        self.check: Callable[[NDArray[np.float64]], None] | None = None
 
         self._description = ACTIONS[form]
         self._components = self._description.components
@@ -107,6 +115,7 @@ class NumbersAction:
         low, high = np.transpose([(one.low, one.high) for one in self._components])
         self.space: Space[object] = spaces.Box(low, high, dtype=np.float64)
         self._count = len(self._components)
+        self.encoded_type = "<f8", (self._count,)
 
     def encode(self, action: object) -> NDArray[np.float64]:
         """Return the action as a float64 array with one number for each component."""
@@ -121,7 +130,70 @@ class NumbersAction:
             if not component.low <= value <= component.high:  # NaN fails the comparison
                 allowed = f"within {component.low:g} and {component.high:g} {component.unit}".rstrip()
                 raise ActionError(f"{component.name} is {value:g} in the action {layout}", fix=f"return it {allowed}")
-        return array.astype(np.float64, copy=False)
+        found = array.astype(np.float64, copy=False)
+        if self.check is not None:
+            self.check(found)
+        return found
+
+
+MAX_POINTS = 64  # of a trajectory: each is in the recording of each step
+_WIDTH = 5
+
+
+class TrajectoryAction:
+    """A trajectory of up to 64 points: an array of the shape (K, 5) with ``time x y heading speed``.
+
+    Times are in s from the present step on, and rise. Positions and headings are those of the centre of the rectangle.
+    An encoded trajectory always has 64 rows; the last point is repeated.
+
+    Attributes:
+        check: function that raises an `ActionError` for an encoded trajectory that the vehicle cannot follow; None if
+            the simulator follows every trajectory.
+    """
+
+    names: tuple[str, ...] = ()
+    encoded_type = "<f8", (MAX_POINTS, _WIDTH)
+
+    def __init__(self) -> None:
+        from gymnasium import spaces
+
+        description = ACTIONS["trajectory"]
+        self._components = description.components
+        low, high = np.transpose([(one.low, one.high) for one in self._components])
+        points = np.ones((MAX_POINTS, 1))
+        self.space: Space[object] = spaces.Box(low * points, high * points, dtype=np.float64)
+        self.check: Callable[[NDArray[np.float64]], None] | None = None
+
+    def encode(self, action: object) -> NDArray[np.float64]:
+        """Return the trajectory as a float64 array of the shape (64, 5)."""
+        array: NDArray[np.generic] | None = None
+        with suppress(Exception):  # converting the agent's object runs the agent's code, which may raise anything
+            array = cast(action, np.dtype(np.float64))
+        if array is None or array.ndim != 2 or array.shape[1] != _WIDTH or not 0 < array.shape[0] <= MAX_POINTS:
+            shape = "" if array is None else f" of the shape {array.shape}"
+            fix = f"return an array (K, {_WIDTH}) of time, x, y, heading and speed, with 1 to {MAX_POINTS} rows"
+            raise ActionError(f"the action {describe_value(action)}{shape} is not a trajectory", fix=fix)
+        points = array.astype(np.float64, copy=False)
+        for component, column in zip(self._components, points.T, strict=True):
+            wrong = ~((component.low <= column) & (column <= component.high))  # NaN fails both comparisons
+            if wrong.any():
+                row = int(wrong.argmax())
+                allowed = f"within {component.low:g} and {component.high:g} {component.unit}".rstrip()
+                message = f"{component.name} of point {row} of the trajectory is {column[row]:g}"
+                raise ActionError(message, fix=f"return it {allowed}")
+        steps = np.diff(points[:, 0])
+        padding = (points[1:] == points[-1]).all(axis=1)
+        wrong = (steps <= 0) & ~(padding & (steps == 0))
+        if wrong.any():
+            row = int(wrong.argmax())
+            message = (
+                f"time of point {row + 1} of the trajectory is {points[row + 1, 0]:g} s, after {points[row, 0]:g} s"
+            )
+            raise ActionError(message, fix="return rising times, in s from the present step on")
+        found = np.concatenate([points, np.repeat(points[-1:], MAX_POINTS - len(points), axis=0)])
+        if self.check is not None:
+            self.check(found)
+        return found
 
 
 class SpaceAction:

@@ -84,6 +84,14 @@ class OfAnyLength(Protocol):
         """The shape of encoded actions in the prologue of a recording: (-1,), which means any length."""
 
 
+class KnowsEncodedType(Protocol):
+    """An action form that reports the type of its encoded actions, because no sample of its space can be encoded."""
+
+    @property
+    def encoded_type(self) -> tuple[str, tuple[int, ...]]:
+        """The data type, as in ``numpy.dtype.str``, and the shape of encoded actions."""
+
+
 class Simulator(Protocol):
     """Runs the episodes of a scenario, one after another.
 

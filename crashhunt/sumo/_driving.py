@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import libsumo
 from libsumo import _libsumo as sumo
 
+from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import META_ACTIONS
+from crashhunt.sumo._free_motion import DrivableArea, FreeMotion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 # Calls go to libsumo's extension module, because the wrapper functions of the package cost twice as much.
 
+FREE_FORMS = tuple(name for name, form in ACTIONS.items() if form.moves_freely)
 _NO_SPEED_CHECKS = 0  # speed mode: the vehicle drives the commanded speed
 _ALL_SPEED_CHECKS = 31  # speed mode: SUMO's default, with which a vehicle drives as its models decide
 _NO_LANE_CHANGES = 0  # lane change mode
@@ -48,19 +51,27 @@ class Driving:
             "meta": self._apply_meta,
             "acceleration": self._apply_acceleration,
             "sumo": self._apply_override,
+            **dict.fromkeys(FREE_FORMS, self._move_freely),
         }
         self._ways = {agent: ways[setup.action_form] for agent, setup in setups.items()}
         self._lateral_speeds: dict[str, float] = {}
         self._overridden: set[str] = set()
+        self._area = DrivableArea()
+        self.moving: dict[str, FreeMotion] = {}
+        """The motion of each vehicle that moves freely in this episode."""
 
     def begin(self, agents: Iterable[str]) -> None:
         """Reset the state of the last episode, but keep data that was read from the network."""
         self._targets = dict.fromkeys(agents, -1)
         self._lateral_speeds.clear()
         self._overridden.clear()
+        self.moving.clear()
         for agent in self._targets:
-            if self._setups[agent].action_form == "sumo":
+            form = self._setups[agent].action_form
+            if form == "sumo":
                 self._leave_to_sumo(agent)
+            elif form in FREE_FORMS:
+                self.moving[agent] = FreeMotion(agent, form, self._step_length_s, self._area)
 
     def apply(self, agent: str, action: NDArray[np.generic]) -> bool:
         """Apply an encoded action; return whether the vehicle stays on the road."""
@@ -130,6 +141,9 @@ class Driving:
         sumo.vehicle_setSpeedMode(agent, _ALL_SPEED_CHECKS)
         sumo.vehicle_setSpeed(agent, -1.0)
         sumo.vehicle_setLaneChangeMode(agent, _OWN_LANE_CHANGES)
+
+    def _move_freely(self, agent: str, action: NDArray[np.generic]) -> bool:
+        return self.moving[agent].apply(action)
 
     def _apply_meta(self, agent: str, encoded: NDArray[np.generic]) -> bool:
         """Apply a meta-action as highway-env does: FASTER and SLOWER select the next target speed."""

@@ -10,7 +10,7 @@ import libsumo
 import numpy as np
 from libsumo import _libsumo as sumo
 
-from crashhunt.simulators import center_of, kind_number, nearest_actors, wrapped
+from crashhunt.simulators import WHEELBASE_SHARE, center_of, kind_number, nearest_actors, wrapped
 from crashhunt.world import PERSON, VehicleData, is_person
 
 if TYPE_CHECKING:
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 
     from crashhunt.sumo._lane_graph import LaneGraph
     from crashhunt.sumo._reader_protocol import Moment, ReaderSetup
-
-WHEELBASE_SHARE = 0.6
-"""Wheelbase of a vehicle as a share of its length, because SUMO has no wheelbase."""
 
 _BRAKE_LIGHT, _RIGHT, _LEFT, _HAZARD = 8, 1, 2, 4  # bits of SUMO's signals
 _NO_VALUE = -1073741824.0  # of SUMO's getters, as in `libsumo.INVALID_DOUBLE_VALUE`

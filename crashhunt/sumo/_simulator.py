@@ -27,11 +27,12 @@ from crashhunt.simulators import (
     NumbersAction,
     SimulatorDrives,
     SpeedAndLaneChange,
+    TrajectoryAction,
     Unseen,
 )
 from crashhunt.sumo._descriptor import BACKEND
 from crashhunt.sumo._disturbances import SumoDisturbances
-from crashhunt.sumo._driving import Driving, hold_vehicle
+from crashhunt.sumo._driving import FREE_FORMS, Driving, hold_vehicle
 from crashhunt.sumo._ego_and_actors import vehicle_data_of
 from crashhunt.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.sumo._files import StagedFiles
@@ -68,6 +69,10 @@ _FORMS: dict[str, Callable[[], ActionForm]] = {
     "speed_and_lateral": partial(NumbersAction, "speed_and_lateral"),
     "meta": MetaAction,
     "acceleration": AccelerationAndLaneChange,
+    "acceleration_steering": partial(NumbersAction, "acceleration_steering"),
+    "throttle_brake_steering": partial(NumbersAction, "throttle_brake_steering"),
+    "trajectory": TrajectoryAction,
+    "target_pose": partial(NumbersAction, "target_pose"),
     "sumo": SimulatorDrives,
 }
 _DECELERATION_LIMIT_BIT = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
@@ -104,7 +109,8 @@ class SumoSimulator:
         # Only with these options of SUMO, or by such an action, can a vehicle leave the centre line of its lane.
         options = scenario.table(SumoSetup).options
         self._drifts = "speed_and_lateral" in self._forms.values()
-        self._lateral = self._drifts or "lateral-resolution" in options or "lanechange.duration" in options
+        moves = not set(FREE_FORMS).isdisjoint(self._forms.values())
+        self._lateral = self._drifts or moves or "lateral-resolution" in options or "lanechange.duration" in options
         self._driving = Driving(scenario.agents, scenario.step_length_s)
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s, self._driving)
         self._loading = Loading(fix_link_order=scenario.table(SumoSetup).fix_link_order is not False)
@@ -192,6 +198,13 @@ class SumoSimulator:
             raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
         self.agents = list(self._setups)
         self._driving.begin(self.agents)
+        for agent, motion in self._driving.moving.items():
+            form = self.actions[agent]
+            if isinstance(form, NumbersAction | TrajectoryAction) and self._forms[agent] in (
+                "trajectory",
+                "target_pose",
+            ):
+                form.check = motion.check
         self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
         self._last_lanes: dict[str, tuple[str, int]] = {}
         self._steps = 0
@@ -299,9 +312,11 @@ class SumoSimulator:
         """Return the size and the limits of a vehicle that has entered."""
         return vehicle_data_of(agent)
 
-    def full_braking(self, agent: str) -> FullBraking:
-        """Return the action for the hardest braking that the speed mode of the vehicle allows."""
+    def full_braking(self, agent: str) -> FullBraking | None:
+        """Return the action for the hardest braking that the speed mode allows; None for vehicles that move freely."""
         setup, form = self._scenario.agents[agent], self._forms[agent]
+        if form in FREE_FORMS:
+            return None
         if form == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
         action = (-MAX_ACCELERATION if form == "acceleration" else 0.0, 0)

@@ -16,6 +16,7 @@ from crashhunt.base.errors import HuntDirectoryError, ScenarioError
 from crashhunt.gym._descriptor import BACKEND as GYM, CrashRule, GymSetup
 from crashhunt.highway._descriptor import BACKEND as HIGHWAY, HighwaySetup
 from crashhunt.scenario import (
+    ACTIONS,
     AgentSetup,
     ArgumentSetup,
     Backend,
@@ -260,7 +261,7 @@ def test_arguments_of_a_scenario_know_their_place(town):
     assert with_action(town, "ego", "meta").agents["ego"].action == "meta"
     assert refusal(with_action, town, "ego", "odd")[:2] == (
         "'odd' is not a form of actions",
-            "give one of speed_and_lane, speed_and_lateral, meta, acceleration, sumo",
+            f"give one of {', '.join(ACTIONS)}",
     )  # fmt: skip
 
 

@@ -1,0 +1,242 @@
+"""Moves vehicles freely in the plane: by a kinematic bicycle model, on a trajectory, or to a pose.
+
+SUMO places the vehicle by ``moveToXY`` with ``keepRoute=2``, and assigns it to the lane below it, so that the other
+vehicles react to it there. SUMO's vehicles do not see a vehicle off all lanes, nor the part of it that is on another
+lane than its front. SUMO reports no collision of such a vehicle, and it does not arrive by itself. crashhunt detects
+collisions by the outlines, and this module detects arrival and leaving the road.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import libsumo
+import numpy as np
+from libsumo import _libsumo as sumo
+
+from crashhunt.base.errors import ActionError
+from crashhunt.simulators import MAX_STEERING_RAD, WHEELBASE_SHARE, BicycleModel, MotionState
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+_FREE = 2  # SUMO's keepRoute: the vehicle may leave its route and all lanes
+_ARRIVED = 2  # SUMO's reason of a removal: the vehicle has arrived
+_MAX_ACCELERATION_MPS2 = 10.0
+_MAX_BRAKING_MPS2 = 15.0
+_MAX_YAW_RATE_RADPS = 1.5
+_MAX_SLIDE_M, _MAX_TURN_RAD = 0.2, 0.05  # by which a trajectory may begin beside the vehicle, as plans are predictions
+
+
+class FreeMotion:
+    """The motion of one vehicle in an episode, which begins with the vehicle on the road.
+
+    Args:
+        vehicle: identifier of the vehicle.
+        form: name of the form of its actions.
+        step_length_s: step length, in s.
+        area: the drivable area of the network.
+    """
+
+    def __init__(self, vehicle: str, form: str, step_length_s: float, area: DrivableArea) -> None:
+        self._vehicle, self._form, self._dt, self._area = vehicle, form, step_length_s, area
+        self._half = sumo.vehicle_getLength(vehicle) / 2
+        heading = math.radians(90.0 - sumo.vehicle_getAngle(vehicle))
+        x, y = sumo.vehicle_getPosition(vehicle)
+        self.state = MotionState(
+            x=x - self._half * math.cos(heading), y=y - self._half * math.sin(heading), heading=heading,
+            speed=sumo.vehicle_getSpeed(vehicle),
+        )  # fmt: skip
+        self.model = BicycleModel(
+            wheelbase=WHEELBASE_SHARE * 2 * self._half,
+            max_acceleration=sumo.vehicle_getAccel(vehicle),
+            max_deceleration=sumo.vehicle_getDecel(vehicle),
+            max_speed=sumo.vehicle_getMaxSpeed(vehicle),
+        )
+        self._kind = sumo.vehicle_getVehicleClass(vehicle)
+        self._route, self._goal = sumo.vehicle_getRouteID(vehicle), sumo.vehicle_getRoute(vehicle)[-1]
+        self._last = len(sumo.vehicle_getRoute(vehicle)) - 1
+        sumo.vehicle_setSpeedMode(vehicle, 0)  # SUMO would otherwise report a speed within its own limits
+
+    def apply(self, action: NDArray[np.generic]) -> bool:
+        """Move the vehicle by an encoded action; return whether its centre stays on the road."""
+        state = self._next(action.tolist())
+        if self._arrives(state):
+            sumo.vehicle_remove(self._vehicle, _ARRIVED)
+            return True
+        self.state = state
+        front = state.x + self._half * math.cos(state.heading), state.y + self._half * math.sin(state.heading)
+        try:
+            sumo.vehicle_moveToXY(self._vehicle, "", -1, *front, 90.0 - math.degrees(state.heading), _FREE)
+        except libsumo.TraCIException:
+            if self._vehicle not in sumo.vehicle_getIDList():
+                raise
+            return False  # no lane is within 100 m
+        sumo.vehicle_setSpeed(self._vehicle, state.speed)
+        return self._area.contains(state.x, state.y, self._kind)
+
+    def check(self, action: NDArray[np.float64]) -> None:
+        """Check that the vehicle can follow an encoded trajectory or target pose in the next step.
+
+        Raises:
+            ActionError: the vehicle would jump, turn on the spot, drive backwards, or has no point to follow.
+        """
+        state, values, dt = self.state, action.tolist(), self._dt
+        if self._form == "trajectory" and values[-1][0] < dt:
+            message = f"the trajectory ends {values[-1][0]:g} s from now, before the step of {dt:g} s"
+            raise ActionError(message, fix="return points beyond the end of the step")
+        following = self._next(values)
+        dx, dy = following.x - state.x, following.y - state.y
+        moved = math.hypot(dx, dy)
+        most = (state.speed + _MAX_ACCELERATION_MPS2 * dt) * dt + _MAX_SLIDE_M
+        least = (state.speed - _MAX_BRAKING_MPS2 * dt) * dt - _MAX_SLIDE_M
+        if not least <= moved <= most:
+            message = f"the {self._words} moves the vehicle by {moved:.2f} m in a step of {dt:g} s"
+            fix = f"return a pose between {max(0.0, least):.2f} and {most:.2f} m away"
+            raise ActionError(message, fix=f"{fix}; positions are those of the centre, in the map's frame")
+        turned = math.remainder(following.heading - state.heading, math.tau)
+        if abs(turned) > _MAX_YAW_RATE_RADPS * dt + _MAX_TURN_RAD:
+            message = f"the {self._words} turns the vehicle by {turned:.2f} rad in a step of {dt:g} s"
+            raise ActionError(message, fix=f"turn by at most {_MAX_YAW_RATE_RADPS * dt + _MAX_TURN_RAD:.2f} rad")
+        if dx * math.cos(state.heading) + dy * math.sin(state.heading) < -_MAX_SLIDE_M:
+            raise ActionError(f"the {self._words} moves the vehicle backwards", fix="return poses ahead of it")
+
+    @property
+    def _words(self) -> str:
+        return self._form.replace("_", " ")
+
+    def _next(self, values: list[float]) -> MotionState:
+        """Return the state after a step."""
+        if self._form == "trajectory":
+            return self._on_trajectory(np.array(values))
+        if self._form == "target_pose":
+            return self._towards(*values)
+        if self._form == "throttle_brake_steering":
+            throttle, brake, share = values
+            acceleration = throttle * self.model.max_acceleration - brake * self.model.max_deceleration
+            return self.model.step(self.state, acceleration, share * MAX_STEERING_RAD, self._dt)
+        acceleration, steering = values
+        return self.model.step(self.state, acceleration, steering, self._dt)
+
+    def _on_trajectory(self, points: NDArray[np.float64]) -> MotionState:
+        """Return the state on a trajectory after a step; it leads from the present pose to its first point."""
+        state, dt = self.state, self._dt
+        times = points[:, 0]
+        index = int(np.searchsorted(times, dt))
+        after = points[min(index, len(points) - 1)].tolist()
+        before = points[index - 1].tolist() if index else [0.0, state.x, state.y, state.heading, state.speed]
+        share = 1.0 if after[0] <= before[0] else min(1.0, (dt - before[0]) / (after[0] - before[0]))
+        x, y, speed = (before[one] + share * (after[one] - before[one]) for one in (1, 2, 4))
+        turned = math.remainder(
+            before[3] + share * math.remainder(after[3] - before[3], math.tau) - state.heading, math.tau
+        )
+        return self._reached(x, y, state.heading + turned, speed)
+
+    def _towards(self, x: float, y: float, heading: float, time_s: float) -> MotionState:
+        """Return the state after a step on the cubic curve from the present pose and speed to a pose at a time."""
+        state, dt = self.state, self._dt
+        heading = state.heading + math.remainder(heading - state.heading, math.tau)
+        if time_s <= dt:
+            return self._reached(x, y, heading, math.hypot(x - state.x, y - state.y) / dt)
+        end_speed = math.hypot(x - state.x, y - state.y) / time_s
+        share = dt / time_s
+        at, slope = [], []
+        for start, end, turn in ((state.x, x, math.cos), (state.y, y, math.sin)):
+            leaves = state.speed * turn(state.heading) * time_s
+            enters = end_speed * turn(heading) * time_s
+            a, b = 2 * start - 2 * end + leaves + enters, -3 * start + 3 * end - 2 * leaves - enters
+            at.append(((a * share + b) * share + leaves) * share + start)
+            slope.append(((3 * a * share + 2 * b) * share + leaves) / time_s)
+        speed = math.hypot(*slope)
+        turned = math.remainder(math.atan2(slope[1], slope[0]) - state.heading, math.tau) if speed > 0.1 else 0.0
+        return self._reached(at[0], at[1], state.heading + turned, speed)
+
+    def _reached(self, x: float, y: float, heading: float, speed: float) -> MotionState:
+        """Return a state at a pose, with the acceleration and the steering angle that lead to it."""
+        state = self.state
+        turned, moved = heading - state.heading, math.hypot(x - state.x, y - state.y)
+        steering = math.atan2(turned * self.model.wheelbase, moved) if moved > 0.01 else 0.0
+        acceleration = (speed - state.speed) / self._dt
+        return MotionState(x=x, y=y, heading=heading, speed=speed, acceleration=acceleration, steering=steering)
+
+    def _arrives(self, state: MotionState) -> bool:
+        """Return whether the front of the vehicle passes the end of its route in a step."""
+        edge = sumo.vehicle_getRoadID(self._vehicle)
+        if edge != self._goal or sumo.vehicle_getLaneIndex(self._vehicle) < 0:
+            return False
+        is_on_route = sumo.vehicle_getRouteID(self._vehicle) == self._route
+        if is_on_route and sumo.vehicle_getRouteIndex(self._vehicle) != self._last:
+            return False  # a ring leads over the last edge several times
+        place = sumo.vehicle_getLanePosition(self._vehicle) + math.hypot(state.x - self.state.x, state.y - self.state.y)
+        return bool(place > sumo.lane_getLength(sumo.vehicle_getLaneID(self._vehicle)))
+
+
+class DrivableArea:
+    """The lanes that a class of vehicles may use, and the junctions between them.
+
+    SUMO finds the lane below a point; of each lane that was below one, the geometry is kept.
+    """
+
+    def __init__(self) -> None:
+        self._lanes: dict[str, tuple[Sequence[tuple[float, float]], float]] = {}
+        self._junctions: dict[str, Sequence[tuple[float, float]]] = {}
+        self._nearest = ""
+
+    def contains(self, x: float, y: float, kind: str) -> bool:
+        """Return whether a point is on a lane that a class of vehicles may use, or inside a junction.
+
+        Args:
+            x: position to the east, in m.
+            y: position to the north, in m.
+            kind: vehicle class.
+        """
+        if self._nearest and self._is_on(self._nearest, x, y):
+            return True
+        try:
+            edge, _, lane = sumo.simulation_convertRoad(x, y, False, kind)
+        except libsumo.TraCIException:
+            return False  # no lane of this class is near
+        self._nearest = f"{edge}_{lane}"
+        if self._is_on(self._nearest, x, y):
+            return True
+        return any(
+            _is_inside(x, y, self._shape(junction))
+            for junction in {sumo.edge_getFromJunction(edge), sumo.edge_getToJunction(edge)}
+        )
+
+    def _is_on(self, lane: str, x: float, y: float) -> bool:
+        found = self._lanes.get(lane)
+        if found is None:
+            found = self._lanes[lane] = (
+                [tuple(point[:2]) for point in sumo.lane_getShape(lane)],
+                sumo.lane_getWidth(lane) / 2,
+            )
+        shape, half = found
+        return any(_distance_squared(x, y, *start, *end) <= half * half for start, end in pairwise(shape))
+
+    def _shape(self, junction: str) -> Sequence[tuple[float, float]]:
+        found = self._junctions.get(junction)
+        if found is None:
+            found = self._junctions[junction] = [tuple(point[:2]) for point in sumo.junction_getShape(junction)]
+        return found
+
+
+def _distance_squared(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:
+    """Return the squared distance of a point from a line between two points, in m²."""
+    dx, dy = bx - ax, by - ay
+    squared = dx * dx + dy * dy
+    share = 0.0 if squared == 0.0 else max(0.0, min(1.0, ((x - ax) * dx + (y - ay) * dy) / squared))
+    return (ax + share * dx - x) ** 2 + (ay + share * dy - y) ** 2
+
+
+def _is_inside(x: float, y: float, shape: Sequence[tuple[float, float]]) -> bool:
+    """Return whether a point is inside a polygon, by the number of its sides to the right of the point."""
+    inside = False
+    for (ax, ay), (bx, by) in zip(shape, [*shape[1:], *shape[:1]], strict=True):
+        if (ay > y) != (by > y) and x < ax + (y - ay) / (by - ay) * (bx - ax):
+            inside = not inside
+    return inside

@@ -1,0 +1,212 @@
+"""Tests of vehicles that move freely on SUMO: pose, road, arrival, contacts, events, and what SUMO makes of them."""
+
+from __future__ import annotations
+
+import math
+
+import libsumo
+import numpy as np
+import pytest
+
+from crashhunt.base.errors import ActionError
+from crashhunt.oracles import Overlap
+from crashhunt.scenario import AgentSetup, argument_values, load_scenario
+from crashhunt.simulators import BicycleModel, MotionState
+from crashhunt.sumo import SumoSimulator
+from crashhunt.sumo._free_motion import DrivableArea, FreeMotion, _is_inside
+
+EMPTY = {"priority_demand": 1, "minor_demand": 1}
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Return a function that begins an episode, and returns the simulator and a function that takes a step."""
+    made = []
+
+    def begin(form, scenario="intersection", seed=3, **values):
+        loaded = load_scenario(scenario)
+        agents = {agent: AgentSetup(**{**vars(setup), "action": form}) for agent, setup in loaded.agents.items()}
+        chosen = type(loaded)(**{**vars(loaded), "agents": agents})
+        simulator = SumoSimulator(chosen, tmp_path)
+        made.append(simulator)
+        simulator.reset(seed=seed, options={"arguments": {**argument_values(chosen), **values}})
+
+        def step(*actions):
+            given = dict(zip(simulator.agents, actions, strict=True))
+            *_, ended, _, _ = simulator.step(
+                {agent: simulator.actions[agent].encode(one) for agent, one in given.items()}
+            )
+            return ended
+
+        return simulator, step
+
+    yield begin
+    for simulator in made:
+        simulator.close()
+
+
+def centre(agent="ego"):
+    heading = math.radians(90 - libsumo.vehicle.getAngle(agent))
+    x, y = libsumo.vehicle.getPosition(agent)
+    half = libsumo.vehicle.getLength(agent) / 2
+    return x - half * math.cos(heading), y - half * math.sin(heading), heading
+
+
+def test_sumo_places_the_vehicle_on_the_course_of_the_bicycle_model(start):
+    _, step = start("acceleration_steering", **EMPTY)
+    x, y, heading = centre()
+    vehicle = libsumo.vehicle
+    state = MotionState(x=x, y=y, heading=heading, speed=vehicle.getSpeed("ego"))
+    model = BicycleModel(
+        wheelbase=0.6 * vehicle.getLength("ego"), max_acceleration=vehicle.getAccel("ego"),
+        max_deceleration=vehicle.getDecel("ego"), max_speed=vehicle.getMaxSpeed("ego"),
+    )  # fmt: skip
+    for number in range(40):
+        action = (-2.0 if number < 20 else 1.0, 0.02 * math.sin(number))
+        step(action)
+        state = model.step(state, *action, 0.1)
+        assert centre() == pytest.approx((state.x, state.y, state.heading), abs=1e-9)
+        assert vehicle.getSpeed("ego") == pytest.approx(state.speed, abs=1e-9)
+
+
+def test_pedals_are_shares_of_the_accelerations_of_the_type(start):
+    _, step = start("throttle_brake_steering", **EMPTY)
+    speed, limits = libsumo.vehicle.getSpeed("ego"), (libsumo.vehicle.getAccel("ego"), libsumo.vehicle.getDecel("ego"))
+    step((0.5, 0.0, 0.0))
+    step((0.0, 0.2, 0.0))
+    assert libsumo.vehicle.getSpeed("ego") == pytest.approx(speed + 0.05 * limits[0] - 0.02 * limits[1])
+
+
+def test_vehicle_arrives_at_the_end_of_its_route_and_leaves(start):
+    simulator, step = start("acceleration_steering", **EMPTY)
+    ended, steps = {"ego": False}, 0
+    while not ended["ego"]:
+        ended = step((1.0, 0.0))
+        steps += 1
+        assert steps < 600
+    assert "ego" not in libsumo.vehicle.getIDList()
+    assert simulator.scene().off_road == ()
+    assert simulator.scene().points == [] or "ego" not in simulator.scene().roster.index
+
+
+def test_vehicle_off_the_road_is_reported_and_stays_where_it_drives(start):
+    simulator, step = start("acceleration_steering", **EMPTY)
+    ended, steps = {"ego": False}, 0
+    while not ended["ego"]:
+        ended = step((0.0, 0.1))
+        steps += 1
+        assert steps < 30
+    assert simulator.scene().off_road == ("ego",)
+    x, y, _ = centre()
+    assert not DrivableArea().contains(x, y, "passenger")
+
+
+def test_wrong_way_is_reported_on_the_lane_below_the_vehicle(start):
+    simulator, step = start("target_pose", **EMPTY)
+    kinds = []
+    for _ in range(200):
+        x, *_ = centre()
+        step((x + 18, 1.6, 0.0, 1.4))
+        kinds += [event.kind for event in simulator.scene().events]
+    assert kinds == ["wrong_way"]
+
+
+def test_followers_brake_for_a_vehicle_that_moves_freely_and_contacts_are_found(start):
+    simulator, step = start("acceleration_steering", "loop", vehicles=35)
+    found = []
+    for _ in range(200):
+        if simulator.agents:
+            step((-5.0, 0.0))
+            found += Overlap().check(simulator.scene(), ("ego",))
+    assert libsumo.vehicle.getSpeed("ego") == 0.0
+    follower, gap = libsumo.vehicle.getFollower("ego", 100.0)
+    assert gap >= 0
+    assert libsumo.vehicle.getLeader(follower, 100.0)[0] == "ego"
+    assert found == []
+
+
+def test_two_vehicles_that_move_freely_collide_by_their_outlines(start):
+    simulator, step = start("acceleration_steering", "loop-two-agents")
+    one, other = simulator.agents
+    for vehicle in {*libsumo.vehicle.getIDList()} - {one, other}:
+        libsumo.vehicle.remove(vehicle)
+    libsumo.vehicle.moveTo(other, "south_0", 112.0)  # on the lane of the first one, ahead of it
+    simulator._driving.moving[other] = FreeMotion(other, "acceleration_steering", 0.1, DrivableArea())
+    found = []
+    for _ in range(120):
+        step((2.0, 0.0), (-5.0, 0.0))
+        found += Overlap().check(simulator.scene(), (one, other))
+        if found:
+            break
+    assert {found[0].collision.collider, found[0].collision.victim} == {one, other}
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (lambda x, y, h, v: [[0.1, x + 5, y, h, v]], r"the trajectory moves the vehicle by 5.00 m in a step of 0.1 s"),
+        (lambda x, y, h, v: [[0.1, x, y, h, v]], r"moves the vehicle by 0.00 m"),
+        (lambda x, y, h, v: [[0.1, x + v / 10, y, h + 0.5, v]], r"turns the vehicle by 0.50 rad"),
+        (lambda x, y, h, v: [[0.05, x + v / 20, y, h, v]], r"the trajectory ends 0.05 s from now"),
+        (lambda x, y, h, v: [[0.2, x, y, h, v], [0.1, x, y, h, v]], "time of point 1 of the trajectory is 0.1 s"),
+        (lambda x, y, h, v: [[-0.1, x, y, h, v]], "time of point 0 of the trajectory is -0.1"),
+        (lambda x, y, h, v: [[0.1, float("nan"), y, h, v]], "x of point 0 of the trajectory is nan"),
+        (lambda x, y, h, v: [], "is not a trajectory"),
+        (lambda x, y, h, v: np.zeros((65, 5)), "of the shape .65, 5. is not a trajectory"),
+    ],
+)  # fmt: skip
+def test_trajectory_that_cannot_be_followed_is_refused_with_value_and_limit(start, points, message):
+    simulator, _ = start("trajectory", **EMPTY)
+    with pytest.raises(ActionError, match=message) as caught:
+        simulator.actions["ego"].encode(points(*centre(), libsumo.vehicle.getSpeed("ego")))
+    assert caught.value.fix
+
+
+def test_trajectory_is_followed_between_its_points(start):
+    simulator, step = start("trajectory", **EMPTY)
+    x, y, h = centre()
+    v = libsumo.vehicle.getSpeed("ego")
+    plan = np.array([[t, x + v * t, y + 0.1 * t, h, v] for t in (0.0, 0.07, 0.5)])
+    encoded = simulator.actions["ego"].encode(plan)
+    assert np.array_equal(simulator.actions["ego"].encode(encoded), encoded)
+    step(plan)
+    assert centre()[:2] == pytest.approx((x + 0.1 * v, y + 0.01), abs=1e-9)
+    assert centre()[2] == pytest.approx(h, abs=1e-9)
+
+
+def test_target_pose_is_reached_at_its_time(start):
+    _, step = start("target_pose", **EMPTY)
+    x, y, _ = centre()
+    v = libsumo.vehicle.getSpeed("ego")
+    for number in range(20):
+        step((x + 2 * v, y + 1.5, 0.0, 2.0 - 0.1 * number))
+    assert centre() == pytest.approx((x + 2 * v, y + 1.5, 0.0), abs=1e-6)
+
+
+def test_area_agrees_with_the_distance_to_every_lane_and_the_winding_around_the_junction(start):
+    start("acceleration_steering", **EMPTY)
+    area, lanes = DrivableArea(), [lane for lane in libsumo.lane.getIDList() if "12" not in lane and "13" not in lane]
+    shapes = {lane: np.array(libsumo.lane.getShape(lane)) for lane in lanes}
+    junction = np.array(libsumo.junction.getShape("center"))
+    rng = np.random.default_rng(5)
+    for point in [*rng.uniform((-60.0, -12.0), (-9.0, 12.0), (200, 2)), *rng.uniform(-12.0, 12.0, (200, 2))]:
+        gaps = []
+        for lane, shape in shapes.items():
+            a, along = shape[:-1], np.diff(shape, axis=0)
+            share = np.clip(((point - a) * along).sum(1) / (along**2).sum(1), 0, 1)[:, None]
+            gaps.append(np.hypot(*(a + share * along - point).T).min() - libsumo.lane.getWidth(lane) / 2)
+        angles = np.arctan2(*(junction - point).T[::-1])
+        winding = abs(sum(math.remainder(turn, math.tau) for turn in np.diff(angles, append=angles[:1]))) > 1.0
+        assert area.contains(*point, "passenger") == (min(gaps) <= 0 or winding), point
+    assert not area.contains(500.0, 900.0, "passenger")
+
+
+def test_polygon_contains_what_it_winds_around():
+    rng = np.random.default_rng(2)
+    corners = [(math.cos(turn) * far, math.sin(turn) * far) for turn, far in zip(
+        np.linspace(0, 6, 9), rng.uniform(1, 4, 9), strict=True
+    )]  # fmt: skip
+    for point in rng.uniform(-4, 4, (200, 2)):
+        angles = np.arctan2(*(np.array(corners) - point).T[::-1])
+        winding = sum(math.remainder(turn, math.tau) for turn in np.diff(angles, append=angles[:1]))
+        assert _is_inside(*point, corners) == (abs(winding) > 1.0)
