@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     from gymnasium import Space
 
+    from crashhunt.base.program_messages import Hello, Observe, ProgramRequest, SpaceDescription
     from crashhunt.simulators import ActionForm, Simulator
     from crashhunt.trial import Kind, Value
 
@@ -118,7 +119,7 @@ class ProgramAgent:
         is_scalar: whether an action is one number, which the program sends as a list of one.
     """
 
-    def __init__(self, command: Sequence[str], hello: Mapping[str, Any], folder: Path, *, is_scalar: bool) -> None:
+    def __init__(self, command: Sequence[str], hello: Hello, folder: Path, *, is_scalar: bool) -> None:
         self._process = _Process(command, folder)
         self._hello = hello
         self._is_scalar = is_scalar
@@ -148,7 +149,7 @@ class ProgramAgent:
                 process.start()
                 _signature_in(process.ask(self._hello, "hello"))
             process.ask({"type": "reset", "seed": self._seed}, "reset")
-        message = {
+        message: Observe = {
             "type": "observe", "step": step, "time_s": round(step * self._step_length_s, 9),
             "observation": _plain(observation),
         }  # fmt: skip
@@ -211,7 +212,7 @@ class _Process:
             if soft == resource.RLIM_INFINITY or soft > _MAX_FILE_BYTES:
                 resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (_MAX_FILE_BYTES, hard))
 
-    def ask(self, message: Mapping[str, Any], shown: str, limit_s: float | None = None) -> dict[str, Any]:
+    def ask(self, message: ProgramRequest, shown: str, limit_s: float | None = None) -> dict[str, Any]:
         """Send a message, and return the program's answer to it.
 
         Args:
@@ -264,7 +265,7 @@ class _Process:
             process.wait()
         process.stdout.close()
 
-    def _encoded(self, message: Mapping[str, Any]) -> bytes:
+    def _encoded(self, message: ProgramRequest) -> bytes:
         if self._packer is None:
             return to_json(message) + b"\n"
         data: bytes = self._packer.pack(message)
@@ -365,20 +366,21 @@ def _await(stream: IO[bytes], deadline: float | None, *, writing: bool = False) 
 _LOGS_FIX = "write only messages to standard output, and logs to standard error"
 
 
-def _hello(agent: str, simulator: Simulator | None, arguments: Mapping[str, Value]) -> dict[str, Any]:
-    described: dict[str, Any] = {"observation": {}, "action": {}, "step_length_s": 0.0}
+def _hello(agent: str, simulator: Simulator | None, arguments: Mapping[str, Value]) -> Hello:
+    found: Hello = {
+        "type": "hello", "protocol": PROTOCOL, "agent": agent, "arguments": dict(arguments), "observation": {},
+        "action": {"shape": [], "columns": [], "units": []}, "step_length_s": 0.0,
+    }  # fmt: skip
     if simulator is not None:
         shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
         names = simulator.observation_names if supports(simulator, NamesObservations) else ()
         layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
-        described = {
-            "observation": layouts[agent].describe()
-            if agent in layouts
-            else _described_observation(shown.get(agent) or simulator.observation_spaces[agent], names),
-            "action": _described_action(simulator.actions[agent]),
-            "step_length_s": simulator.step_length_s,
-        }
-    return {"type": "hello", "protocol": PROTOCOL, "agent": agent, "arguments": dict(arguments), **described}
+        space = shown.get(agent) or simulator.observation_spaces[agent]
+        layout = layouts.get(agent)
+        found["observation"] = layout.describe() if layout is not None else _described_observation(space, names)
+        found["action"] = _described_action(simulator.actions[agent])
+        found["step_length_s"] = simulator.step_length_s
+    return found
 
 
 def _check_ready(ready: Mapping[str, Any]) -> None:
@@ -433,7 +435,7 @@ def _absolute(value: Value) -> Value:
     return str(Path(value).absolute()) if isinstance(value, str) and os.path.isfile(value) else value  # noqa: PTH113
 
 
-def _described_observation(space: Space[object], names: Sequence[str]) -> dict[str, Any]:
+def _described_observation(space: Space[object], names: Sequence[str]) -> dict[str, SpaceDescription]:
     """Return the shape, columns and units of each part of an observation."""
     from gymnasium.spaces import Dict
 
@@ -442,21 +444,23 @@ def _described_observation(space: Space[object], names: Sequence[str]) -> dict[s
     return {"kinematics" if names else "observation": _described_space(space, names)}
 
 
-def _described_action(form: ActionForm) -> dict[str, Any]:
+def _described_action(form: ActionForm) -> SpaceDescription:
     """Return the shape, columns, units and bounds of an action."""
     found = _described_space(form.space, form.names)
-    return found | ({"meanings": list(form.space.meanings)} if supports(form.space, NamesMetaActions) else {})
+    if supports(form.space, NamesMetaActions):
+        found["meanings"] = list(form.space.meanings)
+    return found
 
 
-def _described_space(space: Space[object], names: Sequence[str]) -> dict[str, Any]:
+def _described_space(space: Space[object], names: Sequence[str]) -> SpaceDescription:
     from gymnasium.spaces import Box, Tuple
 
-    columns = {"columns": list(names), "units": [_UNITS.get(name, "") for name in names]}
+    shape = [int(length) for length in space.shape or ()]
+    units = [_UNITS.get(name, "") for name in names]
+    found: SpaceDescription = {"shape": shape, "columns": list(names), "units": units}
     if isinstance(space, Tuple):
-        return {"shape": [len(space.spaces)], **columns, "bounds": [_bounds(one) for one in space.spaces]}
-    shape = [] if space.shape is None else [int(length) for length in space.shape]
-    found: dict[str, Any] = {"shape": shape, **columns}
-    if isinstance(space, Box) and len(shape) == 1:
+        found |= {"shape": [len(space.spaces)], "bounds": [_bounds(one) for one in space.spaces]}
+    elif isinstance(space, Box) and len(shape) == 1:
         found["bounds"] = [_ends(low, high) for low, high in zip(space.low, space.high, strict=True)]
     elif (bounds := _bounds(space)) is not None:
         found["bounds"] = [bounds]

@@ -28,12 +28,12 @@ SECTIONS = {
 _PAGE_ORDER = [
     "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed", "how-often-does-it-crash",
     "which-version-is-better", "cluster", "your-town", "highway-env", "gymnasium", "planner-in-cpp", "ci",
-    "agent", "lib", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
+    "agent", "exec", "lib", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
     "kinds-of-crashes", "notes", "fault", "judge", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
     "criticality", "determinism", "search", "counterfactuals", "crash-rates",
     "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "security",
-    "disturbance-kinds", "forks", "minimization", "export", "clusters",
+    "exec-protocol", "disturbance-kinds", "forks", "minimization", "export", "clusters",
     "gallery", "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
 """Topics in reading order; all other topics follow them."""

@@ -12,6 +12,7 @@ from typing import Any, Literal, TypedDict
 from crashhunt.analysis import Counts, Shrunk
 from crashhunt.base.codec import JsonObject
 from crashhunt.base.json_types import ErrorData, Plain
+from crashhunt.base.program_messages import ProgramAnswer, ProgramRequest
 from crashhunt.base.schemas import json_schema
 from crashhunt.corpus import Bisected, CaseReport
 from crashhunt.crashes import CrashSummary, Fault, Group, Judgement, Note, TrustedOrigin
@@ -226,9 +227,17 @@ SCHEMAS: dict[str, object] = {
 """Every command that has ``--json``, with the type of its output; ``error`` is the output of each if it fails."""
 
 
+MESSAGES: dict[str, tuple[str, object]] = {
+    "messages/exec-request": ("Message of crashhunt to the program of an agent (protocol 1)", ProgramRequest),
+    "messages/exec-answer": ("Message of the program of an agent to crashhunt (protocol 1)", ProgramAnswer),
+}
+"""The messages that crashhunt exchanges with other programs, each with the title of its schema."""
+
+
 def describe_schemas() -> dict[str, str]:
     """Return the text of each schema file, by the file's name without its ending."""
+    titled = {name: (f"crashhunt {name.replace('-', ' ')} --json", kind) for name, kind in SCHEMAS.items()}
     return {
-        name: json.dumps(json_schema(kind, f"crashhunt {name.replace('-', ' ')} --json"), indent=1) + "\n"
-        for name, kind in SCHEMAS.items()
+        name: json.dumps(json_schema(kind, title), indent=1) + "\n"
+        for name, (title, kind) in (titled | MESSAGES).items()
     }

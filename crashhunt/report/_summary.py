@@ -114,6 +114,7 @@ _MAX_BLOCKS = 2  # crashes that are described in full, so that the text fits a s
 _MAX_TYPES = 5
 _MAX_LISTED = 3  # crashes of which only the names are given
 _MAX_REASONS = 3
+_MAX_OUTPUT_CHARACTERS = 300  # of the last line that a process has printed
 _SOURCE_WORDS = {
     ("overlap", "reported"): "the simulator reports it, and the outlines overlap",
     ("overlap",): "the outlines overlap; the simulator does not report it",
@@ -413,5 +414,6 @@ def _evidence(result: TrialResult) -> list[str]:
         dumped = [line for line in frames if line.lstrip().startswith("File")]
         lines += dumped[:3] if failure.kind in ("signal", "timeout") else frames[-4:]
         if failure.last_output.strip():
-            lines.append(f"last output: {failure.last_output.strip().splitlines()[-1]}")
+            last = failure.last_output.strip().splitlines()[-1]
+            lines.append(f"last output: {last[:_MAX_OUTPUT_CHARACTERS]}{'…' * (len(last) > _MAX_OUTPUT_CHARACTERS)}")
     return lines

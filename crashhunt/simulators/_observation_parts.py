@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from gymnasium import spaces
     from numpy.typing import NDArray
 
+    from crashhunt.base.program_messages import SpaceDescription
     from crashhunt.scenario import AgentSetup
 
 
@@ -578,7 +579,7 @@ class ObservationLayout:
         found.flags.writeable = False
         return found
 
-    def describe(self) -> dict[str, dict[str, object]]:
+    def describe(self) -> dict[str, SpaceDescription]:
         """Return the shape, the columns and their units of every part as JSON-compatible data."""
         return {
             name: {

@@ -200,10 +200,11 @@ def is_running(pid):
 
 def test_the_arguments_that_a_program_declares_are_its_signature(planner):
     signature = signature_of(ProgramFactory(f"exec:{planner}"))
-    (speed,) = signature.arguments.values()
+    speed, kind = signature.arguments.values()
     assert (speed.name, speed.default, speed.unit, speed.distribution) == ("speed", 12.0, "m/s", Range(8.0, 20.0))
+    assert (kind.name, kind.default, kind.kind) == ("kind", "", "str")
     assert not signature.open
-    assert takes_of(f"exec:{planner}").defaults == {"speed": 12.0}
+    assert takes_of(f"exec:{planner}").defaults == {"speed": 12.0, "kind": ""}
     assert takes_of("exec:/nowhere/planner").open
 
 

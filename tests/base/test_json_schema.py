@@ -156,7 +156,11 @@ def test_schema_files_are_those_of_the_code():
     if os.environ.get("CRASHHUNT_GOLDEN") == "write":
         for name, text in made.items():
             (json_schemas.FOLDER / f"{name}.json").write_text(text)
-    assert {file.stem: file.read_text() for file in json_schemas.FOLDER.glob("*.json")} == made
+    files = {
+        file.relative_to(json_schemas.FOLDER).with_suffix("").as_posix(): file
+        for file in json_schemas.FOLDER.rglob("*.json")
+    }
+    assert {name: file.read_text() for name, file in files.items()} == made
     for text in made.values():
         jsonschema.Draft202012Validator.check_schema(json.loads(text))
 

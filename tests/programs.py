@@ -1,4 +1,4 @@
-"""The same driver as a program in Python and in C, and as an agent in Python; the program also does harm when told."""
+"""The same driver as a program in Python and in C, and as an agent in Python; the program does harm when told."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 COMPILER = shutil.which("cc")
+COMPILER_CXX = shutil.which("c++")
 
 DRIVER = """\
 class Driver:
@@ -88,14 +89,18 @@ for line in iter(sys.stdin.readline, ""):
         print("hello", message["agent"], message["arguments"], file=sys.stderr, flush=True)
         in_trial = bool(message["agent"])
         speed = message["arguments"].get("speed", speed)
-    if in_trial and message["type"] == when and message.get("step", 3) == 3:
+        kind = message["arguments"].get("kind", kind)
+    if in_trial and kind not in ("none", "blind") and message["type"] == when and message.get("step", 3) == 3:
         harm()
     elif message["type"] == "hello":
-        answer(type="ready", format="json", arguments={"speed": {"range": "8.0:20.0", "unit": "m/s", "default": 12.0}})
+        answer(type="ready", format="json", arguments={
+            "speed": {"range": "8.0:20.0", "unit": "m/s", "default": 12.0}, "kind": {"default": kind},
+        })
     elif message["type"] == "reset":
         answer(type="ok")
     elif message["type"] == "observe":
         ahead = [row[1] for row in message["observation"][1:] if row[0] and row[1] > 0 and abs(row[2]) < 1.5]
+        ahead = [] if kind == "blind" else ahead
         answer(type="act", action=[0.0 if ahead and min(ahead) < 12.0 else speed, 0], panels=None)
     elif kind != "stays":
         break

@@ -1,0 +1,153 @@
+"""Whole hunts in which a program drives (``exec:``): what it declares, what travels, and what its harm costs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+import subprocess
+
+import pytest
+from json_schemas import validator
+from pages import Page
+from programs import COMPILER, COMPILER_CXX, DRIVER, compile_program, write_binary_program, write_program
+
+RUN = ("--scenario", "toy", "--seed", "3")
+
+
+def rows_of(shell, hunt):
+    return list(csv.DictReader(io.StringIO(shell.crashhunt("trials", hunt, "--format", "csv").out)))
+
+
+def test_a_hunt_varies_what_a_program_declares_and_its_crash_replays_where_the_program_is_gone(toy):
+    planner = write_program(toy.folder)
+    done = toy.crashhunt("run", "h", "2", "20", "200", "--agent", "exec:./planner blind", *RUN, "--json")
+    (crash,) = done.json["crashes"]
+    assert crash["outcome"] == "collision"
+    assert crash["confirmed"]
+    speeds = [float(row["ego.speed"]) for row in rows_of(toy, "h")]
+    assert all(8.0 <= speed <= 20.0 for speed in speeds)
+    (shown,) = [toy.crashhunt("show", "h", "--json").json]
+    assert shown["summary"].startswith("ego drove into")
+    toy.crashhunt("report", "h")
+    planner.write_text(planner.read_text().replace("else speed", "else speed / 2"))
+    changed = toy.crashhunt("replay", "h", "--code", "current", "--json", expect=None).json
+    assert changed["verdict"] != "reproduced"
+    assert changed["code_differences"] == ["./planner has changed"]
+    planner.unlink()
+    shutil.move(toy.folder / "h", toy.folder / "elsewhere")
+    assert toy.crashhunt("replay", "elsewhere", "--json").json["verdict"] == "reproduced"
+
+
+def test_each_harm_costs_its_own_trial_with_a_message_that_names_the_vehicle_and_the_step(toy):
+    write_program(toy.folder)
+    harms = {
+        "garbage": "ego: its answer to observe of step 3 is not JSON: thinking",
+        "SIGSEGV": "ego: the program died of SIGSEGV instead of answering observe of step 3",
+        "NaN": "the action [nan, 0] is not (target_speed, lane_change)",
+    }
+    kinds = "|".join([*harms, "none"])
+    toy.crashhunt(
+        "run", "h", "2", "4", "20", "--agent", "exec:./planner - observe", "--arg", f"kind={kinds}", "--arg",
+        "speed=8.0", "--set", "gap_m=30.0", "--sampler", "grid", *RUN, "--keep-going", "--json",
+    )  # fmt: skip
+    outcomes = {row["ego.kind"]: row["outcome"] for row in rows_of(toy, "h")}
+    assert outcomes == {**dict.fromkeys(harms, "agent_error"), "none": "survived"}
+    messages = {json.loads(file.read_text())["failure"]["message"] for file in (toy.folder / "h").rglob("crash.json")}
+    assert len(messages) == len(harms)
+    assert all(any(message.startswith(text) for message in messages) for text in harms.values()), messages
+
+
+def test_a_program_that_fails_at_once_is_an_error_of_the_agent_and_one_that_is_missing_is_refused(toy):
+    program = toy.folder / "fails"
+    program.write_text("#!/bin/sh\necho 'no planner.yaml' >&2\nexit 4\n")
+    program.chmod(0o755)
+    done = toy.crashhunt("run", "h", "1", "1", "20", "--agent", "exec:./fails", *RUN, "--json")
+    assert done.json["outcomes"] == {"agent_error": 1}
+    failed = "the program exited with 4 instead of answering hello"
+    assert f"exec:./fails has not declared its arguments: {failed} (its last output: no planner.yaml)" in done.err
+    assert f"ego: {failed}" in done.err
+    assert "last output: no planner.yaml" in done.err
+    refused = toy.crashhunt("run", "g", "1", "1", "20", "--agent", "exec:./nothing", *RUN, expect=2)
+    assert refused.err == (
+        "crashhunt: 'exec:./nothing': the program './nothing' is not a file; give the path of an executable file, "
+        "such as exec:./planner\n"
+    )
+
+
+@pytest.mark.parametrize("option", [("--probe", "1"), ("--rare",), ("--branch",)])
+def test_options_that_fork_trials_are_refused_in_one_line(toy, option):
+    write_program(toy.folder)
+    done = toy.crashhunt(
+        "run", "h", "1", "1", "20", "--agent", "exec:./planner", *RUN, "--disturb", "brake=0.01", *option, expect=2
+    )
+    assert done.err == (
+        f"crashhunt: {option[0]} forks running trials, and the program that drives ego cannot be forked; "
+        f"omit {option[0]}, or name an agent in Python\n"
+    )
+
+
+def test_a_scenario_names_its_program_relative_to_its_own_folder(toy):
+    write_program(toy.folder / "toy")
+    file = toy.folder / "toy" / "scenario.toml"
+    file.write_text(
+        file.read_text().replace('agent = "crashhunt.agents:KeepLaneWithSpeed"', 'agent = { exec = ["./planner"] }')
+    )
+    assert toy.crashhunt("run", "h", "1", "2", "20", *RUN, "--json").json["trials_run"] == 2
+    file.write_text(file.read_text().replace('["./planner"]', '"./planner"'))
+    refused = toy.crashhunt("run", "g", "1", "2", "20", *RUN, expect=2)
+    assert "agents.ego.agent" in refused.err
+    assert 'write agent = { exec = ["./planner", "--mode", "test"] }' in refused.err
+
+
+def same_driver(shell, trials, scenario, *, max_steps=200):
+    """The digests of trials that one driver drives: in Python, and as programs in Python, with MessagePack and in C."""
+    (shell.folder / "driver.py").write_text(DRIVER)
+    write_program(shell.folder)
+    write_binary_program(shell.folder)
+    agents = ["driver:Driver", "exec:./planner", "exec:./binary"]
+    if COMPILER:
+        compile_program(shell.folder, "compiled")
+        agents.append("exec:./compiled")
+    found = []
+    for number, agent in enumerate(agents):
+        shell.crashhunt(
+            "run", f"h{number}", "2", str(trials), str(max_steps), "--scenario", scenario, "--agent", agent, "--arg",
+            "speed=8.0:20.0", "--seed", "5", "--crash-on", "off_road",
+        )  # fmt: skip
+        found.append([(row["outcome"], row["steps"], row["digest"]) for row in rows_of(shell, f"h{number}")])
+    return found
+
+
+@pytest.mark.long
+def test_one_driver_in_python_and_as_a_program_has_equal_digests(toy):
+    first, *others = same_driver(toy, 3, "toy")
+    assert len(set(first)) == 3
+    assert {"collision", "survived"} >= {outcome for outcome, _, _ in first}
+    assert all(other == first for other in others)
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("scenario", ["motorway", "merge", "toy"])
+def test_one_driver_has_equal_digests_over_200_trials(toy, scenario):
+    first, *others = same_driver(toy, 200, scenario)
+    assert len(set(first)) > 190
+    assert all(other == first for other in others)
+
+
+@pytest.mark.skipif(COMPILER_CXX is None, reason="no compiler for C++")
+def test_the_session_of_the_protocol_page_is_what_the_example_in_cpp_does(shell, tmp_path):
+    session = Page("exec-protocol").text.partition("```text\n")[2].partition("```")[0].splitlines()
+    asked = [line[2:] for line in session if line.startswith("> ")]
+    answered = [line[2:] for line in session if line.startswith("< ")]
+    (tmp_path / "planner.cpp").write_text(Page("exec").files["planner.cpp"])
+    subprocess.run([str(COMPILER_CXX), "-std=c++17", "-o", "planner", "planner.cpp"], cwd=tmp_path, check=True)
+    done = subprocess.run(
+        [tmp_path / "planner"], input="".join(f"{line}\n" for line in asked), capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines() == answered
+    for name, lines in (("request", asked), ("answer", answered)):
+        for line in lines:
+            validator(f"messages/exec-{name}").validate(json.loads(line))
