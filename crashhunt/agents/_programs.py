@@ -24,7 +24,7 @@ from pydantic_core import from_json, to_json
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError, ProgramError
 from crashhunt.base.processes import descendants_of, kill
-from crashhunt.base.programs import command_of, words_of
+from crashhunt.base.programs import command_of, library_path, words_of
 from crashhunt.base.text import one_line
 from crashhunt.simulators import FlattensObservations, NamesMetaActions, NamesObservations, ObservesParts
 from crashhunt.trial import Argument, Signature, kind_of, parse_spec
@@ -103,7 +103,10 @@ class ProgramFactory:
         given = {key: _absolute(value) for key, value in arguments.items()}
         hello = _hello(name, simulator, given)
         is_scalar = simulator.actions[name].space.shape == ()
-        return ProgramAgent(command_of(self._locator, files), hello, folder / f"agent-{name}", is_scalar=is_scalar)
+        process = _Process(
+            command_of(self._locator, files), folder / f"agent-{name}", libraries=library_path(self._locator, files)
+        )
+        return ProgramAgent(process, hello, is_scalar=is_scalar)
 
 
 class ProgramAgent:
@@ -113,14 +116,13 @@ class ProgramAgent:
     recorded trial, as in any other step.
 
     Args:
-        command: the program and its words.
+        process: the process of the program, which has not been started.
         hello: the first message.
-        folder: the folder in which the program runs; it is created.
         is_scalar: whether an action is one number, which the program sends as a list of one.
     """
 
-    def __init__(self, command: Sequence[str], hello: Hello, folder: Path, *, is_scalar: bool) -> None:
-        self._process = _Process(command, folder)
+    def __init__(self, process: _Process, hello: Hello, *, is_scalar: bool) -> None:
+        self._process = process
         self._hello = hello
         self._is_scalar = is_scalar
         self._step_length_s = float(hello["step_length_s"])
@@ -174,10 +176,12 @@ class _Process:
         command: the program and its words.
         folder: the folder in which the program runs; it is created.
         log: file descriptor for its standard error; None for that of this process.
+        libraries: folder with copies of the libraries that the program loads; empty if there are none.
     """
 
-    def __init__(self, command: Sequence[str], folder: Path, log: int | None = None) -> None:
+    def __init__(self, command: Sequence[str], folder: Path, log: int | None = None, *, libraries: str = "") -> None:
         self._command = command
+        self._libraries = libraries
         self._folder = folder
         self._log = log
         self._received = bytearray()
@@ -200,7 +204,7 @@ class _Process:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._process = process = subprocess.Popen(
                 self._command, cwd=self._folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                stderr=self._log if self._log is not None else 2, bufsize=0,
+                stderr=self._log if self._log is not None else 2, bufsize=0, env=self._environment(),
             )  # fmt: skip
         except OSError as error:
             fix = "make it executable here: with #! in its first line if it is a script, and for this machine"
@@ -211,6 +215,13 @@ class _Process:
             soft, hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
             if soft == resource.RLIM_INFINITY or soft > _MAX_FILE_BYTES:
                 resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (_MAX_FILE_BYTES, hard))
+
+    def _environment(self) -> dict[str, str]:
+        # Python would write its caches next to the modules of the snapshot.
+        found = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+        if self._libraries:
+            found["LD_LIBRARY_PATH"] = ":".join(filter(None, [self._libraries, os.environ.get("LD_LIBRARY_PATH")]))
+        return found
 
     def ask(self, message: ProgramRequest, shown: str, limit_s: float | None = None) -> dict[str, Any]:
         """Send a message, and return the program's answer to it.

@@ -5,6 +5,7 @@ The command line of a program is split as a shell would, without a shell.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import shlex
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from crashhunt.base import libraries
+from crashhunt.base.binaries import own_libraries
 from crashhunt.base.errors import PluginError
 
 if TYPE_CHECKING:
@@ -120,6 +122,58 @@ def files_of(locator: str) -> dict[str, Path]:
         if _is_path(name) and os.path.isfile(name):  # noqa: PTH113
             found[name] = Path(name).absolute()
     return found
+
+
+def libraries_of(locator: str) -> tuple[dict[str, Path], list[str]]:
+    """Return the libraries that must travel with an agent's program, in addition to `files_of`; see `own_libraries`.
+
+    Raises:
+        PluginError: the program does not exist or cannot be executed.
+    """
+    if can_fork(locator):
+        return {}, []
+    program = _program(words_of(locator)[0], locator)
+    return ({}, []) if _is_of_system(program) else own_libraries(program)
+
+
+def libraries_folder(locator: str) -> str:
+    """Return the name of the folder with the copies of the libraries of an agent's program."""
+    return f"libraries-{hashlib.blake2b(words_of(locator)[0].encode(), digest_size=4).hexdigest()}"
+
+
+def library_path(locator: str, files: Mapping[str, str]) -> str:
+    """Return the folder in which a snapshot has the libraries of an agent's program; empty if it has none.
+
+    Args:
+        locator: locator of the agent.
+        files: file of a snapshot by the text that names the original file.
+    """
+    name = libraries_folder(locator)
+    return next((folder for folder in map(os.path.dirname, files.values()) if os.path.basename(folder) == name), "")  # noqa: PTH119
+
+
+def neighbouring_modules(file: Path) -> dict[str, Path]:
+    """Return the modules and packages next to a program in Python, by their names relative to its folder.
+
+    A program that is not in Python has none.
+    """
+    if file.suffix != ".py" and b"python" not in _first_line(file):
+        return {}
+    packages = [entry.parent for entry in sorted(file.parent.glob("*/__init__.py"))]
+    found = [
+        *sorted(file.parent.glob("*.py")),
+        *(path for package in packages for path in sorted(package.rglob("*.py"))),
+    ]
+    return {path.relative_to(file.parent).as_posix(): path for path in found if path != file}
+
+
+def _first_line(file: Path) -> bytes:
+    try:
+        with file.open("rb") as opened:
+            line = opened.readline(256)
+    except OSError:
+        return b""
+    return line if line.startswith(b"#!") else b""
 
 
 def _program(word: str, locator: str) -> Path:

@@ -17,7 +17,7 @@ from crashhunt.plans import load_order_change, read_settings, with_recorded_load
 from crashhunt.replays._edits import edited_spec
 from crashhunt.reruns import Reruns
 from crashhunt.scenario import argument_values, load_scenario
-from crashhunt.snapshots import Snapshot, code_differences, environment_changes, processor
+from crashhunt.snapshots import Snapshot, code_differences, environment_changes, processor, program_warnings
 from crashhunt.trial import SENSOR_KINDS
 
 if TYPE_CHECKING:
@@ -161,6 +161,8 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     scenario = with_recorded_load_order(scenario, environment.get("load_order"))
     warnings += [f"{name} was {then} and is {now}" for name, (then, now) in environment_changes(environment).items()]
     warnings += filter(None, [load_order_change(scenario, environment.get("load_order"))])
+    if code == "snapshot" and trusted:
+        warnings += program_warnings(snapshot, [setup.agent for setup in scenario.agents.values()])
     there, here = environment.get("cpu", ""), processor()
     if scenario.backend.per_processor and there != here:
         warnings.append(f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise")

@@ -6,7 +6,7 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._changes import CodeChanges as CodeChanges, code_changes as code_changes
-    from ._differences import code_differences as code_differences
+    from ._differences import code_differences as code_differences, program_warnings as program_warnings
     from ._environment import (
         Environment as Environment,
         environment as environment,

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import os
+import platform
 import sys
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.binaries import describe_binary
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.exceptions import shown_path
 from crashhunt.base.integrity import changed_file
 from crashhunt.base.plugins import registered
-from crashhunt.base.programs import files_of, is_program
+from crashhunt.base.programs import can_fork, files_of, is_program, libraries_folder, words_of
 from crashhunt.snapshots._changes import is_page
 from crashhunt.snapshots._take import code_of_tree
 
@@ -56,6 +58,31 @@ def code_differences(snapshot: Snapshot, locators: Iterable[str]) -> list[str] |
         if place in files and (why := changed_file(str(programs.get(value, value)), files[place])):
             found.append(f"{value} {why}")
     return sorted(found) if compared else None
+
+
+def program_warnings(snapshot: Snapshot, locators: Iterable[str]) -> list[str]:
+    """Return the reasons why this machine cannot run the programs of a snapshot, each as a line of text.
+
+    Args:
+        snapshot: the snapshot, which the caller has verified.
+        locators: locators of the agents.
+    """
+    files, here = snapshot.argument_files, platform.machine()
+    found = []
+    for locator in locators:
+        if not is_program(locator) or can_fork(locator):  # a library is refused where it is loaded
+            continue
+        word = words_of(locator)[0]
+        facts = describe_binary(Path(files[word])) if word in files else None
+        if facts is None:
+            continue
+        if facts["machine"] != here:
+            found.append(f"the program {word} is for {facts['machine']}, and this machine is {here}, so it cannot run")
+            continue
+        own = {Path(file).name for file in files.values() if Path(file).parent.name == libraries_folder(locator)}
+        lacking = [name for name in facts["missing"] if name not in own]
+        found += [f"the program {word} needs the library {name}, which this machine lacks" for name in lacking]
+    return found
 
 
 def _program_files(locator: str) -> dict[str, Path]:

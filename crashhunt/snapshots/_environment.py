@@ -14,6 +14,8 @@ from crashhunt.scenario import installed_backends
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from crashhunt.base.binaries import BinaryFacts
+
 
 class Environment(TypedDict):
     """The contents of ``environment.json``: everything besides code on which a result depends.
@@ -21,7 +23,8 @@ class Environment(TypedDict):
     The entry ``git`` has the revision of each work tree. The entry ``core`` is whether the simulator's compiled core
     was used, which does not change results. The entry ``origins`` has folders of the snapshot and the user's folders
     that they copy. If results depend on an order at load, ``load_order`` is ``fixed`` or ``not fixed: REASON``.
-    Without ``load_order``, the order was not fixed.
+    Without ``load_order``, the order was not fixed. The entry ``programs`` has architecture, build id and libraries of
+    the programs of agents, by their words in the command line.
     """
 
     schema: int
@@ -36,6 +39,7 @@ class Environment(TypedDict):
     variables: dict[str, str]
     core: NotRequired[str]
     load_order: NotRequired[str]
+    programs: NotRequired[dict[str, BinaryFacts]]
     git: NotRequired[dict[str, str]]
     origins: NotRequired[Sequence[tuple[str, str]]]
 

@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.binaries import describe_binary
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import BundleError, SnapshotError, UsageError, remedy
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree
 from crashhunt.base.git import query
 from crashhunt.base.integrity import describe_files, digest_of_content, digest_of_data, digest_of_file
 from crashhunt.base.opened_files import output_files
-from crashhunt.base.programs import files_of, is_program
+from crashhunt.base.programs import files_of, is_program, libraries_folder, libraries_of, neighbouring_modules
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, load_order_of, write_settings
 from crashhunt.scenario import Scenario, as_plain_data
@@ -36,6 +37,7 @@ from crashhunt.trial import Choice, Constant
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    from crashhunt.base.binaries import BinaryFacts
     from crashhunt.base.integrity import FileEntry
     from crashhunt.base.plugins import ImportedModules
     from crashhunt.snapshots._environment import Environment
@@ -440,6 +442,8 @@ def _build(
     facts: Environment = {
         **around, "git": _describe_trees(found.trees, building / layout.GIT_DIFF), "origins": found.origins,
     }  # fmt: skip
+    if programs := _described_programs(settings):
+        facts["programs"] = programs
     if (core := core_of(scenario, settings.run)) is not None:
         facts["core"] = core
     if (load_order := load_order_of(scenario)) is not None:
@@ -512,9 +516,23 @@ def _program_files(settings: HuntSettings, found: Sources, takes_code: bool, hun
             base = next(place for place, origin in found.origins if origin == str(tree))
             places[word] = f"{base}/{path.resolve().relative_to(tree).as_posix()}"
         else:
-            places[word] = f"{layout.FILES}/program-{number}-{path.name}"
+            folder = f"{layout.FILES}/program-{number}"
+            places[word] = f"{folder}/{path.name}"
+            places |= {str(module): f"{folder}/{name}" for name, module in neighbouring_modules(path).items()}
         found.files[places[word]] = str(path)
+    for locator in locators:
+        libraries, fixed = libraries_of(locator)
+        folder = f"{layout.FILES}/{libraries_folder(locator)}"
+        places |= {str(path): f"{folder}/{name}" for name, path in libraries.items() if name not in fixed}
+        found.excluded += [f"{libraries[name]}: the program has its path (DT_RPATH), and uses it" for name in fixed]
     return places
+
+
+def _described_programs(settings: HuntSettings) -> dict[str, BinaryFacts]:
+    """Return what identifies the binary programs of agents, by their words in the command lines."""
+    locators = {agent.agent for agent in settings.agents.values() if is_program(agent.agent)}
+    files = {word: path for locator in sorted(locators) for word, path in files_of(locator).items()}
+    return {word: found for word, path in files.items() if (found := describe_binary(path)) is not None}
 
 
 def _training_records(modules: Sequence[str], argument_files: dict[str, str]) -> dict[str, str]:

@@ -101,6 +101,47 @@ def test_a_scenario_names_its_program_relative_to_its_own_folder(toy):
     assert 'write agent = { exec = ["./planner", "--mode", "test"] }' in refused.err
 
 
+def test_modules_next_to_a_program_in_python_travel_with_it(toy):
+    planner = toy.folder / "planner"
+    write_program(toy.folder)
+    planner.write_text(planner.read_text().replace("import json", "import helper\nimport json", 1))
+    (toy.folder / "helper.py").write_text("import package\n")
+    (toy.folder / "package").mkdir()
+    (toy.folder / "package" / "__init__.py").write_text("")
+    toy.crashhunt("run", "h", "1", "3", "200", "--agent", "exec:./planner blind", "--arg", "speed=18.0", *RUN)
+    (toy.folder / "helper.py").write_text("import missing\n")
+    done = toy.crashhunt("replay", "h", "--json").json
+    assert (done["verdict"], done["warnings"]) == ("reproduced", [])
+    (differing,) = toy.crashhunt("replay", "h", "--code", "current", "--json", expect=None).json["code_differences"]
+    assert differing.endswith("helper.py has changed")
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(COMPILER is None, reason="no compiler for C")
+def test_libraries_that_are_not_the_systems_travel_with_a_program(toy):
+    source = toy.folder / "build"
+    source.mkdir()
+    compiled = ["-L.", "-lchoice", f"-Wl,-rpath,{source}"]
+
+    def build(speed):
+        (source / "choice.c").write_text(f"double choice(void) {{ return {speed}; }}\n")
+        subprocess.run(["cc", "-shared", "-fPIC", "-o", "libchoice.so", "choice.c"], cwd=source, check=True)
+
+    build(18.0)
+    compile_program(source, "planner")
+    text = (source / "planner.c").read_text().replace("int main", "double choice(void);\nint main")
+    (source / "planner.c").write_text(text.replace("nearest < 12.0 ? 0.0 : speed", "choice()"))
+    subprocess.run(["cc", "-o", "planner", "planner.c", *compiled, "-lm"], cwd=source, check=True)
+    toy.crashhunt("run", "h", "1", "3", "200", "--agent", "exec:build/planner", *RUN)
+    build(2.0)
+    assert toy.crashhunt("replay", "h", "--json").json["verdict"] == "reproduced"
+    current = toy.crashhunt("replay", "h", "--code", "current", "--json", expect=None).json
+    assert current["verdict"] != "reproduced"
+    assert [line.rpartition("/")[2] for line in current["code_differences"]] == ["libchoice.so has changed"]
+    shutil.rmtree(source)
+    assert toy.crashhunt("replay", "h", "--json").json["verdict"] == "reproduced"
+
+
 def same_driver(shell, trials, scenario, *, max_steps=200):
     """The digests of trials that one driver drives: in Python, and as programs in Python, with MessagePack and in C."""
     (shell.folder / "driver.py").write_text(DRIVER)

@@ -1,0 +1,119 @@
+"""Binary programs and shared libraries (ELF files): their architecture, build id, and the libraries that they load."""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypedDict
+
+from crashhunt.base.libraries import is_of_system
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_MACHINES: Final = {3: "i686", 40: "arm", 62: "x86_64", 183: "aarch64", 243: "riscv64"}
+_NOTES_TYPE, _BUILD_ID_TYPE = 4, 3  # of a segment, and of a note
+_MAX_NOTES_BYTES: Final = 1 << 16
+_LDD_TIMEOUT_S: Final = 10.0
+_LOADED = re.compile(r"^\s*(\S+) => (/.+) \(0x[\da-f]+\)$", re.MULTILINE)
+_MISSING = re.compile(r"^\s*(\S+) => not found$", re.MULTILINE)
+
+
+class BinaryFacts(TypedDict):
+    """What identifies a binary file.
+
+    ``machine`` is the processor architecture, as `platform.machine` names it. ``build_id`` is empty if the linker wrote
+    none. ``system`` lists the libraries of the operating system that the binary loads, and ``missing`` those that are
+    not found.
+    """
+
+    machine: str
+    build_id: str
+    system: list[str]
+    missing: list[str]
+
+
+def describe_binary(file: Path) -> BinaryFacts | None:
+    """Return what identifies a binary file; None if it is not an ELF file."""
+    head = _head_of(file)
+    if head is None:
+        return None
+    loaded, missing = _loaded_by(file, {})
+    system = sorted(name for name, path in loaded.items() if is_of_system(Path(path)))
+    return {"machine": head[0], "build_id": head[1], "system": system, "missing": missing}
+
+
+def own_libraries(file: Path) -> tuple[dict[str, Path], list[str]]:
+    """Return the libraries that a binary file loads and that do not belong to the operating system.
+
+    Returns:
+        The path of each library by name, and the names of the libraries for which the binary ignores
+        ``LD_LIBRARY_PATH``, so that it would not load a copy. Both are empty if the file is not an ELF file.
+    """
+    if _head_of(file) is None:
+        return {}, []
+    loaded, _ = _loaded_by(file, {})
+    own = {name: Path(path) for name, path in loaded.items() if not is_of_system(Path(path))}
+    if not own:
+        return {}, []
+    with tempfile.TemporaryDirectory(prefix="crashhunt-libraries-") as folder:
+        for name, path in own.items():
+            Path(folder, name).symlink_to(path)
+        redirected, _ = _loaded_by(file, {"LD_LIBRARY_PATH": folder})
+    return own, sorted(name for name in own if not redirected.get(name, "").startswith(f"{folder}/"))
+
+
+def _loaded_by(file: Path, variables: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
+    """Return the path of each library that the dynamic linker would load, and the names of the missing libraries."""
+    try:
+        done = subprocess.run(
+            ["ldd", str(file)], capture_output=True, stdin=subprocess.DEVNULL, check=False, timeout=_LDD_TIMEOUT_S,
+            env={**os.environ, "LC_ALL": "C", **variables},
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired):
+        return {}, []
+    text = os.fsdecode(done.stdout)
+    return dict(_LOADED.findall(text)), sorted(_MISSING.findall(text))
+
+
+def _head_of(file: Path) -> tuple[str, str] | None:
+    """Return the architecture and the build id of an ELF file; None for any other file."""
+    try:
+        with file.open("rb") as opened:
+            head = opened.read(64)
+            if head[:4] != b"\x7fELF" or len(head) < 64:
+                return None
+            order = "<" if head[5] == 1 else ">"
+            (machine,) = struct.unpack_from(f"{order}H", head, 18)
+            name = _MACHINES.get(machine, f"ELF machine {machine}")
+            if head[4] != 2:  # 32 bits
+                return name, ""
+            (table,) = struct.unpack_from(f"{order}Q", head, 32)
+            size, count = struct.unpack_from(f"{order}2H", head, 54)
+            opened.seek(table)
+            segments = opened.read(size * count)
+            for start in range(0, len(segments) - 55, max(size, 56)):
+                kind, _, offset, _, _, length = struct.unpack_from(f"{order}2I4Q", segments, start)
+                if kind == _NOTES_TYPE and length <= _MAX_NOTES_BYTES:
+                    opened.seek(offset)
+                    if found := _build_id_in(opened.read(length), order):
+                        return name, found
+            return name, ""
+    except (OSError, ValueError, struct.error):  # the file is cut, or its offsets are nonsense
+        return None
+
+
+def _build_id_in(notes: bytes, order: str) -> str:
+    at = 0
+    while at + 12 <= len(notes):
+        name_length, length, kind = struct.unpack_from(f"{order}3I", notes, at)
+        name_at = at + 12
+        content_at = name_at + (name_length + 3 & ~3)
+        if kind == _BUILD_ID_TYPE and notes[name_at : name_at + 4] == b"GNU\0":
+            return notes[content_at : content_at + length].hex()
+        at = content_at + (length + 3 & ~3)
+    return ""
