@@ -8,9 +8,11 @@ after ``close``. Anything else is an error of the agent.
 from __future__ import annotations
 
 import os
+import re
 import resource
 import select
 import signal
+import stat
 import subprocess
 import tempfile
 import time
@@ -49,6 +51,19 @@ _MAX_SHOWN_CHARACTERS: Final = 80
 _DESCRIPTION_S: Final = 60.0  # as long as a module may take to import
 _CLOSING_S: Final = 1.0  # from `close` to the end of the program
 _TERMINATION_S: Final = 0.2  # from SIGTERM to SIGKILL
+_MAX_REPORT_BYTES: Final = 1 << 20  # of the end of the log, which may have the report of a sanitizer
+_MAX_REASON_CHARACTERS: Final = 300
+_REASONS: Final = tuple(
+    re.compile(pattern, re.MULTILINE)
+    for pattern in (
+        r"^SUMMARY: (\w+Sanitizer: .+)$",
+        r"^(.+: runtime error: .+)$",  # of the sanitizer for undefined behaviour
+        r"^(.+: Assertion .+ failed\.)$",
+        r"^terminate called after throwing an instance of (.+\n {2}what\(\): .+)$",
+        r"^(terminate called .+)$",
+    )
+)
+"""What the log of a program names as the reason of its end: sanitizers, assert, exceptions of C++."""
 _UNITS: Final = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "heading": "rad", "target_speed": "m/s"}
 _DECLARATION_KEYS: Final = ("range", "unit", "default")
 
@@ -183,7 +198,8 @@ class _Process:
         self._command = command
         self._libraries = libraries
         self._folder = folder
-        self._log = log
+        self._log = 2 if log is None else log
+        self._log_begin: int | None = None  # where the program's log begins; None if it cannot be read
         self._received = bytearray()
         self._packer: Any = None  # of MessagePack; None as long as messages are lines of JSON
         self._unpack: Any = None
@@ -200,11 +216,14 @@ class _Process:
         Raises:
             ProgramError: the operating system cannot run it.
         """
+        with suppress(OSError):
+            status = os.fstat(self._log)
+            self._log_begin = status.st_size if stat.S_ISREG(status.st_mode) else None
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._process = process = subprocess.Popen(
                 self._command, cwd=self._folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                stderr=self._log if self._log is not None else 2, bufsize=0, env=self._environment(),
+                stderr=self._log, bufsize=0, env=self._environment(),
             )  # fmt: skip
         except OSError as error:
             fix = "make it executable here: with #! in its first line if it is a script, and for this machine"
@@ -343,9 +362,20 @@ class _Process:
                 f"the program has closed its end instead of answering {shown}{half}, and is still running"
             )
         code = process.returncode
-        if code < 0:
-            return ProgramError(f"the program died of {_signal_name(-code)} instead of answering {shown}{half}")
-        return ProgramError(f"the program exited with {code} instead of answering {shown}{half}")
+        end = f"died of {_signal_name(-code)}" if code < 0 else f"exited with {code}"
+        return ProgramError(f"the program {end} instead of answering {shown}{half}{self._reason()}")
+
+    def _reason(self) -> str:
+        """Return the reason that the program has written to its standard error, after a colon; empty if it has none."""
+        if self._log_begin is None:
+            return ""
+        with suppress(OSError), open(f"/proc/self/fd/{self._log}", "rb") as log:
+            size = log.seek(0, os.SEEK_END)
+            log.seek(max(self._log_begin, size - _MAX_REPORT_BYTES))
+            text = log.read(_MAX_REPORT_BYTES).decode("utf-8", "replace")
+            found = next((match for pattern in _REASONS if (match := pattern.search(text))), None)
+            return f": {one_line(found[1])[:_MAX_REASON_CHARACTERS]}" if found else ""
+        return ""
 
     @staticmethod
     def _ends_within(process: subprocess.Popen[bytes], limit_s: float) -> bool:

@@ -61,6 +61,31 @@ def test_harm_in_binary_messages_is_an_error_of_the_agent(tmp_path, kind, messag
     agent.close()
 
 
+@pytest.mark.parametrize(
+    ("log", "reason"),
+    [
+        (
+            "==7==ERROR\nSUMMARY: AddressSanitizer: heap-use-after-free a.cpp:14:9 in f()\n==7==ABORTING",
+            "f()",
+        ),
+        ("planner.cpp:9:3: runtime error: division by zero", "division by zero"),
+        ("planner: a.cpp:7: int main(): Assertion `lanes > 0' failed.", "Assertion `lanes > 0' failed."),
+        ("terminate called after throwing an instance of 'std::out_of_range'\n  what():  lane 5", "what():  lane 5"),
+        ("goodbye", "answering hello"),
+    ],
+    ids=["address", "undefined", "assert", "exception", "none"],
+)
+def test_the_reason_in_the_log_of_a_program_that_ends_is_part_of_the_error(tmp_path, capfd, log, reason):
+    program = tmp_path / "ends"
+    (tmp_path / "text").write_text(log, encoding="utf-8")
+    program.write_text(f"#!/bin/sh\ncat {tmp_path}/text >&2\nexit 1\n", encoding="utf-8")
+    program.chmod(0o755)
+    agent = agent_of(f"exec:{program}", tmp_path)
+    with pytest.raises(ProgramError, match=f"^ego: the program exited with 1 instead of .*{re.escape(reason)}$"):
+        agent.act(observations(1)[0])
+    agent.close()
+
+
 def drive(agent):
     return [agent.act(seen) for seen in observations()]
 
