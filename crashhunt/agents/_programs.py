@@ -404,6 +404,7 @@ def _await(stream: IO[bytes], deadline: float | None, *, writing: bool = False) 
         raise TimeoutError
 
 
+_PARTS_FIX = "see crashhunt list observations"
 _LOGS_FIX = "write only messages to standard output, and logs to standard error"
 
 
@@ -441,7 +442,7 @@ def _check_ready(ready: Mapping[str, Any]) -> None:
 
 
 def _signature_in(ready: Mapping[str, Any]) -> Signature:
-    """Return the arguments that a program declares; one that declares none accepts any argument.
+    """Return what a program declares; a program that declares no arguments accepts any.
 
     Raises:
         ProgramError: the program wants another protocol, or does not declare ranges, units and defaults.
@@ -452,7 +453,15 @@ def _signature_in(ready: Mapping[str, Any]) -> Signature:
         raise ProgramError(f"its arguments are {_shown(declared)}, not an object")
     arguments = {name: _argument(name, facts) for name, facts in declared.items()}
     required = tuple(name for name, one in arguments.items() if one.default is None)
-    return Signature(arguments=arguments, open=not arguments, given=(), required=required)
+    observation, action = ready.get("observation") or [], ready.get("action") or ""
+    if not isinstance(observation, list) or not all(isinstance(part, str) for part in observation):
+        raise ProgramError(f"its observation is {_shown(observation)}, not a list of names", fix=_PARTS_FIX)
+    if not isinstance(action, str):
+        raise ProgramError(f"its action is {_shown(action)}, not a name", fix="see crashhunt list actions")
+    return Signature(
+        arguments=arguments, open=not arguments, given=(), required=required, action=action,
+        observation=tuple(observation),
+    )  # fmt: skip
 
 
 def _argument(name: str, facts: object) -> Argument:

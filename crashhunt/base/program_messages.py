@@ -62,12 +62,18 @@ class DeclaredArgument(TypedDict, total=False):
 
 
 class Ready(TypedDict):
-    """The answer to ``hello``."""
+    """The answer to ``hello``.
+
+    ``observation`` lists the parts that the program observes, and ``action`` is the form of its actions, if neither the
+    command line nor the scenario names others.
+    """
 
     type: Literal["ready"]
     protocol: NotRequired[Literal[1]]
     format: NotRequired[Literal["json", "msgpack"]]
     arguments: NotRequired[dict[str, DeclaredArgument]]
+    observation: NotRequired[list[str]]
+    action: NotRequired[str]
     revision: NotRequired[str]
 
 

@@ -23,7 +23,7 @@ def chosen_observations(
     Args:
         asked: value of ``--observe``; may be empty.
         scenario: scenario with its agents.
-        signatures: signature of each agent.
+        signatures: signature of each agent; without one, only the command line and the scenario count.
 
     Raises:
         UsageError: a part does not exist, or the simulator does not have it.
@@ -33,7 +33,7 @@ def chosen_observations(
         words, where = tuple(asked), "--observe"
         if not words and setup.observation:
             words, where = setup.observation, f"agents.{agent}.observation"
-        elif not words:
+        elif not words and agent in signatures:
             words, where = signatures[agent].observation, f"observation of {setup.agent}"
         if words:
             parse_parts(words, scenario.backend.observations, where=where)

@@ -313,8 +313,9 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     with _name_scenario_in_errors(request, scenario):
         disturb = _disturb(request, scenario)
     if code is None or any(setup.agent not in code.signatures for setup in scenario.agents.values()):
+        observed = chosen_observations(request.observe, scenario, {})
         code = describe_code(
-            scenario, oracles=request.oracles, disturb=disturb, sampler=request.sampler,
+            with_observations(scenario, observed), oracles=request.oracles, disturb=disturb, sampler=request.sampler,
             executor=request.run.executor, timeout_s=request.run.timeout_s,
         )  # fmt: skip
     hunted = not varies_only_asked(request.sampler)

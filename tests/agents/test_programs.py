@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from programs import COMPILER, DRIVER, compile_program, write_binary_program, wr
 from crashhunt.agents import ProgramFactory
 from crashhunt.base.errors import ActionError, PluginError, ProgramError
 from crashhunt.base.programs import command_of, files_of
-from crashhunt.plans import takes_of
+from crashhunt.plans import Request, plan_with_code, takes_of
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.trial import Range, signature_of
 
@@ -250,6 +251,28 @@ def test_whole_numbers_of_a_declaration_leave_the_type_to_the_values(tmp_path):
     assert [arguments[name].kind for name in ("speed", "path")] == [None, "str"]
 
 
+def test_the_first_hello_has_the_chosen_parts_and_ready_may_choose_them(tmp_path):
+    program = tmp_path / "chooses"
+    program.write_text(CHOOSES, encoding="utf-8")
+    program.chmod(0o755)
+    request = Request(scenario="loop", agents={"": f"exec:{program}"}, trials=1, max_steps=9)
+    _, chosen, code = plan_with_code(request)
+    assert (chosen.agents["ego"].observation, code.notes) == (("ego",), ())
+    assert chosen.agents["ego"].arguments["observed"].spec == "kinematics"
+    _, asked, code = plan_with_code(replace(request, observe=("actors", "ego")))
+    assert (asked.agents["ego"].observation, code.notes) == (("actors", "ego"), ())
+    assert asked.agents["ego"].arguments["observed"].spec == "actors,ego"
+
+
+CHOOSES = """\
+#!/usr/bin/env python3
+import json
+parts = json.loads(input())["observation"]
+observed = {"default": ",".join(sorted(parts))}
+print(json.dumps({"type": "ready", "observation": ["ego"], "arguments": {"observed": observed}}))
+"""
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -257,6 +280,11 @@ def test_whole_numbers_of_a_declaration_leave_the_type_to_the_values(tmp_path):
         ('{"type": "ready", "arguments": {"speed": {"unit": 5}}}', "its argument speed has the default null and the"),
         ('{"type": "ready", "arguments": {"speed": {"low": 5}}}', "speed has low (allowed: range, unit, default)"),
         ('{"type": "ready", "arguments": {"speed": 5}}', "its argument speed has 5 (allowed: range, unit, default)"),
+        (
+            '{"type": "ready", "observation": "ego"}',
+            'its observation is "ego", not a list of names; see',
+        ),
+        ('{"type": "ready", "action": 5}', "its action is 5, not a name; see crashhunt list actions"),
         ('{"type": "ready", "arguments": [1]}', "its arguments are [1], not an object"),
         ("ready", "its answer to hello is not JSON: ready"),
     ],
