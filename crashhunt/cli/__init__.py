@@ -47,6 +47,7 @@ from crashhunt.cli._report import add_report
 from crashhunt.cli._run import add_run
 from crashhunt.cli._show import add_show
 from crashhunt.cli._shrink import add_shrink
+from crashhunt.cli._signals import add_signals
 from crashhunt.cli._split import add_split
 from crashhunt.cli._status import add_status
 from crashhunt.cli._suite import add_rerun, add_suite
@@ -83,7 +84,7 @@ _COMMANDS = {
     "keep them fixed": (add_corpus, add_gate, add_split),
     "measure": (add_rate, add_compare, add_trials),
     "manage hunts": (add_status, add_logs, add_note_command, add_check, add_trust_command),
-    "look things up": (add_guide, add_list, add_agent_header, add_completion),
+    "look things up": (add_guide, add_list, add_signals, add_agent_header, add_completion),
 }
 
 

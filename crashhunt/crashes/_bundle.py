@@ -72,6 +72,7 @@ class CrashSummary(TypedDict):
     disturbed: NotRequired[bool]
     log_likelihood: NotRequired[float | None]
     danger: NotRequired[float | None]
+    requirement: NotRequired[str]
 
 
 class ArchiveIndex(TypedDict):
@@ -164,6 +165,7 @@ _TYPES: Plain = {
     "disturbed": bool,
     **dict.fromkeys(("log_likelihood", "danger"), float | None),
     "only": list[str] | None,
+    "robustness": dict[str, float | None] | None,
     **dict.fromkeys(("why_unconfirmed", "why_no_escape"), str),
     "script": dict | None,
     "authentication_code": str,
@@ -284,6 +286,8 @@ class Bundle:
             found["why_unconfirmed"] = self.why_unconfirmed
         if self.is_near_miss:
             found["danger"] = plain.get("danger")
+        if self.result.event is not None and self.result.event.name:
+            found["requirement"] = self.result.event.name
         if "log_likelihood" in plain or self.result.spec.disturbances:
             found["disturbed"] = self.result.disturbed
             found["log_likelihood"] = plain.get("log_likelihood")
@@ -328,6 +332,8 @@ class Bundle:
             data["why_no_escape"] = result.why_no_escape
         if result.danger is not None:
             data["danger"] = plain.get("danger")
+        if result.robustness is not None:
+            data["robustness"] = plain.get("robustness")
         if result.log_likelihood is not None or result.spec.disturbances:
             data["disturbed"] = result.disturbed
             data["log_likelihood"] = plain.get("log_likelihood")
@@ -429,6 +435,7 @@ def _bundle(path: Path, data: JsonObject) -> Bundle:
         disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
         log_likelihood=data.get("log_likelihood"),
         danger=data.get("danger"),
+        robustness=data.get("robustness"),
         why_no_escape=data.get("why_no_escape", ""),
     )
     return Bundle(

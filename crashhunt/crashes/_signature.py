@@ -96,7 +96,7 @@ class Signature(Serializable):
         manner: The manner of a collision: ``rear end``, ``side swipe``, ``crossing from the left`` (the side of the
             collision partner), ``crossing from the right``, ``head-on``, ``pedestrian`` or ``off road``. For a
             Gymnasium environment, the crash type that it reports, or its crash rule. For a traffic event, the type of
-            the event. For a software fault, the exception, signal or exit code.
+            the event, and the name of a violated requirement. For a software fault, the exception, signal or exit code.
         lane_change: which of the two actors were changing lanes: ``agent``, ``other``, ``both`` or empty.
         place: the text ``crossing`` where lanes of different directions overlap, ``road`` elsewhere; empty if the map
             is unknown, or if the place does not matter.
@@ -173,7 +173,7 @@ def signature_of_fault(result: TrialResult) -> Signature:
     """Return the signature of a crash that is not a collision, from its trial's result; disturbances do not count."""
     outcome, failure, event = str(result.outcome), result.failure, result.event
     if event is not None:
-        return Signature(outcome, manner=event.kind)
+        return Signature(outcome, manner=event.label)
     if failure is None:
         return Signature(outcome)
     return Signature(outcome, manner=_failure_type(failure), where=_innermost_frames(failure))

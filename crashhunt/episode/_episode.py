@@ -15,7 +15,8 @@ from crashhunt.episode._blame import guarded_check, guarded_reset, guarded_scene
 from crashhunt.episode._disturbance_injection import DisturbanceInjector
 from crashhunt.episode._failures import Ending, close_agent
 from crashhunt.episode._observers import agent_seed, callbacks_for, observation_restorers, options_of
-from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
+from crashhunt.episode._trial_signals import TrialSignals
+from crashhunt.oracles import ChecksEnd, Finding, Oracle, ReadsSignals, SeesMap, TrafficEvents, merge_findings
 from crashhunt.simulators import CountsSetUp, HasMap, SupportsReseeding
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec, in_turn
 
@@ -163,6 +164,7 @@ class Episode(Forkable, Ending):
         self._observations: Observations = {}
         self._rewards: Mapping[str, float] = {}
         self._terminations: Mapping[str, bool] = {}
+        self._infos: Info = {}
         self._scene: Scene | None = None
         self._make_agent = make_agent
         self._crash_on = frozenset(crash_on)
@@ -202,6 +204,11 @@ class Episode(Forkable, Ending):
     def rewards(self) -> Mapping[str, float]:
         """The rewards of the agents that acted in the last step."""
         return self._rewards
+
+    @property
+    def infos(self) -> Info:
+        """The infos of the last step or the reset, by agent."""
+        return self._infos
 
     @property
     def terminations(self) -> Mapping[str, bool]:
@@ -294,7 +301,7 @@ class Episode(Forkable, Ending):
         try:
             simulator = self.simulator
             try:
-                self._observations, rewards, self._terminations, truncations, _ = advance(actions)
+                self._observations, rewards, self._terminations, truncations, self._infos = advance(actions)
                 scene = simulator.scene() if self._look is None else self._look()
             except BaseException as error:  # an environment of a user's may exit as well as an agent
                 return self._fail_in_simulator(error)
@@ -387,7 +394,7 @@ class Episode(Forkable, Ending):
             if spec.reseeding is not None:
                 _require_reseeding(simulator)
             try:
-                self._observations, _ = self._reset(seed=spec.seed, options=options_of(spec, simulator))
+                self._observations, self._infos = self._reset(seed=spec.seed, options=options_of(spec, simulator))
             finally:
                 self.setup_steps = simulator.setup_steps if supports(simulator, CountsSetUp) else None
             self.names = tuple(simulator.agents)
@@ -414,6 +421,10 @@ class Episode(Forkable, Ending):
             if supports(oracle, SeesMap):
                 lanes = simulator.lanes() if supports(simulator, HasMap) else ()
                 (oracle.see_map if is_ours(oracle) else _MAP_BOUNDARY.around(oracle.see_map))(lanes)
+            if supports(oracle, ReadsSignals):
+                oracle.read_signals(TrialSignals(self), self.names)
+            if supports(oracle, ChecksEnd):
+                self._on_end.append(oracle.complete)  # last, because it replaces values of other observers
         # Oracles of a user's are asked inside a boundary; crashhunt's own fail only by a fault of crashhunt.
         self._checks = [oracle.check if is_ours(oracle) else guarded_check(oracle.check) for oracle in self._oracles]
         finding = self._find(scene)
@@ -461,8 +472,18 @@ class Episode(Forkable, Ending):
             present, over = set(self.simulator.agents), self.terminations
             self.acting = tuple([number for number, name in enumerate(self.names) if name in present])
             if not self.acting or all(over.get(name) or truncations.get(name) for name in actions):
-                return self._end(Outcome.FINISHED)
-        return self._end(Outcome.SURVIVED) if self.steps >= self._max_steps else None
+                return self._end_whole(Outcome.FINISHED)
+        return self._end_whole(Outcome.SURVIVED) if self.steps >= self._max_steps else None
+
+    def _end_whole(self, outcome: Outcome) -> TrialResult:
+        """End the episode without a crash, unless an oracle finds one at the end."""
+        assert self._scene is not None
+        ending = [oracle for oracle in self._oracles if supports(oracle, ChecksEnd)]
+        findings = [finding for oracle in ending for finding in oracle.check_end(self._scene, self.names)]
+        finding = merge_findings([finding for finding in findings if finding.outcome in self._crash_on])
+        if finding is not None:
+            return self._end(finding.outcome, collision=finding.collision, event=finding.event)
+        return self._end(outcome)
 
     def _find(self, scene: Scene) -> Finding | None:
         """Return the findings of the oracles in a scene that end the episode."""

@@ -16,7 +16,7 @@ from crashhunt.base.program_messages import ProgramAnswer, ProgramRequest
 from crashhunt.base.schemas import json_schema
 from crashhunt.corpus import Bisected, CaseReport
 from crashhunt.crashes import CrashSummary, Fault, Group, Judgement, Note, TrustedOrigin
-from crashhunt.hunts import AuditReport, Checked, StoppedBecause
+from crashhunt.hunts import AuditReport, Checked, SignalList, StoppedBecause
 from crashhunt.ledger import KindData
 from crashhunt.replays import ReplayReport
 from crashhunt.report import ListingEntry
@@ -221,6 +221,7 @@ SCHEMAS: dict[str, object] = {
         "oracles?": list[ListingEntry],
         "scenarios?": list[ListingEntry],
     },
+    "signals": SignalList,
     "guide": ({"topics": [_TOPIC]}, {**_TOPIC, "text": str}),
     "error": ErrorData,
 }

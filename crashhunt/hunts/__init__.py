@@ -21,5 +21,6 @@ if TYPE_CHECKING:
         StrategyStatus as StrategyStatus,
     )
     from ._reports import AuditReport as AuditReport, HuntReport as HuntReport, StoppedBecause as StoppedBecause
+    from ._signal_list import SignalEntry as SignalEntry, SignalList as SignalList, list_signals as list_signals
 
 offer_lazily(__name__)

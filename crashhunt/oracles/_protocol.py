@@ -16,7 +16,7 @@ from crashhunt.trial import Constant, Outcome, parse_spec, signature_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
-    from crashhunt.trial import Category, Collision, Value
+    from crashhunt.trial import Category, Collision, TrialResult, Value
     from crashhunt.world import Event, Lane, Scene
 
 
@@ -70,6 +70,45 @@ class BringsOutcomes(Protocol):
     ``--crash-on`` says otherwise."""
 
 
+class SignalSource(Protocol):
+    """The signals of a running episode: what formulas of requirements may name."""
+
+    step_length_s: float
+    """Time between two samples, in s."""
+
+    def reader(self, names: Sequence[str], agent: str) -> Callable[[], Sequence[float] | None]:
+        """Return a function that returns the values of signals in the last scene, in the given order.
+
+        The function returns None in scenes without the agent, and before the first step if a signal has no value there.
+
+        Args:
+            names: names of the signals.
+            agent: the agent to which names without an agent refer.
+
+        Raises:
+            UnusableValueError: a signal is unknown.
+        """
+
+
+@runtime_checkable
+class ReadsSignals(Protocol):
+    """An oracle that reads the signals of an episode."""
+
+    def read_signals(self, source: SignalSource, agents: Sequence[str]) -> None:
+        """Receive the signals, and the controlled vehicles, before the first `Oracle.check`."""
+
+
+@runtime_checkable
+class ChecksEnd(Protocol):
+    """An oracle that also decides at the end of a trial, and adds to the trial's result."""
+
+    def check_end(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
+        """Return the crashes that are certain only because the trial ends with this scene."""
+
+    def complete(self, result: TrialResult) -> TrialResult:
+        """Return the result of the trial, with the data of this oracle added."""
+
+
 def merge_findings(findings: Sequence[Finding]) -> Finding | None:
     """Return the first finding, with the names of all oracles that detected its collision; None without a finding."""
     if not findings:
@@ -91,6 +130,9 @@ DEFAULT_ORACLES = ("reported-collision", "overlap", "off-road")
 
 ORACLES_OF_ACTORS = ("overlap", "off-road", "too-close")
 """Oracles of crashhunt that detect nothing if scenes contain no actors."""
+
+REQUIREMENT = "requirement"
+"""The oracle of requirements, which is written ``requirement:TITLE=FORMULA``."""
 
 _NONE = "none"
 # A colon may belong to module:attribute; one that is followed by key= begins the arguments.
@@ -163,6 +205,9 @@ def parse_oracle(text: str) -> OracleChoice:
     match = _CHOICE.fullmatch(text)
     if match is None:
         raise UsageError(f"--oracle {text!r} names no oracle", fix="give NAME or NAME:key=value")
+    if match["name"] == REQUIREMENT:
+        title, _, formula = (match["arguments"] or "").partition("=")
+        return OracleChoice(REQUIREMENT, {"title": title, "formula": formula}, locate("oracles", REQUIREMENT))
     name, pairs = match["name"], match["arguments"]
     factory: Callable[..., Oracle] = locate("oracles", name)
     signature = signature_of(factory)

@@ -114,6 +114,15 @@ class Subject(_Options):
         "none switches off the default oracles; the option may be given several times",
         flag="--oracle", metavar="NAME[:KEY=VALUE,…]", group="what",
     )  # fmt: skip
+    requirements: Sequence[str] = option(
+        (), "requirements as ``NAME=FORMULA``, in temporal logic; a violation is a crash with the outcome "
+        "``requirement``",
+        help="what must hold, in temporal logic, such as headway='always (headway_s >= 1)'; a violation is a crash "
+        "with the outcome requirement; crashhunt signals SCENARIO lists the signals; the option may be given several "
+        "times",
+        unset="those of the scenario, if it has any",
+        flag="--require", metavar="[NAME=]FORMULA", group="what",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

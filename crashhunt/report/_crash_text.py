@@ -143,6 +143,7 @@ class Story:
         elif self.encounter is not None and self.encounter.moments:
             sentences += self._about_encounter(self.encounter)
             sentences += self._about_fault()
+        sentences += [f"{line}." for line in result.event.details] if result.event is not None else []
         sentences += about_events(recording, self._first, besides=result.event)
         hit = result.collision
         if result.event is not None or (hit is not None and hit.role == "alone"):

@@ -77,7 +77,7 @@ def undefined(term: Term, text: str, sample: int, what: str) -> FormulaError:
     """Return the error for a term without a value at a sample."""
     begin, end = term.span
     return FormulaError(
-        f"the requirement {what} at sample {sample}: {' '.join(text[begin:end].split())}",
+        f"it {what} at sample {sample}: {' '.join(text[begin:end].split())}",
         fix="exclude this case, such as with: x > 0 -> …", text=text, begin=begin, end=end,
     )  # fmt: skip
 
@@ -282,6 +282,6 @@ def checked_signals(
         length = len(values)
         found[name] = values
         flags |= {name} if raw.dtype.kind == "b" else set()
-    if not length:
+    if length == 0:
         raise ArgumentError("the trace has no sample", fix="give at least one sample of each signal")
     return found, frozenset(flags)

@@ -120,7 +120,7 @@ def _kind(result: TrialResult) -> str:
     elif failed is not None:
         words += [failed.kind, failed.agent]
     elif event is not None:
-        words += [event.kind, _NUMBER_AT_END.sub("", event.lane)]
+        words += [event.label, _NUMBER_AT_END.sub("", event.lane)]
     else:
         return ""
     return " ".join(words).rstrip()

@@ -181,6 +181,7 @@ class Scenario:
         events: limits of traffic events that differ from the default, such as ``not_moving`` in s.
         disturbances: disturbances, which are faults of other vehicles and of the agent's sensors: rate per second by
             name. Only hunts use disturbances.
+        requirement: what must hold, as formulas in temporal logic, by name. Only hunts use requirements.
         schema: version of the file format.
         name: name shown to users; by default the name of the folder.
         folder: folder of the scenario's files; not part of the file.
@@ -200,6 +201,7 @@ class Scenario:
     tables: dict[str, object] = field(default_factory=dict)
     events: dict[str, float] = field(default_factory=dict)
     disturbances: dict[str, float | str] = field(default_factory=dict)
+    requirement: dict[str, str] = field(default_factory=dict)
     schema: Literal[1] = 1
     name: str = ""
     folder: Path = Path()
@@ -369,7 +371,7 @@ def as_plain_data(scenario: Scenario) -> dict[str, object]:
 
     said = asdict(replace(scenario, folder=Path()))
     data = as_in_file({key: plain(value) for key, value in said.items() if value is not None})
-    for later in ("events", "disturbances"):  # which an earlier crashhunt does not know
+    for later in ("events", "disturbances", "requirement"):  # which an earlier crashhunt does not know
         if not data[later]:
             del data[later]
     return {key: value for key, value in data.items() if key not in ("folder", "file", "notes", "added")}

@@ -249,6 +249,8 @@ class TrialResult(Serializable):
         driven_s: Time that all agents together drove, in s of simulation time; None if it is unknown.
         step_length_s: Step length of the simulator, in s; None if it is unknown.
         forced: The results of forks with a forced first disturbance; None if there were none.
+        robustness: The robustness of each requirement by name, negative if it is violated; None if it is infinite. The
+            mapping is None if the trial had no requirements.
     """
 
     spec: TrialSpec
@@ -277,12 +279,13 @@ class TrialResult(Serializable):
     driven_s: float | None = field(default=None, metadata={**OMIT_DEFAULT, **null_is(None)})
     step_length_s: float | None = field(default=None, metadata={**OMIT_DEFAULT, **null_is(None)})
     forced: Forced | None = field(default=None, metadata=OMIT_DEFAULT)
+    robustness: Mapping[str, float | None] | None = field(default=None, metadata=OMIT_DEFAULT)
 
     json_keys = (
         "steps", "sim_time_s", "digest", "wall_s", "setup_s", "worker", "kept", "outcome", "category?", "spec",
         "closest", "collision", "failure", "escape", "event", "events", "disturbances", "log_likelihood", "danger",
         "stress", "branches", "setup_steps", "why_no_escape", "driven_m", "driven_s",
-        "step_length_s", "forced",
+        "step_length_s", "forced", "robustness",
     )  # fmt: skip
 
     @classmethod

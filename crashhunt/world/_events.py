@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from crashhunt.base.codec import Serializable, null_is
+from crashhunt.base.codec import OMIT_DEFAULT, Serializable, null_is
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -42,6 +42,8 @@ class Event(Serializable):
         x: x of the front bumper of the controlled vehicle, in m.
         y: y of the front bumper of the controlled vehicle, in m.
         speed: speed of the controlled vehicle, in m/s.
+        name: name of the violated requirement; empty for other events.
+        details: the parts of the requirement that are violated, one line each; empty for other events.
     """
 
     kind: str
@@ -52,6 +54,13 @@ class Event(Serializable):
     x: float = field(default=math.nan, metadata=null_is(math.nan))
     y: float = field(default=math.nan, metadata=null_is(math.nan))
     speed: float = field(default=math.nan, metadata=null_is(math.nan))
+    name: str = field(default="", metadata=OMIT_DEFAULT)
+    details: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
+
+    @property
+    def label(self) -> str:
+        """The kind of the event, and the name of a violated requirement."""
+        return self.kind if self.name in ("", self.kind) else f"{self.kind} {self.name}"
 
 
 def event_counts(counts: Mapping[str, int]) -> str:

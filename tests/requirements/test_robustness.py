@@ -140,9 +140,9 @@ def test_windows_of_any_width_are_evaluated_on_long_traces():
         ("x > 1", {"x": []}, "the trace has no sample"),
         ("x > 1", {"x": 3.0}, "the signal 'x' is no row of numbers: float64 ()"),
         ("x > 1", {"x": ["a"]}, "the signal 'x' is no row of numbers: <U1 (1,)"),
-        ("1 / x > 1", {"x": [1.0, 0.0]}, "the requirement divides by zero at sample 1: 1 / x; exclude this case"),
-        ("sqrt(x) > 1", {"x": [-1.0]}, "the requirement is not a number at sample 0: sqrt(x)"),
-        ("x - x > 1", {"x": [math.inf]}, "the requirement is not a number at sample 0: x - x"),
+        ("1 / x > 1", {"x": [1.0, 0.0]}, "it divides by zero at sample 1: 1 / x; exclude this case"),
+        ("sqrt(x) > 1", {"x": [-1.0]}, "it is not a number at sample 0: sqrt(x)"),
+        ("x - x > 1", {"x": [math.inf]}, "it is not a number at sample 0: x - x"),
         ("always[0:0.25] (x > 1)", {"x": [1.0]}, "0.25 s, not a multiple of the step length of 0.1 s; give 0.2"),
     ],
 )  # fmt: skip

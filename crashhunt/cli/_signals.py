@@ -1,0 +1,50 @@
+"""``crashhunt signals``: the signals that requirements may name."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from crashhunt.base.text import visible
+from crashhunt.cli._common import add_json, pairs
+
+if TYPE_CHECKING:
+    import argparse
+
+    from crashhunt.cli._common import Commands
+
+
+def add_signals(commands: Commands) -> None:
+    """Add the command ``signals`` to the parser."""
+    signals = commands.add_parser(
+        "signals",
+        help="list the signals that requirements may name in a scenario",
+        description="List the signals that the formulas of --require may name in a scenario, with their units. Runs "
+        "one step of a trial, because a Gymnasium environment adds keys of info in its steps.",
+    )
+    signals.add_argument("scenario", metavar="SCENARIO", help="name of an included scenario, or a path")
+    signals.add_argument("--ego", metavar="VEHICLE", default="", help="as for crashhunt run")
+    signals.add_argument(
+        "--agent", metavar="[ID=]MODULE:ATTR", action="append", default=[], help="as for crashhunt run"
+    )
+    add_json(signals)
+    signals.set_defaults(command=_signals)
+
+
+def _signals(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.hunts import list_signals
+    from crashhunt.plans import HuntOptions, plan, request_of
+    from crashhunt.report import aligned
+
+    agents = pairs(options.agent, "--agent", named=False)
+    asked = HuntOptions(scenario=options.scenario, ego=options.ego, agents=agents)
+    found = list_signals(*plan(request_of(asked, trials=1, max_steps=1, parallel=1)))
+    if options.json:
+        print(json.dumps(found))
+        return 0
+    rows = [["signal", "unit", "meaning"], *([one["name"], one["unit"], one["meaning"]] for one in found["signals"])]
+    lines = aligned(rows, left=3)
+    if len(found["agents"]) > 1:
+        lines.append(f"each agent has these signals; {found['agents'][0]}.speed names one of an agent")
+    print(visible("\n".join(lines)))
+    return 0

@@ -1,0 +1,371 @@
+"""The signals of a running trial, which requirements name: of the scene, the observation, the reward and ``info``."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from crashhunt.base.capabilities import supports
+from crashhunt.base.errors import UnusableValueError
+from crashhunt.base.scalars import number_of
+from crashhunt.base.text import did_you_mean, listed
+from crashhunt.simulators import HasMap, NamesObservations, ReportsEvents, ReportsSurroundings
+from crashhunt.world import EVENT_WORDS, approaches
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.simulators import Info, Observations, Simulator
+    from crashhunt.world import Lane, Scene
+
+Read = Callable[[], float | None]
+
+UNITS: Mapping[str, str] = {
+    "time_s": "s",
+    "x": "m",
+    "y": "m",
+    "heading": "rad",
+    "speed": "m/s",
+    "acceleration": "m/s²",
+    "jerk": "m/s³",
+    "yaw_rate": "rad/s",
+    "gap_m": "m",
+    "headway_s": "s",
+    "ttc_s": "s",
+    "leader_speed": "m/s",
+    "red_light_m": "m",
+    "clearance_m": "m",
+    "lane": "",
+    "lane_offset_m": "m",
+}
+"""The signals of scenes with actors, and their units."""
+
+MEANINGS: Mapping[str, str] = {
+    "time_s": "time since the first step",
+    "x": "centre of the front bumper, in the frame of the map",
+    "y": "centre of the front bumper, in the frame of the map",
+    "heading": "counter-clockwise from the x axis",
+    "speed": "speed along the heading",
+    "acceleration": "change of the speed since the last step",
+    "jerk": "change of the acceleration since the last step",
+    "yaw_rate": "change of the heading since the last step",
+    "gap_m": "between the bumpers, to the nearest vehicle ahead on the path; infinite without one",
+    "headway_s": "gap_m at the own speed; infinite without a vehicle ahead, or at a standstill",
+    "ttc_s": "time to collision with the vehicle ahead; infinite if the gap grows",
+    "leader_speed": "speed of the nearest vehicle ahead; infinite without one",
+    "red_light_m": "to the stop line of the next red light; infinite without one",
+    "clearance_m": "between the outlines, to the nearest actor in any direction; infinite beyond 50 m",
+    "lane": "number at the end of the lane's name",
+    "lane_offset_m": "of the centre from the centre line of the nearest lane; positive to the left",
+}
+
+_OBSERVATION = re.compile(r"observation\[(\d+)\]")
+_TRAILING_NUMBER = re.compile(r"\d+$")
+_INFO, _REWARD = "info.", "reward"
+
+
+class SignalledEpisode(Protocol):
+    """The part of an `Episode` from which signals are read."""
+
+    simulator: Simulator
+    names: tuple[str, ...]
+    steps: int
+
+    @property
+    def scene(self) -> Scene | None:
+        """The scene after the last step."""
+
+    @property
+    def observations(self) -> Observations:
+        """The observations of the next step, by agent."""
+
+    @property
+    def rewards(self) -> Mapping[str, float]:
+        """The rewards of the last step, by agent."""
+
+    @property
+    def infos(self) -> Info:
+        """The infos of the last step, by agent."""
+
+
+class TrialSignals:
+    """Reads the signals of a running episode.
+
+    Args:
+        episode: the episode, whose simulator has been reset.
+    """
+
+    def __init__(self, episode: SignalledEpisode) -> None:
+        self._episode = episode
+        self.step_length_s = episode.simulator.step_length_s
+
+    def reader(self, names: Sequence[str], agent: str) -> Callable[[], Sequence[float] | None]:
+        """Return a function that returns the values of signals in the last scene; see `SignalSource`."""
+        readers = [self._one(name, agent) for name in names]
+        episode = self._episode
+        has_actors = agent in self._scene().roster.index
+
+        def read() -> Sequence[float] | None:
+            if has_actors and agent not in self._scene().roster.index:
+                return None
+            row = [one() for one in readers]
+            return (
+                None
+                if None in row and not episode.steps
+                else [_known(value, name) for value, name in zip(row, names, strict=True)]
+            )
+
+        return read
+
+    def known(self, agent: str) -> dict[str, str]:
+        """Return the signals of an agent in the last scene, and their units."""
+        found = dict(self._of_scene(agent))
+        for kind in self._events():
+            found[kind] = ""
+        if agent in self._episode.rewards or not found:
+            found[_REWARD] = ""
+        observation = self._episode.observations.get(agent)
+        if observation is not None:
+            found |= {f"observation[{number}]": "" for number in range(min(observation.size, _MAX_ELEMENTS))}
+        return found | {
+            (key if key not in found else f"{_INFO}{key}"): ""
+            for key, value in self._info(agent).items()
+            if _NAME.fullmatch(str(key)) and _is_number(value)
+        }
+
+    def meaning(self, name: str) -> str:
+        """Return the meaning of a signal of `known`."""
+        element = _OBSERVATION.fullmatch(name)
+        if name in MEANINGS:
+            return MEANINGS[name]
+        if element is not None:
+            return self._column(int(element[1]))
+        if name in self._events():
+            return f"true in the steps with this event: {EVENT_WORDS[name][0]}"
+        return "reward of the step" if name == _REWARD else "key of info"
+
+    def _column(self, number: int) -> str:
+        """Return the meaning of an element of the observation."""
+        simulator = self._episode.simulator
+        columns = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()
+        if not columns:
+            return "element of the observation"
+        return f"{columns[number % len(columns)]} in row {number // len(columns)} of the observation"
+
+    def _scene(self) -> Scene:
+        scene = self._episode.scene
+        assert scene is not None
+        return scene
+
+    def _info(self, agent: str) -> Mapping[str, object]:
+        found = self._episode.infos.get(agent)
+        return found if isinstance(found, Mapping) else {}
+
+    def _events(self) -> Sequence[str]:
+        simulator = self._episode.simulator
+        return tuple(simulator.reported_events) if supports(simulator, ReportsEvents) else ()
+
+    def _of_scene(self, agent: str) -> dict[str, str]:
+        if agent not in self._scene().roster.index:
+            return {"time_s": UNITS["time_s"]}
+        simulator = self._episode.simulator
+        lacks = set() if supports(simulator, ReportsSurroundings) else set(_SURROUNDINGS)
+        lacks |= set() if supports(simulator, HasMap) else {"lane", "lane_offset_m"}
+        return {name: unit for name, unit in UNITS.items() if name not in lacks}
+
+    def _one(self, name: str, agent: str) -> Read:
+        """Return the function that reads one signal."""
+        whose = next((one for one in sorted(self._episode.names, key=len)[::-1] if name.startswith(f"{one}.")), "")
+        if whose:
+            agent, name = whose, name[len(whose) + 1 :]
+        if name in self._of_scene(agent):
+            return _SceneReader(self._episode, agent).read(name)
+        if name in self._events():
+            return lambda: any(event.kind == name and event.agent == agent for event in self._scene().events)
+        if name == _REWARD:
+            return lambda: self._episode.rewards.get(agent) if self._episode.steps else None
+        element = _OBSERVATION.fullmatch(name)
+        if element is not None:
+            return self._element(int(element[1]), agent, name)
+        key = name.removeprefix(_INFO)
+        if self._scene().roster.index and name == key and not self._episode.infos:
+            raise self._unknown(name, agent)
+        return lambda: self._info_value(key, agent, name)
+
+    def _element(self, number: int, agent: str, name: str) -> Read:
+        size = self._episode.observations[agent].size
+        if number >= size:
+            fix = f"give an index from 0 to {size - 1}"
+            raise UnusableValueError(f"the signal {name!r} is not in the observation of {size} numbers", fix=fix)
+        return lambda: float(self._episode.observations[agent].flat[number])
+
+    def _info_value(self, key: str, agent: str, name: str) -> float | None:
+        info = self._info(agent)
+        if key in info:
+            value = info[key]
+            number = number_of(value, f"info[{key!r}]", "name a key of info whose value is a number")
+            return bool(number) if isinstance(value, bool | np.bool_) else number
+        if not self._episode.steps:
+            return None
+        raise self._unknown(name, agent)
+
+    def _unknown(self, name: str, agent: str) -> UnusableValueError:
+        known = self.known(agent)
+        shown = [one for one in known if not one.startswith("observation[")]
+        fix = did_you_mean(name, known) or f"name one of {listed(shown)}"
+        return UnusableValueError(f"the signal {name!r} of {agent} is unknown", fix=fix)
+
+
+_MAX_ELEMENTS = 1000
+_NAME = re.compile(r"[A-Za-z_]\w*")
+_SURROUNDINGS = ("gap_m", "headway_s", "ttc_s", "leader_speed", "red_light_m")
+
+
+def _known(value: float | None, name: str) -> float:
+    if value is None or value != value:
+        what = "has no value" if value is None else "is NaN"
+        raise UnusableValueError(
+            f"the signal {name!r} {what}", fix="give a number in every step, or name another signal"
+        )
+    return value
+
+
+def _is_number(value: object) -> bool:
+    try:
+        number_of(value, "", "")
+    except UnusableValueError:
+        return False
+    return True
+
+
+class _SceneReader:
+    """Reads the signals of one agent from scenes.
+
+    Args:
+        episode: the episode.
+        agent: the agent, which is in the scene.
+    """
+
+    def __init__(self, episode: SignalledEpisode, agent: str) -> None:
+        self._episode, self._agent = episode, agent
+        self._step_s = episode.simulator.step_length_s
+        self._lanes: Sequence[Lane] | None = None
+
+    def read(self, name: str) -> Read:
+        """Return the function that reads a signal."""
+        simple: dict[str, Read] = {
+            "time_s": lambda: self._episode.steps * self._step_s,
+            "x": lambda: self._scene.points[self._row][0],
+            "y": lambda: self._scene.points[self._row][1],
+            "heading": lambda: self._scene.headings[self._row],
+            "speed": self._speed,
+            "acceleration": _Rate(self._speed, self._step_s),
+            "jerk": _Rate(_Rate(self._speed, self._step_s), self._step_s, unknown=1),
+            "yaw_rate": _Rate(lambda: self._scene.headings[self._row], self._step_s, turn=True),
+            "gap_m": lambda: self._ahead()[0],
+            "headway_s": self._headway,
+            "ttc_s": self._time_to_collision,
+            "leader_speed": lambda: self._ahead()[1],
+            "red_light_m": self._red_light,
+            "clearance_m": self._clearance,
+            "lane": self._lane_number,
+            "lane_offset_m": lambda: self._nearest_lane()[1],
+        }
+        return simple[name]
+
+    @property
+    def _scene(self) -> Scene:
+        scene = self._episode.scene
+        assert scene is not None
+        return scene
+
+    @property
+    def _row(self) -> int:
+        return self._scene.roster.index[self._agent]
+
+    def _speed(self) -> float:
+        return self._scene.speeds[self._row]
+
+    def _ahead(self) -> tuple[float, float]:
+        """Return the gap to the nearest vehicle ahead, in m, and its speed, in m/s; both infinite without one."""
+        simulator = self._episode.simulator
+        assert supports(simulator, ReportsSurroundings)
+        ahead = [one for one in simulator.surroundings(self._agent).ahead if one.kind == "vehicle"]
+        nearest = min(ahead, key=lambda one: one.gap_m, default=None)
+        return (math.inf, math.inf) if nearest is None else (nearest.gap_m, nearest.speed_mps)
+
+    def _headway(self) -> float:
+        speed = self._speed()
+        return self._ahead()[0] / speed if speed > 0 else math.inf
+
+    def _time_to_collision(self) -> float:
+        gap_m, speed = self._ahead()
+        closing = self._speed() - speed
+        return max(0.0, gap_m) / closing if closing > 0 else math.inf
+
+    def _red_light(self) -> float:
+        simulator = self._episode.simulator
+        assert supports(simulator, ReportsSurroundings)
+        ahead = simulator.surroundings(self._agent).ahead
+        return min((one.gap_m for one in ahead if one.kind == "red light"), default=math.inf)
+
+    def _clearance(self) -> float:
+        return float(approaches([self._scene.frame], self._agent)[1][0])
+
+    def _lane_number(self) -> float | None:
+        lane = self._scene.agent_lanes.get(self._agent) or self._nearest_lane()[0]
+        number = _TRAILING_NUMBER.search(lane)
+        return float(number[0]) if number else None
+
+    def _nearest_lane(self) -> tuple[str, float]:
+        """Return the name of the lane whose centre line is nearest to the agent's centre, and the offset from it."""
+        if self._lanes is None:
+            simulator = self._episode.simulator
+            assert supports(simulator, HasMap)
+            self._lanes = simulator.lanes()
+            pieces = [
+                (number, *first, *last)
+                for number, lane in enumerate(self._lanes)
+                for first, last in zip(lane.shape, lane.shape[1:], strict=False)
+            ]
+            self._pieces = np.array(pieces, float).reshape(-1, 5)
+        if not len(self._pieces):
+            return "", math.nan
+        x, y = self._scene.centers[self._row]
+        _, x0, y0, x1, y1 = self._pieces.T
+        along_x, along_y = x1 - x0, y1 - y0
+        length = np.maximum(np.hypot(along_x, along_y), 1e-9)
+        share = np.clip(((x - x0) * along_x + (y - y0) * along_y) / length**2, 0.0, 1.0)
+        nearest = int(np.argmin(np.hypot(x - x0 - share * along_x, y - y0 - share * along_y)))
+        offset = (along_x[nearest] * (y - y0[nearest]) - along_y[nearest] * (x - x0[nearest])) / length[nearest]
+        return self._lanes[int(self._pieces[nearest, 0])].id, float(offset)
+
+
+class _Rate:
+    """The change of a signal per second since the last step; 0 before the first step.
+
+    Args:
+        signal: function that returns the signal.
+        step_s: step length, in s.
+        turn: whether the signal is an angle, in rad.
+        unknown: number of first values of the signal that are not known, and only stand in for it.
+    """
+
+    def __init__(self, signal: Callable[[], float], step_s: float, *, turn: bool = False, unknown: int = 0) -> None:
+        self._signal, self._step_s, self._turn, self._unknown = signal, step_s, turn, unknown
+        self._last: float | None = None
+
+    def __call__(self) -> float:
+        value, last = self._signal(), self._last
+        if self._unknown:
+            self._unknown -= 1
+            return 0.0
+        self._last = value
+        if last is None:
+            return 0.0
+        change = math.remainder(value - last, math.tau) if self._turn else value - last
+        return change / self._step_s

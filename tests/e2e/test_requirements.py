@@ -1,0 +1,94 @@
+"""Requirements on the command line: from the formula to the crash that is replayed, shown and kept."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+
+import pytest
+
+CALM = "calm=always (acceleration > -6)"
+
+
+def hunt(shell, *words, name="h", trials="12", expect=0):
+    options = ["--scenario", "toy", "--seed", "4", "--json"]
+    return shell.crashhunt("run", name, "2", trials, "60", *options, *words, expect=expect)
+
+
+def collect(shell):
+    """Collect the violations of two requirements, in ``h``; for `made_once`."""
+    words = ["--require", CALM, "--require", "apart=always (clearance_m > 6)", "--oracle", "none", "--keep-going"]
+    hunt(shell, *words)
+
+
+def test_violations_are_crashes_of_one_type_per_requirement(toy, made_once):
+    made_once(collect, toy)
+    found = {}
+    for path in (toy.folder / "h" / "crashes").iterdir():
+        crash = json.loads((path / "crash.json").read_text())
+        found.setdefault(crash["event"]["name"], path.name)
+        assert crash["outcome"] == "requirement"
+        assert crash["confirmed"] is True
+        assert set(crash["robustness"]) == {"calm", "apart"}
+    assert set(found) == {"calm", "apart"}
+    for name, crash in found.items():
+        assert toy.crashhunt("replay", "h", "--crash", crash, "--json").json["verdict"] == "reproduced"
+        shown = toy.crashhunt("show", "h", "--crash", crash).out
+        assert f"violates {name}: always (" in shown
+        assert "is false at step" in shown
+    types = {group["signature"]["manner"] for group in toy.crashhunt("crashes", "h", "--json").json["groups"]}
+    assert types == {"requirement calm", "requirement apart"}
+    assert toy.crashhunt("check", "h").code == 0
+
+
+def test_a_kept_violation_is_reproduced_and_fails_the_corpus(toy, made_once):
+    made_once(collect, toy)
+    crash = min(path.name for path in (toy.folder / "h" / "crashes").iterdir())
+    toy.crashhunt("corpus", "add", "h", "--to", "kept", "--crash", crash)
+    case = toy.crashhunt("corpus", "run", "kept", "--json", expect=None).json["cases"][0]
+    assert case["got"] == "still"
+
+
+def test_requirements_of_the_scenario_hold_unless_others_are_given(toy):
+    file = toy.folder / "toy" / "scenario.toml"
+    text = file.read_text()
+    file.write_text('requirement.calm = "always (acceleration > -6)"\n' + text)
+    crash = hunt(toy).json["crashes"][0]
+    assert (crash["outcome"], crash["requirement"]) == ("requirement", "calm")
+    settings = tomllib.loads((toy.folder / "h" / "hunt.toml").read_text())
+    assert "requirement:calm=always (acceleration > -6)" in settings["oracles"]
+    other = hunt(toy, "--require", "always (speed >= 0)", name="o", trials="3").json
+    assert "requirement" not in other["outcomes"]
+
+
+MISTAKES = [
+    ("always (speed > 1", "--require: the requirement ends too early; close the parenthesis\n  always (speed > 1\n"),
+    ("calm=always[5:2] (speed > 1)", "--require calm: a window ends at 2 s, before it begins at 5 s; swap"),
+    ("calm=", "--require calm: the requirement is empty"),
+    ("always[0:90] (speed > 1)", "its windows end 90 s after a sample, and 60 steps take"),
+    ("always[0:0.123] (speed > 1)", "a window has the bound 0.123 s, not a multiple of the step length of"),
+    ("always (sped > 1)", "the signal 'sped' of ego is unknown; did you mean 'speed'?"),
+    ("always (1 / (speed - speed) > 1)", "it divides by zero at sample 0: 1 / (speed - speed)"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "message"), MISTAKES)
+def test_a_requirement_that_cannot_be_used_is_refused_in_one_line(text, message, toy):
+    done = hunt(toy, "--require", text, expect=2)
+    assert message in done.err
+    assert "Traceback" not in done.err
+    assert "\n" not in done.json["error"]["message"]
+
+
+def test_two_requirements_of_one_name_and_names_that_are_none_are_refused(toy):
+    assert "'a' is given twice" in hunt(toy, "--require", "a=speed > 1", "--require", "a=speed > 2", expect=2).err
+    file = toy.folder / "toy" / "scenario.toml"
+    file.write_text('requirement."so so" = "speed > 1"\n' + file.read_text())
+    assert "'so so' is not a name of a requirement" in hunt(toy, expect=2).err
+
+
+def test_signals_are_listed_with_units(toy):
+    listed = toy.crashhunt("signals", "toy", "--json").json
+    assert {"name": "speed", "unit": "m/s", "meaning": "speed along the heading"} in listed["signals"]
+    assert listed["agents"] == ["ego"]
+    assert "m/s²" in toy.crashhunt("signals", "toy").out
