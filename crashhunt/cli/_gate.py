@@ -37,8 +37,9 @@ if TYPE_CHECKING:
     from crashhunt.suites import GateProgress, RunRequest
 
 _HUNT_OPTIONS = (
-    "scenario", "ego", "action", "observe", "agents", "arguments", "scenario_arguments", "oracles", "seed", "crash_on",
-    "disturb",     "timeout_s", "accelerate", "native", "executor", "snapshot_roots", "snapshot_limit_mb",
+    "scenario", "ego", "action", "observe", "agents", "arguments", "scenario_arguments", "oracles", "requirements",
+    "seed", "crash_on", "disturb", "timeout_s", "accelerate", "native", "executor", "snapshot_roots",
+    "snapshot_limit_mb",
 )  # fmt: skip
 _TRIAL_OPTIONS = tuple(name for name in _HUNT_OPTIONS if name != "executor")  # which a suite says itself
 _MOST, _MAX_STEPS, _MARGIN = 1000, 1500, 0.01

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_of
-from crashhunt.guide._reference import describe_api, describe_commands, describe_json, describe_keys, describe_modules
+from crashhunt.guide._reference import (
+    describe_api,
+    describe_commands,
+    describe_json,
+    describe_keys,
+    describe_modules,
+    describe_signals,
+)
 
 if TYPE_CHECKING:
     import argparse
@@ -28,12 +35,13 @@ SECTIONS = {
 _PAGE_ORDER = [
     "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed", "how-often-does-it-crash",
     "which-version-is-better", "cluster", "your-town", "highway-env", "gymnasium", "planner-in-cpp", "ci",
-    "agent", "exec", "lib", "scenario", "map", "searching", "disturbances", "probes", "branches", "look-into-a-crash",
+    "agent", "exec", "lib", "scenario", "map", "searching", "requirements", "disturbances",
+    "probes", "branches", "look-into-a-crash",
     "kinds-of-crashes", "notes", "fault", "judge", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
     "criticality", "determinism", "search", "counterfactuals", "crash-rates",
     "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "security",
-    "exec-protocol", "disturbance-kinds", "forks", "minimization", "export", "clusters",
+    "exec-protocol", "disturbance-kinds", "requirement-language", "forks", "minimization", "export", "clusters",
     "gallery", "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
 """Topics in reading order; all other topics follow them."""
@@ -117,7 +125,7 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
 
     Args:
         text: Markdown text, in which ``<!-- made from the code: commands -->`` is a placeholder; ``api``, ``json``,
-            ``keys`` and ``modules`` are further placeholders.
+            ``keys``, ``modules`` and ``signals`` are further placeholders.
         parser: parser of the command line.
     """
     makers = {
@@ -126,6 +134,7 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
         "json": describe_json,
         "keys": describe_keys,
         "modules": describe_modules,
+        "signals": describe_signals,
     }
     # Remove the text that follows a placeholder for readers of the raw file, up to the next blank line.
     return re.sub(_GENERATED_MARK.pattern + r"(?:.+\n)*", lambda found: makers[found[1]](), text, flags=re.MULTILINE)

@@ -40,6 +40,7 @@ _PUBLIC_MODULES = {
     "crashhunt.scenario": "load_scenario Scenario AgentSetup ObservationSetup Backend Configuration Accelerator",
     "crashhunt.simulators": "Simulator ActionForm FullBraking SpeedAndLaneChange MetaAction SpaceAction Kinematics",
     "crashhunt.oracles": "Oracle Finding SeesMap BringsOutcomes ReportedCollision Overlap OffRoad TooClose",
+    "crashhunt.requirements": "parse Requirement Violation",
     "crashhunt.samplers": "",
     "crashhunt.executors": "Executor PoolExecutor FreshProcessExecutor",
     "crashhunt.render": "Action ActionDistribution Bar Contour Curve Curve3D Heatmap Picture Text scope",
@@ -434,6 +435,16 @@ _SUBJECTS = {
     ".js": re.compile(r"\A/\* (.+?) \*/"),
 }
 """What a file says first of itself; read as text, since importing everything would take seconds."""
+
+
+def describe_signals() -> str:
+    """Return the signals of scenes with actors, as a table in Markdown."""
+    from crashhunt.episode import MEANINGS, UNITS  # they import NumPy, which the help does not need
+    from crashhunt.world import EVENT_WORDS
+
+    rows = [f"| `{name}` | {unit} | {MEANINGS[name]} |" for name, unit in UNITS.items()]
+    rows += [f"| `{kind}` | | true in the steps with this event: {words[0]} |" for kind, words in EVENT_WORDS.items()]
+    return "\n".join(["| signal | unit | meaning |", "| --- | --- | --- |", *rows]) + "\n"
 
 
 def describe_modules() -> str:
