@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.analysis._causes import find_why, lanes_around_crash
+from crashhunt.analysis._driver_runs import PREVENTABILITY_RUNS, find_preventability
 from crashhunt.analysis._omissions import find_omission
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.base.text import command_line
@@ -203,6 +204,7 @@ def judge(
     runs: int = 60,
     why: int = 0,
     reference: int = 0,
+    drivers: bool = False,
     parallel: int = 1,
     watch: Watch | None = None,
     stopped: Callable[[], bool] = lambda: False,
@@ -220,6 +222,7 @@ def judge(
         runs: maximum number of trials for avoiding the crash.
         why: maximum number of trials for the causes; 0 for none.
         reference: maximum number of trials with a reference driver, which show what the agent omitted; 0 for none.
+        drivers: whether models of a competent driver are asked whether they would have prevented a collision.
         parallel: number of runs at a time.
         watch: function called with the number of finished runs and the maximum number.
         stopped: function that returns whether to stop; called repeatedly. After a stop, the results of the finished
@@ -240,7 +243,7 @@ def judge(
 
     def tell(done: int) -> None:
         if watch is not None:
-            watch(done, runs + why + reference)
+            watch(done, runs + why + reference + (PREVENTABILITY_RUNS if drivers and of_two else 0))
 
     with closing(reruns_of(rerun, parallel=parallel, stopped=stopped)) as reruns:
         lanes = lanes_around_crash(rerun)
@@ -260,8 +263,14 @@ def judge(
         omitted = find_omission(
             rerun, most=reference, parallel=parallel, stopped=stopped, tell=lambda done: tell(before + done)
         )
+    prevented = None
+    if drivers and of_two and search.why_not != INTERRUPTED:
+        before += len(omitted.runs) if omitted is not None else 0
+        prevented = find_preventability(
+            rerun, parallel=parallel, stopped=stopped, tell=lambda done: tell(before + done)
+        )
     visible = visible_from(rerun.recorded, hit.agent, hit.other) if of_two and hit is not None else None
-    return replace(search.judgement(), why=found, visible_step=visible, reference=omitted)
+    return replace(search.judgement(), why=found, visible_step=visible, reference=omitted, drivers=prevented)
 
 
 def _require_judgeable(bundle: Bundle, *, of_two: bool, why: int) -> None:

@@ -62,6 +62,10 @@ def add_judge(commands: Commands) -> None:
         "default: 20",
     )  # fmt: skip
     judge.add_argument(
+        "--no-drivers", action="store_true",
+        help="do not ask models of a competent driver (UN R157) whether they would have prevented a collision",
+    )  # fmt: skip
+    judge.add_argument(
         "--parallel",
         metavar="N",
         type=integer,
@@ -141,6 +145,7 @@ def _judge_one(
             runs=options.runs,
             why=options.why,
             reference=options.reference,
+            drivers=not options.no_drivers,
             parallel=options.parallel or len(os.sched_getaffinity(0)),
             watch=watch,
             stopped=lambda: bool(stops),
@@ -151,6 +156,8 @@ def _judge_one(
         found = replace(found, why=known.why)
     if found.reference is None and known is not None:
         found = replace(found, reference=known.reference)
+    if found.drivers is None and known is not None:
+        found = replace(found, drivers=known.drivers)
     bundle = with_judgement(as_stored(bundle) if write else bundle, found)
     if write and ran and (not stops or known is None):  # half an answer does not replace a whole one
         bundle.write()

@@ -100,6 +100,11 @@ if TYPE_CHECKING:
         ReferenceRun as ReferenceRun,
         Without as Without,
     )
+    from ._preventability import (
+        COMPETENT_DRIVERS as COMPETENT_DRIVERS,
+        DriverRun as DriverRun,
+        Preventability as Preventability,
+    )
     from ._signature import (
         SIGNATURE_VERSION as SIGNATURE_VERSION,
         Signature as Signature,

@@ -11,6 +11,7 @@ from crashhunt.base.codec import Serializable, typed_where_there
 from crashhunt.base.integrity import typed
 from crashhunt.crashes._last_avoidable_step import Ending, last_avoiding
 from crashhunt.crashes._omission import Reference, Without as Without
+from crashhunt.crashes._preventability import Preventability
 from crashhunt.trial import Value
 
 if TYPE_CHECKING:
@@ -211,6 +212,7 @@ class Judgement(Serializable):
         visible_step: The step after which an observation of the agent first contained the collision partner; None if
             that is unknown.
         reference: The results of runs with a reference driver; None if there were no such runs.
+        drivers: The answers of models of a competent driver; None if they were not asked.
     """
 
     attempts: tuple[Attempt, ...] = ()
@@ -218,11 +220,17 @@ class Judgement(Serializable):
     why: Why | None = None
     visible_step: int | None = None
     reference: Reference | None = None
+    drivers: Preventability | None = None
 
     json_keys = (
         "avoidable", "manoeuvre", "last_step=best.last_step", "runs", "why_not", "attempts", "verdict", "visible_step",
-        "why?", "reference?",
+        "why?", "reference?", "preventable_by", "drivers?",
     )  # fmt: skip
+
+    @property
+    def preventable_by(self) -> dict[str, bool | None]:
+        """Whether each model of a competent driver would have prevented the collision; None if that is unknown."""
+        return (self.drivers or Preventability()).answers
 
     @property
     def verdict(self) -> JudgementVerdict:
@@ -239,7 +247,7 @@ class Judgement(Serializable):
     @property
     def is_interrupted(self) -> bool:
         """Whether the user interrupted the analysis; running it again may then add results."""
-        parts = (self.why, self.reference)
+        parts = (self.why, self.reference, self.drivers)
         return INTERRUPTED in (self.why_not, *(part.why_not for part in parts if part is not None))
 
     @property
@@ -273,7 +281,14 @@ def judgement_of(bundle: Bundle) -> Judgement | None:
     data: Any = bundle.added.get(_CRASH_JSON_KEY)
     try:
         typed_where_there(
-            data, {"visible_step": int | None, "why_not": str, "why": dict | None, "reference": dict | None}
+            data,
+            {
+                "visible_step": int | None,
+                "why_not": str,
+                "why": dict | None,
+                "reference": dict | None,
+                "drivers": dict | None,
+            },
         )
         attempts = []
         for each in data["attempts"]:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     )
     from ._blame import has_users_code as has_users_code, internal_error as internal_error
     from ._branches import Brancher as Brancher
+    from ._competent_driver import CompetentDriver as CompetentDriver
     from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
     from ._failures import are_functions_replaced as are_functions_replaced, failure_of as failure_of
     from ._fast_path import FastEpisode as FastEpisode

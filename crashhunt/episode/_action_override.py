@@ -8,9 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.agents import Closes, Recorded
+from crashhunt.agents import REFERENCE_MODELS, Closes, Recorded
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.episode._competent_driver import CompetentDriver
 from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import (
     MAX_ACCELERATION,
@@ -50,6 +51,8 @@ def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -
     Raises:
         InvalidEpisodeError: the simulator does not support this override.
     """
+    if overruled.reference in REFERENCE_MODELS:
+        return CompetentDriver(driver, simulator, overruled)
     if overruled.reference:
         return ReferenceDriver(driver, simulator, overruled)
     if overruled.keeps:

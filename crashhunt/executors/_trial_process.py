@@ -31,6 +31,7 @@ from crashhunt.episode import (
     BUDGET,
     BUDGET_BESIDE,
     Brancher,
+    CompetentDriver,
     FirstCopy,
     HandedOver,
     OnsetForcer,
@@ -114,7 +115,7 @@ class TrialProcess:
         self._modules = frozenset(sys.modules)
         self._made_at = time.time()
         self._opened: OpenedFiles | None = None
-        self._reference: ReferenceDriver | None = None
+        self._reference: ReferenceDriver | CompetentDriver | None = None
         self._fork_runners: tuple[ForkRunner, ...] = ()  # of copies of the trial
         # Line by line, so that what a dying process printed last is in the file.
         sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
@@ -344,7 +345,7 @@ class TrialProcess:
             made = HandedOver(made, spec.handover)
         if spec.overruled is not None and spec.overruled.agent == agent:
             made = overruled_agent(made, simulator, spec.overruled)
-            self._reference = made if isinstance(made, ReferenceDriver) else None
+            self._reference = made if isinstance(made, ReferenceDriver | CompetentDriver) else None
         return made
 
 

@@ -29,6 +29,7 @@ from crashhunt.report._words import (
     about_changes,
     about_danger,
     about_disturbances,
+    about_drivers,
     about_events,
     about_gap,
     about_judgement,
@@ -307,7 +308,9 @@ class Story:
         reference = self.judgement.reference
         blamed = self.fault.verdict in ("ego", "both")
         cause = about_reference(reference, self._ago, self.agent, had_to_yield=blamed) if reference is not None else []
-        return [*cause, *about_judgement(self.judgement, self._ago, self.agent, self.other), *why]
+        drivers = self.judgement.drivers
+        prevented = about_drivers(drivers, self._ago, self.agent, self.other) if drivers is not None else []
+        return [*cause, *about_judgement(self.judgement, self._ago, self.agent, self.other), *prevented, *why]
 
     def _calculated(self, braking: float) -> str:
         if self.escape is None:

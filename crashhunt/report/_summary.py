@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.text import command_line, count_of, in_lines, out_of
-from crashhunt.crashes import count_causes, join_causes
+from crashhunt.crashes import count_causes, join_causes, judgement_of
 from crashhunt.report._rate_text import describe_rates
 from crashhunt.report._status_screen import describe_types, format_arguments, format_inputs, format_seconds
 from crashhunt.report._words import (
     by_likelihood,
     describe_branches,
     describe_disturbances,
+    describe_drivers,
     describe_probes,
     describe_versions,
     fault_words,
@@ -49,9 +50,10 @@ def describe_groups(
         return "No crash was saved."
     hunts = {bundle.hunt for group in groups for bundle in group.bundles}
     faults = any(group.fault for group in groups)
+    prevented = [_describe_prevented(group) for group in groups]
     rows = [["crashes", "type", *(["at fault"] if faults else []), "shortest"]]
-    rows[0] += [*(["known as"] if known is not None else []), "steps"]
-    for group in groups:
+    rows[0] += [*(["known as"] if known is not None else []), *(["preventable"] if any(prevented) else []), "steps"]
+    for group, answers in zip(groups, prevented, strict=True):
         shortest = group.shortest
         name = shortest.id if len(hunts) == 1 else str(shortest.path)
         rows.append(
@@ -61,6 +63,7 @@ def describe_groups(
                 *([fault_words(group.fault)] if faults else []),
                 name,
                 *([known.get(group.signature, "new")] if known is not None else []),
+                *([answers] if any(prevented) else []),
                 str(shortest.result.steps),
             ]
         )
@@ -70,6 +73,12 @@ def describe_groups(
     if saved < count:
         words += f" ({saved} of {count} have a bundle{', and faults are of these' if faults else ''})"
     return "\n".join([f"{words}:", "", *_lines(rows)])
+
+
+def _describe_prevented(group: Group) -> str:
+    """Return which models of a competent driver would have prevented the shortest crash; empty if it is not judged."""
+    judgement = judgement_of(group.shortest)
+    return "" if judgement is None or judgement.drivers is None else describe_drivers(judgement.drivers)
 
 
 def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGroup]]) -> str:

@@ -15,12 +15,14 @@ if TYPE_CHECKING:
         Attempt,
         Bundle,
         DangerCourse,
+        DriverRun,
         Encounter,
         Factor,
         Judgement,
         Moment,
         Note,
         Omission,
+        Preventability,
         Reference,
         Why,
     )
@@ -334,6 +336,48 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
     if judgement.why_not:
         sentences.append(f"Whether it could have been avoided is not fully known: {judgement.why_not}.")
     return sentences
+
+
+_DRIVER_NAMES = {"cc_human": "careful human", "fsm": "FSM", "rss": "RSS", "reg157": "R157 5.2.5.2"}
+_ANSWER_WORDS = {True: "yes", False: "no", None: "no answer"}
+
+
+def about_drivers(drivers: Preventability, ago: Callable[[int], str], agent: str, other: str) -> list[str]:
+    """Return whether models of a competent driver would have prevented the crash, and when the risk was perceived.
+
+    Args:
+        drivers: the answers of the models.
+        ago: function that returns the time of a step as text, as in `about_judgement`.
+        agent: identifier of the controlled vehicle.
+        other: identifier of the collision partner.
+    """
+    if not drivers.runs:
+        return [f"Whether a competent driver would have prevented it is not known: {drivers.why_not}."]
+    answers = "; ".join(_driver_answer(run) for run in drivers.runs)
+    sentences = [f"Preventable by a competent driver ({answers})."]
+    perceived = drivers.perceived
+    if perceived is not None and perceived.perceived_step is not None:
+        sentences.append(
+            f"The model {_DRIVER_NAMES[perceived.model]} perceives the risk first, {ago(perceived.perceived_step)}: "
+            f"{other} is {perceived.gap_m or 0.0:.1f} m ahead and drives {perceived.other_speed_mps or 0.0:.1f} m/s, "
+            f"and {agent} drives {perceived.speed_mps or 0.0:.1f} m/s."
+        )
+    if drivers.why_not:
+        sentences.append(f"Not all models were asked: {drivers.why_not}.")
+    return sentences
+
+
+def describe_drivers(drivers: Preventability) -> str:
+    """Return the answers of the models in one line; empty if no model has answered."""
+    known = [run for run in drivers.runs if run.prevented is not None]
+    return ", ".join(f"{_DRIVER_NAMES[run.model]}: {_ANSWER_WORDS[run.prevented]}" for run in known)
+
+
+def _driver_answer(run: DriverRun) -> str:
+    answer = f"{_DRIVER_NAMES.get(run.model, run.model)}: {_ANSWER_WORDS[run.prevented]}"
+    if run.prevented and run.margin_m is not None:
+        return f"{answer}, by {run.margin_m:.1f} m"
+    return f"{answer} because {run.why_not}" if run.why_not else answer
 
 
 _FACULTY_WORDS = {

@@ -43,6 +43,9 @@ class Overruled(Serializable):
         reference: either ``longitudinal``, ``lateral`` or ``both``: the agent still acts, and a reference driver
             corrects its speeds, its lane changes, or both, where they are not safe. ``none``: the reference driver only
             reports where it would correct the agent. In these cases, the manoeuvre and ``keeps`` have no effect.
+            The name of a model of a competent driver, such as ``cc_human``: the agent drives until the model perceives
+            a risk, and the model controls the speed from then on.
+        other: Identifier of the actor to which a model of a competent driver reacts.
     """
 
     agent: str
@@ -50,6 +53,7 @@ class Overruled(Serializable):
     manoeuvre: str = field(default="brake", metadata=_ESSENTIAL_METADATA)
     keeps: str = field(default="", metadata=_ESSENTIAL_METADATA)
     reference: str = field(default="", metadata=_ESSENTIAL_METADATA)
+    other: str = field(default="", metadata=_ESSENTIAL_METADATA)
 
 
 @dataclass(frozen=True, slots=True)
