@@ -112,6 +112,7 @@ def test_json_lists_the_runs():
              "all_later_run": True, "deceleration": 8.0, "changed": []},
         ],
         "verdict": "avoidable", "visible_step": None,
+        "preventable_by": dict.fromkeys(("cc_human", "fsm", "rss", "reg157")),
     }  # fmt: skip
 
 

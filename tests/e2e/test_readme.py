@@ -16,8 +16,8 @@ ROOTS = [topic for topic in PAGES if not Page(topic).before and Page(topic).comm
 AT_NIGHT = (
     "agent", "api", "ci", "compare", "disturbances", "exec", "executor", "film", "files", "find-a-crash", "gymnasium",
     "hand-over", "highway-env", "how-often-does-it-crash", "lib", "look-into-a-crash", "oracle", "planner-in-cpp",
-    "prove-that-it-is-fixed", "requirements", "sampler", "scenario", "simulator", "suites", "train", "watch-and-see-why",
-    "which-version-is-better", "your-town",
+    "prove-that-it-is-fixed", "requirements", "sampler", "scenario", "simulator", "suites", "train",
+    "watch-and-see-why", "which-version-is-better", "your-town",
 )  # fmt: skip
 BY_DAY = [root for root in ROOTS if root not in AT_NIGHT]
 # By day, the first hunt of the README and its replay; "all of README" runs the others at night. By day, tests of
