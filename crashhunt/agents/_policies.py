@@ -15,6 +15,7 @@ import numpy as np
 from crashhunt.agents._car_following import VX, Y, check_layout
 from crashhunt.agents._protocol import SPEED_OR_META, meta_actions
 from crashhunt.agents._trained_inputs import NOT_NORMALIZED, TrainedInputs, is_equal, read_statistics
+from crashhunt.base.extras import install_command
 from crashhunt.trial import Argument
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ class StableBaselines3:
         if not module and name not in _ALGORITHMS:
             raise ValueError(f"algorithm {algorithm!r} is unknown (allowed: {', '.join(_ALGORITHMS)}, module:Class)")
         kind = getattr(
-            _library(module or "stable_baselines3", "sb3-contrib" if module == "sb3_contrib" else "'crashhunt[sb3]'"),
+            _library(module or "stable_baselines3", "sb3-contrib" if module == "sb3_contrib" else "sb3"),
             name,
             None,
         )
@@ -284,7 +285,7 @@ class TorchPolicy(_Network):
     libraries = ("torch",)  # imported before any trial's time runs
 
     def _load(self, path: str) -> None:
-        self._torch = _library("torch", "'crashhunt[torch]'")
+        self._torch = _library("torch", "torch")
         file = _existing(path)
         if file.suffix == ".pt2":
             self._module = self._torch.export.load(file).module()
@@ -324,7 +325,7 @@ class OnnxPolicy(_Network):
     libraries = ("onnxruntime",)  # imported before any trial's time runs
 
     def _load(self, path: str) -> None:
-        runtime = _library("onnxruntime", "'crashhunt[onnx]'")
+        runtime = _library("onnxruntime", "onnx")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         self._session = runtime.InferenceSession(_existing(path), options, providers=["CPUExecutionProvider"])
@@ -339,10 +340,12 @@ class OnnxPolicy(_Network):
 
 
 def _library(name: str, package: str) -> ModuleType:
+    """Import a library of an extra of crashhunt, or of a package, whose name has a hyphen."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise ValueError(f"the agent needs the package {name}: pip install {package} ({error})") from error
+        command = f"pip install {package}" if "-" in package else install_command(package)
+        raise ValueError(f"the agent needs the package {name}: {command} ({error})") from error
 
 
 def _existing(path: str) -> Path:

@@ -110,12 +110,14 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"did you mean {spelled[close[0]]!r}?" if close else ""
 
 
-def near_path(path: Path, *endings: str) -> str:
+def near_path(path: Path, *endings: str, with_file: tuple[str, ...] = ()) -> str:
     """Return ``did you mean 'PATH'? `` for a missing path, with a similar name or an allowed ending.
 
     Args:
         path: the missing path.
         endings: the endings of files that are suggested in addition.
+        with_file: names of files; a folder is suggested only if it, or a folder in it, contains one of these files.
+            Empty: all folders are suggested.
     """
     try:
         siblings = sorted(path.parent.iterdir())
@@ -124,10 +126,17 @@ def near_path(path: Path, *endings: str) -> str:
     wanted = [
         str(path.parent / found.name)
         for found in siblings
-        if not found.name.startswith(".") and found != path and (found.is_dir() or found.name.endswith(endings))
+        if not found.name.startswith(".")
+        and found != path
+        and ((found.is_dir() and _has_file(found, with_file)) or found.name.endswith(endings))
     ]
     hint = did_you_mean(str(path), wanted)
     return f"{hint} " if hint else ""
+
+
+def _has_file(folder: Path, names: tuple[str, ...]) -> bool:
+    found = (path for name in names for path in (folder / name, *folder.glob(f"*/{name}")))
+    return not names or any(path.exists() for path in found)
 
 
 def listed(known: Iterable[str], *, none: str = "none") -> str:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import argparse
 
     from crashhunt.cli._common import Commands
-    from crashhunt.guide import Page
+    from crashhunt.guide import FoundPage, Page
 
 
 def add_guide(commands: Commands) -> None:
@@ -28,9 +28,9 @@ def add_guide(commands: Commands) -> None:
     guide.add_argument(
         "topic",
         metavar="TOPIC",
-        nargs="?",
-        default="",
-        help="page to show, or a word to find; default: list all pages",
+        nargs="*",
+        default=[],
+        help="page to show, or words to find, such as replay differs; default: list all pages",
     )
     add_json(guide)
     guide.set_defaults(command=_guide)
@@ -39,21 +39,21 @@ def add_guide(commands: Commands) -> None:
 def _guide(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.guide import find_page, for_terminal, list_pages, search_pages
 
-    pages = list_pages()
-    is_search = False
-    if options.topic:
-        try:
-            page = find_page(options.topic)
-        except UsageError:
-            pages, is_search = search_pages(options.topic), True
-            if not pages:
-                raise
-    if is_search or not options.topic:
+    words = " ".join(options.topic)
+    if not words:
+        pages = list_pages()
+        print(json.dumps({"topics": [_about(page) for page in pages]}) if options.json else _listing(pages))
+        return 0
+    try:
+        page = find_page(words)
+    except UsageError:
+        found = search_pages(words)
+        if not found:
+            raise
         if options.json:
-            said = [{"topic": page.topic, "section": page.section, "title": page.title} for page in pages]
-            print(json.dumps({"topics": said}))
+            print(json.dumps({"topics": [{**_about(one.page), "heading": one.heading} for one in found]}))
         else:
-            print(_listing(pages, f"the pages with the word {options.topic!r}" if is_search else "one of these"))
+            print(_results(found, words))
         return 0
     text = page.text(options.parser)
     if options.json:
@@ -65,11 +65,28 @@ def _guide(options: argparse.Namespace, _words: list[str]) -> int:
     return 0
 
 
-def _listing(pages: list[Page], which: str) -> str:
+def _about(page: Page) -> dict[str, str]:
+    return {"topic": page.topic, "section": page.section, "title": page.title}
+
+
+_MAX_RESULTS = 12
+
+
+def _results(found: list[FoundPage], words: str) -> str:
+    """Return the pages of a search as text, the best first."""
+    width = max(len(one.page.topic) for one in found[:_MAX_RESULTS])
+    lines = [f"crashhunt guide TOPIC shows the pages about {words!r}, the best first:", ""]
+    for page, heading, _ in found[:_MAX_RESULTS]:
+        lines.append(f"  {page.topic:{width}}  {page.title}{f' > {heading}' if heading else ''}")
+    more = len(found) - _MAX_RESULTS
+    return "\n".join([*lines, *([f"  and {more} more"] if more > 0 else [])])
+
+
+def _listing(pages: list[Page]) -> str:
     from crashhunt.guide import SECTIONS
 
     width = max(len(page.topic) for page in pages)
-    lines = [f"crashhunt guide TOPIC shows {which}:"]
+    lines = ["crashhunt guide TOPIC shows one of these:"]
     for section, members in groupby(pages, key=lambda page: page.section):
         lines += ["", f"{SECTIONS[section]}:", *(f"  {page.topic:{width}}  {page.title}" for page in members)]
     return "\n".join(lines)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
+from crashhunt.base.extras import install_command
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.text import command_line
 from crashhunt.cli._common import (
@@ -102,7 +103,7 @@ def film_options(options: argparse.Namespace) -> FilmOptions | None:
     try:
         from crashhunt.render import FilmOptions, check_places
     except ImportError as error:
-        raise UsageError(f"a film needs Pillow: {error}", fix="pip install 'crashhunt[video]'") from None
+        raise UsageError(f"a film needs Pillow: {error}", fix=install_command("video")) from None
     check_places(video=options.video, gif=options.gif, folder=options.frames)
     width, _, height = options.size.partition("x")
     if not (width.isdecimal() and height.isdecimal()):

@@ -637,7 +637,7 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
                 fix="unpack it into a new folder if crashhunt export wrote it, and give that folder",
             )
         if not directory.is_dir():
-            fix = f"{near_path(directory, '.zip')}give the directory of a hunt"
+            fix = f"{near_path(directory, '.zip', with_file=(layout.HUNT, layout.CRASH))}give the directory of a hunt"
             raise BundleError(f"{str(directory)!r} does not exist", fix=fix)
         # The directory of a gate or a suite has those of its hunts.
         hunts = [str(path.parent) for path in sorted(directory.glob(f"*/{layout.HUNT}"))]

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from crashhunt.base.errors import UsageError
+from crashhunt.base.extras import install_command
 from crashhunt.base.text import near_path
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def serve(
         UsageError: a path does not exist, the port is in use, the token is too short, or the extra is not installed.
     """
     if missing := _missing():
-        raise UsageError(f"the dashboard needs {', '.join(missing)}", fix="run: pip install 'crashhunt[dashboard]'")
+        raise UsageError(f"the dashboard needs {', '.join(missing)}", fix=f"run {install_command('dashboard')}")
     from crashhunt.dashboard._application import make_application
     from crashhunt.dashboard._catalog import Catalog
     from crashhunt.dashboard._security import MIN_TOKEN, is_loopback

@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 
 from crashhunt.base.errors import UsageError
+from crashhunt.base.extras import install_command
 from crashhunt.base.text import one_of
 from crashhunt.envs._env_episodes import Episodes
 from crashhunt.envs._process import RemoteEpisodes
@@ -76,7 +77,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         if render_mode not in (None, "rgb_array"):
             raise UsageError(f"render_mode is {render_mode!r}", fix=one_of(str(render_mode), ("rgb_array",)))
         if render_mode is not None and importlib.util.find_spec("PIL") is None:
-            raise UsageError("render_mode needs Pillow", fix="pip install 'crashhunt[video]'")
+            raise UsageError("render_mode needs Pillow", fix=install_command("video"))
         if not isinstance(scenario, str | Path) or not str(scenario):
             raise UsageError(f"scenario is {scenario!r}", fix="give the name of a shipped scenario, or a path")
         for name, text in (("agent", agent), ("action", action), ("disturb", disturb)):

@@ -2,6 +2,7 @@
 
 from crashhunt.guide._pages import (
     SECTIONS as SECTIONS,
+    FoundPage as FoundPage,
     Page as Page,
     completed as completed,
     find_page as find_page,

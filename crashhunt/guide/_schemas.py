@@ -222,7 +222,7 @@ SCHEMAS: dict[str, object] = {
         "scenarios?": list[ListingEntry],
     },
     "signals": SignalList,
-    "guide": ({"topics": [_TOPIC]}, {**_TOPIC, "text": str}),
+    "guide": ({"topics": [{**_TOPIC, "heading?": str}]}, {**_TOPIC, "text": str}),
     "error": ErrorData,
 }
 """Every command that has ``--json``, with the type of its output; ``error`` is the output of each if it fails."""

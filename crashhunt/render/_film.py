@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, ImageSequence
 
 from crashhunt.base.errors import UsageError
+from crashhunt.base.extras import install_command
 from crashhunt.base.files import cannot_write, whole_file
 from crashhunt.base.progress import watched
 from crashhunt.base.temporary import temporary_beside
@@ -152,7 +153,7 @@ def check_places(*, video: Path | None = None, gif: Path | None = None, folder: 
             import av  # noqa: F401
         except ImportError as error:
             raise UsageError(
-                f"--video needs PyAV: {error}", fix="pip install 'crashhunt[video]', or give --gif or --frames"
+                f"--video needs PyAV: {error}", fix=f"{install_command('video')}, or give --gif or --frames"
             ) from None
 
 

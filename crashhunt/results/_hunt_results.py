@@ -17,6 +17,7 @@ import numpy as np
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import HuntDirectoryError, UntrustedError, UsageError
+from crashhunt.base.extras import install_command
 from crashhunt.base.files import whole_file
 from crashhunt.base.temporary import temporary_beside, temporary_folder, temporary_name
 from crashhunt.base.text import one_of, out_of
@@ -476,7 +477,7 @@ def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()
         # Not pyarrow: libsumo brings an Arrow of its own along, and warns of every other in the same environment.
         import polars as pl
     except ImportError:
-        raise UsageError("Parquet needs polars", fix="pip install 'crashhunt[parquet]', or give csv") from None
+        raise UsageError("Parquet needs polars", fix=f"{install_command('parquet')}, or give csv") from None
     kinds = _kinds(hunt, list(islice(hunt.rows(outcomes=outcomes), _MAX_INSPECTED_ROWS)))
     schema = {name: getattr(pl, kind) for name, kind in kinds.items()}
     with (

@@ -251,7 +251,7 @@ def is_hunt(directory: Path) -> bool:
 
 def _explain_missing(directory: Path, what: str) -> HuntDirectoryError:
     is_file = directory.exists()
-    near = "" if is_file else near_path(directory)
+    near = "" if is_file else near_path(directory, with_file=_HUNT_FILES)
     wrong = "is a file" if is_file else "does not exist"
     return HuntDirectoryError(f"{str(directory)!r} {wrong}", fix=f"{near}give the directory of {what}")
 

@@ -13,6 +13,7 @@ from optuna.storages import InMemoryStorage
 from optuna.trial import FrozenTrial, TrialState
 
 from crashhunt.base.errors import PluginError, UsageError
+from crashhunt.base.extras import install_command
 from crashhunt.base.text import one_of
 from crashhunt.samplers._learning import Learning
 from crashhunt.samplers._protocol import HuntFacts
@@ -35,10 +36,10 @@ _INSTEAD = {
 }
 """Samplers of Optuna that make no sense here, and alternatives."""
 _NEEDS = {
-    "cmaes": ("cmaes", "pip install 'crashhunt[search]'"),
-    "gp": ("torch", "pip install 'crashhunt[torch]'"),
+    "cmaes": ("cmaes", "search"),
+    "gp": ("torch", "torch"),
 }
-"""Packages that Optuna itself does not bring."""
+"""Packages that Optuna itself does not bring, each with its extra."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +70,7 @@ def optuna_maker(name: str) -> OptunaMaker:
     try:
         samplers = importlib.import_module("optuna.samplers")
     except ImportError:
-        raise UsageError(
-            f"the sampler {name!r} needs the package optuna", fix="pip install 'crashhunt[search]'"
-        ) from None
+        raise UsageError(f"the sampler {name!r} needs the package optuna", fix=install_command("search")) from None
     kinds = {
         _short(kind): kind
         for kind in samplers.__all__
@@ -83,10 +82,11 @@ def optuna_maker(name: str) -> OptunaMaker:
     if short not in kinds:
         known = [kind for key, kind in kinds.items() if key not in _INSTEAD]
         raise PluginError(f"Optuna has no sampler {asked!r}", fix=one_of(asked, known))
-    package, fix = _NEEDS.get(short, ("optuna", ""))
+    package, extra = _NEEDS.get(short, ("optuna", ""))
     try:
         importlib.import_module(package)
     except ImportError:
+        fix = install_command(extra or "search")
         raise UsageError(f"the sampler {name!r} needs the package {package}", fix=fix) from None
     return OptunaMaker(kinds[short])
 

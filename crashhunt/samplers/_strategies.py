@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crashhunt.base.errors import UsageError
+from crashhunt.base.extras import install_command
 from crashhunt.samplers._strategy import Draft, Elites, reflected
 
 if TYPE_CHECKING:
@@ -45,9 +46,7 @@ class CmaEs:
         try:
             self._cmaes: Any = importlib.import_module("cmaes")
         except ImportError:
-            raise UsageError(
-                "the sampler 'cma-es' needs the package cmaes", fix="pip install 'crashhunt[search]'"
-            ) from None
+            raise UsageError("the sampler 'cma-es' needs the package cmaes", fix=install_command("search")) from None
         self._dimensions = cube.dimensions
         self._elites = Elites(_FIRST)
         self._run: Any = None

@@ -44,6 +44,10 @@ def test_a_neighbour_is_meant(tmp_path):
     assert near_path(tmp_path / "befor") == f"did you mean {str(tmp_path / 'before')!r}? "
     assert near_path(tmp_path / "crash.zp", ".zip") == f"did you mean {str(tmp_path / 'crash.zip')!r}? "
     assert near_path(tmp_path / "gone" / "befor") == ""
+    assert near_path(tmp_path / "befor", with_file=("hunt.toml",)) == ""
+    (tmp_path / "befora" / "0").mkdir(parents=True)
+    (tmp_path / "befora" / "0" / "hunt.toml").touch()
+    assert near_path(tmp_path / "befor", with_file=("hunt.toml",)) == f"did you mean {str(tmp_path / 'befora')!r}? "
 
 
 @pytest.mark.parametrize(

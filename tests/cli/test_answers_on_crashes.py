@@ -703,11 +703,15 @@ def test_guide_shows_a_page_or_the_pages_with_a_word(capsys):
     assert run("guide", topic) == 0
     assert page["title"] in capsys.readouterr().out
     assert run("guide", "blake2b") == 0
-    assert capsys.readouterr().out.startswith("crashhunt guide TOPIC shows the pages with the word 'blake2b':")
+    assert capsys.readouterr().out.startswith("crashhunt guide TOPIC shows the pages about 'blake2b', the best first:")
     assert run("guide", "blake2b", "--json") == 0
-    assert 0 < len(json.loads(capsys.readouterr().out)["topics"]) < len(topics)
+    found = json.loads(capsys.readouterr().out)["topics"]
+    assert 0 < len(found) < len(topics)
+    assert found[0].keys() == {"topic", "section", "title", "heading"}
+    assert run("guide", "my", "crash", "does", "not", "reproduce") == 0
+    assert "  troubleshooting  " in capsys.readouterr().out.splitlines()[2]
     with pytest.raises(UsageError):
-        run("guide", "no page has this word")
+        run("guide", "no", "page", "has", "xyzzy")
     assert _guide._MAX_COLUMNS == 120
 
 

@@ -89,9 +89,27 @@ def test_an_unknown_topic_is_one_line(shell):
 
 
 def test_a_word_that_is_no_topic_lists_the_pages_with_this_word():
-    found = {page.topic for page in search_pages("openstreetmap")}
+    found = {one.page.topic for one in search_pages("openstreetmap")}
     assert {"map"} <= found < {page.topic for page in list_pages()}
-    assert search_pages("no such word at all") == []
+    assert search_pages("xyzzy") == search_pages("crash xyzzy") == search_pages("") == search_pages("!?") == []
+
+
+@pytest.mark.parametrize(
+    ("words", "topic", "heading"),
+    [
+        ("my crash does not reproduce", "troubleshooting", "My crash does not reproduce"),
+        ("how many crash-free kilometres", "how-often-does-it-crash", "How many crash-free kilometres"),
+        ("my own network has no pedestrians", "troubleshooting", "My own network has no pedestrians"),
+        ("which version is better", "which-version-is-better", ""),
+        ("install the dashboard", "dashboard", ""),
+        ("vehicle at fault", "fault", ""),
+        ("notes and tags", "notes", ""),
+    ],
+)
+def test_question_of_a_new_user_is_answered_by_one_of_the_first_pages(words, topic, heading):
+    best = search_pages(words)[:2]
+    assert topic in [one.page.topic for one in best]
+    assert any(one.page.topic == topic and one.heading.startswith(heading) for one in best)
 
 
 def test_former_topic_shows_the_page_that_replaced_it():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from contextlib import closing
 from dataclasses import replace
@@ -229,9 +230,13 @@ def test_folder_without_a_hunt_is_refused_with_what_it_is(hunt, tmp_path):
         with pytest.raises(HuntDirectoryError, match=f"file' is a file; give the directory of {what}$"):
             function(tmp_path / "file")
     (tmp_path / "nightly").mkdir()
+    (tmp_path / "nightly" / "run").mkdir()
+    (tmp_path / "nightly" / "run" / "hunt.toml").touch()
+    (tmp_path / "nightlie").mkdir()  # has no hunt
     for function in (find_hunts, hunt_state):
         with pytest.raises(HuntDirectoryError, match=r"nightli' does not exist; did you mean '.*nightly'\? give the"):
             function(tmp_path / "nightli")
+    shutil.rmtree(tmp_path / "nightly" / "run")
     with pytest.raises(HuntDirectoryError, match="is not the directory of a hunt"):
         hunt_state(tmp_path / "nightly")
     for name in (layout.LEDGER, layout.REQUEST, layout.HUNT):

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings, strategies as st
 from spaces import are_inside, ask, spaces, spec_of
 
+from crashhunt.base.extras import install_command
 from crashhunt.errors import CrashhuntError, PluginError, UsageError
 from crashhunt.samplers import HuntFacts, NamedSampler, RandomSampler, varies_only_asked
 from crashhunt.samplers._optuna import OptunaMaker, optuna_maker
@@ -160,9 +161,9 @@ def test_a_name_that_is_none_is_one_line(name, kind, says):
 @pytest.mark.parametrize(
     ("package", "name", "fix"),
     [
-        ("optuna.samplers", "optuna:tpe", "needs the package optuna; pip install 'crashhunt[search]'"),
-        ("cmaes", "optuna:CmaEsSampler", "needs the package cmaes; pip install 'crashhunt[search]'"),
-        ("torch", "optuna:gp", "needs the package torch; pip install 'crashhunt[torch]'"),
+        ("optuna.samplers", "optuna:tpe", f"needs the package optuna; {install_command('search')}"),
+        ("cmaes", "optuna:CmaEsSampler", f"needs the package cmaes; {install_command('search')}"),
+        ("torch", "optuna:gp", f"needs the package torch; {install_command('torch')}"),
     ],
 )
 def test_without_a_package_it_is_refused(monkeypatch, package, name, fix):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import random
 from dataclasses import replace
 
@@ -22,6 +23,7 @@ from crashhunt.statistics import (
     UnitSequence,
     make_rate,
 )
+from crashhunt.statistics._anytime_interval import RateTest
 
 RULE = CountingRule(max_steps=100)
 
@@ -306,3 +308,16 @@ def test_running_rate_is_made_again_only_where_something_has_changed():
     paced = Paced(lambda: made.append(1) or len(made))
     assert [paced(1), paced(1), paced(1, now=True)] == [1, 1, 1]
     assert paced(2, now=True) == 2
+
+
+@pytest.mark.parametrize(("bar", "needed_km"), [(10.0, 350.0), (1.0, 3_500.0), (0.1, 35_000.0)])
+@pytest.mark.parametrize(("max_steps", "km_per_trial"), [(600, 0.8), (1500, 2.0)])
+def test_crash_free_kilometres_for_a_claim_are_those_of_the_guide(bar, needed_km, max_steps, km_per_trial):
+    def upper_bound(km):
+        interval = RateTest(CountingRule(max_steps=max_steps).bets("1000km", 0.1))
+        interval.add(0.0, km_per_trial / 1000, times=round(km / km_per_trial))
+        return interval.interval(0.05).high
+
+    assert upper_bound(0.85 * needed_km) > bar > upper_bound(1.15 * needed_km)
+    # With the number of kilometres fixed beforehand, the exact bound of a Poisson process is -log(0.05) / km.
+    assert upper_bound(needed_km) > -math.log(0.05) / needed_km * 1000

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from crashhunt.base.errors import PluginError, UsageError
+from crashhunt.base.extras import install_command
 from crashhunt.executors.ray import _node_actor
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def require_ray() -> None:
     """
     spec = importlib.util.find_spec("ray")
     if spec is None or spec.origin is None:  # some folder of that name is none
-        raise PluginError("--executor ray needs Ray, which is not installed", fix="pip install 'crashhunt[ray]'")
+        raise PluginError("--executor ray needs Ray, which is not installed", fix=install_command("ray"))
     with suppress(importlib.metadata.PackageNotFoundError):
         there_is = importlib.metadata.version("ray")
         found = re.match(r"(\d+)\.(\d+)", there_is)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
+from crashhunt.base.extras import install_command
 from crashhunt.sumo.maps._road_network import BICYCLE, CAR, PERSON, RoadNetwork, read_network
 from crashhunt.sumo.maps._source import fix_of_bbox
 from crashhunt.sumo.maps._tools import first_error
@@ -142,7 +143,7 @@ def _unpack_pbf(path: Path, target: Path) -> None:
         import osmium
     except ImportError:
         message = "the map is a PBF, and the package osmium is not installed"
-        raise ScenarioError(message, fix="pip install 'crashhunt[maps]'", where=str(path)) from None
+        raise ScenarioError(message, fix=install_command("maps"), where=str(path)) from None
     try:
         with osmium.SimpleWriter(str(target)) as writer:
             for one in osmium.FileProcessor(str(path)):

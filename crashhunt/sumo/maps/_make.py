@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, ScenarioError, UsageError
+from crashhunt.base.extras import install_command
 from crashhunt.base.files import cannot_write, is_empty_folder, sync_tree
 from crashhunt.base.git import work_tree
 from crashhunt.base.temporary import new_folder, temporary_folder
@@ -285,7 +286,7 @@ def _draw(found: MadeScenario, folder: Path) -> None:
             busiest=_busiest(found),
         )
     except ImportError:
-        raise ScenarioError("the picture of the map needs Pillow", fix="pip install 'crashhunt[maps]'") from None
+        raise ScenarioError("the picture of the map needs Pillow", fix=install_command("maps")) from None
 
 
 def _write_texts(found: MadeScenario, options: MapOptions, building: Path, target: Path) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
+from crashhunt.base.extras import install_command
 from crashhunt.base.processes import die_with
 from crashhunt.base.signals import blocked_signals
 
@@ -91,7 +92,7 @@ class Tools:
                         child.kill()
                         child.wait()
         except OSError as error:
-            fix = "install it again: pip install --force-reinstall 'crashhunt[maps]'"
+            fix = f"install it again: {install_command('maps')} --force-reinstall"
             raise ScenarioError(f"{program} cannot be started: {error.strerror}", fix=fix) from None
         if shutil.disk_usage(folder).free < _LEAST_FREE_BYTES:
             fix = "free some space, or set TMPDIR to a folder on another disk"
@@ -118,7 +119,7 @@ def find_tools() -> Tools:
     Raises:
         ScenarioError: eclipse-sumo is not installed, or its version does not fit that of libsumo.
     """
-    install = "pip install 'crashhunt[maps]'"
+    install = install_command("maps")
     # The package is called sumo, and so is many a folder of users: only the one of the distribution has programs.
     found = importlib.util.find_spec("sumo")
     home = Path(found.origin).parent if found is not None and found.origin else None
