@@ -511,3 +511,11 @@ def toy(shell: Shell) -> Shell:
 def keeps_going(toy: Shell) -> None:
     """Hunt 25 trials of it, of which some crash, in ``h``; for `made_once`."""
     toy.crashhunt("run", "h", "2", "25", "99", "--scenario", "toy", "--seed", "4", "--keep-going")
+
+
+@pytest.fixture
+def agents_may_command_sumo(monkeypatch):
+    """Lets agents of a test command SUMO, which brings about in a few steps what rarely happens by itself."""
+    from crashhunt.sumo import _agent_calls  # imports libsumo, which other tests do not need
+
+    monkeypatch.setattr(_agent_calls, "_CALLERS_OF_AGENTS", {})

@@ -30,6 +30,7 @@ from crashhunt.simulators import (
     TrajectoryAction,
     Unseen,
 )
+from crashhunt.sumo._agent_calls import guard_against_agents
 from crashhunt.sumo._descriptor import BACKEND
 from crashhunt.sumo._disturbances import SumoDisturbances
 from crashhunt.sumo._driving import FREE_FORMS, Driving, hold_vehicle
@@ -61,6 +62,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Paths, RoadMap, Scene, Surroundings, VehicleData
 
+guard_against_agents()
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
 _USUAL_CLASS = "passenger"  # of vehicles whose type names no class
 _WINDOW_WIDTH_M = 150.0  # width of the visible part of the network when the window follows a vehicle

@@ -422,6 +422,7 @@ MEDDLING = {
 }
 
 
+@pytest.mark.usefixtures("agents_may_command_sumo")
 @pytest.mark.parametrize("what", MEDDLING)
 def test_an_agent_that_meddles_with_sumo_sees_the_same(street, what, tmp_path, monkeypatch):
     import libsumo
@@ -439,6 +440,7 @@ def test_an_agent_that_meddles_with_sumo_sees_the_same(street, what, tmp_path, m
     assert street.comes[DONE] > 10
 
 
+@pytest.mark.usefixtures("agents_may_command_sumo")
 def test_what_sumo_does_not_report_is_seen_by_the_oracle(street):
     import libsumo
 

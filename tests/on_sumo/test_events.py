@@ -21,6 +21,8 @@ from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.sumo import SumoEvents, SumoSetup, SumoSimulator
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
 
+pytestmark = pytest.mark.usefixtures("agents_may_command_sumo")
+
 NET = Path(__file__).with_name("signal.net.xml")
 ROUTES = """<routes>
 <vType id="car" sigma="0"/><vType id="oncoming" sigma="0" lcOpposite="1"/>

@@ -17,6 +17,8 @@ from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.sumo import SumoSetup, SumoSimulator
 from crashhunt.trial import CRASHES, Disturbance, Outcome, TrialSpec
 
+pytestmark = pytest.mark.usefixtures("agents_may_command_sumo")
+
 NET = Path(__file__).with_name("signal.net.xml")
 HEAD = """<vType id="car" sigma="0" speedDev="0"/><vType id="cab" vClass="taxi" sigma="0">
 <param key="has.taxi.device" value="true"/></vType><route id="across" edges="west east"/>"""

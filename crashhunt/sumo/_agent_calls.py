@@ -1,0 +1,70 @@
+"""Refuses calls with which an agent would change the simulation other than by its action.
+
+An agent runs in the process of the simulation, so it can import libsumo. It may read everything. A call that changes
+something, such as ``vehicle.setSpeed`` of another vehicle, ``simulationStep`` or ``close``, would reach round the
+agent's action. Such a call raises an `ActionError` in the agent, and SUMO does not receive it.
+
+Calls of crashhunt, of a user's simulator, oracle or disturbance, and of a program that uses the environment of
+Gymnasium, are not restricted. The nearest function of crashhunt on the stack tells whether an agent calls. Only
+functions that change something are wrapped, so reading costs nothing.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+from typing import TYPE_CHECKING
+
+from libsumo import _libsumo as sumo
+
+from crashhunt.base.errors import ActionError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType
+
+_READING = ("get", "is", "has", "convert", "domain", "subscribe", "unsubscribe", "addSubscription", "find", "save")
+"""Beginnings of the names of functions that change nothing."""
+_NOT_THE_TRAFFIC = ("gui",)
+_CALLERS_OF_AGENTS = {
+    "crashhunt.episode._episode": ("_act", "_make"),
+    "crashhunt.episode._fast_path": ("step", "resume_after"),
+    "crashhunt.episode._run_episode": ("agent",),
+    "crashhunt.episode._action_override": ("act", "reset", "close"),
+    "crashhunt.episode._failures": ("close_agent",),
+}
+"""The functions that call agents, by module."""
+
+
+def guard_against_agents() -> None:
+    """Wrap the functions of libsumo that change the simulation; a second call does nothing."""
+    domains = {name.partition("_")[0] for name in dir(sumo) if name.endswith("_domainID")} - {*_NOT_THE_TRAFFIC}
+    for name in dir(sumo):
+        domain, _, what = name.partition("_")
+        if domain in domains and what and not what.startswith((*_READING, "swig")):
+            function = getattr(sumo, name)
+            if not hasattr(function, "__wrapped__"):
+                setattr(sumo, name, _guarded(f"{domain}.{what}", function))
+
+
+def _guarded(name: str, function: Callable[..., object]) -> Callable[..., object]:
+    @functools.wraps(function)
+    def call(*given: object, **named: object) -> object:
+        caller = sys._getframe(1)
+        if not caller.f_globals.get("__name__", "").startswith("crashhunt.sumo.") and _is_by_agent(caller):
+            shown = name.replace("simulation.step", "simulationStep").replace("simulation.close", "close")
+            message = f"the agent called libsumo's {shown}, which changes the simulation"
+            raise ActionError(message, fix="return an action; agents may only read the simulation")
+        return function(*given, **named)
+
+    return call
+
+
+def _is_by_agent(caller: FrameType | None) -> bool:
+    """Return whether a call comes from an agent: from below a function of crashhunt that calls agents."""
+    while caller is not None:
+        module = caller.f_globals.get("__name__", "")
+        if module.startswith("crashhunt."):
+            return caller.f_code.co_name in _CALLERS_OF_AGENTS.get(module, ()) or module.startswith("crashhunt.agents.")
+        caller = caller.f_back
+    return False

@@ -1,0 +1,109 @@
+"""Tests of agents that call libsumo: reading is allowed, and a call that changes something is the agent's error."""
+
+from __future__ import annotations
+
+import libsumo
+import pytest
+
+from crashhunt.episode import Episode
+from crashhunt.oracles import OffRoad
+from crashhunt.scenario import argument_values, load_scenario
+from crashhunt.sumo import SumoSimulator
+from crashhunt.trial import Outcome, TrialSpec
+
+
+class Calls:
+    """Calls a function in its third step."""
+
+    def __init__(self, call, place="act"):
+        self.call, self.place, self.step = call, place, 0
+
+    def reset(self, seed):
+        if self.place == "reset":
+            self.call()
+
+    def act(self, observation):
+        self.step += 1
+        if self.step == 3 and self.place == "act":
+            self.call()
+        return 15.0, 0
+
+
+@pytest.fixture(scope="module")
+def simulator(tmp_path_factory):
+    made = SumoSimulator(load_scenario("loop"), tmp_path_factory.mktemp("stage"))
+    yield made
+    made.close()
+
+
+def driven(simulator, call, place="act", steps=6, oracles=()):
+    values = argument_values(load_scenario("loop"))
+    spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments=values, max_steps=steps)
+    agent = Calls(call, place)
+    with Episode(spec, simulator=simulator, make_agent=lambda *_: agent, oracles=oracles) as episode:
+        result = episode.start()
+        while result is None:
+            result = episode.step()
+    return result
+
+
+def other():
+    return next(name for name in libsumo.vehicle.getIDList() if name != "ego")
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("vehicle.setSpeed", lambda: libsumo.vehicle.setSpeed(other(), 0.0)),
+        ("vehicle.changeLane", lambda: libsumo.vehicle.changeLane("ego", 1, 1.0)),
+        ("vehicle.moveToXY", lambda: libsumo.vehicle.moveToXY("ego", "", -1, 0.0, 0.0)),
+        ("vehicle.remove", lambda: libsumo.vehicle.remove(other())),
+        ("simulationStep", lambda: libsumo.simulationStep()),
+        ("simulation.load", lambda: libsumo.load(["-n", "none"])),
+        ("close", lambda: libsumo.close()),
+    ],
+)  # fmt: skip
+def test_call_that_changes_the_simulation_is_an_error_of_the_agent_and_has_no_effect(simulator, name, call):
+    result = driven(simulator, call)
+    assert (result.outcome, result.steps) == (Outcome.AGENT_ERROR, 2)
+    assert f"the agent called libsumo's {name}, which changes the simulation" in str(result.failure)
+    assert libsumo.isLoaded()
+    assert driven(simulator, lambda: None).outcome is Outcome.SURVIVED
+
+
+def test_agent_that_changes_the_simulation_in_reset_makes_the_trial_invalid(simulator):
+    result = driven(simulator, lambda: libsumo.vehicle.setSpeed(other(), 0.0), "reset")
+    assert result.outcome is Outcome.INVALID
+    assert "vehicle.setSpeed" in str(result.failure)
+
+
+def test_reading_is_allowed_and_changes_nothing(simulator):
+    def read():
+        libsumo.vehicle.subscribe("ego")
+        assert libsumo.vehicle.getSpeed(other()) >= 0.0
+        assert libsumo.simulation.convertRoad(0.0, -64.8)[0]
+        assert libsumo.vehicle.getNextTLS("ego") == ()
+
+    ended = []
+    for call in (read, lambda: None):
+        assert driven(simulator, call).outcome is Outcome.SURVIVED
+        ended.append([libsumo.vehicle.getPosition(name) for name in libsumo.vehicle.getIDList()])
+    assert ended[0] == ended[1]
+
+
+def test_agent_that_hides_the_error_has_changed_nothing(simulator):
+    def swallow():
+        with pytest.raises(Exception, match="changes the simulation"):
+            libsumo.vehicle.setSpeed(other(), 0.0)
+
+    assert driven(simulator, swallow).outcome is Outcome.SURVIVED
+
+
+def test_oracle_of_a_user_and_a_program_may_command_sumo(simulator):
+    class Commands(OffRoad):
+        def check(self, scene, agents):
+            libsumo.vehicle.setSpeed(other(), 3.0)
+            return []
+
+    assert driven(simulator, lambda: None, oracles=[Commands()]).outcome is Outcome.SURVIVED
+    libsumo.vehicle.setSpeed(other(), -1.0)
