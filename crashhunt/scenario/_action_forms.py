@@ -152,7 +152,7 @@ ACTIONS: dict[str, ActionDescription] = {
     "trajectory": ActionDescription(
         title="Points with time, pose and speed, followed by interpolation; the vehicle moves freely.",
         components=(_TIME, _X, _Y, _HEADING, _SPEED),
-        shape="(K, 5) time x y heading speed, K up to 64",
+        shape="K rows of time, x, y, heading, speed; K up to 64",
         moves_freely=True,
     ),
     "target_pose": ActionDescription(

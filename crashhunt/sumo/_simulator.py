@@ -202,17 +202,15 @@ class SumoSimulator:
         self._driving.begin(self.agents)
         for agent, motion in self._driving.moving.items():
             form = self.actions[agent]
-            if isinstance(form, NumbersAction | TrajectoryAction) and self._forms[agent] in (
-                "trajectory",
-                "target_pose",
-            ):
+            if motion.is_planned and isinstance(form, NumbersAction | TrajectoryAction):
                 form.check = motion.check
         self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
         self._last_lanes: dict[str, tuple[str, int]] = {}
         self._steps = 0
         self._kinematics.hidden.clear()
         self._off_road: list[str] = []
-        self._parts.begin(self._start, sumo.simulation_getTime())
+        steering = {agent: motion.steering for agent, motion in self._driving.moving.items()}
+        self._parts.begin(self._start, sumo.simulation_getTime(), steering)
         self._read_scene()
         observations = self._observe_all()
         usual = self._usual_steps()

@@ -53,7 +53,7 @@ def centre(agent="ego"):
 
 
 def test_sumo_places_the_vehicle_on_the_course_of_the_bicycle_model(start):
-    _, step = start("acceleration_steering", **EMPTY)
+    simulator, step = start("acceleration_steering", **EMPTY)
     x, y, heading = centre()
     vehicle = libsumo.vehicle
     state = MotionState(x=x, y=y, heading=heading, speed=vehicle.getSpeed("ego"))
@@ -67,6 +67,7 @@ def test_sumo_places_the_vehicle_on_the_course_of_the_bicycle_model(start):
         state = model.step(state, *action, 0.1)
         assert centre() == pytest.approx((state.x, state.y, state.heading), abs=1e-9)
         assert vehicle.getSpeed("ego") == pytest.approx(state.speed, abs=1e-9)
+        assert simulator._driving.moving["ego"].steering() == state.steering
 
 
 def test_pedals_are_shares_of_the_accelerations_of_the_type(start):
