@@ -97,11 +97,12 @@ class LibraryFactory:
         """
         return self._signature(describe_library(self._locator, path_of(self._locator)).declaration)
 
-    def load(self, files: Mapping[str, str]) -> None:
+    def load(self, files: Mapping[str, str], scratch: Path) -> None:
         """Load the library into this process, unless it is loaded.
 
         Args:
             files: file of the snapshot by the text that names the original file; empty if there is no snapshot.
+            scratch: not used, because a library is loaded from where it lies.
 
         Raises:
             CrashhuntError: the library cannot be used, or needs another library that is not loaded from the snapshot.
@@ -141,14 +142,14 @@ class LibraryFactory:
             folder: not used, because a library runs in the process of the trial.
             files: file of the snapshot by the text that names the original file.
         """
-        self.load(files)
+        self.load(files, folder)
         assert self._library is not None
         shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
         names = simulator.observation_names if supports(simulator, NamesObservations) else ()
         form = simulator.actions[name]
         return LibraryAgent(
-            self._library, name=name, parts=_Parts(shown.get(name) or simulator.observation_spaces[name], names),
-            action=_Action(form.space, form.names), step_length_s=simulator.step_length_s,
+            self._library, name=name, parts=Parts(shown.get(name) or simulator.observation_spaces[name], names),
+            action=Action(form.space, form.names), step_length_s=simulator.step_length_s,
             arguments={**self._defaults, **arguments},
         )  # fmt: skip
 
@@ -203,7 +204,7 @@ class LibraryAgent:
     """
 
     def __init__(
-        self, library: ctypes.CDLL, *, name: str, parts: _Parts, action: _Action, step_length_s: float,
+        self, library: ctypes.CDLL, *, name: str, parts: Parts, action: Action, step_length_s: float,
         arguments: Mapping[str, Value],
     ) -> None:  # fmt: skip
         self._library, self._name, self._parts, self._action = library, name, parts, action
@@ -306,7 +307,7 @@ class _Leaf:
         return _described(self.name, self.shape, self.columns, None if is_bytes else data, data if is_bytes else None)
 
 
-class _Parts:
+class Parts:
     """The arrays of an observation.
 
     Args:
@@ -356,7 +357,7 @@ def _chained(key: object, get: Getter) -> Getter:
     return lambda observation: get(observation[key])
 
 
-class _Action:
+class Action:
     """The array of an action at a fixed address, followed by values that the library must not change.
 
     Args:
@@ -379,17 +380,17 @@ class _Action:
         shape = (len(parts),) if self._is_tuple else tuple(space.shape or ())
         self._whole = [np.dtype(part.dtype).kind in "iub" for part in parts]
         buffer = np.zeros(math.prod(shape) + _GUARD_VALUES)
-        self._values, self._guard = buffer[:-_GUARD_VALUES], buffer[-_GUARD_VALUES:]
+        self.values, self._guard = buffer[:-_GUARD_VALUES], buffer[-_GUARD_VALUES:]
         self._guard[:] = _GUARD
         self._expected = _GUARD.tobytes()
-        self._shaped = self._values.reshape(shape)
+        self._shaped = self.values.reshape(shape)
         columns = tuple(names) if shape and len(names) == shape[-1] else ()
         self.address: int = buffer.ctypes.data
         self.described = _described("action", shape, columns, None, None)
 
     def clear(self) -> None:
         """Make each value NaN, which is refused, so that a value that the library does not write has no effect."""
-        self._values.fill(math.nan)
+        self.values.fill(math.nan)
 
     def read(self) -> object:
         """Return the action; None if the library has written more values."""
@@ -398,7 +399,7 @@ class _Action:
         if self._is_tuple:
             return tuple(
                 [_whole_number(value) if is_whole else value
-                 for value, is_whole in zip(self._values.tolist(), self._whole, strict=True)]
+                 for value, is_whole in zip(self.values.tolist(), self._whole, strict=True)]
             )  # fmt: skip
         if not self._shaped.shape:
             value = self._shaped.item()

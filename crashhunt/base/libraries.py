@@ -41,11 +41,6 @@ class Library:
     dependencies: tuple[Path, ...]
 
 
-def is_library(locator: str) -> bool:
-    """Return whether the locator of an agent names a shared library."""
-    return locator.startswith(PREFIX)
-
-
 def path_of(locator: str) -> Path:
     """Return the absolute path of the library that an agent's locator names.
 

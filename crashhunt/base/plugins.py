@@ -76,7 +76,7 @@ def locate(group: Group, name: str) -> Any:
     """Return the object with a registered name or a ``module:attribute``.
 
     The module of a ``module:attribute`` may lie in the current folder. An agent may also be a program
-    (``exec:…``) or a library (``lib:…``).
+    (``exec:…``), a library (``lib:…``) or an FMU (``fmu:…``).
 
     Raises:
         PluginError: the object does not exist, or its import failed.
@@ -87,7 +87,11 @@ def locate(group: Group, name: str) -> Any:
     target = points[name].value if name in points else name
     module_name, colon, attribute = target.partition(":")
     if not colon or not module_name or not attribute:
-        more = "module:attribute, exec:PROGRAM, or lib:FILE.so" if group == "agents" else "or module:attribute"
+        more = (
+            "module:attribute, exec:PROGRAM, lib:FILE.so, or fmu:FILE.fmu"
+            if group == "agents"
+            else "or module:attribute"
+        )
         fix = f"{one_of(name, points, none='(none)')}, {more}"
         raise PluginError(f"{name!r} is not a registered name of {group}", fix=fix)
     return load_object(target, shown=name, installed=name in points)

@@ -1,4 +1,4 @@
-"""Locators of agents that are not Python: programs (``exec:PROGRAM [WORD…]``) and libraries (``lib:FILE.so``).
+"""Locators of agents that are not Python: programs (``exec:PROGRAM [WORD…]``), libraries (``lib:FILE.so``), FMUs.
 
 The command line of a program is split as a shell would, without a shell.
 """
@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crashhunt.base import libraries
+from crashhunt.base import fmus, libraries
 from crashhunt.base.binaries import own_libraries
 from crashhunt.base.errors import PluginError
 
@@ -25,6 +25,7 @@ PREFIX: Final = "exec:"
 FACTORIES: Final = {
     PREFIX: "crashhunt.agents:ProgramFactory",
     libraries.PREFIX: "crashhunt.agents:LibraryFactory",
+    fmus.PREFIX: "crashhunt.agents:FmuFactory",
 }
 """The class that creates the agents of each kind of locator."""
 _INTERPRETERS = re.compile(r"(python|pypy|perl|ruby|node|java|julia|lua|env|sh|bash|dash|zsh)[\d.]*")
@@ -33,13 +34,18 @@ _PROGRAM_FIX = "give the path of an executable file, such as exec:./planner"
 
 
 def is_program(locator: str) -> bool:
-    """Return whether the locator of an agent names a program or a library, and not Python code."""
+    """Return whether the locator of an agent names a program, a library or an FMU, and not Python code."""
     return locator.startswith(tuple(FACTORIES))
 
 
 def can_fork(locator: str) -> bool:
     """Return whether an agent lives in the process of the trial, so that a fork of the trial contains the agent."""
     return not locator.startswith(PREFIX)
+
+
+def is_native(locator: str) -> bool:
+    """Return whether an agent consists of native code that runs in the process of the trial."""
+    return is_program(locator) and can_fork(locator)
 
 
 def factory_of(locator: str) -> str:
@@ -84,9 +90,10 @@ def anchored(locator: str, folder: Path) -> str:
     Raises:
         PluginError: the locator is not a command line.
     """
-    if locator.startswith(libraries.PREFIX):
-        path = locator.removeprefix(libraries.PREFIX)
-        return f"{libraries.PREFIX}{folder / path}" if path else locator
+    for prefix in (libraries.PREFIX, fmus.PREFIX):
+        if locator.startswith(prefix):
+            path = locator.removeprefix(prefix)
+            return f"{prefix}{folder / path}" if path else locator
     return relative_to(folder, words_of(locator))
 
 
@@ -114,6 +121,8 @@ def files_of(locator: str) -> dict[str, Path]:
     """
     if locator.startswith(libraries.PREFIX):
         return libraries.files_of(locator)
+    if fmus.is_fmu(locator):
+        return fmus.files_of(locator)
     first, *rest = words_of(locator)
     program = _program(first, locator)
     found = {} if _is_of_system(program) else {first: program}

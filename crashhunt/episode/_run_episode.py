@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crashhunt.agents import LibraryFactory, NeedsLibraries, ProgramFactory
+from crashhunt.agents import FmuFactory, LibraryFactory, NeedsLibraries, ProgramFactory
 from crashhunt.base.boundaries import Boundary, Party, is_ours
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
@@ -256,7 +256,7 @@ class Parts:
         """
         try:
             factory, given = self._prepared(agent, simulator, arguments)
-            if isinstance(factory, ProgramFactory | LibraryFactory):
+            if isinstance(factory, ProgramFactory | LibraryFactory | FmuFactory):
                 stage, files = stage_of(self._settings.scratch, os.getpid()), self._settings.argument_files
                 return factory.agent(agent, simulator, given, folder=stage, files=files)
         except CrashhuntError:
@@ -307,9 +307,11 @@ class Parts:
         found = self._factories.get(agent)
         if found is None:
             factory = locate("agents", self._settings.scenario.agents[agent].agent)
-            if isinstance(factory, LibraryFactory):
-                factory.load(self._settings.argument_files)
-            if isinstance(factory, ProgramFactory | LibraryFactory):  # which would have to run to tell its arguments
+            if isinstance(factory, LibraryFactory | FmuFactory):
+                factory.load(self._settings.argument_files, self._settings.scratch)
+            if isinstance(
+                factory, ProgramFactory | LibraryFactory | FmuFactory
+            ):  # which would have to run to tell its arguments
                 return self._factories.setdefault(agent, (factory, Signature({}, open=True, given=())))
             if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
                 require_origin(factory.__module__, self._settings.code)

@@ -21,8 +21,8 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
 from crashhunt.base.exceptions import is_users
 from crashhunt.base.forks import copying, watchdog
-from crashhunt.base.libraries import is_library
 from crashhunt.base.opened_files import OpenedFiles
+from crashhunt.base.programs import is_native
 from crashhunt.base.shared_state import SharedState
 from crashhunt.base.signals import block_signals
 from crashhunt.base.temporary import begin_records, end_records
@@ -274,7 +274,7 @@ class TrialProcess:
         _close(stack)
         faulthandler.enable(self._stack)
         faulthandler.register(signal.SIGUSR1, self._stack)
-        if any(is_library(setup.agent) for setup in self._settings.scenario.agents.values()):
+        if any(is_native(setup.agent) for setup in self._settings.scenario.agents.values()):
             record_native_stack(self._stack.fileno())
 
     def _report(self, result: TrialResult, simulator: Simulator, job: Job) -> Report:
@@ -289,7 +289,9 @@ class TrialProcess:
         if self._opened is not None:
             with suppress(Exception):  # the code of a trial may have replaced any function
                 snapshot = Snapshot(Path(settings.code[0]).parent)
-                report["notices"] += describe_unsaved(self._opened.paths(), snapshot, since=self._made_at)
+                scratch = f"{settings.scratch.resolve()}{os.sep}"  # with what was extracted from files of the snapshot
+                opened = [path for path in self._opened.paths() if not path.startswith(scratch)]
+                report["notices"] += describe_unsaved(opened, snapshot, since=self._made_at)
         kept = settings.keeps(result)
         wants_map = (kept or job["wants_map"]) and result.outcome is not Outcome.INVALID
         if wants_map and supports(simulator, HasMap):

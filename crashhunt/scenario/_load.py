@@ -10,7 +10,7 @@ from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from crashhunt.base import layout, libraries
+from crashhunt.base import layout
 from crashhunt.base.codec import known_part
 from crashhunt.base.errors import ArgumentError, HuntDirectoryError, ScenarioError
 from crashhunt.base.files import cannot_write
@@ -379,7 +379,7 @@ def _join_commands(data: Plain, where: str, folder: Path) -> None:
     Relative paths of such an agent, and of one that is written as such a locator, begin in the scenario's folder.
 
     Raises:
-        ScenarioError: the command is not a list of texts, or the path of the library is not a text.
+        ScenarioError: the command is not a list of texts, or the path of the library or FMU is not a text.
         PluginError: the text is not a command line.
     """
     agents = data.get("agents")
@@ -388,15 +388,15 @@ def _join_commands(data: Plain, where: str, folder: Path) -> None:
         if isinstance(agent, str) and is_program(agent):
             table["agent"] = anchored(agent, folder)
         elif isinstance(agent, dict):
-            words, library = agent.get("exec"), agent.get("lib")
+            words, files = agent.get("exec"), [(key, agent[key]) for key in ("lib", "fmu") if key in agent]
             is_list = isinstance(words, list) and all(isinstance(word, str) for word in words)
-            if isinstance(library, str) and library and len(agent) == 1:
-                table["agent"] = anchored(f"{libraries.PREFIX}{library}", folder)
+            if len(agent) == len(files) == 1 and isinstance(files[0][1], str) and files[0][1]:
+                table["agent"] = anchored(":".join(files[0]), folder)
             elif isinstance(words, list) and is_list and any(words[:1]) and len(agent) == 1:
                 table["agent"] = relative_to(folder, words)
             else:
                 fix = 'write agent = { exec = ["./planner", "--mode", "test"] } or agent = { lib = "./libplanner.so" }'
-                refuse(where, f"agents.{name}.agent", agent, "is neither a command nor a library", fix)
+                refuse(where, f"agents.{name}.agent", agent, "is neither a command nor a library or an FMU", fix)
 
 
 def _resolve_default_path(setup: AgentSetup, folder: Path) -> AgentSetup:

@@ -222,7 +222,7 @@ def test_a_needed_library_comes_from_the_snapshot_or_is_refused(tmp_path):
     assert agent.act(np.zeros((8, 7), np.float32)) == (13.5, 0)
     files = {f"lib:{built}/libnameless.so": str(tmp_path / "saved" / "libnameless.so"), str(nameless): str(nameless)}
     with pytest.raises(CrashhuntError, match=r"libnameless.so, which was not loaded from the snapshot"):
-        LibraryFactory(f"lib:{nameless}").load(files)
+        LibraryFactory(f"lib:{nameless}").load(files, tmp_path)
 
 
 TOY = ("--scenario", "toy", "--seed", "5", "--set", "gap_m=5.0:25.0")

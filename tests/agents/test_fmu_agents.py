@@ -1,0 +1,151 @@
+"""Agents that are FMUs: their variables, their parameters, and what they cannot be."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from programs import COMPILER, DRIVER
+
+pytest.importorskip("fmpy", reason="FMPy is not installed", exc_type=ImportError)
+
+from built_fmus import COLUMNS, build_fmu
+
+from crashhunt.agents import FmuFactory
+from crashhunt.base.errors import ActionError, PluginError, ProgramError
+from crashhunt.simulators import SpeedAndLaneChange
+from crashhunt.trial import Range, signature_of
+
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
+
+
+class Simulated:
+    """What an FMU is told of a simulator."""
+
+    step_length_s = 0.1
+    observation_names: ClassVar = COLUMNS
+    observation_spaces: ClassVar = {"ego": spaces.Box(-np.inf, np.inf, (8, 7), np.float32)}
+
+    def __init__(self):
+        self.actions = {"ego": SpeedAndLaneChange()}
+
+
+def agent_of(fmu, **arguments):
+    agent = FmuFactory(f"fmu:{fmu}").agent("ego", Simulated(), arguments, folder=fmu.parent, files={})
+    agent.reset(2**63 + 5)
+    return agent
+
+
+def observations(count=20):
+    rng = np.random.default_rng(1)
+    return [rng.uniform(-30, 30, (8, 7)).astype(np.float32) for _ in range(count)]
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_fmu_acts_like_the_agent_in_python_in_each_of_its_instances(tmp_path, version):
+    names: dict = {}
+    exec(DRIVER, names)
+    driver, agent = names["Driver"](speed=9.125), agent_of(build_fmu(tmp_path, version), speed=9.125)
+    for seed in (1, 2):
+        agent.reset(seed)
+        answers = [agent.act(seen) for seen in observations()]
+        assert answers == [driver.act(seen) for seen in observations()]
+        assert [type(part) for part in answers[0]] == [float, int]
+    assert {speed for speed, _ in answers} == {0.0, 9.125}
+    agent.close()
+    agent.close()
+
+
+def test_a_table_names_the_sources_of_inputs_and_of_the_action(tmp_path):
+    fmu = build_fmu(tmp_path, 2, place="other_{row}_{column}", speed="v")
+    rows = [
+        f'other_{row}_{column} = "kinematics[{row}].{column}"'
+        for row in range(1, 8)
+        for column in COLUMNS
+        if column[0] not in "cs"
+    ]
+    rows += [f"other_{row}_{column} = 0.0" for row in range(1, 8) for column in ("cos_h", "sin_h")]
+    table = ["[inputs]", *rows, "[action]", 'target_speed = "v"', "lane_change = 1"]
+    (tmp_path / "planner.toml").write_text("\n".join(table), encoding="utf-8")
+    agent = agent_of(fmu, speed=9.125)
+    actions = [agent.act(seen) for seen in observations()]
+    assert set(actions) == {(0.0, 1), (9.125, 1)}
+
+
+def test_parameters_are_arguments_with_their_units_and_bounds(tmp_path):
+    arguments = signature_of(FmuFactory(f"fmu:{build_fmu(tmp_path, 2)}")).arguments
+    speed = arguments["speed"]
+    assert (speed.default, speed.unit, speed.distribution) == (12.0, "m/s", Range(8.0, 20.0))
+    assert (arguments["harm"].default, arguments["harm"].distribution) == (0, None)
+    assert arguments.keys() == {"speed", "harm"}
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_failure_is_an_error_that_names_the_agent_and_the_function(tmp_path, version):
+    agent = agent_of(build_fmu(tmp_path, version), harm=1)
+    message = f"ego: the FMU has failed in step 1: fmi{version}DoStep failed with status 3 (error)"
+    with pytest.raises(ProgramError, match=f"^{re.escape(message)}"):
+        agent.act(observations()[0])
+    agent.close()
+
+
+def test_an_action_that_is_not_a_number_is_left_to_the_check_of_all_agents(tmp_path):
+    with pytest.raises(ActionError):
+        SpeedAndLaneChange().encode(agent_of(build_fmu(tmp_path, 2), harm=2).act(observations()[0]))
+
+
+@pytest.mark.parametrize(
+    ("options", "table", "message"),
+    [
+        ({"machine": "win64"}, "", "it has no binary for linux64 (it has: win64)"),
+        ({"description": "<fmi"}, "", "it is not an FMU: "),
+        ({"place": "row{row}.{column}"}, "", "its input row1.presence has no source: an observation has no place"),
+        ({"place": "kinematics[8{row}].{column}"}, "", "no place 'kinematics[81].presence'"),
+        ({"place": "kinematics[{row}].a{column}"}, "", "no place 'kinematics[1].apresence'"),
+        ({"speed": "v"}, "", "no output has the name target_speed, which is a value of the action"),
+        ({}, "[inputs]\nx = 1", "it has no input x (it has: "),
+        ({}, '[action]\nspeed = "v"', "an action has no value speed (it has: target_speed, lane_change, "),
+        (
+            {},
+            '[action]\ntarget_speed = "v"',
+            "it has no output v for target_speed (it has: lane_change, target_speed)",
+        ),
+        ({}, '[inputs]\n"kinematics[1].x" = "kinematics[1]"', "kinematics[1].x has 1 values, and its place 7"),
+        ({}, "[outputs]\nx = 1", "planner.toml has outputs (allowed: the tables inputs, action)"),
+        ({}, "[inputs", "planner.toml cannot be read: "),
+    ],
+)
+def test_an_fmu_that_does_not_fit_is_refused_in_one_line(tmp_path, options, table, message):
+    fmu = build_fmu(tmp_path, 2, **options)
+    if table:
+        (tmp_path / "planner.toml").write_text(table, encoding="utf-8")
+    with pytest.raises(PluginError, match=re.escape(message)) as refused:
+        FmuFactory(f"fmu:{fmu}").declared_signature("ego", Simulated())
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.nightly
+def test_a_hunt_with_an_fmu_has_the_digests_of_one_with_the_same_driver_in_python(toy):
+    build_fmu(toy.folder, 3)
+    (toy.folder / "driver.py").write_text(DRIVER, encoding="utf-8")
+    for name, agent in (("by_fmi", "fmu:./planner.fmu"), ("in_python", "driver:Driver")):
+        words = ("--agent", agent, "--arg", "speed=8.0:20.0", "--keep-going")
+        toy.crashhunt("run", name, "1", "4", "60", "--scenario", "toy", "--seed", "5", *words)
+    table = [toy.crashhunt("trials", name, "--format", "csv").out.splitlines() for name in ("by_fmi", "in_python")]
+    place = table[0][0].split(",").index("digest")
+    by_fmi, in_python = ([line.split(",")[place] for line in lines[1:]] for lines in table)
+    assert by_fmi == in_python
+    assert len(set(by_fmi)) == 4
+
+
+def test_a_file_that_is_no_fmu_is_refused(tmp_path):
+    (tmp_path / "a.fmu").write_text("no archive", encoding="utf-8")
+    with zipfile.ZipFile(tmp_path / "b.fmu", "w") as archive:
+        archive.writestr("readme.txt", "empty")
+    for name, message in {"a.fmu": "it is not an FMU", "b.fmu": "it is not an FMU", "c.fmu": "is not a file"}.items():
+        with pytest.raises(PluginError, match=message):
+            signature_of(FmuFactory(f"fmu:{tmp_path / name}"))
