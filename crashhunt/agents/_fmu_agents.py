@@ -20,11 +20,9 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from crashhunt.agents._library_agents import Action, Parts
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import PluginError, ProgramError
 from crashhunt.base.fmus import places_of
 from crashhunt.base.text import listed, one_line
-from crashhunt.simulators import FlattensObservations, NamesObservations
 from crashhunt.trial import Argument, Signature, parse_spec
 
 if TYPE_CHECKING:
@@ -88,16 +86,13 @@ class FmuFactory:
         """Return the parameters of the FMU as arguments.
 
         Args:
-            agent: the vehicle that the FMU drives.
-            simulator: the simulator, whose spaces must fit the variables; None if this is not to be checked.
+            agent: not used, because an FMU has the same parameters for every vehicle.
+            simulator: not used, because options may choose other observations and actions than the scenario.
 
         Raises:
             PluginError: the FMU cannot be used.
         """
-        model = self._read({})
-        if simulator is not None:
-            self._wired(model, agent, simulator)
-        return model.signature()
+        return self._read({}).signature()
 
     def load(self, files: Mapping[str, str], scratch: Path) -> None:
         """Extract the FMU into a folder, unless this has been done.
@@ -158,12 +153,9 @@ class FmuFactory:
             raise self._refusal(str(error), error.fix) from None
 
     def _wired(self, model: _Model, name: str, simulator: Simulator) -> _Wiring:
-        shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
-        names = simulator.observation_names if supports(simulator, NamesObservations) else ()
         form = simulator.actions[name]
-        parts = Parts(shown.get(name) or simulator.observation_spaces[name], names)
         try:
-            return _Wiring(model, parts, Action(form.space, form.names), form.names)
+            return _Wiring(model, Parts.of(simulator, name), Action(form.space, form.names), form.names)
         except _UnusableError as error:
             raise self._refusal(str(error), error.fix) from None
 

@@ -16,10 +16,10 @@ from crashhunt.base.errors import CrashhuntError, PluginError, ProgramError
 from crashhunt.base.libraries import describe_library, load_order, path_of
 from crashhunt.base.library_probe import declaration_of, loaded_files, missing_symbols
 from crashhunt.base.text import one_line
-from crashhunt.simulators import FlattensObservations, NamesObservations
+from crashhunt.simulators import FlattensObservations, NamesObservations, ObservesParts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from gymnasium import Space
@@ -144,11 +144,9 @@ class LibraryFactory:
         """
         self.load(files, folder)
         assert self._library is not None
-        shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
-        names = simulator.observation_names if supports(simulator, NamesObservations) else ()
         form = simulator.actions[name]
         return LibraryAgent(
-            self._library, name=name, parts=Parts(shown.get(name) or simulator.observation_spaces[name], names),
+            self._library, name=name, parts=Parts.of(simulator, name),
             action=Action(form.space, form.names), step_length_s=simulator.step_length_s,
             arguments={**self._defaults, **arguments},
         )  # fmt: skip
@@ -293,7 +291,7 @@ class _Leaf:
         get: function that returns the part of an observation.
     """
 
-    def __init__(self, name: str, space: Space[object], columns: Sequence[str], get: Getter) -> None:
+    def __init__(self, name: str, space: Space[object], columns: Collection[str], get: Getter) -> None:
         self.name, self.get = name, get
         self.shape = tuple(space.shape or ())
         self.columns = tuple(columns) if self.shape and len(columns) == self.shape[-1] else ()
@@ -312,17 +310,33 @@ class Parts:
 
     Args:
         space: the observation space.
-        names: the names of the columns, if an observation is one table.
+        columns: the names of the columns of each part.
+        top: the name of an observation that is one array.
 
     Raises:
         PluginError: the space has parts that are no arrays of a fixed shape.
     """
 
-    def __init__(self, space: Space[object], names: Sequence[str]) -> None:
-        top = "kinematics" if names else "observation"
-        self.leaves = [_Leaf(name or top, one, names, get) for name, one, get in _leaves(space)]
+    def __init__(self, space: Space[object], columns: Mapping[str, Collection[str]], top: str) -> None:
+        found = [(name or top, one, get) for name, one, get in _leaves(space)]
+        self.leaves = [_Leaf(name, one, columns.get(name, ()), get) for name, one, get in found]
         is_single = len(self.leaves) == 1 and self.leaves[0].name == top
         self._single = self.leaves[0].values if is_single else None
+
+    @classmethod
+    def of(cls, simulator: Simulator, agent: str) -> Parts:
+        """Return the arrays of the observations of a vehicle.
+
+        Raises:
+            PluginError: the observations have parts that are no arrays of a fixed shape.
+        """
+        layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
+        if agent in layouts:
+            return cls(layouts[agent].space, layouts[agent].columns, "")
+        shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
+        names = simulator.observation_names if supports(simulator, NamesObservations) else ()
+        space = shown.get(agent) or simulator.observation_spaces[agent]
+        return cls(space, {"kinematics": names}, "kinematics" if names else "observation")
 
     def write(self, observation: object) -> None:
         """Copy an observation to the addresses that the library reads."""

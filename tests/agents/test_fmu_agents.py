@@ -124,7 +124,7 @@ def test_an_fmu_that_does_not_fit_is_refused_in_one_line(tmp_path, options, tabl
     if table:
         (tmp_path / "planner.toml").write_text(table, encoding="utf-8")
     with pytest.raises(PluginError, match=re.escape(message)) as refused:
-        FmuFactory(f"fmu:{fmu}").declared_signature("ego", Simulated())
+        FmuFactory(f"fmu:{fmu}").agent("ego", Simulated(), {}, folder=tmp_path, files={})
     assert "\n" not in str(refused.value)
 
 

@@ -135,6 +135,19 @@ def test_nested_observations_step_time_and_arguments_arrive_in_order(echo):
     assert form.encode(agent.act(seen)).tolist() == [*flat, 2, 1, 0.25, 1.0, 2, 3.0]
 
 
+def test_the_parts_that_an_agent_observes_have_their_columns(tmp_path):
+    source = ECHO.replace('(double)crashhunt_part(kept, "camera/image")', 'crashhunt_column(&kept->parts[1], "speed")')
+    simulator = Simulated(SpaceAction(spaces.Box(-np.inf, np.inf, (5,), np.float64)), SPACE)
+    space = spaces.Dict({"actors": spaces.Box(-9, 9, (2, 1)), "ego": spaces.Box(-9, 9, (2,))})
+    columns = {"actors": {"x": 0}, "ego": {"x": 0, "speed": 1}}
+    simulator.observation_layouts = {"ego": type("Layout", (), {"space": space, "columns": columns})}
+    seen = {"actors": np.array([[1], [2]], np.float32), "ego": np.array([3, 4], np.float32)}
+    library = compile_library(tmp_path, "libcolumns.so", source)
+    agent = LibraryFactory(f"lib:{library}").agent("ego", simulator, {}, folder=tmp_path, files={})
+    agent.reset(2**64 - 1)
+    assert agent.act(seen).tolist() == [1, 2, 3, 4, 1]
+
+
 @pytest.mark.parametrize(
     ("space", "value"),
     [
