@@ -105,7 +105,7 @@ class AgentSetup:
             of the agent declares, or else ``speed_and_lane``.
         target_speeds: the target speeds that the actions FASTER and SLOWER of ``meta`` select in order, in m/s.
         observation: parts that the agent observes, such as ``ego`` or ``actors:rows=8``, as `crashhunt list
-            observations` shows them; without them, the agent's class chooses the parts, or the agent observes the
+            observations` lists them; without them, the agent's class chooses the parts, or the agent observes the
             table ``[observation]``.
         speed_mode: SUMO's speed mode bits; 6 keeps physical limits and ignores the safe speed.
         arguments: the arguments of the agent that the scenario describes.
