@@ -131,8 +131,9 @@ class LibraryFactory:
         self._library = library
 
     def agent(
-        self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path, files: Mapping[str, str]
-    ) -> LibraryAgent:
+        self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path,
+        files: Mapping[str, str], limit_s: float | None = None,
+    ) -> LibraryAgent:  # fmt: skip
         """Return the agent of a vehicle; the library creates it in the first step.
 
         Args:
@@ -141,6 +142,7 @@ class LibraryFactory:
             arguments: arguments of the agent.
             folder: not used, because a library runs in the process of the trial.
             files: file of the snapshot by the text that names the original file.
+            limit_s: not used, because only the process of the trial can be ended.
         """
         self.load(files, folder)
         assert self._library is not None

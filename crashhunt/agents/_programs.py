@@ -104,8 +104,9 @@ class ProgramFactory:
                 program.close()
 
     def agent(
-        self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path, files: Mapping[str, str]
-    ) -> ProgramAgent:
+        self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path,
+        files: Mapping[str, str], limit_s: float | None = None,
+    ) -> ProgramAgent:  # fmt: skip
         """Return the agent of a vehicle; its program starts in the first step.
 
         Args:
@@ -114,6 +115,7 @@ class ProgramFactory:
             arguments: arguments of the agent.
             folder: scratch folder of the trial, in which the program gets a folder of its own.
             files: file of the snapshot by the word that names the original file.
+            limit_s: time limit for the answer to each observation, in s; None if only that of the trial applies.
         """
         given = {key: _absolute(value) for key, value in arguments.items()}
         hello = _hello(name, simulator, given)
@@ -121,7 +123,7 @@ class ProgramFactory:
         process = _Process(
             command_of(self._locator, files), folder / f"agent-{name}", libraries=library_path(self._locator, files)
         )
-        return ProgramAgent(process, hello, is_scalar=is_scalar)
+        return ProgramAgent(process, hello, is_scalar=is_scalar, limit_s=limit_s)
 
 
 class ProgramAgent:
@@ -134,10 +136,12 @@ class ProgramAgent:
         process: the process of the program, which has not been started.
         hello: the first message.
         is_scalar: whether an action is one number, which the program sends as a list of one.
+        limit_s: time limit for the answer to each observation, in s; None if only that of the trial applies.
     """
 
-    def __init__(self, process: _Process, hello: Hello, *, is_scalar: bool) -> None:
+    def __init__(self, process: _Process, hello: Hello, *, is_scalar: bool, limit_s: float | None) -> None:
         self._process = process
+        self._limit_s = limit_s
         self._hello = hello
         self._is_scalar = is_scalar
         self._step_length_s = float(hello["step_length_s"])
@@ -170,7 +174,7 @@ class ProgramAgent:
             "type": "observe", "step": step, "time_s": round(step * self._step_length_s, 9),
             "observation": _plain(observation),
         }  # fmt: skip
-        answer = process.ask(message, f"observe of step {step}")
+        answer = process.ask(message, f"observe of step {step}", self._limit_s)
         if "action" not in answer:
             raise ProgramError(
                 f"its answer to observe of step {step} has no action", fix='send {"type": "act", "action": […]}'

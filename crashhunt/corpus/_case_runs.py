@@ -224,6 +224,7 @@ def _run_case(path: Path, keep: Path | None, stopped: Callable[[], bool]) -> Cas
         crash_on=settings.crash_on,
         scratch=Path(),
         timeout_s=settings.run.timeout_s,
+        step_timeout_s=settings.run.step_timeout_s,
         keep_trials=True,
     )
     try:

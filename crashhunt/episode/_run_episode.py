@@ -258,7 +258,8 @@ class Parts:
             factory, given = self._prepared(agent, simulator, arguments)
             if isinstance(factory, ProgramFactory | LibraryFactory | FmuFactory):
                 stage, files = stage_of(self._settings.scratch, os.getpid()), self._settings.argument_files
-                return factory.agent(agent, simulator, given, folder=stage, files=files)
+                limit_s = self._settings.step_timeout_s or None
+                return factory.agent(agent, simulator, given, folder=stage, files=files, limit_s=limit_s)
         except CrashhuntError:
             raise
         except Exception as error:

@@ -64,6 +64,7 @@ class WorkerSettings(Serializable):
         branch: The rates of disturbances in branches, each as ``NAME=RATE``; empty for no branches.
         force: The rates of disturbances in forks with a forced first disturbance, each as ``NAME=RATE``; empty for
             none.
+        step_timeout_s: wall-clock limit of each answer of an agent's program to an observation, in s; 0 for none.
     """
 
     scenario: Scenario
@@ -82,10 +83,11 @@ class WorkerSettings(Serializable):
     probe_s: float = field(default=0.0, metadata=OMIT_DEFAULT)
     branch: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
     force: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
+    step_timeout_s: float = field(default=0.0, metadata=OMIT_DEFAULT)
 
     json_keys: ClassVar[tuple[str, ...]] = (
         "oracles", "crash_on", "scratch", "code", "argument_files", "timeout_s", "keep_trials", "sealed",
-        "find_escapes", "audit", "hunt_seed", "warm_copies", "probe_s", "branch", "force",
+        "find_escapes", "audit", "hunt_seed", "warm_copies", "probe_s", "branch", "force", "step_timeout_s",
     )  # fmt: skip
 
     def keeps(self, result: TrialResult) -> bool:

@@ -379,6 +379,7 @@ def _settings(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> Work
         code=snapshot.code,
         argument_files=snapshot.argument_files,
         timeout_s=settings.run.timeout_s,
+        step_timeout_s=settings.run.step_timeout_s,
     )
 
 

@@ -205,6 +205,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         code=snapshot.code if code == "snapshot" else (),
         argument_files=snapshot.argument_files if code == "snapshot" else {},
         timeout_s=settings.run.timeout_s,
+        step_timeout_s=settings.run.step_timeout_s,
         keep_trials=True,
         sealed=None if code != "log" or trusted else (str(bundle.path.resolve()),),
     )

@@ -164,6 +164,7 @@ def _run_one(options: HuntOptions, example: Example, max_steps: int) -> TrialRes
         worker = WorkerSettings(
             scenario=scenario, oracles=settings.oracles, crash_on=settings.crash_on, scratch=scratch,
             timeout_s=settings.run.timeout_s,
+            step_timeout_s=settings.run.step_timeout_s,
         )  # fmt: skip
         executor = PoolExecutor(worker)
         try:

@@ -482,6 +482,25 @@ def bench_waves() -> Iterator[Figure]:
     yield Figure(name="waves_ratio", value=ours / theirs, unit="x", better="higher", target=5.0, note=note)
 
 
+def child_agents(place: str) -> dict[str, float]:
+    """A step and a start of an agent that is a program."""
+    import bench_agents
+
+    return bench_agents.measure(Path(place))
+
+
+def bench_agents() -> Iterator[Figure]:
+    """A step and a start of an agent that is a program, an echo in C."""
+    with folder() as place:
+        found = in_child("child_agents", str(place))
+    pipes_us, step_us = 1e6 * found["pipes_s"], 1e6 * found["step_s"]
+    yield Figure(
+        "exec_step", step_us, "µs", "lower", 60.0, f"observe and act of an echo in C; {pipes_us:.3g} µs are its pipes"
+    )
+    start_ms = 1e3 * (found["start_s"] - found["step_s"])
+    yield Figure("exec_start", start_ms, "ms", "lower", 3.0, "start, hello, reset and close of an echo in C")
+
+
 def bench_pool() -> Iterator[Figure]:
     """A hunt on highway-fast-v0 against ``multiprocessing.Pool`` on plain highway-env, in turns, 200 steps a trial.
 
@@ -1459,6 +1478,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "ceiling": bench_ceiling,
     "waves": bench_waves,
     "pool": bench_pool,
+    "agents": bench_agents,
     "warmup": bench_warmup,
     "first_crash": bench_first_crash,
     "help": bench_help,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import time
 from dataclasses import replace
 from typing import ClassVar
@@ -40,9 +41,9 @@ class Simulated:
         self.actions = {"ego": form}
 
 
-def agent_of(locator, folder, *, form=None, **arguments):
+def agent_of(locator, folder, *, form=None, limit_s=None, **arguments):
     simulator = Simulated(form or SpeedAndLaneChange())
-    return ProgramFactory(locator).agent("ego", simulator, arguments, folder=folder, files={})
+    return ProgramFactory(locator).agent("ego", simulator, arguments, folder=folder, files={}, limit_s=limit_s)
 
 
 @pytest.mark.parametrize(
@@ -188,6 +189,19 @@ def test_harm_is_an_error_that_names_the_agent_and_the_message(planner, tmp_path
         os.close(kept)
         agent.close()
     assert (tmp_path / "log").stat().st_size <= 64 << 20
+
+
+@pytest.mark.parametrize("size", [(8, 7), (400, 400)])
+def test_a_late_answer_is_an_error_that_names_the_step_also_if_the_program_does_not_read(planner, tmp_path, size):
+    agent = agent_of(f"exec:{planner} late observe", tmp_path, limit_s=0.3)
+    agent.reset(1)
+    for seen in observations(3):
+        agent.act(seen)
+    agent._process._process.send_signal(signal.SIGSTOP)
+    with pytest.raises(ProgramError, match=r"^ego: it has not answered observe of step 3 within 0\.3 s$"):
+        agent.act(np.zeros(size, np.float32))
+    agent._process._process.send_signal(signal.SIGCONT)
+    agent.close()
 
 
 @pytest.mark.parametrize("kind", ["NaN", "shape"])
