@@ -6,9 +6,10 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Obstacle
 
-from crashhunt.simulators import Standstill
+from crashhunt.simulators import LanePlace, Standstill
 from crashhunt.trial import ALL_AGENTS
 from crashhunt.world import Contact, Event, Lane, rectangle_gap
 
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from highway_env.road.road import Road, RoadNetwork
-    from highway_env.vehicle.kinematics import Vehicle
     from highway_env.vehicle.objects import RoadObject
 
     from crashhunt.world import Actor
@@ -34,6 +34,30 @@ def lanes_of(network: RoadNetwork, named: Callable[[tuple[str, str, int]], str])
         shape = tuple((float(x), -float(y)) for x, y in points)
         found.append(Lane(named(index), float(lane.width_at(lane.length / 2)), shape))
     return found
+
+
+_MAX_ROADS = 3  # roads between two vehicles that count as being on one lane
+
+
+def lane_place(network: RoadNetwork, vehicle: RoadObject, other: RoadObject) -> LanePlace:
+    """Return the place of an object on the lanes, relative to the lane of a vehicle.
+
+    Args:
+        network: The roads.
+        vehicle: The vehicle of an agent.
+        other: An object, which may be the vehicle itself.
+    """
+    start, end, number = other.lane_index
+    front = other.position + other.LENGTH / 2 * np.array([math.cos(other.heading), math.sin(other.heading)])
+    _, right = other.lane.local_coordinates(front)
+    same = vehicle.lane_index == other.lane_index or any(
+        network.is_connected_road(one.lane_index, two.lane_index, one.route, same_lane=True, depth=_MAX_ROADS)
+        for one, two in ((vehicle, other), (other, vehicle))
+        if isinstance(one, Vehicle)
+    )
+    # highway-env counts lanes from the left, and its lateral coordinate points to the right.
+    index = len(network.graph[start][end]) - 1 - (number or 0)
+    return LanePlace(same_lane=same, offset=0.0 - float(right), index=index)
 
 
 def gap(one: RoadObject, two: RoadObject) -> float:

@@ -34,7 +34,7 @@ from crashhunt.base.scalars import number_of, truth_of
 from crashhunt.highway._config import configured, mistake, restore_classes
 from crashhunt.highway._descriptor import BACKEND, HighwaySetup
 from crashhunt.highway._disturbances import HighwayDisturbances
-from crashhunt.highway._lanes_and_contacts import Hidden, HighwayEvents, VehicleFilter, contact_of, lanes_of
+from crashhunt.highway._lanes_and_contacts import Hidden, HighwayEvents, VehicleFilter, contact_of, lane_place, lanes_of
 from crashhunt.highway._scripted import Puppet, Puppets
 from crashhunt.highway._steering import action_with, is_steered, motion_of
 from crashhunt.highway._surroundings import surroundings_of
@@ -45,6 +45,7 @@ from crashhunt.simulators import (
     Kinematics,
     MetaAction,
     ObservationForm,
+    SceneObserver,
     Unseen,
     action_form,
     action_mask_of,
@@ -99,6 +100,8 @@ class HighwaySimulator:
         self._setup = scenario.table(HighwaySetup)
         self._kinematics = Kinematics(scenario.observation) if scenario.observation is not None else None
         self._possible = tuple(scenario.agents)
+        self._parts = SceneObserver(scenario.agents)
+        self.observation_layouts = self._parts.layouts
         reason = ""
         if not self._setup.accelerate:
             switch_off()
@@ -156,6 +159,7 @@ class HighwaySimulator:
         self._watch()
         self._events = HighwayEvents(self.step_length_s, self._scenario.events, lanes_are_road=self._lanes_are_road)
         self._read_scene(())
+        self._parts.begin(self._begins_s, self.step_length_s)
         return self._show(self.agents, shown), {}
 
     party = Party.SIMULATOR
@@ -291,6 +295,8 @@ class HighwaySimulator:
         """Disturb a vehicle until the disturbance ends."""
         thing = next(thing for thing, actor in self._known.values() if actor.id == vehicle)
         if disturbance.what == "unseen":
+            if disturbance.agent in self.observation_layouts:
+                return Unseen(self._parts, disturbance.agent, vehicle)
             if self._kinematics is not None:
                 return Unseen(self._kinematics, disturbance.agent, vehicle)
             return Hidden(self._env.road, self._seeing[disturbance.agent], thing)
@@ -368,7 +374,8 @@ class HighwaySimulator:
     def _adopt(self, env: AbstractEnv) -> None:
         """Read the vehicles, spaces and action forms of a new environment."""
         self._env = env
-        self._skipping = SkippedObservation(env) if self._kinematics is not None else nullcontext()
+        is_unused = self._kinematics is not None or len(self.observation_layouts) == len(self._possible)
+        self._skipping = SkippedObservation(env) if is_unused else nullcontext()
         rate = env.config["simulation_frequency"]
         self.step_length_s = int(rate // env.config["policy_frequency"]) / rate  # highway-env rounds sub-steps down
         chosen = self._setup.off_road
@@ -393,6 +400,8 @@ class HighwaySimulator:
             self.shown_spaces = {agent: form.original for agent, form in self._forms.items() if form.structured}
             kind = env.observation_type.agents_observation_types[0] if self._many_see else env.observation_type
             self.observation_names = tuple(getattr(kind, "features", ())) if len(seen[0].shape or ()) == 2 else ()
+        for agent, layout in self.observation_layouts.items():
+            self.observation_spaces[agent], self.shown_spaces[agent] = layout.flat_space, layout.space
 
     def _start_scripts(self, script: Paths) -> None:
         """Move the other actors along recorded paths; an agent whose path is scripted no longer drives."""
@@ -418,13 +427,28 @@ class HighwaySimulator:
         return space.n // 2 if isinstance(space, Discrete) else np.zeros(space.shape, space.dtype)
 
     def _show(self, agents: Iterable[str], shown: Any) -> Observations:
+        by_parts = {agent: self._observe_parts(agent) for agent in agents if agent in self.observation_layouts}
+        others = [agent for agent in agents if agent not in by_parts]
         if self._kinematics is not None:
-            return {agent: self._observe(agent) for agent in agents}
+            return by_parts | {agent: self._observe(agent) for agent in others}
         each = shown if self._many_see else (shown,)
-        found = {agent: self._forms[agent].encode(each[self._possible.index(agent)]) for agent in agents}
+        found = {agent: self._forms[agent].encode(each[self._possible.index(agent)]) for agent in others}
         if any(map(has_nan, found.values())):
             self._notice(f"the environment {self._setup.id!r} shows its agent an observation that contains NaN")
-        return found
+        return by_parts | found
+
+    def _observe_parts(self, agent: str) -> NDArray[np.generic]:
+        """Return the recorded array of the parts that an agent observes."""
+        vehicle, objects = self._controlled[agent], self._objects()
+        network = self._env.road.network
+        return self._parts.observe(
+            agent,
+            self._scene,
+            distance=self._driven[agent],
+            place=lambda row: lane_place(network, vehicle, objects[row]),
+            # highway-env's y points down, so that its positive angles turn to the right.
+            steering=0.0 - float(vehicle.action["steering"]) if "steering" in (vehicle.action or {}) else None,
+        )
 
     def _observe(self, agent: str) -> NDArray[np.float32]:
         """Return the agent's observation in the Kinematics layout that SUMO scenarios use as well."""

@@ -85,6 +85,13 @@ if TYPE_CHECKING:
         SupportsScripts as SupportsScripts,
         TranslatesMotion as TranslatesMotion,
     )
+    from ._scene_observation import (
+        SCENE_PARTS as SCENE_PARTS,
+        WHEELBASE_SHARE as WHEELBASE_SHARE,
+        LanePlace as LanePlace,
+        SceneObserver as SceneObserver,
+        bicycle_steering as bicycle_steering,
+    )
     from ._scene_parts import (
         NearActor as NearActor,
         RayCaster as RayCaster,

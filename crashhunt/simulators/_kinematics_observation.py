@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from math import atan2, cos, sin
 from operator import itemgetter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -182,6 +182,13 @@ class Kinematics:
 # The disturbance `unseen`: the observation omits a vehicle for a while, and nothing else changes.
 
 
+class HidesActors(Protocol):
+    """An object that makes observations, and that can leave out actors."""
+
+    hidden: set[tuple[str, str]]
+    """Pairs of identifiers: an agent, and an actor that this agent does not see."""
+
+
 class Unseen:
     """Hides one vehicle from one agent, from the next observation on.
 
@@ -193,7 +200,7 @@ class Unseen:
 
     how_strong = 1.0
 
-    def __init__(self, kinematics: Kinematics, agent: str, vehicle: str) -> None:
+    def __init__(self, kinematics: HidesActors, agent: str, vehicle: str) -> None:
         self._hidden = kinematics.hidden
         self._pair = agent, vehicle
         self._hidden.add(self._pair)

@@ -18,6 +18,7 @@ from crashhunt.scenario import ObservationSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics_observation import Kinematics, Unseen
 from crashhunt.simulators._protocol import FullBraking
+from crashhunt.simulators._scene_observation import LanePlace, SceneObserver
 from crashhunt.world import Actor, Contact, Lane, Roster, Scene
 
 if TYPE_CHECKING:
@@ -59,6 +60,11 @@ class ToySimulator:
         self._kinematics = Kinematics(scenario.observation or ObservationSetup())
         self.observation_names = self._kinematics.features
         self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
+        self._parts = SceneObserver(scenario.agents)
+        self.observation_layouts = self._parts.layouts
+        self.observation_spaces |= {agent: layout.flat_space for agent, layout in self.observation_layouts.items()}
+        if self.observation_layouts:
+            self.shown_spaces = {agent: layout.space for agent, layout in self.observation_layouts.items()}
         self.actions: dict[str, ActionForm] = {
             agent: MetaAction() if setup.action_form == "meta" else SpeedAndLaneChange()
             for agent, setup in scenario.agents.items()
@@ -80,6 +86,7 @@ class ToySimulator:
         self._start = dict(self._x)
         self._touched: set[str] = set()
         self._kinematics.hidden.clear()
+        self._parts.begin(0.0, self.step_length_s)
         self._disturbed: dict[str, float] = {}  # disturbed vehicles: target speed in m/s
         self._roster_of()
         self._look(())
@@ -120,9 +127,7 @@ class ToySimulator:
                 del self._x[agent]
             self._roster_of()
         self._look(contacts)
-        observations = {
-            agent: self._observe(agent) if agent in self._x else self._kinematics.blank() for agent in actions
-        }
+        observations = {agent: self._observe(agent) if agent in self._x else self._blank(agent) for agent in actions}
         return observations, rewards, terminations, dict.fromkeys(actions, False), {agent: {} for agent in actions}
 
     def scene(self) -> Scene:
@@ -149,7 +154,8 @@ class ToySimulator:
     def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance:
         """Make a vehicle brake, at most as hard as its maximum deceleration, or hide the vehicle."""
         if disturbance.what == "unseen":
-            return Unseen(self._kinematics, disturbance.agent, vehicle)
+            by_parts = disturbance.agent in self.observation_layouts
+            return Unseen(self._parts if by_parts else self._kinematics, disturbance.agent, vehicle)
         return _Braking(self, vehicle, min(disturbance.how_strong, _BRAKING))
 
     def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
@@ -231,7 +237,13 @@ class ToySimulator:
             swept=True,
         )
 
-    def _observe(self, agent: str) -> NDArray[np.float32]:
+    def _blank(self, agent: str) -> NDArray[np.generic]:
+        return self._parts.blank(agent) if agent in self.observation_layouts else self._kinematics.blank()
+
+    def _observe(self, agent: str) -> NDArray[np.generic]:
+        if agent in self.observation_layouts:
+            driven = self._x[agent] - self._start[agent]
+            return self._parts.observe(agent, self._scene, distance=driven, place=lambda _row: LanePlace())
         return self._kinematics.observe(
             self._scene,
             self._roster.index[agent],

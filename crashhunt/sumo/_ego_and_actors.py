@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from math import cos, sin
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ import libsumo
 import numpy as np
 from libsumo import _libsumo as sumo
 
-from crashhunt.simulators import WHEELBASE_SHARE, center_of, kind_number, nearest_actors, wrapped
+from crashhunt.simulators import WHEELBASE_SHARE, bicycle_steering, center_of, kind_number, nearest_actors, wrapped
 from crashhunt.world import PERSON, VehicleData, is_person
 
 if TYPE_CHECKING:
@@ -64,10 +63,7 @@ class EgoReader:
         turned = 0.0 if self._heading is None else wrapped(heading - self._heading)
         self._heading = heading
         yaw_rate = turned / setup.step_length_s
-        if setup.steering is not None:
-            steering = setup.steering()
-        else:  # of a kinematic bicycle model, in which yaw rate = speed * tan(steering angle) / wheelbase
-            steering = math.atan2(yaw_rate * WHEELBASE_SHARE * actor.length, speed) if speed > 0.0 else 0.0
+        steering = setup.steering() if setup.steering is not None else bicycle_steering(yaw_rate, speed, actor.length)
         x, y = center_of(scene, row)
         return np.array(
             (

@@ -85,8 +85,8 @@ def test_observation_cannot_be_changed_by_the_agent(hunted):
 
 
 def test_simulator_without_the_part_refuses_in_one_line(shell):
-    refused = shell.crashhunt("run", "x", "1", "1", "5", "--scenario", "highway", "--observe", "lidar2d", expect=2)
-    assert "--observe: the simulator of this scenario has no part 'lidar2d'" in refused.err
+    refused = shell.crashhunt("run", "x", "1", "1", "5", "--scenario", "highway", "--observe", "signals", expect=2)
+    assert "--observe: the simulator of this scenario has no part 'signals'" in refused.err
     assert refused.err.count("\n") == 1
 
 

@@ -26,6 +26,7 @@ def simulator():
     """A simulator of one agent on a road with another vehicle, without an environment."""
     road = straight()
     made = object.__new__(HighwaySimulator)
+    made.observation_layouts = {}
     agent, made.other = put(road, 100.0, 1, kind=MDPVehicle), put(road, 130.0, 1)
     road.objects += [Obstacle(road, [150.0, 0.0]), Landmark(road, [160.0, 0.0])]
     made._env, made._controlled, made.step_length_s = (

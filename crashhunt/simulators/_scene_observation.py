@@ -1,0 +1,189 @@
+"""Observations that consist of parts which follow from scenes, for simulators without readers of their own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from math import cos, sin
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crashhunt.simulators._kinematics_observation import kind_number
+from crashhunt.simulators._observation_parts import History, layouts_of
+from crashhunt.simulators._scene_parts import RayCaster, center_of, nearest_actors, predictions_of, wrapped
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from numpy.typing import NDArray
+
+    from crashhunt.scenario import AgentSetup
+    from crashhunt.simulators._observation_parts import RequestedPart
+    from crashhunt.simulators._scene_parts import NearActor
+    from crashhunt.world import Scene
+
+SCENE_PARTS = ("ego", "actors", "predictions", "lidar2d")
+"""The parts that follow from scenes and from `LanePlace`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LanePlace:
+    """The place of an actor on the lanes.
+
+    Args:
+        same_lane: Whether the actor is on the lane of the agent's vehicle, or on a lane before or after it.
+        offset: Distance of the front bumper's centre from the centre line of the lane, in m, positive to the left.
+        index: Index of the lane on its road, from 0 for the outer lane.
+    """
+
+    same_lane: bool = True
+    offset: float = 0.0
+    index: int = 0
+
+
+class SceneObserver:
+    """Builds the observations of all agents that observe parts.
+
+    Args:
+        setups: The setups of all agents of the scenario, by agent.
+
+    Attributes:
+        layouts: The layout of each such agent's observation.
+        hidden: Pairs of identifiers: an agent, and an actor that this agent does not see.
+    """
+
+    def __init__(self, setups: Mapping[str, AgentSetup]) -> None:
+        self.layouts = layouts_of(setups, SCENE_PARTS)
+        self.hidden: set[tuple[str, str]] = set()
+        self._step_length_s = self._start_s = 0.0
+        self._histories: dict[str, History] = {}
+        self._casters: dict[str, RayCaster] = {}
+        self._before: dict[str, dict[str, tuple[float, float]]] = {}
+
+    def begin(self, time_s: float, step_length_s: float) -> None:
+        """Begin an episode at a simulation time, with a step length, both in s."""
+        self._start_s, self._step_length_s = time_s, step_length_s
+        self._histories = {agent: History(layout) for agent, layout in self.layouts.items()}
+        self._before = {}
+        self.hidden.clear()
+
+    def blank(self, agent: str) -> NDArray[np.generic]:
+        """Return the recorded array of an agent that has left the simulation."""
+        return self.layouts[agent].blank()
+
+    def observe(
+        self,
+        agent: str,
+        scene: Scene,
+        *,
+        distance: float,
+        place: Callable[[int], LanePlace],
+        steering: float | None = None,
+    ) -> NDArray[np.generic]:
+        """Return the recorded array of an agent's observation; crashhunt calls this method once per step.
+
+        Args:
+            agent: The agent.
+            scene: The scene after the last step, which contains the agent's vehicle.
+            distance: The distance that the vehicle has driven, in m.
+            place: Function that returns the place on the lanes of the actor in a row of the scene.
+            steering: The steering angle, in rad, positive to the left; None to compute it from the yaw rate.
+        """
+        layout, row = self.layouts[agent], scene.roster.index[agent]
+        motion = _Motion(scene, self._before.get(agent, {}), self._step_length_s)
+        self._before[agent] = motion.now
+        arrays = {}
+        for name, one in layout.parts.items():
+            if name == "ego":
+                arrays[name] = self._ego(scene, row, motion, place(row), distance=distance, steering=steering)
+                continue
+            reach = one.settings["range"] + max(scene.roster.lengths) if name == "lidar2d" else one.settings["radius"]
+            limit = None if name == "lidar2d" else int(one.settings["rows"])
+            hidden = frozenset(other for who, other in self.hidden if who == agent)
+            near = nearest_actors(scene, row, hidden=hidden, radius=reach, limit=limit)
+            if name == "lidar2d":
+                arrays[name] = self._caster(agent, one).cast(scene, row, [found.row for found in near])
+            elif name == "predictions":
+                arrays[name] = predictions_of(scene, near, shape=one.shape, interval=one.settings["interval"])
+            else:
+                arrays[name] = _actors(scene, row, near, motion, place, one.shape)
+        return layout.flat(self._histories[agent].add(arrays))
+
+    def _ego(
+        self, scene: Scene, row: int, motion: _Motion, place: LanePlace, *, distance: float, steering: float | None
+    ) -> NDArray[np.float64]:
+        actor, heading, speed = scene.roster.actors[row], scene.headings[row], scene.speeds[row]
+        acceleration, yaw_rate = motion.of(row)
+        if steering is None:
+            steering = bicycle_steering(yaw_rate, speed, actor.length)
+        x, y = center_of(scene, row)
+        return np.array(
+            (
+                x, y, wrapped(heading), speed, acceleration, yaw_rate, steering, actor.length, actor.width,
+                place.index, place.offset, distance, scene.time_s - self._start_s,
+            )
+        )  # fmt: skip
+
+    def _caster(self, agent: str, one: RequestedPart) -> RayCaster:
+        found = self._casters.get(agent)
+        if found is None:
+            found = self._casters[agent] = RayCaster(int(one.settings["rays"]), one.settings["range"])
+        return found
+
+
+class _Motion:
+    """The changes of speed and heading of actors since the last step.
+
+    Args:
+        scene: The scene after the last step.
+        before: The heading and the speed of each actor one step before, by identifier.
+        step_length_s: Length of a step, in s.
+    """
+
+    def __init__(self, scene: Scene, before: Mapping[str, tuple[float, float]], step_length_s: float) -> None:
+        self.now = {
+            actor.id: (heading, speed)
+            for actor, heading, speed in zip(scene.roster.actors, scene.headings, scene.speeds, strict=True)
+        }
+        self._actors, self._before, self._step_length_s = scene.roster.actors, before, step_length_s
+
+    def of(self, row: int) -> tuple[float, float]:
+        """Return the acceleration and the yaw rate of an actor; 0 if it was not there one step before."""
+        name = self._actors[row].id
+        heading, speed = self.now[name]
+        was_heading, was_speed = self._before.get(name, (heading, speed))
+        return (speed - was_speed) / self._step_length_s, wrapped(heading - was_heading) / self._step_length_s
+
+
+def bicycle_steering(yaw_rate: float, speed: float, length: float) -> float:
+    """Return the steering angle with which a kinematic bicycle model turns as a vehicle does, in rad.
+
+    In this model, the yaw rate is the speed times the tangent of the steering angle, divided by the wheelbase.
+    """
+    return math.atan2(yaw_rate * WHEELBASE_SHARE * length, speed) if speed > 0.0 else 0.0
+
+
+WHEELBASE_SHARE = 0.6
+"""Wheelbase of a vehicle as a share of its length, because simulators do not report a wheelbase."""
+
+
+def _actors(
+    scene: Scene,
+    row: int,
+    near: Iterable[NearActor],
+    motion: _Motion,
+    place: Callable[[int], LanePlace],
+    shape: tuple[int, ...],
+) -> NDArray[np.float64]:
+    own_x, own_y = center_of(scene, row)
+    own_cos, own_sin = cos(scene.headings[row]), sin(scene.headings[row])
+    rows = np.zeros(shape)
+    for number, one in enumerate(near):
+        actor, heading, speed = scene.roster.actors[one.row], scene.headings[one.row], scene.speeds[one.row]
+        on_lane, ahead = place(one.row), (one.x - own_x) * own_cos + (one.y - own_y) * own_sin
+        rows[number] = (
+            1.0, one.x, one.y, wrapped(heading), speed * cos(heading), speed * sin(heading), motion.of(one.row)[0],
+            actor.length, actor.width, kind_number(actor.kind), on_lane.same_lane, ahead, on_lane.offset, 0.0, 0.0,
+        )  # fmt: skip
+    return rows
