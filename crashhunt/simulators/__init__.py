@@ -101,5 +101,6 @@ if TYPE_CHECKING:
         wrapped as wrapped,
     )
     from ._standstill import Standstill as Standstill
+    from ._surroundings_raster import Raster as Raster, picture as picture
 
 offer_lazily(__name__)

@@ -187,6 +187,8 @@ BACKEND: Backend = Backend(
         "speed_limit",
         "predictions",
         "lidar2d",
+        "grid",
+        "image",
     ),
     configurations=(
         Configuration(

@@ -18,7 +18,7 @@ from crashhunt.sumo._road_readers import (
     SignalsReader,
     SpeedLimitReader,
 )
-from crashhunt.sumo._scene_readers import PredictionsReader, RangesReader
+from crashhunt.sumo._scene_readers import GridReader, ImageReader, PredictionsReader, RangesReader
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 READERS: Mapping[str, type[Reader]] = {
     "actors": ActorsReader,
     "ego": EgoReader,
+    "grid": GridReader,
+    "image": ImageReader,
     "lanes": LanesReader,
     "lidar2d": RangesReader,
     "predictions": PredictionsReader,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from contextlib import closing
 from dataclasses import replace
@@ -185,3 +186,40 @@ def test_default_observation_keeps_its_fast_path_and_other_agents_keep_theirs(tm
         assert after[second].tobytes() == before[second].tobytes()
         assert set(simulator.restore_observation(first, after[first])) == {"ego"}
         assert set(simulator.shown_spaces) == {first}
+
+
+def test_grid_and_image_show_the_lanes_and_the_vehicles_of_the_network(tmp_path):
+    with closing(
+        simulator_of("intersection", tmp_path / "stage", "grid:resolution=2", "image:rows=64:columns=64")
+    ) as one:
+        *_, shown = episode(one, 3, 150, speed=12.0)
+        road = grid_of_lanes(one, 64, 2.0)
+        assert (shown["grid"][1] == road).mean() > 0.995  # the rest are cells on the border of a lane
+        scene = one.scene()
+        near = [row for row in range(len(scene.roster)) if np.abs(scene.centers[row] - center("ego")).max() < 40.0]
+        assert shown["grid"][0].any() == (len(near) > 1)
+        assert shown["image"][32, 32].tolist() == [224, 138, 0]
+        assert one.observation_layouts["ego"].space.contains(shown)
+        # Only bytes are recorded as bytes.
+        assert one.observation_spaces["ego"].dtype == np.uint8
+
+
+def grid_of_lanes(simulator, cells, resolution):
+    """The cells on lanes that cars may use, from libsumo's shapes, cell by cell."""
+    x, y = center("ego")
+    heading = math.radians(90.0 - libsumo.vehicle.getAngle("ego"))
+    steps = (cells / 2 - np.arange(cells) - 0.5) * resolution
+    ahead, left = np.meshgrid(steps, steps, indexing="ij")
+    px = x + ahead * math.cos(heading) - left * math.sin(heading)
+    py = y + ahead * math.sin(heading) + left * math.cos(heading)
+    found = np.zeros((cells, cells), bool)
+    for lane in libsumo.lane.getIDList():
+        allowed = libsumo.lane.getAllowed(lane)
+        if allowed and "passenger" not in allowed:
+            continue
+        points, half = np.array(libsumo.lane.getShape(lane)), libsumo.lane.getWidth(lane) / 2
+        for (ax, ay), (bx, by) in itertools.pairwise(points):
+            dx, dy = bx - ax, by - ay
+            share = np.clip(((px - ax) * dx + (py - ay) * dy) / max(dx * dx + dy * dy, 1e-12), 0, 1)
+            found |= np.hypot(px - ax - share * dx, py - ay - share * dy) <= half
+    return found

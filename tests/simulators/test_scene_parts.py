@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from crashhunt.simulators import RayCaster, center_of, nearest_actors, predictions_of, wrapped
+from crashhunt.simulators import Raster, RayCaster, center_of, nearest_actors, picture, predictions_of, wrapped
 from crashhunt.world import Actor, Roster, Scene, corners
 
 number = st.floats(-40.0, 40.0).map(lambda value: round(value, 3))
@@ -107,3 +108,64 @@ def test_angles_are_wrapped_to_half_a_turn():
     assert [wrapped(angle) for angle in (0.0, 4.0, -4.0, 20.0)] == pytest.approx(
         [0.0, 4.0 - math.tau, math.tau - 4.0, 20.0 - 3 * math.tau]
     )
+
+
+def cell_center(scene, cell, shape, resolution):
+    """The map position of the centre of a cell."""
+    x, y = center_of(scene, 0)
+    c, s = math.cos(scene.headings[0]), math.sin(scene.headings[0])
+    ahead, left = ((shape[axis] / 2 - cell[axis] - 0.5) * resolution for axis in (0, 1))
+    return x + ahead * c - left * s, y + ahead * s + left * c
+
+
+@given(st.lists(poses, min_size=2, max_size=4), st.sampled_from([(8, 8), (13, 5)]), st.sampled_from([0.7, 3.0, 9.0]))
+def test_cells_are_occupied_if_their_centre_is_inside_an_outline(actors, shape, resolution):
+    scene = scene_of(*actors)
+    found = Raster(*shape, resolution).occupied(scene, 0, range(1, len(actors)))
+    for cell in np.ndindex(*shape):
+        x, y = cell_center(scene, cell, shape, resolution)
+        slow = [slow_range(corners(scene, other), x, y, 0.1) == 0.0 for other in range(1, len(actors))]
+        nearly = [
+            slow_range(corners(scene, other), x + dx, y + dy, 0.1) == 0.0
+            for other in range(1, len(actors)) for dx in (-1e-6, 1e-6) for dy in (-1e-6, 1e-6)
+        ]  # fmt: skip
+        if len(set(nearly)) == 1 or any(slow):
+            assert found[cell] == any(slow) or len(set(nearly)) == 2
+
+
+@given(
+    poses,
+    st.lists(st.lists(st.tuples(number, number), min_size=2, max_size=4), min_size=1, max_size=3),
+    st.sampled_from([(8, 8), (13, 5)]),
+    st.sampled_from([0.7, 3.0, 9.0]),
+)
+def test_cells_are_on_a_lane_if_they_are_near_its_centre_line(ego, lines, shape, resolution):
+    scene, width = scene_of(ego), 3.2
+    found = Raster(*shape, resolution).on_lanes(scene, 0, [(np.array(line), width) for line in lines])
+    for cell in np.ndindex(*shape):
+        place = np.array(cell_center(scene, cell, shape, resolution))
+        away = math.inf
+        for line in lines:
+            for start, end in itertools.pairwise(np.array(line)):
+                step = end - start
+                share = np.clip((place - start) @ step / max(step @ step, 1e-12), 0, 1)
+                away = min(away, float(np.hypot(*(place - start - share * step))))
+        if abs(away - width / 2) > 1e-6:
+            assert found[cell] == (away < width / 2)
+
+
+def test_raster_without_lanes_is_empty_and_pictures_have_the_colours_of_films():
+    scene = scene_of((2.5, 0.0, 0.0, 5.0, 2.0, 0.0), (12.5, 0.0, 0.0, 5.0, 2.0, 0.0))
+    raster = Raster(30, 10, 1.0)
+    assert not raster.on_lanes(scene, 0, []).any()
+    assert not raster.on_lanes(scene, 0, [(np.array([[500.0, 0.0], [600.0, 0.0]]), 3.0)]).any()
+    drawn = picture(
+        raster.on_lanes(scene, 0, [(np.array([[-50.0, 0.0], [50.0, 0.0]]), 4.0)]),
+        raster.occupied(scene, 0, [1]),
+        raster.occupied(scene, 0, [0]),
+    )
+    assert drawn.dtype == np.uint8
+    assert drawn[15, 5].tolist() == [224, 138, 0]  # ego, in the middle
+    assert drawn[5, 5].tolist() == [125, 139, 156]  # 10 m ahead
+    assert drawn[0, 5].tolist() == [228, 232, 237]  # the road
+    assert drawn[15, 0].tolist() == [246, 247, 249]
