@@ -87,7 +87,6 @@ if TYPE_CHECKING:
     )
     from ._scene_observation import (
         SCENE_PARTS as SCENE_PARTS,
-        WHEELBASE_SHARE as WHEELBASE_SHARE,
         LanePlace as LanePlace,
         SceneObserver as SceneObserver,
         bicycle_steering as bicycle_steering,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from crashhunt.simulators._bicycle_model import WHEELBASE_SHARE
 from crashhunt.simulators._kinematics_observation import kind_number
 from crashhunt.simulators._observation_parts import History, layouts_of
 from crashhunt.simulators._scene_parts import RayCaster, center_of, nearest_actors, predictions_of, wrapped
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from crashhunt.simulators._observation_parts import RequestedPart
     from crashhunt.simulators._scene_parts import NearActor
     from crashhunt.world import Scene
+
+_MAX_BEND = 2.0  # of the wheelbase times the curvature, with the front wheels across
 
 SCENE_PARTS = ("ego", "actors", "predictions", "lidar2d")
 """The parts that follow from scenes and from `LanePlace`."""
@@ -159,13 +162,13 @@ class _Motion:
 def bicycle_steering(yaw_rate: float, speed: float, length: float) -> float:
     """Return the steering angle with which a kinematic bicycle model turns as a vehicle does, in rad.
 
-    In this model, the yaw rate is the speed times the tangent of the steering angle, divided by the wheelbase.
+    The model is that of `BicycleModel`: with the steering angle δ and the wheelbase L, the yaw rate is the speed times
+    t / √(1 + t² / 4) / L, where t = tan(δ). The result is 0 at a standstill.
     """
-    return math.atan2(yaw_rate * WHEELBASE_SHARE * length, speed) if speed > 0.0 else 0.0
-
-
-WHEELBASE_SHARE = 0.6
-"""Wheelbase of a vehicle as a share of its length, because simulators do not report a wheelbase."""
+    bend = yaw_rate * WHEELBASE_SHARE * length / speed if speed > 0.0 else 0.0
+    if abs(bend) >= _MAX_BEND:
+        return math.copysign(math.pi / 2, bend)
+    return math.atan(bend / math.sqrt(1.0 - bend * bend / 4.0))
 
 
 def _actors(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from math import cos, sin
 from typing import TYPE_CHECKING
 
@@ -53,27 +54,33 @@ class EgoReader:
 
     def __init__(self, setup: ReaderSetup) -> None:
         self._setup = setup
-        self._heading: float | None = None
+        self._last: tuple[float, float] | None = None  # heading and speed
+        self._place: tuple[float, float] | None = None
+        self._driven_m = 0.0
 
     def observe(self, moment: Moment) -> NDArray[np.float64]:
         """Return the columns of ``ego``."""
         setup, scene, row = self._setup, moment.scene, moment.row
         agent, actor = setup.agent, scene.roster.actors[row]
         heading, speed = scene.headings[row], scene.speeds[row]
-        turned = 0.0 if self._heading is None else wrapped(heading - self._heading)
-        self._heading = heading
-        yaw_rate = turned / setup.step_length_s
+        acceleration, yaw_rate = _known(sumo.vehicle_getAcceleration(agent)), 0.0
+        if self._last is not None:  # SUMO reports no acceleration of a vehicle that it has moved to a position
+            acceleration = (speed - self._last[1]) / setup.step_length_s
+            yaw_rate = wrapped(heading - self._last[0]) / setup.step_length_s
+        self._last = heading, speed
         steering = setup.steering() if setup.steering is not None else bicycle_steering(yaw_rate, speed, actor.length)
         x, y = center_of(scene, row)
+        distance = sumo.vehicle_getDistance(agent) - setup.start_m
+        if setup.steering is not None:  # SUMO measures along the lane, even if the vehicle crosses it
+            self._driven_m += math.dist((x, y), self._place) if self._place is not None else 0.0
+            self._place, distance = (x, y), self._driven_m
         return np.array(
             (
                 x, y, wrapped(heading), speed,
-                _known(sumo.vehicle_getAcceleration(agent)),
-                yaw_rate, steering, actor.length, actor.width,
+                acceleration, yaw_rate, steering, actor.length, actor.width,
                 float(moment.lane.rpartition("_")[2] or 0),
                 _known(sumo.vehicle_getLateralLanePosition(agent)),
-                sumo.vehicle_getDistance(agent) - setup.start_m,
-                scene.time_s - setup.start_s,
+                distance, scene.time_s - setup.start_s,
             )
         )  # fmt: skip
 
@@ -107,8 +114,8 @@ class ActorsReader:
         for _, other, x, y in near:
             actor, heading, speed = actors[other], headings[other], speeds[other]
             lane, offset, acceleration, signals = _state_of(actor.id)
-            if not lane or actor.id.startswith(PERSON):
-                acceleration = (speed - last_speeds.get(actor.id, speed)) / self._setup.step_length_s
+            if (last := last_speeds.get(actor.id)) is not None:
+                acceleration = (speed - last) / self._setup.step_length_s
             self._speeds[actor.id] = speed
             ahead = (x - own_x) * own_cos + (y - own_y) * own_sin
             indicator = _indicator(signals)

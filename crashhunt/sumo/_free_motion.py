@@ -79,6 +79,10 @@ class FreeMotion:
         sumo.vehicle_setSpeed(self._vehicle, state.speed)
         return self._area.contains(state.x, state.y, self._kind)
 
+    def steering(self) -> float:
+        """Return the steering angle of the last step in rad, positive to the left."""
+        return self.state.steering
+
     def check(self, action: NDArray[np.float64]) -> None:
         """Check that the vehicle can follow an encoded trajectory or target pose in the next step.
 

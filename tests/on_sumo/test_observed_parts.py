@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from crashhunt.scenario import argument_values, load_scenario
-from crashhunt.simulators import PARTS
+from crashhunt.simulators import PARTS, BicycleModel, MotionState
 from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._observing import READERS
 from crashhunt.trial import Disturbance
@@ -75,7 +75,7 @@ def test_ego_and_actors_are_what_libsumo_reports(name, speed, tmp_path):
             if start is None:
                 start, time = getters.getDistance(agent), libsumo.simulation.getTime()
             assert own["speed"] == getters.getSpeed(agent)
-            assert own["acceleration"] == getters.getAcceleration(agent)
+            assert own["acceleration"] == pytest.approx(getters.getAcceleration(agent), abs=1e-9)
             assert (own["length"], own["width"]) == (getters.getLength(agent), getters.getWidth(agent))
             assert own["lane_index"] == getters.getLaneIndex(agent)
             assert own["lane_offset"] == getters.getLateralLanePosition(agent)
@@ -96,7 +96,7 @@ def test_ego_and_actors_are_what_libsumo_reports(name, speed, tmp_path):
                 actor = {column: row[index] for column, index in actors.items()}
                 assert (actor["x"], actor["y"]) == pytest.approx(tuple(center(one)), abs=1e-9)
                 assert math.hypot(actor["vx"], actor["vy"]) == pytest.approx(getters.getSpeed(one))
-                assert actor["acceleration"] == getters.getAcceleration(one)
+                assert actor["acceleration"] == pytest.approx(getters.getAcceleration(one), abs=1e-9)
                 assert (actor["length"], actor["width"]) == (getters.getLength(one), getters.getWidth(one))
                 assert actor["lane_offset"] == getters.getLateralLanePosition(one)
                 signals = getters.getSignals(one)
@@ -133,9 +133,14 @@ def test_yaw_rate_and_steering_are_those_of_a_circle(tmp_path):
     assert yaw_rate[1:] == pytest.approx(turned / 0.1)
     assert yaw_rate[0] == 0
     assert abs(yaw_rate).max() > 0.05
-    # A bicycle with this wheelbase and this steering angle turns as the vehicle does.
-    wheelbase = 0.6 * rows[:, columns["length"]]
-    assert speed * np.tan(rows[:, columns["steering"]]) / wheelbase == pytest.approx(yaw_rate, abs=1e-9)
+    # A bicycle with this steering angle turns as the vehicle does.
+    model = BicycleModel(
+        wheelbase=0.6 * rows[0, columns["length"]], max_acceleration=9.0, max_deceleration=9.0, max_speed=99.0
+    )
+    for number in np.flatnonzero(abs(yaw_rate) > 0.01)[:40]:
+        angle = rows[number, columns["steering"]]
+        state = MotionState(x=0.0, y=0.0, heading=0.0, speed=speed[number], steering=angle)
+        assert model.step(state, 0.0, angle, 0.001).heading / 0.001 == pytest.approx(yaw_rate[number])
 
 
 def test_hidden_vehicle_is_not_among_the_actors(tmp_path):
@@ -223,3 +228,27 @@ def grid_of_lanes(simulator, cells, resolution):
             share = np.clip(((px - ax) * dx + (py - ay) * dy) / max(dx * dx + dy * dy, 1e-12), 0, 1)
             found |= np.hypot(px - ax - share * dx, py - ay - share * dy) <= half
     return found
+
+
+@pytest.mark.parametrize("form", ["acceleration_steering", "throttle_brake_steering"])
+def test_ego_that_moves_freely_is_where_its_bicycle_model_is(form, tmp_path):
+    scenario = load_scenario("motorway")
+    agents = {"ego": replace(scenario.agents["ego"], observation=("ego", "actors"), action=form)}
+    with closing(SumoSimulator(replace(scenario, agents=agents), tmp_path)) as simulator:
+        simulator.reset(seed=2, options={"arguments": argument_values(scenario)})
+        motion, columns = simulator._driving.moving["ego"], simulator.observation_layouts["ego"].columns["ego"]
+        driven, before = 0.0, motion.state
+        for step in range(25):
+            wave = 0.02 * math.sin(step / 4)
+            action = (0.5, wave) if form == "acceleration_steering" else (0.3, 0.0, wave)
+            observations, *_ = simulator.step({"ego": simulator.actions["ego"].encode(action)})
+            own = simulator.restore_observation("ego", observations["ego"])["ego"]
+            state = motion.state
+            driven += math.hypot(state.x - before.x, state.y - before.y)
+            expected = {
+                "x": state.x, "y": state.y, "speed": state.speed, "steering": state.steering, "heading": state.heading,
+                "yaw_rate": (state.heading - before.heading) / 0.1, "acceleration": (state.speed - before.speed) / 0.1,
+            }  # fmt: skip
+            assert own[[columns[name] for name in expected]] == pytest.approx([*expected.values()], abs=2e-3), step
+            assert own[columns["distance"]] == pytest.approx(driven, rel=1e-4)
+            before = state
