@@ -114,10 +114,6 @@ class FreeMotion:
         """Whether the actions are poses, which the vehicle may be unable to reach."""
         return self._form in ("trajectory", "target_pose")
 
-    def steering(self) -> float:
-        """Return the steering angle after the last step, in rad, positive to the left."""
-        return self.state.steering
-
     @property
     def _words(self) -> str:
         return self._form.replace("_", " ")
