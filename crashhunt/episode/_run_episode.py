@@ -29,7 +29,7 @@ from crashhunt.episode._observers import Nearness, Recorder
 from crashhunt.oracles import parse_oracle
 from crashhunt.scenario import check_action
 from crashhunt.simulators import FlattensObservations, MasksActions, ObservesParts, ProvidesRoadMaps, ReportsNotices
-from crashhunt.trial import CRASHES, Signature, signature_of
+from crashhunt.trial import CRASHES, Signature, fold_signals, signature_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -302,7 +302,7 @@ class Parts:
         values = {
             name: files.get(value, value) if isinstance(value, str) else value for name, value in arguments.items()
         }
-        return factory, {**given, **values}
+        return factory, {**given, **fold_signals(values)}
 
     def _factory(self, agent: str) -> tuple[Any, Signature]:
         found = self._factories.get(agent)

@@ -46,6 +46,7 @@ from crashhunt.trial import (
     Constant,
     Outcome,
     Signature,
+    expand_signal,
     parse_spec,
     signature_of,
 )
@@ -56,7 +57,7 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances import DisturbanceModel, DisturbanceSampler
     from crashhunt.plans._settings import Request
-    from crashhunt.trial import Category, Value
+    from crashhunt.trial import Category, Kind, Value
 
     Surveyor = Callable[[Scenario, Request, HuntSettings], Scenario]
 
@@ -693,6 +694,7 @@ def _agents(
         agent, argument = _owner(name, scenario, signatures)
         asked[agent][argument] = spec
     agents: dict[str, AgentSettings] = {}
+    duration_s = request.max_steps * scenario.backend.step_length_s(scenario)
     for agent, setup in scenario.agents.items():
         signature = signatures[agent]
         known = scenario.agent_arguments(agent)
@@ -704,7 +706,11 @@ def _agents(
                     where=scenario.origin,
                 )
         specs: dict[str, ArgumentSpec] = {}
-        for name in sorted({*signature.arguments, *known, *asked[agent]}):
+        for name, spec in asked[agent].items():
+            signal = expand_signal(name, spec, duration_s, where=f"--arg {name}")
+            kinds: dict[str, Kind] = {name: "str"}
+            specs |= {part: ArgumentSpec(spec=text, kind=kinds.get(part, "float")) for part, text in signal.items()}
+        for name in sorted({*signature.arguments, *known, *asked[agent]} - specs.keys()):
             found = _spec(name, signature.arguments.get(name), known.get(name), asked[agent].get(name), hunted=hunted)
             if found is not None:
                 specs[name] = found

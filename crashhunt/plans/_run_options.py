@@ -34,6 +34,7 @@ Spec = str | int | float | bool
 Driver = str | Callable[..., object]  # a class is one, too
 
 _SPEC = "a value (20), a range (5:40, 5:40:5), a log range (log:1e-3:1) or a choice (a|b|c)"
+_SIGNAL = "; or a signal over the time of a trial (signal:0:1:points=5:kind=constant|linear|pchip)"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,8 +97,8 @@ class Subject(_Options):
     )  # fmt: skip
     arguments: Mapping[str, Spec] | None = option(
         {}, '``NAME`` or ``AGENT.NAME`` to a value or a specification such as ``"5:40"``',
-        help=f"values to try for an argument of the agent: {_SPEC}; if there are several agents, ID.NAME=SPEC names "
-        "the agent",
+        help=f"values to try for an argument of the agent: {_SPEC}{_SIGNAL}; if there are several "
+        "agents, ID.NAME=SPEC names the agent",
         brief="values of an agent's argument: one (20), a range (5:40 or log:1e-3:1) or a choice (a|b|c)",
         flag="--arg", metavar="NAME=SPEC", group="what",
     )  # fmt: skip

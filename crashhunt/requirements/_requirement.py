@@ -74,6 +74,9 @@ class Requirement:
     text: str
     formula: Formula
 
+    def __str__(self) -> str:
+        return self.text
+
     @property
     def signals(self) -> tuple[str, ...]:
         """The names of the signals, in the order of the text."""

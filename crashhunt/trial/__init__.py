@@ -24,6 +24,11 @@ if TYPE_CHECKING:
         Escape as Escape,
         Failure as Failure,
     )
+    from ._input_signal import (
+        InputSignal as InputSignal,
+        expand_signal as expand_signal,
+        fold_signals as fold_signals,
+    )
     from ._outcome import (
         CRASHES as CRASHES,
         EVENTS as EVENTS,

@@ -80,6 +80,10 @@ def test_names_of_signals_have_dots_and_indices_and_may_begin_like_an_operator()
     )  # fmt: skip
 
 
+def test_a_requirement_is_printed_as_its_text():
+    assert str(parse("always  (x > 1)")) == "always  (x > 1)"
+
+
 def test_the_horizon_is_the_latest_time_that_windows_name():
     assert parse("always[0:70] eventually[0:30] (x > 1)").horizon_s == 100
     assert parse("always[5:inf] (x > 1 -> once[0:50] (x > 2))").horizon_s == 5
