@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         rewritten as rewritten,
         written_by as written_by,
     )
+    from ._fleet import Fleet as Fleet
     from ._names import check_names as check_names, explained as explained
     from ._options import (
         HARMLESS as HARMLESS,

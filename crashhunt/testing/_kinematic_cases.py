@@ -1,4 +1,4 @@
-"""The three kinds of cases of UN R157 as point masses with a size, for many cases at a time.
+"""The three kinds of cases of UN R157, for many cases at a time; the own vehicles move as a simulator says.
 
 The steps are those of the published comparison of the driver models: 0.1 s; first the speed, then the position with the
 new speed; contact is examined before the step. Both vehicles are 4.3 m long and 1.9 m wide, and lanes are 3.5 m wide.
@@ -6,7 +6,7 @@ new speed; contact is examined before the step. Both vehicles are 4.3 m long and
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from crashhunt.agents import GRAVITY_MPS2, REFERENCE_MODELS, Situation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from types import TracebackType
+    from typing import Self
 
     from numpy.typing import NDArray
 
@@ -37,6 +39,49 @@ _SIDE_GAP_M = LANE_WIDTH_M - WIDTH_M  # between vehicles in the middles of neigh
 _OWN_LANE_M = 2 * LANE_WIDTH_M
 
 
+class Vehicles(Protocol):
+    """The own vehicles of all cases, which drive with commanded accelerations."""
+
+    speeds: Values
+
+    def __enter__(self) -> Self:
+        """Return the vehicles."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Remove the vehicles."""
+
+    def drive(self, accelerations: Values) -> Values:
+        """Simulate one step; return the way that each vehicle has driven in the step, in m."""
+
+
+class KinematicVehicles:
+    """Vehicles whose speed changes by the acceleration; the position changes by the new speed.
+
+    Args:
+        speeds: speed of each vehicle at the beginning, in m/s.
+    """
+
+    def __init__(self, speeds: Values) -> None:
+        self.speeds = speeds
+
+    def __enter__(self) -> Self:
+        """Return the vehicles."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Do nothing."""
+
+    def drive(self, accelerations: Values) -> Values:
+        """Move all vehicles for one step; return their ways in m."""
+        self.speeds = np.maximum(self.speeds + accelerations * STEP_S, 0.0)
+        moved: Values = self.speeds * STEP_S
+        return moved
+
+
 def run_up_steps(lateral_speed: Values) -> NDArray[np.int_]:
     """Return the number of steps in which a lateral speed grows from 0, at 1.5 m/s²."""
     tenths = np.round(lateral_speed * 10)
@@ -45,15 +90,16 @@ def run_up_steps(lateral_speed: Values) -> NDArray[np.int_]:
     return np.ceil(speed / LATERAL_ACCELERATION_MPS2 / STEP_S).astype(int)
 
 
-def solve_cut_in(cases: Columns, model: str) -> dict[str, Values]:
+def solve_cut_in(cases: Columns, model: str, vehicles: Vehicles) -> dict[str, Values]:
     """Return 0 (no collision), 1 (own front beyond the other front at contact) or 2 for each case of a cut-in.
 
     Args:
         cases: ``ego_kmh``, ``other_kmh``, ``gap_m`` (at the moment at which the lateral speed is full), and
             ``lateral_mps``.
         model: name of the model that drives.
+        vehicles: the own vehicles, with their first speeds.
     """
-    speed, other_speed = cases["ego_kmh"] / _KMH, cases["other_kmh"] / _KMH
+    speed, other_speed = vehicles.speeds, cases["other_kmh"] / _KMH
     full, count = cases["lateral_mps"], len(cases["gap_m"])
     driver = REFERENCE_MODELS[model](count, STEP_S)
     run_up = run_up_steps(full)
@@ -81,15 +127,21 @@ def solve_cut_in(cases: Columns, model: str) -> dict[str, Values]:
         )
         acceleration = driver.brake(situation)
         lateral = np.where(y < _OWN_LANE_M, np.minimum(full, lateral + LATERAL_ACCELERATION_MPS2 * STEP_S), 0.0)
-        speed = np.maximum(speed + acceleration * STEP_S, 0.0)
-        gap = gap - (speed - other_speed) * STEP_S
+        moved, speed = vehicles.drive(acceleration), vehicles.speeds
+        gap = gap - (moved - other_speed * STEP_S)
         y = y + lateral * STEP_S
-        if np.all((answer > 0) | driver.dismissed | (gap <= -2 * LENGTH_M) | ((side < 0) & (speed <= other_speed))):
+        if np.all(
+            (full == 0)
+            | (answer > 0)
+            | driver.dismissed
+            | (gap <= -2 * LENGTH_M)
+            | ((side < 0) & (speed <= other_speed))
+        ):
             break
     return {model: np.where(driver.dismissed, 0.0, answer)}
 
 
-def solve_cut_out(cases: Columns, model: str) -> dict[str, Values]:
+def solve_cut_out(cases: Columns, model: str, vehicles: Vehicles) -> dict[str, Values]:
     """Return for each case of a cut-out whether the own vehicle and the vehicle ahead hit the standing vehicle.
 
     The driver sees the standing vehicle when the vehicle ahead is 0.375 m off the middle of its lane, or has hit it and
@@ -98,8 +150,9 @@ def solve_cut_out(cases: Columns, model: str) -> dict[str, Values]:
     Args:
         cases: ``ego_kmh``, ``front_m`` (from the vehicle ahead to the standing vehicle), and ``lateral_mps``.
         model: name of the model that drives.
+        vehicles: the own vehicles, with their first speeds.
     """
-    speed, lateral = cases["ego_kmh"] / _KMH, np.abs(cases["lateral_mps"])
+    speed, lateral = vehicles.speeds, np.abs(cases["lateral_mps"])
     count = len(speed)
     driver = REFERENCE_MODELS[model](count, STEP_S, **_REACTS_AT_ONCE.get(model, {}))
     following = driver.following_distance(speed)
@@ -126,22 +179,23 @@ def solve_cut_out(cases: Columns, model: str) -> dict[str, Values]:
             other_length=length,
             visible=(y >= WANDERING_M - _TIE) | front_answer,
         )
-        speed = np.maximum(speed + driver.brake(situation) * STEP_S, 0.0)
-        distance = distance - speed * STEP_S
-        gap = gap - (speed - front_speed) * STEP_S
+        moved, speed = vehicles.drive(driver.brake(situation)), vehicles.speeds
+        distance = distance - moved
+        gap = gap - (moved - front_speed * STEP_S)
         front = front - front_speed * STEP_S
         y = y + lateral * STEP_S
     return {model: answer, f"front_{model}": front_answer.astype(float), f"gap_{model}": following}
 
 
-def solve_car_following(cases: Columns, model: str) -> dict[str, Values]:
+def solve_car_following(cases: Columns, model: str, vehicles: Vehicles) -> dict[str, Values]:
     """Return for each case of a braking leader whether the own vehicle hits it, and with which speed difference.
 
     Args:
         cases: ``ego_kmh`` and ``decel_g``, the deceleration of the vehicle ahead in units of 9.81 m/s².
         model: name of the model that drives.
+        vehicles: the own vehicles, with their first speeds.
     """
-    speed = cases["ego_kmh"] / _KMH
+    speed = vehicles.speeds
     leader, count = speed, len(speed)
     driver = REFERENCE_MODELS[model](count, STEP_S)
     following = gap = driver.following_distance(speed)
@@ -162,14 +216,28 @@ def solve_car_following(cases: Columns, model: str) -> dict[str, Values]:
         )
         acceleration = driver.brake(situation)
         leader = np.maximum(leader - cases["decel_g"] * GRAVITY_MPS2 * STEP_S, 0.0)
-        speed = np.maximum(speed + acceleration * STEP_S, 0.0)
-        gap = gap - (speed - leader) * STEP_S
+        moved, speed = vehicles.drive(acceleration), vehicles.speeds
+        gap = gap - (moved - leader * STEP_S)
     return {model: answer, f"gap_{model}": following, f"dv_{model}": difference}
 
 
-SOLVERS: Mapping[str, Callable[[Columns, str], dict[str, Values]]] = {
+_SOLVERS: Mapping[str, Callable[[Columns, str, Vehicles], dict[str, Values]]] = {
     "cut_in": solve_cut_in,
     "cut_out": solve_cut_out,
     "car_following": solve_car_following,
 }
-"""The function for each kind of cases."""
+
+
+def solve(
+    kind: str, cases: Columns, model: str, make: Callable[[Values], Vehicles] = KinematicVehicles
+) -> dict[str, Values]:
+    """Return the answers of a model to cases of a kind, by the names of their columns.
+
+    Args:
+        kind: ``cut_in``, ``cut_out`` or ``car_following``.
+        cases: the columns of the cases.
+        model: name of the model that drives.
+        make: function that makes the own vehicles from their first speeds.
+    """
+    with make(cases["ego_kmh"] / _KMH) as vehicles:
+        return _SOLVERS[kind](cases, model, vehicles)

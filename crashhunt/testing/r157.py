@@ -12,6 +12,7 @@ import csv
 import math
 import sys
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
     Columns = Mapping[str, NDArray[np.float64]]
 
-_CASES_AT_ONCE = 20_000  # bounds the memory, whatever the length of the file
+_CASES_AT_ONCE = 1_000  # bounds the memory, whatever the length of the file
 _DECIMALS = 6
 _INTERRUPTED = 130
 
@@ -87,7 +88,10 @@ def _answer(words: Sequence[str] | None) -> int:
     parser.add_argument("cases", metavar="CASES.csv", type=Path, help="one case a row; columns depend on KIND")
     parser.add_argument("out", metavar="OUT.csv", type=Path, help="the cases with the answers; replaced if it exists")
     parser.add_argument(
-        "--simulator", default="kinematic", metavar="NAME", help="kinematic (default): equations of motion"
+        "--simulator",
+        default="kinematic",
+        metavar="NAME",
+        help="that moves the own vehicle: kinematic (default: equations of motion) or sumo",
     )
     given = parser.parse_args(words)
     if given.kind not in _KINDS:
@@ -104,11 +108,17 @@ def _answer(words: Sequence[str] | None) -> int:
 
 
 def _solver_of(simulator: str, kind: str) -> Callable[[Columns, str], Mapping[str, NDArray[np.float64]]]:
-    from crashhunt.testing._kinematic_cases import SOLVERS
+    from crashhunt.testing._kinematic_cases import LENGTH_M, STEP_S, solve
 
     if simulator == "kinematic":
-        return SOLVERS[kind]
-    raise UsageError(f"the simulator {describe_value(simulator)} is unknown", fix=one_of(simulator, ("kinematic",)))
+        return partial(solve, kind)
+    if simulator == "sumo":
+        from crashhunt.sumo import Fleet
+
+        return partial(solve, kind, make=partial(Fleet, length_m=LENGTH_M, step_s=STEP_S))
+    raise UsageError(
+        f"the simulator {describe_value(simulator)} is unknown", fix=one_of(simulator, ("kinematic", "sumo"))
+    )
 
 
 def _opened(path: Path) -> TextIO:

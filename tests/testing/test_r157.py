@@ -10,7 +10,7 @@ import pytest
 
 from crashhunt.agents import REFERENCE_MODELS
 from crashhunt.testing import r157
-from crashhunt.testing._kinematic_cases import LENGTH_M, SOLVERS, WIDTH_M
+from crashhunt.testing._kinematic_cases import LENGTH_M, WIDTH_M, solve
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference" / "r157"
 needs_reference = pytest.mark.skipif(not REFERENCE.is_dir(), reason="the published answers are not on this machine")
@@ -21,7 +21,7 @@ def columns(**values: float) -> dict[str, np.ndarray]:
 
 
 def cut_in(model: str, **values: float) -> int:
-    return int(SOLVERS["cut_in"](columns(**values), model)[model][0])
+    return int(solve("cut_in", columns(**values), model)[model][0])
 
 
 @needs_reference
@@ -55,7 +55,7 @@ def test_no_model_reacts_to_a_vehicle_that_stays_in_its_lane():
         name: np.full(20, value) for name, value in (("ego_kmh", 100.0), ("other_kmh", 30.0), ("lateral_mps", 0.0))
     }
     for model in REFERENCE_MODELS:
-        assert not SOLVERS["cut_in"]({**cases, "gap_m": np.arange(1.0, 41.0, 2.0)}, model)[model].any()
+        assert not solve("cut_in", {**cases, "gap_m": np.arange(1.0, 41.0, 2.0)}, model)[model].any()
 
 
 def test_cut_in_without_a_reaction_ends_as_plain_arithmetic_says():
@@ -84,7 +84,7 @@ def test_careful_human_stops_behind_a_standing_vehicle_exactly_as_far_as_its_bra
     seen = 0.1 * speed  # the vehicle ahead is 0.95 m aside after one step
     front = way + seen - 2 * speed - LENGTH_M
     for extra, answer in ((0.0, 0), (-3.0, 1)):  # a step of 0.1 s is 2.2 m
-        found = SOLVERS["cut_out"](columns(ego_kmh=80, front_m=front + extra, lateral_mps=-9.5), "cc_human")
+        found = solve("cut_out", columns(ego_kmh=80, front_m=front + extra, lateral_mps=-9.5), "cc_human")
         assert (found["front_cc_human"][0], found["cc_human"][0]) == (0, answer)
 
 
@@ -134,3 +134,18 @@ def test_answers_follow_the_columns_of_the_cases(tmp_path):
     assert (tmp_path / "out.csv").read_text() == (
         "name,lateral_mps,gap_m,other_kmh,ego_kmh,cc_human,fsm,rss,reg157\n'a b',1.7,20,10,70,2,2,2,2\n"
     )
+
+
+@pytest.mark.parametrize("kind", ["cut_in", "cut_out", "car_following"])
+def test_vehicles_in_sumo_give_the_same_answers(kind, tmp_path):
+    rng = np.random.default_rng(7)
+    ranges = {name: (low + (high - low) * 0.02, high * 0.3) for name, (low, high) in r157._KINDS[kind].columns.items()}
+    names = [*ranges]
+    rows = [[f"{rng.uniform(*ranges[name]):.3f}" for name in names] for _ in range(40)]
+    (tmp_path / "cases.csv").write_text("\n".join([",".join(names), *(",".join(row) for row in rows)]))
+    for simulator in ("kinematic", "sumo"):
+        words = [kind, str(tmp_path / "cases.csv"), str(tmp_path / f"{simulator}.csv"), "--simulator", simulator]
+        assert r157.main(words) == 0
+    found = (tmp_path / "sumo.csv").read_text().splitlines()
+    expected = (tmp_path / "kinematic.csv").read_text().splitlines()
+    assert found == expected
