@@ -23,6 +23,7 @@ from crashhunt.agents._library_agents import Action, Parts
 from crashhunt.base.errors import PluginError, ProgramError
 from crashhunt.base.fmus import places_of
 from crashhunt.base.text import listed, one_line
+from crashhunt.simulators import PARTS
 from crashhunt.trial import Argument, Signature, parse_spec
 
 if TYPE_CHECKING:
@@ -236,7 +237,11 @@ class _Model:
             found[one.name] = Argument(
                 name=one.name, kind=kind, default=default, distribution=distribution, unit=one.unit or ""
             )
-        return Signature(arguments=found, open=False, given=())
+        # Without --observe, the parts that the inputs need are observed.
+        sources = [self.inputs.get(one.name, one.name) for one in self.of("input")]
+        places = [_PLACE.fullmatch(source) for source in sources if isinstance(source, str)]
+        parts = dict.fromkeys(place[1] for place in places if place is not None and place[1] in PARTS)
+        return Signature(arguments=found, open=False, given=(), observation=tuple(parts))
 
 
 _EXPORT = "export it as an FMU for co-simulation by FMI 2 or 3, with a binary for this machine"

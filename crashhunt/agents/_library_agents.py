@@ -6,6 +6,7 @@ import ctypes
 import json
 import math
 import os
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 _MAX_SHOWN_CHARACTERS: Final = 300
 _GUARD_VALUES: Final = 4  # after an action; a library that writes more numbers than the action has changes them
-_GUARD: Final = np.full(_GUARD_VALUES, -1.2345e300)
+_GUARD: Final = [-1.2345e300] * _GUARD_VALUES
 
 
 class _Argument(ctypes.Structure):
@@ -158,6 +159,7 @@ class LibraryFactory:
             ready = json.loads(declaration)
             # The macro for an argument ends with a comma, and an argument without a range has an empty text.
             declared = {name: facts for name, facts in ready["arguments"].items() if name}
+            observed, action = str(declared.pop("<observation>", "")), str(declared.pop("<action>", ""))
             ready["arguments"] = {
                 name: {key: value for key, value in facts.items() if value != ""} for name, facts in declared.items()
             }
@@ -166,7 +168,8 @@ class LibraryFactory:
             text = one_line(declaration)[:_MAX_SHOWN_CHARACTERS]
             raise PluginError(f"{self._locator!r}: its declaration is not JSON: {text}", fix=fix) from None
         try:
-            return _signature_in(ready)
+            observation = tuple(filter(None, observed.split(",")))
+            return replace(_signature_in(ready), observation=observation, action=action)
         except ProgramError as error:
             fix = error.fix or "correct its CRASHHUNT_AGENT(...)"
             raise PluginError(f"{self._locator!r}: {error.message}", fix=fix) from None
@@ -343,10 +346,10 @@ class Parts:
     def write(self, observation: object) -> None:
         """Copy an observation to the addresses that the library reads."""
         if self._single is not None:
-            np.copyto(self._single, observation)  # type: ignore[arg-type]
+            self._single[...] = observation  # type: ignore[assignment]  # in a third of the time of `np.copyto`
             return
         for leaf in self.leaves:
-            np.copyto(leaf.values, leaf.get(observation))  # type: ignore[arg-type]
+            leaf.values[...] = leaf.get(observation)  # type: ignore[assignment]
 
 
 def _leaves(space: Space[object]) -> Iterator[tuple[str, Space[object], Getter]]:
@@ -394,14 +397,15 @@ class Action:
             raise PluginError(f"a library cannot return actions of the space {one_line(str(space))}", fix=fix)
         self._is_tuple = isinstance(space, Tuple)
         shape = (len(parts),) if self._is_tuple else tuple(space.shape or ())
-        self._whole = [np.dtype(part.dtype).kind in "iub" for part in parts]
-        buffer = np.zeros(math.prod(shape) + _GUARD_VALUES)
-        self.values, self._guard = buffer[:-_GUARD_VALUES], buffer[-_GUARD_VALUES:]
-        self._guard[:] = _GUARD
-        self._expected = _GUARD.tobytes()
+        self._is_whole = [np.dtype(part.dtype).kind in "iub" for part in parts]
+        self._whole_places = [place for place, is_whole in enumerate(self._is_whole) if is_whole]
+        self._size = math.prod(shape)
+        self._all = np.zeros(self._size + _GUARD_VALUES)
+        self._all[self._size :] = _GUARD
+        self.values = self._all[: self._size]
         self._shaped = self.values.reshape(shape)
         columns = tuple(names) if shape and len(names) == shape[-1] else ()
-        self.address: int = buffer.ctypes.data
+        self.address: int = self._all.ctypes.data
         self.described = _described("action", shape, columns, None, None)
 
     def clear(self) -> None:
@@ -410,18 +414,17 @@ class Action:
 
     def read(self) -> object:
         """Return the action; None if the library has written more values."""
-        if self._guard.tobytes() != self._expected:
+        values = self._all.tolist()
+        if values[self._size :] != _GUARD:
             return None
         if self._is_tuple:
-            return tuple(
-                [_whole_number(value) if is_whole else value
-                 for value, is_whole in zip(self.values.tolist(), self._whole, strict=True)]
-            )  # fmt: skip
+            for place in self._whole_places:
+                values[place] = _whole_number(values[place])
+            return tuple(values[: self._size])
         if not self._shaped.shape:
-            value = self._shaped.item()
-            return _whole_number(value) if self._whole[0] else value
+            return _whole_number(values[0]) if self._is_whole[0] else values[0]
         action = self._shaped.copy()
-        if self._whole[0] and bool(np.all(action == np.rint(action))) and bool(np.all(np.abs(action) < 2**53)):
+        if self._is_whole[0] and bool(np.all(action == np.rint(action))) and bool(np.all(np.abs(action) < 2**53)):
             return action.astype(np.int64)
         return action
 

@@ -84,7 +84,8 @@ CRASHHUNT_EXPORT void crashhunt_destroy(void *agent);
 
        CRASHHUNT_AGENT(CRASHHUNT_ARGUMENT("speed", "5.0:25.0", "m/s", 12.0) CRASHHUNT_ARGUMENT("mode", "a|b", "", "a"))
 
-   A hunt varies the arguments within their ranges. CRASHHUNT_AGENT() declares none, and accepts any argument. */
+   A hunt varies the arguments within their ranges. CRASHHUNT_AGENT() declares none, and accepts any argument. It may
+   also contain CRASHHUNT_OBSERVES and CRASHHUNT_ACTS. */
 #define CRASHHUNT_AGENT(...)                       \
     CRASHHUNT_EXPORT const char crashhunt_agent[]; \
     const char crashhunt_agent[] = "{\"protocol\": " CRASHHUNT_PROTOCOL ", \"arguments\": {" __VA_ARGS__ "\"\": null}}";
@@ -92,6 +93,11 @@ CRASHHUNT_EXPORT void crashhunt_destroy(void *agent);
 /* An argument: its name, its range as in --arg ("" for a fixed value), its unit, and its default, a number or a text. */
 #define CRASHHUNT_ARGUMENT(name, range, unit, otherwise) \
     "\"" name "\": {\"range\": \"" range "\", \"unit\": \"" unit "\", \"default\": " #otherwise "}, "
+
+/* The parts that the agent observes, such as "ego,actors:rows=8", and the form of its actions, such as "acceleration":
+   see crashhunt list observations and crashhunt list actions. --observe, --action and the scenario take precedence. */
+#define CRASHHUNT_OBSERVES(parts) "\"<observation>\": \"" parts "\", "
+#define CRASHHUNT_ACTS(form) "\"<action>\": \"" form "\", "
 
 /* Return the value of a numeric argument. */
 static inline double crashhunt_number(const struct crashhunt_setup *setup, const char *name, double otherwise) {

@@ -84,6 +84,13 @@ def test_parameters_are_arguments_with_their_units_and_bounds(tmp_path):
     assert arguments.keys() == {"speed", "harm"}
 
 
+def test_the_parts_that_inputs_need_are_observed(tmp_path):
+    assert signature_of(FmuFactory(f"fmu:{build_fmu(tmp_path, 2)}")).observation == ()
+    fmu = build_fmu(tmp_path, 2, place="actors[{row}].{column}")
+    (tmp_path / "planner.toml").write_text('[inputs]\n"actors[1].x" = "ego.speed"\n"actors[1].y" = 5', "utf-8")
+    assert signature_of(FmuFactory(f"fmu:{fmu}")).observation == ("actors", "ego")
+
+
 @pytest.mark.parametrize("version", [2, 3])
 def test_a_failure_is_an_error_that_names_the_agent_and_the_function(tmp_path, version):
     agent = agent_of(build_fmu(tmp_path, version), harm=1)

@@ -118,6 +118,14 @@ def test_the_arguments_that_a_library_declares_are_its_signature_and_its_default
     assert agent_of(planner).act(np.zeros((8, 7), np.float32)) == (12.0, 0)
 
 
+def test_a_library_may_choose_its_parts_and_the_form_of_its_actions(tmp_path):
+    chosen = 'CRASHHUNT_AGENT(CRASHHUNT_OBSERVES("ego,actors:rows=8") CRASHHUNT_ACTS("acceleration"))'
+    library = compile_library(tmp_path, "libchooses.so", ECHO.replace("CRASHHUNT_AGENT()", chosen))
+    signature = signature_of(LibraryFactory(f"lib:{library}"))
+    assert (signature.observation, signature.action) == (("ego", "actors:rows=8"), "acceleration")
+    assert signature.open
+
+
 def test_nested_observations_step_time_and_arguments_arrive_in_order(echo):
     image = spaces.Box(0, 255, (2, 2), np.uint8)
     camera = spaces.Dict({"gain": spaces.Discrete(5), "image": image})
