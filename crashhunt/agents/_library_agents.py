@@ -6,7 +6,6 @@ import ctypes
 import json
 import math
 import os
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -168,8 +167,7 @@ class LibraryFactory:
             text = one_line(declaration)[:_MAX_SHOWN_CHARACTERS]
             raise PluginError(f"{self._locator!r}: its declaration is not JSON: {text}", fix=fix) from None
         try:
-            observation = tuple(filter(None, observed.split(",")))
-            return replace(_signature_in(ready), observation=observation, action=action)
+            return _signature_in({**ready, "observation": [*filter(None, observed.split(","))], "action": action})
         except ProgramError as error:
             fix = error.fix or "correct its CRASHHUNT_AGENT(...)"
             raise PluginError(f"{self._locator!r}: {error.message}", fix=fix) from None

@@ -6,16 +6,16 @@ import os
 import re
 import struct
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypedDict
-
-from crashhunt.base.libraries import is_of_system
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _MACHINES: Final = {3: "i686", 40: "arm", 62: "x86_64", 183: "aarch64", 243: "riscv64"}
+_SYSTEM_FOLDERS = ("/lib", "/lib32", "/lib64", "/usr/lib", "/usr/lib32", "/usr/lib64")
 _NOTES_TYPE, _BUILD_ID_TYPE = 4, 3  # of a segment, and of a note
 _MAX_NOTES_BYTES: Final = 1 << 16
 _LDD_TIMEOUT_S: Final = 10.0
@@ -45,6 +45,18 @@ def describe_binary(file: Path) -> BinaryFacts | None:
     loaded, missing = _loaded_by(file, {})
     system = sorted(name for name, path in loaded.items() if is_of_system(Path(path)))
     return {"machine": head[0], "build_id": head[1], "system": system, "missing": missing}
+
+
+def machine_of(file: Path) -> str:
+    """Return the processor architecture of a binary file, as `platform.machine` names it; empty for another file."""
+    head = _head_of(file)
+    return "" if head is None else head[0]
+
+
+def is_of_system(library: Path) -> bool:
+    """Return whether a library belongs to the operating system or to the environment of Python."""
+    homes = (*_SYSTEM_FOLDERS, f"{sys.prefix}/lib", f"{sys.base_prefix}/lib")
+    return not library.is_absolute() or any(library.resolve().is_relative_to(home) for home in homes)
 
 
 def own_libraries(file: Path) -> tuple[dict[str, Path], list[str]]:

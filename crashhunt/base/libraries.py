@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from crashhunt.base import library_probe
+from crashhunt.base.binaries import is_of_system, machine_of
 from crashhunt.base.errors import PluginError
 from crashhunt.base.signals import describe_death
 from crashhunt.base.text import one_line
@@ -22,9 +24,6 @@ PREFIX: Final = "lib:"
 _LIBRARY_FIX = "give the path of a shared library, such as lib:./libplanner.so"
 _INTERFACE_FIX = "include crashhunt_agent.h, which crashhunt agent-header prints, and export all four functions"
 _PROBE_S: Final = 60.0  # as long as a module may take to import
-_MAGIC: Final = b"\x7fELF"
-_MACHINES: Final = {3: "x86", 40: "ARM", 62: "x86-64", 183: "AArch64", 243: "RISC-V"}  # e_machine of ELF
-_SYSTEM_FOLDERS = ("/lib", "/lib32", "/lib64", "/usr/lib", "/usr/lib32", "/usr/lib64")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +80,12 @@ def describe_library(locator: str, path: Path) -> Library:
     """
     try:
         status = path.stat()
-        _check_machine(path)
     except OSError as error:
         raise PluginError(f"{locator!r}: it cannot be read: {error.strerror}", fix=_LIBRARY_FIX) from None
-    except ValueError as error:
-        raise PluginError(f"{locator!r}: {error}", fix="build the library on this machine, with -shared") from None
+    machine, own = machine_of(path), platform.machine()
+    if machine != own:
+        what = f"is built for {machine} (allowed: {own})" if machine else "is not a shared library (an ELF file)"
+        raise PluginError(f"{locator!r}: it {what}", fix="build the library on this machine, with -shared")
     try:
         return _probed(path, status.st_mtime_ns, status.st_size, status.st_ino)
     except PluginError as error:
@@ -106,31 +106,6 @@ def load_order(locator: str, files: Mapping[str, str]) -> list[Path]:
     if word not in files:
         return [path_of(locator)]
     return [Path(copy) for name, copy in files.items() if name.startswith(PREFIX)] + [Path(files[word])]
-
-
-def _check_machine(path: Path) -> None:
-    """Refuse a file that is no ELF file for the machine of this process.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: the file is for another machine, or is no library.
-    """
-    own, found = (_header_of(file) for file in (Path("/proc/self/exe"), path))
-    if found[:4] != _MAGIC or len(found) < 20:
-        raise ValueError("it is not a shared library (an ELF file)")
-    if own[:4] == _MAGIC and _machine_in(own) != _machine_in(found):
-        raise ValueError(f"it is built for {_machine_in(found)} (allowed: {_machine_in(own)})")
-
-
-def _header_of(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(20)
-
-
-def _machine_in(header: bytes) -> str:
-    order = "little" if header[5] == 1 else "big"
-    number = int.from_bytes(header[18:20], order)  # type: ignore[arg-type]
-    return f"{_MACHINES.get(number, f'machine {number}')}, {32 * header[4]} bits"
 
 
 @cache
@@ -164,9 +139,3 @@ def _probed(path: Path, *_version: int) -> Library:
         raise PluginError(f"it does not export {', '.join(found['missing'])}", fix=_INTERFACE_FIX)
     dependencies = tuple(Path(one).absolute() for one in found["libraries"] if not is_of_system(Path(one)))
     return Library(found["declaration"], dependencies)
-
-
-def is_of_system(library: Path) -> bool:
-    """Return whether a library belongs to the operating system or to the environment of Python."""
-    homes = (*_SYSTEM_FOLDERS, f"{sys.prefix}/lib", f"{sys.base_prefix}/lib")
-    return not library.is_absolute() or any(library.resolve().is_relative_to(home) for home in homes)

@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from crashhunt.base.libraries import is_of_system
+from crashhunt.base.binaries import is_of_system
 
 _LIBRARY: Final = "_crashhunt_native_stack"  # installed if it could be built; a snapshot of the code does not have it
 _INTERFACE = 1

@@ -325,7 +325,7 @@ def test_a_replay_runs_the_saved_library_and_reports_that_the_current_one_differ
         (lambda file: file.write_bytes(b""), "it is not a shared library (an ELF file)"),
         (
             lambda file: file.write_bytes(b"\x7fELF\2\1\1" + bytes(11) + b"\xb7\0" + bytes(99)),
-            "it is built for AArch64",
+            "it is built for aarch64",
         ),
         (
             lambda file: compile_library(file.parent, source=IN_C.replace("crashhunt_reset", "crashhunt_rest")),
