@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from gymnasium import Space
 
     from crashhunt.base.program_messages import Hello, Observe, ProgramRequest, SpaceDescription
+    from crashhunt.panels import Panel
     from crashhunt.simulators import ActionForm, Simulator
     from crashhunt.trial import Kind, Value
 
@@ -145,6 +146,7 @@ class ProgramAgent:
         self._hello = hello
         self._is_scalar = is_scalar
         self._step_length_s = float(hello["step_length_s"])
+        self._panels: Any = None
         self._seed = 0
         self._step = 0
 
@@ -179,9 +181,15 @@ class ProgramAgent:
             raise ProgramError(
                 f"its answer to observe of step {step} has no action", fix='send {"type": "act", "action": […]}'
             )
-        self._step = step + 1
+        self._step, self._panels = step + 1, answer.get("panels")
         action = answer["action"]
         return action[0] if self._is_scalar and isinstance(action, list) and len(action) == 1 else action
+
+    def panels(self) -> dict[str, Panel]:
+        """Return the panels in the last answer of the program; see `panels_in`."""
+        from crashhunt.agents._program_panels import panels_in
+
+        return panels_in(self._panels)
 
     def close(self) -> None:
         """Send ``close`` to the program, and end it with all processes that it has started."""

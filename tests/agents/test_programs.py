@@ -7,6 +7,7 @@ import re
 import signal
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -14,9 +15,11 @@ import pytest
 from gymnasium import spaces
 from programs import COMPILER, DRIVER, compile_program, write_binary_program, write_program
 
+import crashhunt
 from crashhunt.agents import ProgramFactory
 from crashhunt.base.errors import ActionError, PluginError, ProgramError
 from crashhunt.base.programs import command_of, files_of
+from crashhunt.panels import labelled
 from crashhunt.plans import Request, plan_with_code, takes_of
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.trial import Range, signature_of
@@ -202,6 +205,54 @@ def test_a_late_answer_is_an_error_that_names_the_step_also_if_the_program_does_
         agent.act(np.zeros(size, np.float32))
     agent._process._process.send_signal(signal.SIGCONT)
     agent.close()
+
+
+def answering(folder, panels, *, before=""):
+    """An agent whose program answers the first observation with panels."""
+    program = folder / "shows"
+    answers = ('{"type":"ready"}', '{"type":"ok"}', f'{{"type":"act","action":[2,0],"panels":{panels}}}')
+    lines = [f"read -r line; {before} echo '{answer}'" for answer in answers]
+    program.write_text("\n".join(["#!/bin/sh", *lines, "read -r line", ""]), encoding="utf-8")
+    program.chmod(0o755)
+    agent = agent_of(f"exec:{program}", folder)
+    agent.reset(1)
+    assert agent.act(observations(1)[0]) == [2, 0]
+    agent.close()
+    return agent
+
+
+def test_panels_of_a_program_are_shown_by_the_kind_of_their_values(tmp_path):
+    shown = '{"mode":"wait","costs":[1,2.5],"grid":[[0,1],[2,3]],"weights":{"a":1,"b":2},"plans":{"a":[1,2],"b":[3,4]}}'
+    panels = dict(labelled(answering(tmp_path, shown).panels()))
+    assert {label: type(panel).__name__ for label, panel in panels.items()} == {
+        "mode": "Text", "costs": "Curve", "grid": "Heatmap", "weights": "Bar", "plans": "Curve",
+    }  # fmt: skip
+    assert all(panel.draw().dtype == np.uint8 for panel in panels.values())
+    assert answering(tmp_path, "null").panels() == {}
+
+
+@pytest.mark.parametrize("shown", ['{"odd":[[1],[2,3]]}', '{"odd":{"a":"b"}}', '{"odd":[]}', '{"odd":null}'])
+def test_panels_that_cannot_be_shown_fail_when_they_are_shown(tmp_path, shown):
+    with pytest.raises(ValueError, match="the panel 'odd' is neither text nor numbers"):
+        answering(tmp_path, shown).panels()
+    with pytest.raises(ValueError, match="panels is not an object"):
+        answering(tmp_path, "[1]").panels()
+
+
+def test_a_script_moves_the_messages_of_a_program_that_prints_to_another_descriptor(tmp_path, capfd):
+    page = (Path(crashhunt.__file__).parent / "guide" / "reference" / "exec-protocol.md").read_text(encoding="utf-8")
+    script = next(block for block in re.findall(r"```text\n(.*?)```", page, re.DOTALL) if "$@" in block)
+    (tmp_path / "quiet.sh").write_text(script, encoding="utf-8")
+    (tmp_path / "quiet.sh").chmod(0o755)
+    program = write_program(tmp_path)
+    answer = "print('hm', flush=True); os.write(3, f'{json.dumps(message)}\\n'.encode())"
+    text = program.read_text(encoding="utf-8").replace("print(json.dumps(message), flush=True)", answer)
+    program.write_text(text, encoding="utf-8")
+    agent = agent_of(f"exec:{tmp_path}/quiet.sh {program}", tmp_path, speed=9.0)
+    agent.reset(1)
+    assert {tuple(agent.act(seen)) for seen in observations()} == {(9.0, 0), (0.0, 0)}
+    agent.close()
+    assert capfd.readouterr().err.count("hm") == 22
 
 
 @pytest.mark.parametrize("kind", ["NaN", "shape"])
