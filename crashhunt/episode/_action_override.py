@@ -96,16 +96,16 @@ class Braking(_Overruling):
         if braking is None:
             raise InvalidEpisodeError(f"{agent} cannot be made to brake fully: its simulator has no action for it")
         self._driver, self._after = driver, after
-        self._action = braking.action
-        self._first = braking.action if manoeuvre == "brake" else _lane_change(simulator, agent, manoeuvre)
+        self._choose = braking.choose or (lambda: braking.action)
+        self._first = None if manoeuvre == "brake" else _lane_change(simulator, agent, manoeuvre)
         self._step = 0
 
     def act(self, observation: object) -> object:
         """Return the agent's action, or the braking action after the step."""
         step, self._step = self._step, self._step + 1
-        if step == self._after:
-            return self._first
-        return self._driver.act(observation) if step < self._after else self._action
+        if step < self._after:
+            return self._driver.act(observation)
+        return self._first if step == self._after and self._first is not None else self._choose()
 
 
 class Keeping(_Overruling):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypedDict
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     import numpy as np
     from gymnasium import Space
@@ -50,11 +50,14 @@ class FullBraking:
         action: The agent's action in every step.
         how: A description of the braking, for a sentence that begins with "Braking".
         deceleration: The deceleration in m/s²; None if the simulator does not report it.
+        choose: Function that returns the agent's action before each step, as for a vehicle that must steer to keep its
+            lane; None if ``action`` is the same in every step.
     """
 
     action: object
     how: str
     deceleration: float | None = None
+    choose: Callable[[], object] | None = None
 
 
 class ActionForm(Protocol):

@@ -18,6 +18,7 @@ from libsumo import _libsumo as sumo
 
 from crashhunt.base.errors import ActionError
 from crashhunt.simulators import MAX_STEERING_RAD, WHEELBASE_SHARE, BicycleModel, MotionState
+from crashhunt.world import Motion
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,6 +30,9 @@ _ARRIVED = 2  # SUMO's reason of a removal: the vehicle has arrived
 _MAX_ACCELERATION_MPS2 = 10.0
 _MAX_BRAKING_MPS2 = 15.0
 _MAX_YAW_RATE_RADPS = 1.5
+_OVER_M = 1.0  # a vehicle so far over the side of its lane is in the way of the next lane
+_LOOK_S, _MIN_LOOK_M = 0.5, 4.0  # how far ahead a vehicle that keeps its lane looks
+_MAX_LANES_AHEAD = 10
 _MAX_SLIDE_M, _MAX_TURN_RAD = 0.2, 0.05  # by which a trajectory may begin beside the vehicle, as plans are predictions
 
 
@@ -108,6 +112,79 @@ class FreeMotion:
             raise ActionError(message, fix=f"turn by at most {_MAX_YAW_RATE_RADPS * dt + _MAX_TURN_RAD:.2f} rad")
         if dx * math.cos(state.heading) + dy * math.sin(state.heading) < -_MAX_SLIDE_M:
             raise ActionError(f"the {self._words} moves the vehicle backwards", fix="return poses ahead of it")
+
+    def motion_of(self, action: NDArray[np.generic]) -> Motion:
+        """Return what an encoded action does: the speed after the step, and whether the vehicle leaves its lane."""
+        after = self._next(action.tolist())
+        path = self._path(_LOOK_S * after.speed)
+        aside, direction = _beside(path, after.x, after.y)
+        moves = after.speed * math.sin(after.heading - direction) * _LOOK_S
+        border = sumo.lane_getWidth(sumo.vehicle_getLaneID(self._vehicle)) / 2 - _OVER_M if path else math.inf
+        leaves = abs(aside + moves) > border and moves * (aside + moves) > 0
+        return Motion(speed_mps=after.speed, lane_change=0 if not leaves else 1 if aside + moves > 0 else -1)
+
+    def action_with(self, action: NDArray[np.generic], *, speed_mps: float | None, keeps_lane: bool) -> object:
+        """Return the action with another speed after the step, or with the steering that keeps the lane."""
+        after = self._next(action.tolist())
+        acceleration = after.acceleration if speed_mps is None else (speed_mps - self.state.speed) / self._dt
+        return self._action(acceleration, self._lane_keeping_angle() if keeps_lane else after.steering)
+
+    def brake(self) -> object:
+        """Return the action that brakes as hard as the vehicle can, and steers to the middle of its lane."""
+        return self._action(-self.model.max_deceleration, self._lane_keeping_angle())
+
+    def _action(self, acceleration: float, steering: float) -> object:
+        """Return the agent's action for an acceleration in m/s² and a steering angle in rad."""
+        model = self.model
+        acceleration = max(-_MAX_ACCELERATION_MPS2, min(_MAX_ACCELERATION_MPS2, acceleration))
+        steering = max(-MAX_STEERING_RAD, min(MAX_STEERING_RAD, steering))
+        if self._form == "acceleration_steering":
+            return acceleration, steering
+        if self._form == "throttle_brake_steering":
+            throttle = min(1.0, max(0.0, acceleration) / model.max_acceleration)
+            return throttle, min(1.0, max(0.0, -acceleration) / model.max_deceleration), steering / MAX_STEERING_RAD
+        state, after = self.state, model.step(self.state, acceleration, steering, self._dt)
+        if self._form == "target_pose":  # whose speed after the step is that of the way to the pose
+            dx, dy = after.x - state.x, after.y - state.y
+            share = after.speed * self._dt / max(math.hypot(dx, dy), 1e-9)
+            return state.x + share * dx, state.y + share * dy, after.heading, self._dt
+        return [[self._dt, after.x, after.y, after.heading, after.speed]]
+
+    def _lane_keeping_angle(self) -> float:
+        """Return the steering angle to a point ahead on the middle of the lane, in rad (pure pursuit)."""
+        state, model = self.state, self.model
+        path = self._path(_MIN_LOOK_M + _LOOK_S * state.speed)
+        if not path:
+            return 0.0
+        x, y = path[-1]
+        bearing = math.remainder(math.atan2(y - state.y, x - state.x) - state.heading, math.tau)
+        return math.atan(2 * model.wheelbase * math.sin(bearing) / max(1.0, math.hypot(x - state.x, y - state.y)))
+
+    def _path(self, length: float) -> list[tuple[float, float]]:
+        """Return the middle of the lane from its begin to a distance ahead of the vehicle's front; empty off all lanes.
+
+        At the end of a lane, the path follows the link to the next edge of the route, or else the first link.
+        """
+        lane = sumo.vehicle_getLaneID(self._vehicle)
+        if not lane:
+            return []
+        rest, path = sumo.vehicle_getLanePosition(self._vehicle) + length, list[tuple[float, float]]()
+        route = frozenset(sumo.vehicle_getRoute(self._vehicle))
+        for _ in range(_MAX_LANES_AHEAD):
+            for start, end in pairwise([tuple(point[:2]) for point in sumo.lane_getShape(lane)]):
+                far = math.dist(start, end)
+                path.append(start)
+                if rest <= far:
+                    share = rest / far if far else 0.0
+                    return [*path, (start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1]))]
+                rest -= far
+                last = end
+            links = sumo.lane_getLinks(lane)
+            if not links:
+                return [*path, last]
+            link = next((link for link in links if link[0].rpartition("_")[0] in route), links[0])
+            lane = link[4] or link[0]
+        return path
 
     @property
     def is_planned(self) -> bool:
@@ -232,6 +309,16 @@ class DrivableArea:
         if found is None:
             found = self._junctions[junction] = [tuple(point[:2]) for point in sumo.junction_getShape(junction)]
         return found
+
+
+def _beside(path: Sequence[tuple[float, float]], x: float, y: float) -> tuple[float, float]:
+    """Return how far a point is to the left of the nearest part of a path, in m, and the direction of this part."""
+    nearest = (math.inf, 0.0, 0.0)
+    for (ax, ay), (bx, by) in pairwise(path):
+        squared, direction = _distance_squared(x, y, ax, ay, bx, by), math.atan2(by - ay, bx - ax)
+        if squared < nearest[0] and (ax, ay) != (bx, by):
+            nearest = squared, (y - ay) * math.cos(direction) - (x - ax) * math.sin(direction), direction
+    return nearest[1:]
 
 
 def _distance_squared(x: float, y: float, ax: float, ay: float, bx: float, by: float) -> float:

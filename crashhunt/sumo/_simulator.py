@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.simulators import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Paths, RoadMap, Scene, Surroundings, VehicleData
+    from crashhunt.world import Motion, Paths, RoadMap, Scene, Surroundings, VehicleData
 
 guard_against_agents()
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
@@ -312,17 +312,34 @@ class SumoSimulator:
         """Return the size and the limits of a vehicle that has entered."""
         return vehicle_data_of(agent)
 
-    def full_braking(self, agent: str) -> FullBraking | None:
-        """Return the action for the hardest braking that the speed mode allows; None for vehicles that move freely."""
+    def full_braking(self, agent: str) -> FullBraking:
+        """Return the action for the hardest braking that the speed mode of the vehicle allows."""
         setup, form = self._scenario.agents[agent], self._forms[agent]
-        if form in FREE_FORMS:
-            return None
+        if motion := self._driving.moving.get(agent):
+            most = motion.model.max_deceleration
+            return FullBraking(motion.brake(), "the maximum of its vehicle type, in its lane", most, motion.brake)
         if form == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
         action = (-MAX_ACCELERATION if form == "acceleration" else 0.0, 0)
         if setup.speed_mode & _DECELERATION_LIMIT_BIT:
             return FullBraking(action, "the maximum of its vehicle type", float(libsumo.vehicle.getDecel(agent)))
         return FullBraking(action, f"as hard as its speed mode {setup.speed_mode} allows")
+
+    def is_steered(self, agent: str) -> bool:
+        """Whether a vehicle moves freely, so that its actions have no lanes."""
+        return self._forms[agent] in FREE_FORMS
+
+    def motion_of(self, agent: str, action: NDArray[np.generic]) -> Motion:
+        """Return what an encoded action of a vehicle that moves freely does within the next step."""
+        self.scene()  # brings SUMO to the current step
+        return self._driving.moving[agent].motion_of(action)
+
+    def action_with(
+        self, agent: str, action: NDArray[np.generic], *, speed_mps: float | None, keeps_lane: bool
+    ) -> NDArray[np.generic]:
+        """Return an action with another speed, or with the steering that keeps the lane."""
+        moving = self._driving.moving[agent]
+        return self.actions[agent].encode(moving.action_with(action, speed_mps=speed_mps, keeps_lane=keeps_lane))
 
     def surroundings(self, agent: str) -> Surroundings:
         """Return what a careful driver of the vehicle would consider after the last step."""

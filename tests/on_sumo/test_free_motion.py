@@ -211,3 +211,39 @@ def test_polygon_contains_what_it_winds_around():
         angles = np.arctan2(*(np.array(corners) - point).T[::-1])
         winding = sum(math.remainder(turn, math.tau) for turn in np.diff(angles, append=angles[:1]))
         assert _is_inside(*point, corners) == (abs(winding) > 1.0)
+
+
+@pytest.mark.parametrize("form", ["acceleration_steering", "throttle_brake_steering", "trajectory", "target_pose"])
+def test_full_braking_stops_the_vehicle_in_its_lane_in_a_bend(start, form):
+    simulator, step = start(form, "loop", vehicles=10)
+    for vehicle in {*libsumo.vehicle.getIDList()} - {"ego"}:
+        libsumo.vehicle.remove(vehicle)
+    libsumo.vehicle.moveTo("ego", "east_0", 5.0)  # on the half circle
+    simulator._driving.moving["ego"] = motion = FreeMotion("ego", form, 0.1, DrivableArea())
+    simulator.actions["ego"].check = motion.check if motion.is_planned else None
+    speed, steps = motion.state.speed, 0
+    while motion.state.speed > 0:
+        step(simulator.full_braking("ego").choose())
+        steps += 1
+        assert simulator.agents == ["ego"]
+        assert libsumo.vehicle.getLaneID("ego") == "east_0"
+    assert abs(libsumo.vehicle.getLateralLanePosition("ego")) < 0.5
+    assert steps == pytest.approx(speed / motion.model.max_deceleration / 0.1, abs=2)
+
+
+@pytest.mark.parametrize("form", ["acceleration_steering", "throttle_brake_steering", "trajectory"])
+def test_steering_out_of_the_lane_is_told_and_corrected_for_a_reference_driver(start, form):
+    simulator, step = start(form, "motorway")
+    motion = simulator._driving.moving["ego"]
+    plain = simulator.actions["ego"].encode(motion._action(0.0, 0.0))
+    assert simulator.is_steered("ego")
+    found = simulator.motion_of("ego", plain)
+    assert (found.lane_change, found.speed_mps) == (0, pytest.approx(motion.state.speed))
+    for _ in range(5):
+        left = simulator.actions["ego"].encode(motion._action(0.0, 0.1))
+        step(left)
+    left = simulator.actions["ego"].encode(motion._action(0.0, 0.1))
+    assert simulator.motion_of("ego", left).lane_change == 1
+    kept = simulator.action_with("ego", left, speed_mps=motion.state.speed - 0.2, keeps_lane=True)
+    assert motion._next(kept.tolist()).steering < motion.state.steering
+    assert simulator.motion_of("ego", kept).speed_mps == pytest.approx(motion.state.speed - 0.2, abs=1e-6)
