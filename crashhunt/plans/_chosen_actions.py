@@ -9,7 +9,7 @@ from crashhunt.base.text import one_of
 from crashhunt.scenario import ACTIONS, canonical_action, check_action, is_action_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Signature
@@ -42,6 +42,22 @@ def chosen_actions(asked: str, scenario: Scenario, signatures: Mapping[str, Sign
             found[agent] = signature.action
         check_action(found.get(agent, setup.action), signature.actions, setup.agent)
     return found
+
+
+def refuse_late_plans(scenario: Scenario, kinds: Iterable[str]) -> None:
+    """Refuse late actions of agents that return plans: a plan is relative to the step in which it is returned.
+
+    Args:
+        scenario: scenario with its agents.
+        kinds: kinds of the disturbances.
+
+    Raises:
+        UsageError: the actions of an agent are plans, and a disturbance delays them.
+    """
+    for agent, setup in scenario.agents.items():
+        if setup.action_form in ("trajectory", "target_pose") and "late_action" in kinds:
+            message = f"--disturb late_action: {agent} returns a {setup.action_form}, which cannot be delayed"
+            raise UsageError(message, fix="omit late_action, or give --action acceleration_steering")
 
 
 def notes_on_actions(scenario: Scenario, signatures: Mapping[str, Signature]) -> Iterator[str]:

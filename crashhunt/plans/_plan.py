@@ -22,7 +22,7 @@ from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import ModelApart, disturber_of, locate_model, parse_fixed, parse_rates, word_of
 from crashhunt.native import HOW_TO_REBUILD, outdated_modules
 from crashhunt.oracles import ORACLES_OF_ACTORS, chosen_oracles, oracle_name, outcomes_brought
-from crashhunt.plans._chosen_actions import chosen_actions, notes_on_actions
+from crashhunt.plans._chosen_actions import chosen_actions, notes_on_actions, refuse_late_plans
 from crashhunt.plans._chosen_observations import chosen_observations
 from crashhunt.plans._chosen_requirements import chosen_requirements
 from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code
@@ -359,6 +359,9 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     scenario = _with_notes_on_crashes(_with_notes(scenario, request.run), settings, request, code.oracles)
     notes = (*code.notes, *_notes_on_statistics(settings, signatures), *notes_on_actions(scenario, signatures))
     scenario = replace(scenario, notes=(*scenario.notes, *notes))
+    refuse_late_plans(
+        scenario, [*parse_rates(disturb), *(one.what for one in parse_fixed(disturb, tuple(scenario.agents)))]
+    )
     find = partial(_model_apart, code, request.run.timeout_s)
     with _name_scenario_in_errors(request, scenario):
         disturber(scenario, settings.disturb, tuple(settings.agents), find=find)  # it refuses what cannot be meant

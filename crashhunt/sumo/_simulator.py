@@ -317,7 +317,8 @@ class SumoSimulator:
         setup, form = self._scenario.agents[agent], self._forms[agent]
         if motion := self._driving.moving.get(agent):
             most = motion.model.max_deceleration
-            return FullBraking(motion.brake(), "the maximum of its vehicle type, in its lane", most, motion.brake)
+            how = "the maximum of its vehicle type, in its lane"
+            return FullBraking(motion.brake(), how, deceleration=most, choose=motion.brake)
         if form == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
         action = (-MAX_ACCELERATION if form == "acceleration" else 0.0, 0)

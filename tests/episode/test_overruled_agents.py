@@ -11,7 +11,7 @@ from crashhunt import recording
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.episode import overruled_agent
 from crashhunt.episode._action_override import HandedOver
-from crashhunt.simulators import MetaAction, SpeedAndLaneChange, action_form
+from crashhunt.simulators import FullBraking, MetaAction, SpeedAndLaneChange, action_form
 from crashhunt.trial import Handover, Overruled
 
 WORDS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
@@ -41,7 +41,7 @@ class Lanes:
         self.actions = {"ego": form or SpeedAndLaneChange()}
         self.speed = 7.5
         if brakes:
-            self.full_braking = lambda agent: SimpleNamespace(action=brakes) if agent == "ego" else None
+            self.full_braking = lambda agent: FullBraking(brakes, "fully") if agent == "ego" else None
 
     def scene(self):
         roster = SimpleNamespace(index={"other": 0, "ego": 1})

@@ -69,6 +69,11 @@ def test_agent_without_a_declaration_leaves_the_settings_as_they_are():
         ("Strict", {"scenario": "motorway"}, "acceleration or sumo, not meta"),
         ("Other", {}, "the attribute action of acting_agents:Other is 'teleport'"),
         ("crashhunt.agents:CarFollowing", {"action": "acceleration"}, "speed_and_lane or meta, not acceleration"),
+        (
+            "Busy",
+            {"action": "trajectory", "disturb": ("late_action=0.1",)},
+            "ego returns a trajectory, which cannot be",
+        ),
     ],
 )
 def test_form_that_an_agent_cannot_return_is_refused_before_the_first_trial(agent, options, message):
