@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, NamedTuple
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_of
 from crashhunt.guide._reference import (
+    describe_actions,
     describe_api,
     describe_commands,
     describe_json,
     describe_keys,
     describe_modules,
+    describe_observations,
     describe_signals,
 )
 
@@ -187,6 +189,8 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
         "json": describe_json,
         "keys": describe_keys,
         "modules": describe_modules,
+        "observations": describe_observations,
+        "actions": describe_actions,
         "signals": describe_signals,
     }
     # Remove the text that follows a placeholder for readers of the raw file, up to the next blank line.

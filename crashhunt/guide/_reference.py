@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from crashhunt.base.codec import JsonObject
+    from crashhunt.report import ListingEntry
 
 
 _PUBLIC_MODULES = {
@@ -445,6 +446,41 @@ def describe_signals() -> str:
     rows = [f"| `{name}` | {unit} | {MEANINGS[name]} |" for name, unit in UNITS.items()]
     rows += [f"| `{kind}` | | true in the steps with this event: {words[0]} |" for kind, words in EVENT_WORDS.items()]
     return "\n".join(["| signal | unit | meaning |", "| --- | --- | --- |", *rows]) + "\n"
+
+
+def describe_observations() -> str:
+    """Return the parts of observations with their columns and settings, as Markdown."""
+    from crashhunt.report import list_observations  # it imports the descriptors of simulators
+
+    return "\n".join(_described_entries(list_observations()))
+
+
+def describe_actions() -> str:
+    """Return the forms of actions with their components, as Markdown."""
+    from crashhunt.report import list_actions
+
+    return "\n".join(_described_entries(list_actions()))
+
+
+def _described_entries(entries: Iterable[ListingEntry]) -> Iterator[str]:
+    """Yield a section for each observation or action: its title, its shape, and tables of values and settings."""
+    for entry in entries:
+        where = entry["locator"] if "shape" in entry else f"`{entry['locator']}`"
+        yield f"### {entry['name']}\n\n{_plain(entry['title'])}\n"
+        shape = entry.get("shape")
+        yield f"{f'Simulators: {where}.' if 'shape' in entry else where}{f' Shape: {tuple(shape)}.' if shape else ''}\n"
+        if components := entry.get("components"):
+            yield "| column | unit | range | meaning |\n| --- | --- | --- | --- |"
+            for one in components:
+                limits = one["range"].replace("|", "\\|")
+                yield f"| `{one['name']}` | {one['unit']} | {limits} | {_plain(one['help'])} |"
+            yield ""
+        if "shape" in entry and entry["arguments"]:
+            yield "| setting | unit | range | default | meaning |\n| --- | --- | --- | --- | --- |"
+            for given in entry["arguments"]:
+                facts = given["unit"], given["range"], given["default"], given["help"]
+                yield f"| `{given['name']}` | {' | '.join(map(str, facts))} |"
+            yield ""
 
 
 def describe_modules() -> str:

@@ -104,9 +104,9 @@ class AgentSetup:
         action: form of the actions, a name that ``crashhunt list actions`` shows; by default the form that the class
             of the agent declares, or else ``speed_and_lane``.
         target_speeds: the target speeds that the actions FASTER and SLOWER of ``meta`` select in order, in m/s.
-        observation: parts that the agent observes, such as ``ego`` or ``actors:rows=8``, as `crashhunt list
-            observations` lists them; without them, the agent's class chooses the parts, or the agent observes the
-            table ``[observation]``.
+        observation: parts that the agent observes, such as ``ego`` or ``actors:rows=8``; ``crashhunt list
+            observations`` prints all parts. Without this key, the agent's class chooses the parts, or else the agent
+            observes Kinematics.
         speed_mode: SUMO's speed mode bits; 6 keeps physical limits and ignores the safe speed.
         arguments: the arguments of the agent that the scenario describes.
     """

@@ -183,7 +183,7 @@ class Kinematics:
 
 
 class HidesActors(Protocol):
-    """An object that makes observations, and that can leave out actors."""
+    """An object that makes observations, and that can omit actors."""
 
     hidden: set[tuple[str, str]]
     """Pairs of identifiers: an agent, and an actor that this agent does not see."""

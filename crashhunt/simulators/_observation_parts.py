@@ -414,7 +414,7 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
 
     Args:
         words: One word per part: its name, and its settings as ``:NAME=VALUE``, such as ``actors:rows=8:radius=50``;
-            or only `KINEMATICS`. The word `HISTORY` is checked and left out.
+            or only `KINEMATICS`. The word `HISTORY` is checked, but not returned.
         available: Names of the parts that the simulator has.
         where: The option or key that contains the words, for messages.
 

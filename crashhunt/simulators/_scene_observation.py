@@ -162,8 +162,8 @@ class _Motion:
 def bicycle_steering(yaw_rate: float, speed: float, length: float) -> float:
     """Return the steering angle with which a kinematic bicycle model turns as a vehicle does, in rad.
 
-    The model is that of `BicycleModel`: with the steering angle δ and the wheelbase L, the yaw rate is the speed times
-    t / √(1 + t² / 4) / L, where t = tan(δ). The result is 0 at a standstill.
+    The model is that of `BicycleModel`. Let δ be the steering angle, t = tan(δ), and L the wheelbase. Then the yaw rate
+    is the speed times t / √(1 + t² / 4) / L. The result is 0 at a standstill.
     """
     bend = yaw_rate * WHEELBASE_SHARE * length / speed if speed > 0.0 else 0.0
     if abs(bend) >= _MAX_BEND:

@@ -53,7 +53,14 @@ def _contents() -> list[str]:
 
 def _always_read(*_: object) -> list[str]:
     """The pages of which the code makes a part, which may have changed although the file has not."""
-    return ["index", "reference/api", "reference/commands", "reference/json", "reference/toml"]
+    return [
+        "index",
+        "reference/api",
+        "reference/commands",
+        "reference/json",
+        "reference/observations-and-actions",
+        "reference/toml",
+    ]
 
 
 def setup(app: Any) -> None:
