@@ -64,6 +64,15 @@ class AgentChannel(Serializable):
     observation_names: tuple[str, ...] = ()
     observation_parts: tuple[ObservedPart, ...] = field(default=(), metadata=OMIT_DEFAULT)
 
+    def part(self, name: str, observation: NDArray[Any]) -> NDArray[Any] | None:
+        """Return a part of a recorded observation; None if the observation has no such part."""
+        begin = 0
+        for part in self.observation_parts:
+            if part.name == name:
+                return observation[begin : begin + part.size].reshape(part.shape)
+            begin += part.size
+        return None
+
     def values_by_name(self, observation: NDArray[Any]) -> dict[str, float]:
         """Return the first values of an observation with their names: the agent's own row, as text for users.
 
