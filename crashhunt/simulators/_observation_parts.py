@@ -312,6 +312,17 @@ PARTS: Mapping[str, Part] = {
             measured=("other_distance", "other_speed", "other_arrival"),
         ),
         Part(
+            name="stop_line",
+            meaning="the stop line of the next junction on the route",
+            columns=(
+                _PRESENT,
+                _distance("distance", "distance of the front bumper to the stop line, negative inside the junction"),
+                _flag("must_yield", "1 if the rules of the junction name a stream to yield to"),
+                _flag("stop_sign", "1 if the controlled vehicle must stop at the stop line"),
+                _flag("signal", "1 if a traffic light controls the lane"),
+            ),
+        ),
+        Part(
             name="speed_limit",
             meaning="speed limit of the controlled vehicle's lane",
             columns=(Column("speed_limit", "m/s", 0.0, _SPEED_MPS, "speed limit of the lane for this vehicle"),),

@@ -184,6 +184,7 @@ BACKEND: Backend = Backend(
         "route_state",
         "signals",
         "right_of_way",
+        "stop_line",
         "speed_limit",
         "predictions",
         "lidar2d",

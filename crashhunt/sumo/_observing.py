@@ -17,6 +17,7 @@ from crashhunt.sumo._road_readers import (
     RouteStateReader,
     SignalsReader,
     SpeedLimitReader,
+    StopLineReader,
 )
 from crashhunt.sumo._scene_readers import GridReader, ImageReader, PredictionsReader, RangesReader
 
@@ -43,6 +44,7 @@ READERS: Mapping[str, type[Reader]] = {
     "route_state": RouteStateReader,
     "signals": SignalsReader,
     "speed_limit": SpeedLimitReader,
+    "stop_line": StopLineReader,
 }
 """The reader of each part, by name of the part; these are the parts that SUMO has."""
 

@@ -434,6 +434,28 @@ def path_across(place: Place) -> tuple[LaneLink, float] | None:
     return entry, -(entry.length_m - link.length_m - lane.data.length_m) - place.position_m
 
 
+class StopLineReader:
+    """Reads the stop line of the next junction.
+
+    Args:
+        setup: The part and the vehicle.
+    """
+
+    def __init__(self, setup: ReaderSetup) -> None:
+        self._setup = setup
+
+    def observe(self, moment: Moment) -> Array:
+        """Return the columns of ``stop_line``."""
+        place = self._setup.places.find(moment)
+        path = path_across(place) if place is not None else None
+        if path is None:
+            return np.zeros(self._setup.shape)
+        link, line = path
+        around = self._setup.conflicts.around(link)
+        yields = any(one.conflict.must_yield for approaches in around.values() for one in approaches)
+        return np.array((1.0, line, yields, link.state in _STOP_STATES, bool(link.signal)), float)
+
+
 class SpeedLimitReader:
     """Reads the speed limit of the controlled vehicle's lane.
 
