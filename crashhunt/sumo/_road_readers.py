@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 _NEAR_M = 50.0  # lanes are shown within this distance
-_SQUARE_M = 8.0  # within squares of this size, the same lanes are candidates
-_WINDOW_M = 16.0  # within a square, the nearest point of a lane moves less along the lane
+_SQUARE_M = 16.0  # within squares of this size, the same lanes are candidates
+_WINDOW_M = 24.0  # within a square, the nearest point of a lane moves less along the lane
 _STANDING_MPS, NEVER_S = 0.1, 1000.0  # an actor that stands arrives after this time
 _STATES = {"G": 0.0, "g": 0.0, "y": 1.0, "Y": 1.0, "r": 2.0, "R": 2.0, "u": 2.0, "s": 2.0, "o": 3.0, "O": 3.0}
 _OFF = 3.0
@@ -70,17 +70,22 @@ class LanesReader:
         if key != self._key:
             self._key, self._block = key, self._made(place, square)
         block = self._block
-        squared = (block.x - place.x) ** 2 + (block.y - place.y) ** 2
+        # The squared distances, except for a term that all points have in common.
+        squared = block.x * (-2.0 * (place.x - block.middle_x))
+        squared += block.y * (-2.0 * (place.y - block.middle_y))
+        squared += block.squared
         nearest = squared.argmin(axis=1)
-        chosen = block.fixed
-        if len(nearest) > 3 and self._lanes > 3:
-            best = squared[3:].min(axis=1)
-            order = np.argsort(best, kind="stable")[: self._lanes - 3]
-            chosen = np.append(chosen, 3 + order[best[order] <= _NEAR_M * _NEAR_M])
-        rows = (block.begin + nearest)[chosen][:, None] + self._steps
-        rows = np.where((rows >= block.low[chosen][:, None]) & (rows < block.high[chosen][:, None]), rows, 0)
+        limit = _NEAR_M * _NEAR_M - (place.x - block.middle_x) ** 2 - (place.y - block.middle_y) ** 2
+        chosen = list(range(min(3, self._lanes)))
+        if self._lanes > 3:
+            best = squared[3:].min(axis=1).tolist()
+            others = sorted(range(len(best)), key=best.__getitem__)[: self._lanes - 3]
+            chosen += [3 + one for one in others if best[one] <= limit]
+        rows = (block.begin + nearest)[chosen, None] + self._steps
+        np.maximum(rows, block.low[chosen], out=rows)
+        np.minimum(rows, block.high[chosen], out=rows)
         found = np.zeros(self._setup.shape)
-        found[: len(chosen)] = block.rows[rows]
+        block.rows.take(rows, axis=0, out=found[: len(chosen)], mode="clip")
         return found
 
     def _made(self, place: Place, square: tuple[int, int]) -> _Block:
@@ -141,13 +146,15 @@ class _Block(NamedTuple):
     """The candidates of the lanes around a square, with the own lane, the left and the right lane first.
 
     Args:
-        rows: points of all lanes; row 0 is empty.
-        low: first row of each lane.
-        high: row behind the last row of each lane.
+        rows: points of all lanes, with an empty row before and behind each lane.
+        low: the empty row before each lane, shape (lanes, 1).
+        high: the empty row behind each lane, shape (lanes, 1).
         begin: first row of the window of each lane, in which the nearest point is.
-        x: x of the points in the windows, shape (lanes, points).
-        y: y of the points in the windows.
-        fixed: indices of the first three lanes.
+        x: x of the points in the windows, from the middle of the square, shape (lanes, points).
+        y: y of the points in the windows, from the middle of the square.
+        squared: squared distance of these points from the middle of the square.
+        middle_x: x of the middle of the square.
+        middle_y: y of the middle of the square.
     """
 
     rows: Array
@@ -156,34 +163,36 @@ class _Block(NamedTuple):
     begin: NDArray[np.intp]
     x: Array
     y: Array
-    fixed: NDArray[np.intp]
+    squared: Array
+    middle_x: float
+    middle_y: float
 
 
-def _block_of(paths: list[LanePath | None], x: float, y: float, window: NDArray[np.intp]) -> _Block:
-    parts: list[Array] = [np.zeros((1, 6))]
-    low: list[int] = []
-    high: list[int] = []
-    begin: list[int] = []
+_EMPTY = np.zeros((1, 6))
+
+
+def _block_of(paths: list[LanePath | None], middle_x: float, middle_y: float, window: NDArray[np.intp]) -> _Block:
+    parts: list[Array] = [_EMPTY]
+    places = np.zeros((len(paths), 4), np.intp)  # low, high, begin, last row of the window
     total = 1
     for number, path in enumerate(paths):
         if path is None:
-            for empty in (low, high, begin):
-                empty.append(0)
             continue
         start = path.first if number > 2 else path.begin
         own = path.rows[start : path.last + 1]
-        nearest = start + int(np.argmin((own[:, 1] - x) ** 2 + (own[:, 2] - y) ** 2))
-        low.append(total)
-        parts.append(path.rows[:, :6])
-        total += len(path.rows)
-        high.append(total)
+        nearest = start + int(((own[:, 1] - middle_x) ** 2 + (own[:, 2] - middle_y) ** 2).argmin())
         first = max(start, min(nearest - len(window) // 2, path.last + 1 - len(window)))
-        begin.append(low[-1] + first)
+        parts += (path.rows[:, :6], _EMPTY)
+        places[number] = total - 1, total + len(path.rows), total + first, total + path.last
+        total += len(path.rows) + 1
     rows = np.concatenate(parts)
-    index = np.array(begin)[:, None] + window
-    last = [0 if path is None else start + path.last for path, start in zip(paths, low, strict=True)]
-    index = np.minimum(index, np.array(last)[:, None])
-    return _Block(rows, np.array(low), np.array(high), np.array(begin), rows[index, 1], rows[index, 2], np.arange(3))
+    low, high, begin, last = places.T
+    index = np.minimum(begin[:, None] + window, last[:, None])
+    x, y = rows[index, 1] - middle_x, rows[index, 2] - middle_y
+    return _Block(
+        rows=rows, low=low[:, None], high=high[:, None], begin=begin, x=x, y=y, squared=x * x + y * y,
+        middle_x=middle_x, middle_y=middle_y,
+    )  # fmt: skip
 
 
 class RouteReader:
