@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 # The panels that every film has.
 
 _SHOWN_S = 10.0  # of the built-in curves
-_WITH_OTHER = ("time to collision s", "gap m", "speed m/s", "action")
-_WITH_NEAREST = ("least time to collision s", "nearest gap m", "speed m/s", "action")  # a crash without a partner
+_WITH_OTHER = ("time to collision (s)", "gap (m)", "speed (m/s)", "action")
+_WITH_NEAREST = ("least time to collision (s)", "nearest gap (m)", "speed (m/s)", "action")  # a crash without a partner
 _PANELS_WITHOUT_SCENE = ("reward", "action")
 
 
@@ -96,6 +96,10 @@ class BuiltinPanels:
         spread = np.array(taken).reshape(len(taken), -1) if taken else np.zeros((1, 1))
         # The bounds are not recorded; what was decided in the whole episode says enough.
         self._low, self._high = np.minimum(spread.min(axis=0), 0.0), np.maximum(spread.max(axis=0), 1.0)
+        # A value with two directions, such as a lane change to the left or right, has its 0 in the middle.
+        has_sides = (self._low < 0) | np.isin(self._names or [""] * len(self._low), ["lane_change"])
+        self._low = np.where(has_sides, -np.maximum(-self._low, self._high), self._low)
+        self._high = np.where(has_sides, -self._low, self._high)
 
     def panels(self, step: int) -> list[tuple[str, Panel]]:
         """Return each panel with its label."""

@@ -22,8 +22,11 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 _SKY, _ROAD, _MARK = (246, 247, 249), (228, 232, 237), (170, 180, 192)
-_EGO, _CRASH, _AGENT, _OTHER = (224, 138, 0), (198, 40, 40), (46, 158, 91), (125, 139, 156)
+# The contrast of the agent and its collision partner is that of the report.
+_EGO, _PARTNER, _AGENT, _OTHER = (255, 179, 26), (143, 15, 63), (46, 158, 91), (154, 165, 179)
+_CRASH = (198, 40, 40)
 _DISTURBANCE_COLOR = (128, 62, 158)
+_POINTS_PER_EDGE = 40  # of the outline of an actor
 _TRAIL_S = 4.0  # of where the agent has been
 _PERSON_PIXELS = 4  # radius at least; a person is 20 cm long
 _OVERSAMPLING = 2  # drawn so many times larger, for smooth edges
@@ -91,7 +94,7 @@ class SceneView:
         image = Image.new("RGB", size, _SKY)
         draw = ImageDraw.Draw(image)
         self._draw_road(draw)
-        for name, color in ((self._other, _CRASH), (self._agent, _EGO)):
+        for name, color in ((self._other, _PARTNER), (self._agent, _EGO)):
             self._draw_trail(draw, name, color, step)
         order = range(len(scene.roster))
         for other in sorted(order, key=scene.heights.__getitem__) if scene.heights else order:
@@ -99,12 +102,23 @@ class SceneView:
         for one in self._active_disturbances(step):
             self._ring(draw, scene, one.vehicle)
         if self._marked(step) and row is not None:
-            x, y = self._to_pixels(np.array([scene.points[row]]))[0]
+            x, y = self._to_pixels(self._contact(scene, row, step)[np.newaxis])[0]
             for radius in (34, 38):
                 draw.ellipse((x - radius, y - radius, x + radius, y + radius), outline=_CRASH, width=3)
         smooth = image.reduce(_OVERSAMPLING)
         self._label(ImageDraw.Draw(smooth), scene, step, row)
         return as_array(smooth)
+
+    def _contact(self, scene: Scene, row: int, step: int) -> NDArray[np.float64]:
+        """Return the position to mark: where the outlines of the two actors are closest, or the front of the agent."""
+        other = scene.roster.index.get(self._other)
+        if step != self._crash_step or other is None:
+            return np.array(scene.points[row])
+        first, second = (_along(corners(scene, one)) for one in (row, other))
+        apart = np.linalg.norm(first[:, np.newaxis] - second[np.newaxis], axis=2)
+        one, two = np.unravel_index(apart.argmin(), apart.shape)
+        middle: NDArray[np.float64] = (first[one] + second[two]) / 2
+        return middle
 
     def _marked(self, step: int) -> str:
         """Return the text above a marked step; empty if the step is not marked."""
@@ -184,7 +198,7 @@ class SceneView:
         if name == self._agent:
             return _EGO
         if name == self._other:
-            return _CRASH
+            return _PARTNER
         return _AGENT if name in self._agents else _OTHER
 
     def _label(self, draw: ImageDraw.ImageDraw, scene: Scene, step: int, row: int | None) -> None:
@@ -227,7 +241,7 @@ class SceneView:
 
     def _legend(self, draw: ImageDraw.ImageDraw, step: int) -> None:
         """Write the names of vehicles with their colours, and active disturbances, down to the scale of the picture."""
-        names = [(self._agent, _EGO), (self._other, _CRASH)]
+        names = [(self._agent, _EGO), (self._other, _PARTNER)]
         names += [(name, _AGENT) for name in sorted(self._agents - {self._agent, self._other})]
         names = [(name, color) for name, color in names if name]
         margin = self._pixels(12)
@@ -267,6 +281,13 @@ class SceneView:
 
     def _font(self, full: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
         return font(max(_MIN_FONT_PIXELS, round(full * self._shrink)))
+
+
+def _along(outline: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points along the edges of an outline, about 10 cm apart on a car."""
+    shares = np.linspace(0.0, 1.0, _POINTS_PER_EDGE, endpoint=False)[:, np.newaxis]
+    edges = zip(outline, np.roll(outline, -1, axis=0), strict=True)
+    return np.concatenate([start + shares * (end - start) for start, end in edges])
 
 
 def _box(right: NDArray[np.float64], left: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -118,7 +118,7 @@ function show(crash, rows) {
   crash.rows ??= rowsOf(crash);
   $("plot").style.height = `${HEAD + crash.rows.length * ROW + BELOW}px`;
   $("avoidable").hidden = $("avoidable-words").hidden = !crash.avoidable;
-  $("avoidable-words").textContent = crash.avoidable ? `Last avoidable step: ${crash.avoidable[0]}. A run from this step avoids the crash, in which ${crash.agent} ${crash.avoidable[1]}.` : "";
+  $("avoidable-words").textContent = crash.avoidable ? `Last avoidable step: ${crash.avoidable[0]}. A run from this step avoids the crash, in which ${crash.agent} ${crash.avoidable[1]}.${crash.avoidable[2] ? ` After it, the dashed outline shows where braking at ${crash.avoidable[2].toFixed(1)} m/s² leads (a calculation).` : ""}` : "";
   fitEncounter();
   go(begin(crash));
   pause();
@@ -167,6 +167,33 @@ function accelerationOf(step, actor) {
   return now && before ? (now[3] - before[3]) / view.crash.dt : NaN;
 }
 const SLOWS_DOWN = -0.5;  // m/s²
+
+/* Where the outlines of the agent and its collision partner are closest; null where one of them is not there. */
+function contactPoint(step) {
+  const crash = view.crash, COUNT = 40;
+  const outline = (actor) => {
+    const pose = actor < 0 || crash.nearest !== null ? null : state(step, actor);
+    if (!pose) return null;
+    const [, , length, breadth] = crash.actors[actor], [x, y, heading] = pose, points = [];
+    const corners = [[0, breadth / 2], [-length, breadth / 2], [-length, -breadth / 2], [0, -breadth / 2]];
+    corners.forEach(([ahead, left], place) => {
+      const [nextAhead, nextLeft] = corners[(place + 1) % 4];
+      for (let part = 0; part < COUNT; part++) {
+        const along = ahead + ((nextAhead - ahead) * part) / COUNT, across = left + ((nextLeft - left) * part) / COUNT;
+        points.push([x + along * Math.cos(heading) - across * Math.sin(heading), y + along * Math.sin(heading) + across * Math.cos(heading)]);
+      }
+    });
+    return points;
+  };
+  const own = outline(view.agent), its = outline(view.other);
+  if (!own || !its) return null;
+  let least = Infinity, found = null;
+  for (const a of own) for (const b of its) {
+    const apart = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2;
+    if (apart < least) [least, found] = [apart, [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2]];
+  }
+  return found;
+}
 
 /* Words with a halo, which can be read on any ground. */
 function label(context, text, x, y) {
@@ -266,7 +293,8 @@ function drawScene() {
     context.strokeStyle = css("--crash");
     context.lineWidth = 2.5;
     context.beginPath();
-    context.arc(width / 2 + (own[0] - view.x) * view.scale, height / 2 - (own[1] - view.y) * view.scale, 18, 0, 7);
+    const [x, y] = contactPoint(view.step) ?? own;
+    context.arc(width / 2 + (x - view.x) * view.scale, height / 2 - (y - view.y) * view.scale, 18, 0, 7);
     context.stroke();
   }
   if (!crash.actors.length) {
@@ -508,7 +536,6 @@ function valuesAt(crash, step) {
 
 function showNow() {
   const crash = view.crash, parts = [["step", `${view.step} of ${crash.steps - 1}`], ...valuesAt(crash, view.step)];
-  if (ghostOf(view.step)) parts.push(["dashed", `calculated: ${crash.agent} brakes at ${crash.avoidable[2].toFixed(1)} m/s² from step ${crash.avoidable[0]} on`]);
   $("now").replaceChildren(...parts.map(([name, value]) => {
     const span = make("span", `${name} `, "faint");
     span.append(make("b", value));

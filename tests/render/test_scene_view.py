@@ -17,9 +17,10 @@ from crashhunt.render import FilmOptions, Shot, frames
 from crashhunt.render._film import _steps, shown_steps
 from crashhunt.render._panel_drawing import BuiltinPanels, save_panels
 from crashhunt.render._scene_from_above import SceneView
-from crashhunt.world import PERSON, Actor, Roster, Scene
+from crashhunt.world import PERSON, Actor, Roster, Scene, corners
 
-EGO, CRASH, AGENT, OTHER, MARK = (224, 138, 0), (198, 40, 40), (46, 158, 91), (125, 139, 156), (170, 180, 192)
+EGO, PARTNER, AGENT, OTHER, MARK = (255, 179, 26), (143, 15, 63), (46, 158, 91), (154, 165, 179), (170, 180, 192)
+CRASH = (198, 40, 40)
 WIDTH, HEIGHT, SCALE = 400, 300, 8.0
 MIDDLE = np.array([WIDTH / 2, HEIGHT / 2])
 
@@ -80,7 +81,7 @@ def test_others_are_where_they_are_relative_to_the_agent_north_up():
     places = {"ego": (2.5, 0.0, 0.0, 5.0), "other": (16.0, 8.0, 0.0, 5.0), "b": (-9.5, -6.0, 0.0, 5.0)}
     found = recording(places, actors=[CAR, TRUCK, Actor("b", "passenger", 5.0, 2.0)], agents=("ego", "b"))
     picture = view(found, other="other").draw(0)
-    for color, middle, size in ((CRASH, (10.0, 8.0), (12.0, 2.5)), (AGENT, (-12.0, -6.0), (5.0, 2.0))):
+    for color, middle, size in ((PARTNER, (10.0, 8.0), (12.0, 2.5)), (AGENT, (-12.0, -6.0), (5.0, 2.0))):
         at, extent = box(picture, color)
         assert (at - MIDDLE) / SCALE == pytest.approx((middle[0], -middle[1]), abs=0.2)
         assert extent / SCALE == pytest.approx(size, abs=0.3)
@@ -196,10 +197,45 @@ def test_panels_show_time_to_collision_gap_and_speed_of_the_last_seconds(other):
         (action,) = [panel for panel in panels.values() if isinstance(panel, Action)]
         assert action.value == pytest.approx([3.0 - step, 0.5])
         assert action.low == pytest.approx([-117.0, 0.0])
-        assert action.high == pytest.approx([2.0, 1.0])
+        assert action.high == pytest.approx([117.0, 1.0])  # with two directions, 0 is in the middle
     assert len(dict(builtin_panels(shot).panels(0))) == 3  # nothing has been decided yet
     beginning = dict(builtin_panels(following(other=other, steps=5)).panels(2))
     assert max(next(iter(beginning.values())).series) <= 10.0
+
+
+def test_lane_change_of_0_is_in_the_middle_of_its_axis():
+    found = following(steps=4).recording
+    channel = SimpleNamespace(id="ego", action_names=("target_speed", "lane_change"), action_shape=(2,))
+    found.prologue = SimpleNamespace(agents=(channel,), step_length_s=0.1)
+    panels = BuiltinPanels(found, agent="ego", other="")
+    assert (panels._low[1], panels._high[1]) == (-1.0, 1.0)
+
+
+def test_ring_of_a_crash_is_where_the_outlines_meet():
+    # ego, 5 m long and 2 m wide, drives east and touches with its left front corner a truck that crosses ahead.
+    step = {"ego": (2.5, 0.0, 0.0, 10.0), "other": (4.0, 0.9, -np.pi / 2, 5.0)}
+    found = recording(step, step, actors=[CAR, TRUCK])
+    picture = view(found, width=400, height=400, crash_step=1, other="other").draw(1)
+    apart = np.abs(picture.astype(int) - CRASH).max(axis=2)
+    apart[:60] = 255  # the word above
+    rows, columns = np.nonzero(apart < 40)
+    scene = found.scene(1)
+    expected = _nearest_middle(*(np.array(corners(scene, scene.roster.index[name])) for name in ("ego", "other")))
+    offset = (expected - scene.centers[scene.roster.index["ego"]]) * 8.0
+    assert (columns.min() + columns.max()) / 2 == pytest.approx(200 + offset[0], abs=1.5)
+    assert (rows.min() + rows.max()) / 2 == pytest.approx(200 - offset[1], abs=1.5)
+
+
+def _nearest_middle(first, second):
+    """Return the middle between the closest points of two convex outlines, by their vertices and edges."""
+    best = (np.inf, None)
+    for one, other in ((first, second), (second, first)):
+        for vertex in one:
+            for start, end in zip(other, np.roll(other, -1, axis=0), strict=True):
+                share = np.clip(np.dot(vertex - start, end - start) / np.dot(end - start, end - start), 0, 1)
+                near = start + share * (end - start)
+                best = min(best, (np.linalg.norm(vertex - near), (vertex + near) / 2), key=lambda each: each[0])
+    return best[1]
 
 
 def test_a_film_has_its_panels_next_to_the_scene_in_every_picture():
