@@ -118,9 +118,9 @@ class Conflicts:
         for inside in link.inside:
             yield inside, Approach(conflict, offset, edges, -1)
             offset += graph.length(inside)
-        for beside in graph.edges[source.edge]:
-            if beside is source or not any(graph.lanes[one.target].edge == edges[1] for one in beside.links):
-                yield beside.id, Approach(conflict, -beside.data.length_m, edges, 0)
+        for neighbor in graph.edges[source.edge]:
+            if neighbor is source or not any(graph.lanes[one.target].edge == edges[1] for one in neighbor.links):
+                yield neighbor.id, Approach(conflict, -neighbor.data.length_m, edges, 0)
         # Edges further upstream, each with the shortest distance.
         waiting, known = [(source, -source.data.length_m, 0)], {source.edge}
         while waiting:
@@ -133,8 +133,8 @@ class Conflicts:
                     yield inside, Approach(conflict, place, edges, back + 1)
                 if before.edge not in known:
                     known.add(before.edge)
-                    for beside in graph.edges[before.edge]:
-                        yield beside.id, Approach(conflict, place - beside.data.length_m, edges, back + 1)
+                    for neighbor in graph.edges[before.edge]:
+                        yield neighbor.id, Approach(conflict, place - neighbor.data.length_m, edges, back + 1)
                     waiting.append((before, place - before.data.length_m, back + 1))
 
     def _area(self, own: tuple[str, ...], other: tuple[str, ...]) -> tuple[float, float, float, float] | None:

@@ -171,7 +171,7 @@ class LaneGraph:
         """Return the lanes of an edge that a class of vehicles may use."""
         return [lane for lane in self.edges.get(edge, ()) if is_open(lane.data, vehicle_class)]
 
-    def beside(self, lane: GraphLane, change: int) -> GraphLane | None:
+    def neighbor(self, lane: GraphLane, change: int) -> GraphLane | None:
         """Return the neighbouring lane to the left (1) or to the right (-1); None if there is none."""
         index = lane.index + (-change if self.is_left_hand else change)
         lanes = self.edges[lane.edge]
@@ -179,7 +179,7 @@ class LaneGraph:
 
     def may_change(self, lane: GraphLane, change: int, vehicle_class: str) -> bool:
         """Return whether a class of vehicles may change to the left (1) or right (-1), by the lanes and the marking."""
-        other = self.beside(lane, change)
+        other = self.neighbor(lane, change)
         if other is None or not is_open(other.data, vehicle_class):
             return False
         allowed = lane.data.change_up if other.index > lane.index else lane.data.change_down
@@ -204,7 +204,7 @@ class LaneGraph:
         return found
 
     def _map_lane(self, lane: GraphLane, vehicle_class: str, predecessors: Iterable[str]) -> MapLane:
-        left, right = self.beside(lane, 1), self.beside(lane, -1)
+        left, right = self.neighbor(lane, 1), self.neighbor(lane, -1)
         lines, data = self.lines(lane), lane.data
         return MapLane(
             id=lane.id, road=lane.edge, index=lane.index,
@@ -365,8 +365,8 @@ class RouteStep(NamedTuple):
 class RouteGuide:
     """A route on the graph: which lanes to use, and what lies ahead.
 
-    Where several lanes lead along the route, the best lanes are those with which the route can be followed furthest
-    without a lane change; of these, those with which the fewest changes follow.
+    The best lanes of a road are those on which the route can be followed furthest without a lane change. Of these, the
+    lanes with the fewest lane changes behind them are the best.
 
     Args:
         graph: the graph.

@@ -104,7 +104,7 @@ class LanePaths:
         points = np.concatenate(centers)
         owner = np.repeat(np.arange(len(lanes)), [len(center) for center in centers])
         gaps = np.hypot(*np.diff(points, axis=0).T)
-        gaps[np.diff(owner) != 0] = 0.0  # a lane change, where the route leads to a lane beside
+        gaps[np.diff(owner) != 0] = 0.0  # a lane change on the route
         along = np.append(0.0, np.cumsum(gaps))
         start = float(along[np.searchsorted(owner, len(before))])
         end = float(along[np.searchsorted(owner, len(before), side="right") - 1])

@@ -92,11 +92,11 @@ class LanesReader:
         graph, places, lane = self._graph, self._setup.places, place.lane
         own = self._own_paths(place)
         around: list[LanePath | None] = [own.path(lane)]
-        beside = []
+        sides = []
         for change in (1, -1):
-            other = graph.beside(lane, change)
+            other = graph.neighbor(lane, change)
             is_usable = other is not None and is_open(other.data, places.vehicle_class)
-            beside.append(other if is_usable else None)
+            sides.append(other if is_usable else None)
             around.append(own.path(other) if other is not None and is_usable else None)
         if self._others is None:
             vehicle_class = places.vehicle_class
@@ -109,7 +109,7 @@ class LanesReader:
         x, y = ((number + 0.5) * _SQUARE_M for number in square)
         reach = _NEAR_M + _SQUARE_M
         near = graph.near(x, y, reach, places.vehicle_class) if self._lanes > 3 else []
-        taken = {one.id for one in (lane, *beside) if one is not None}
+        taken = {one.id for one in (lane, *sides) if one is not None}
         near = [one for one in near if one[1] not in taken]
         limit = near[min(len(near), self._lanes - 3) - 1][0] + 2 * _SQUARE_M if near else 0.0
         around += [self._others.path(graph.lanes[name]) for distance, name in near if distance <= limit]

@@ -398,9 +398,9 @@ FILLED_BY_NAME: Final = (
 )  # fmt: skip
 """Parameters of an agent that crashhunt fills.
 
-These are the spaces of the vehicle, the step length in s, the masks, the identifier of the agent, the index of each
-column of the observed parts by part and name, the map of the roads with the vehicle's route, and the size and limits of
-the vehicle."""
+These are the spaces of the vehicle, the step length in s, the masks, and the identifier of the agent. `columns` is the
+index of each column of the observed parts, by part and name. `map` is the map of the roads with the vehicle's route, and
+`vehicle` the size and the limits of the vehicle."""
 _KINDS: dict[object, Kind] = {float: "float", int: "int", bool: "bool", str: "str"}
 
 

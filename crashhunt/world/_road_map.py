@@ -153,7 +153,7 @@ def lane_lines(shape: Sequence[tuple[float, float]], width_m: float) -> LaneLine
     center = distinct_points(np.array(shape, float))
     if len(center) == 1:
         center = np.vstack((center, center + np.array((10 * _MIN_SPACING_M, 0.0))))
-    left, right = (_beside(center, side * width_m / 2) for side in (1.0, -1.0))
+    left, right = (_parallel_line(center, side * width_m / 2) for side in (1.0, -1.0))
     lines = np.stack((center, left, right))
     longest = np.hypot(*np.moveaxis(np.diff(lines, axis=1), 2, 0)).max(axis=0)
     found = _subdivided(lines, np.maximum(1, np.ceil(longest / MAX_SPACING_M - 1e-9)).astype(int))
@@ -170,7 +170,7 @@ def distinct_points(line: Line) -> Line:
     return line if len(keep) == len(line) else line[keep]
 
 
-def _beside(center: Line, offset_m: float) -> Line:
+def _parallel_line(center: Line, offset_m: float) -> Line:
     """Return a line at a distance to the left of a line, with one point for each point, that never turns back."""
     along = np.diff(center, axis=0)
     along /= np.hypot(along[:, 0], along[:, 1])[:, None]

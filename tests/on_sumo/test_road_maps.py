@@ -80,7 +80,7 @@ def test_the_edges_of_a_lane_are_half_a_width_from_its_centre_and_never_turn_bac
 
 def test_a_lane_whose_marking_forbids_it_may_not_be_left():
     graph = LaneGraph(read_network(NETS / "grid-lights.net.xml.gz", with_junctions=True))
-    lane = next(one for one in graph.lanes.values() if not one.is_internal and graph.beside(one, 1) is not None)
+    lane = next(one for one in graph.lanes.values() if not one.is_internal and graph.neighbor(one, 1) is not None)
     assert graph.may_change(lane, 1, CAR)
     object.__setattr__(lane.data, "change_up", frozenset({"bus"}))
     assert not graph.may_change(lane, 1, CAR)

@@ -117,7 +117,7 @@ def town(request, tmp_path):
         yield found
 
 
-def test_signals_are_those_that_traci_names_and_as_old_as_a_stopwatch_says(tmp_path):
+def test_signals_show_the_lights_that_traci_names_and_the_age_of_their_state(tmp_path):
     with Town("grid-lights", tmp_path) as town:
         since, seen = {}, 0
         for vehicles in town.steps(110):

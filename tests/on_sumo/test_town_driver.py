@@ -1,0 +1,111 @@
+"""The driver of the guide's page "Connect your planner", in a foreign town with traffic lights and traffic."""
+
+from __future__ import annotations
+
+import random
+import re
+from pathlib import Path
+
+import pytest
+
+libsumo = pytest.importorskip("libsumo")
+sumolib = pytest.importorskip("sumolib")
+
+import crashhunt.guide  # noqa: E402
+from crashhunt.scenario import load_scenario  # noqa: E402
+
+NETS = Path(__file__).parent / "nets"
+PAGE = Path(crashhunt.guide.__file__).parent / "tutorials" / "connect-your-planner.md"
+SCENARIO = """schema = 1
+simulator = "sumo"
+step_length_s = 0.1
+warmup_s = 30.0
+[sumo]
+net = "{net}"
+routes = ["r.rou.xml"]
+[agents.ego]
+route = "ego"
+observation = {parts}
+"""
+
+
+def page_driver():
+    text = PAGE.read_text(encoding="utf-8")
+    code = re.search(r"^# town.py\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)[1]
+    assert len(code.splitlines()) < 80
+    made = {}
+    exec(compile(code, str(PAGE), "exec"), made)
+    return made["TownDriver"]
+
+
+def walk(net, draw, length, begin=None):
+    route = [begin or draw.choice(sorted(net.getEdges(withInternal=False), key=lambda one: one.getID()))]
+    while len(route) < length and (after := sorted(route[-1].getOutgoing(), key=lambda one: one.getID())):
+        route.append(draw.choice(after))
+    return [one.getID() for one in route]
+
+
+def town(name, folder, parts, seed):
+    path = NETS / f"{name}.net.xml.gz"
+    net, draw = sumolib.net.readNet(str(path)), random.Random(seed)
+    rows = [f'<route id="ego" edges="{" ".join(walk(net, draw, 40))}"/>']
+    for number in range(60):
+        rows.append(f'<vehicle id="v{number}" depart="{number * 2}" departLane="best" departSpeed="max">')
+        rows.append(f'<route edges="{" ".join(walk(net, draw, 30))}"/></vehicle>')
+    (folder / "r.rou.xml").write_text(f"<routes>{''.join(rows)}</routes>")
+    (folder / path.name).write_bytes(path.read_bytes())
+    (folder / "scenario.toml").write_text(SCENARIO.format(net=path.name, parts=list(parts)))
+    return load_scenario(str(folder))
+
+
+def drive(name, folder, metres, seed):
+    """Drive until a distance is reached; return the distance and the red lights and stop lines that were run over."""
+    from crashhunt.sumo import SumoSimulator
+
+    kind = page_driver()
+    scenario = town(name, folder, kind.observation, seed)
+    simulator = SumoSimulator(scenario, folder)
+    driven, offences, stops, light = 0.0, [], 0, ""
+    try:
+        shown, _ = simulator.reset(seed=seed, options={})
+        agent = kind(simulator.observation_layouts["ego"].columns)
+        agent.reset(seed)
+        line = lane = ""
+        for _ in range(int(metres)):
+            if driven >= metres or not simulator.agents:
+                break
+            before, lane = lane, libsumo.vehicle.getLaneID("ego")
+            if before and lane != before and lane.startswith(":") and not before.startswith(":"):
+                offences += [(lane, light)] if light and light in "rRu" else []
+                offences += [(lane, "no stop")] if line == "s" and not stops else []
+                stops = 0
+            nearest = libsumo.lane.getLength(lane) - libsumo.vehicle.getLanePosition("ego")
+            lights = [one for one in libsumo.vehicle.getNextTLS("ego") if abs(one[2] - nearest) < 0.1]
+            light = lights[0][3] if lights else ""
+            ahead = libsumo.vehicle.getNextLinks("ego")
+            line = ahead[0][5] if ahead and not lane.startswith(":") else ""
+            stops += libsumo.vehicle.getSpeed("ego") < 0.1 and nearest < 3.0
+            action = agent.act(simulator.restore_observation("ego", shown["ego"]))
+            shown, *_ = simulator.step({"ego": simulator.actions["ego"].encode(action)})
+            scene = simulator.scene()
+            offences += [(lane, event.kind) for event in scene.events if event.kind == "red_light"]
+            offences += [(lane, f"hit {one.victim}") for one in scene.contacts if "ego" in (one.collider, one.victim)]
+            if "ego" in scene.roster.index:
+                driven += scene.speed(scene.roster.index["ego"]) * 0.1
+    finally:
+        simulator.close()
+    return driven, offences
+
+
+def test_the_driver_of_the_guide_runs_no_red_light(tmp_path):
+    driven, offences = drive("grid-lights", tmp_path, 800.0, seed=2)
+    assert driven > 250.0
+    assert offences == []
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("name", ["grid-lights", "rand", "stops", "left-grid"])
+def test_the_driver_of_the_guide_obeys_lights_and_stop_signs_in_any_town(name, seed, tmp_path):
+    _, offences = drive(name, tmp_path, 3000.0, seed)
+    assert offences == []
