@@ -399,8 +399,8 @@ FILLED_BY_NAME: Final = (
 """Parameters of an agent that crashhunt fills.
 
 These are the spaces of the vehicle, the step length in s, the masks, and the identifier of the agent. `columns` is the
-index of each column of the observed parts, by part and name. `map` is the map of the roads with the vehicle's route, and
-`vehicle` the size and the limits of the vehicle."""
+index of each column of the observed parts, by part and name. `map` is the map of the roads with the vehicle's route.
+`vehicle` is the size and the limits of the vehicle."""
 _KINDS: dict[object, Kind] = {float: "float", int: "int", bool: "bool", str: "str"}
 
 
