@@ -23,6 +23,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 import numpy as np
 from pydantic_core import from_json, to_json
 
+from crashhunt.base import layout
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError, ProgramError
 from crashhunt.base.processes import descendants_of, kill
@@ -248,8 +249,10 @@ class _Process:
                 resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (_MAX_FILE_BYTES, hard))
 
     def _environment(self) -> dict[str, str]:
-        # Python would write its caches next to the modules of the snapshot.
-        found = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+        # Python would write its caches next to the modules of the snapshot. A replay imports from the snapshot's code,
+        # and a program in Python must find the same modules there as in the hunt.
+        paths = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if not _is_of_snapshot(path)]
+        found = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": os.pathsep.join(paths)}
         if self._libraries:
             found["LD_LIBRARY_PATH"] = ":".join(filter(None, [self._libraries, os.environ.get("LD_LIBRARY_PATH")]))
         return found
@@ -402,6 +405,11 @@ class _Process:
         except subprocess.TimeoutExpired:
             return False
         return True
+
+
+def _is_of_snapshot(path: str) -> bool:
+    code = layout.PACKAGE.parent
+    return code.name == layout.CODE and (code.parent / layout.MANIFEST).exists() and Path(path).is_relative_to(code)
 
 
 def _await(stream: IO[bytes], deadline: float | None, *, writing: bool = False) -> None:

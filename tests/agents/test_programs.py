@@ -255,6 +255,19 @@ def test_a_script_moves_the_messages_of_a_program_that_prints_to_another_descrip
     assert capfd.readouterr().err.count("hm") == 22
 
 
+def test_a_program_does_not_import_from_the_code_of_a_snapshot(tmp_path, monkeypatch):
+    code = tmp_path / "snapshot" / "code"
+    (code / "crashhunt").mkdir(parents=True)
+    (code.parent / "manifest.json").write_text("{}", encoding="utf-8")
+    monkeypatch.setattr("crashhunt.base.layout.PACKAGE", code / "crashhunt")
+    monkeypatch.setenv("PYTHONPATH", f"{code}:{code}/@project:/my/modules")
+    program = tmp_path / "tells"
+    program.write_text("#!/bin/sh\nread -r line\necho $PYTHONPATH >&2\nexit 3\n", encoding="utf-8")
+    program.chmod(0o755)
+    with pytest.raises(ProgramError, match=r"\(its last output: /my/modules\)"):
+        ProgramFactory(f"exec:{program}").declared_signature()
+
+
 @pytest.mark.parametrize("kind", ["NaN", "shape"])
 def test_an_action_outside_of_the_space_is_left_to_the_check_of_all_agents(planner, tmp_path, kind):
     agent = agent_of(f"exec:{planner} {kind} observe", tmp_path)
