@@ -368,7 +368,7 @@ function drawGhost(context) {
 }
 
 /* The curves: one above the other, each with its own axis. */
-const HEAD = 14, ROW = 66, TITLE = 16, BELOW = 22, LEFT = 46, RIGHT = 12, TTC_CUT_S = 10, GAP_CUT_M = 100;
+const HEAD = 14, ROW = 66, TITLE = 16, BELOW = 22, LEFT = 46, RIGHT = 12, TTC_CUT_S = 10, GAP_CUT_M = 100, PULL_CUT_MPS2 = 12;
 const ROUND = [1, 2, 3, 5, 10, 15, 20, 30, 40, 50, 60, 80, 100, 150, 200];
 function rowsOf(crash) {
   const whole = (count, value) => Float32Array.from({ length: count }, (_, step) => value(step));
@@ -382,8 +382,8 @@ function rowsOf(crash) {
   const own = (values, more = {}) => ({ name: crash.agent, color: "--ego-line", values, ...more });
   const its = (values) => (view.other < 0 ? [] : [{ name: crash.other, color: "--partner", dash: [5, 3], values }]);
   const widest = above(Math.min(GAP_CUT_M, most(crash.gaps)));
-  const pulls = [...crash.pulls, ...crash.otherPulls].filter(Number.isFinite);
-  const strongest = Math.min(12, above(Math.max(1, -Math.min(0, ...pulls)))), quickest = Math.min(12, above(Math.max(1, Math.max(0, ...pulls))));
+  const braked = most(...[crash.pulls, crash.otherPulls].map((one) => one.map((value) => -value)));
+  const strongest = Math.min(PULL_CUT_MPS2, above(Math.max(1, braked))), quickest = Math.min(PULL_CUT_MPS2, above(Math.max(1, most(crash.pulls, crash.otherPulls))));
   const rows = [
     { title: `time to collision${crash.other ? ` with ${crash.other}` : " with any actor"}`, unit: "s", low: 0, high: TTC_CUT_S, series: [{ name: "", color: "--accent", values: crash.ttcs }] },
     { title: `gap${crash.other ? ` to ${crash.other}` : " to the closest actor"}`, unit: "m", low: 0, high: widest, series: [{ name: "", color: "--accent", values: crash.gaps }] },
@@ -395,10 +395,10 @@ function rowsOf(crash) {
   crash.actionNames.slice(0, 4).forEach((name, place) => {
     const values = whole(crash.steps, (step) => crash.acts[step * size + place]), finite = values.filter(Number.isFinite);
     if (!finite.length) return;
-    const [low, high] = [Math.min(...finite), Math.max(...finite)];
+    const low = finite.reduce((a, b) => Math.min(a, b)), high = finite.reduce((a, b) => Math.max(a, b));
     rows.push({ title: `action: ${name}`, unit: "", low: low === high ? low - 1 : low, high: low === high ? high + 1 : high, isStep: true, series: [own(values, { name: "" })] });
   });
-  return rows;
+  return rows.filter((row) => row.series.some((one) => one.values.some(Number.isFinite)));
 }
 const shortNumber = (value) => String(Number(value.toPrecision(3)));
 
@@ -455,7 +455,7 @@ function drawRow(context, row, top, bottom, x, right) {
   for (const tick of ticks) context.fillText(shortNumber(tick), LEFT - 5, Math.min(bottom, Math.max(top + 8, y(tick) + 4)));
   context.textAlign = "left";
   context.fillStyle = css("--text");
-  const title = `${row.title}${row.unit ? ` (${row.unit})` : ""}`, isCut = row.series.some((one) => one.values.some((value) => value > high || value < low));
+  const title = `${row.title}${row.unit ? ` (${row.unit})` : ""}`, isCut = row.series.some((one) => one.values.some((value) => Number.isFinite(value) && (value > high || value < low)));
   context.fillText(title, LEFT, top - 4, right - LEFT);
   let at = LEFT + context.measureText(title).width + 14;
   const told = [...row.series.filter((one) => one.name).map((one) => [one.name, one.color, one.dash ?? []]), ...(isCut ? [["cut at the axis", "--faint", [1, 3]]] : [])];

@@ -212,7 +212,7 @@ def test_charts_draw_what_the_api_returns(hunts, page):
 @pytest.mark.nightly
 def test_charts_out_of_sight_are_drawn_when_they_come_near(hunts, page):
     with served(hunts) as dashboard:
-        page.size(1280, 600)
+        page.size(1280, 1200)
         page.open(f"{dashboard.url}/hunts/{dashboard.hunts()['one']['id']}")
         assert page.run("return document.getElementById('discovery').data.length > 0")
         page.wait("document.getElementById('map').data")  # never drawn before: without scrolling, when there is time

@@ -131,6 +131,11 @@ def test_curves_are_those_of_the_recording_for_both_vehicles(hunt, browser):
         f"time to collision with {other} s", f"gap to {other} m", "speed m/s", "acceleration m/s²", "criticality",
     ]  # fmt: skip
     assert "action: target_speed" in titles
+    never = browser.execute_script(
+        "const crash = { ...crashhuntView.crash, ttcs: crashhuntView.crash.ttcs.map(() => Infinity) };"
+        "return rowsOf(crash).map((row) => `${row.title} ${row.unit}`.trim())"
+    )
+    assert never == titles[1:]  # a row without a value is not shown
     # Each row has room for its title, its axis and its curve, and the tip has the values of all.
     assert browser.execute_script("return document.getElementById('plot').clientHeight") >= 60 * len(titles)
     browser.execute_script(
