@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections import deque
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -120,8 +120,13 @@ class Slot:
 QUIET = ("--agent", "keep-lane", "--arg", "speed=5", "--seed", "1", "--keep-going")
 
 
-def child_step(scenario: str) -> dict[str, float]:
-    """A whole step against a bare libsumo loop over the same traffic, alternating in one process."""
+def child_step(scenario: str, observation: str = "") -> dict[str, float]:
+    """A whole step against a bare libsumo loop over the same traffic, alternating in one process.
+
+    Args:
+        scenario: name of the scenario.
+        observation: parts that the agents observe, separated by commas; empty for Kinematics.
+    """
     import libsumo
 
     from crashhunt.agents import KeepLaneWithSpeed
@@ -136,6 +141,10 @@ def child_step(scenario: str) -> dict[str, float]:
     steps, speed = 1000, 10.0
     clock = time.process_time  # what others do on this machine costs nothing
     chosen = load_scenario(scenario)
+    if observation:
+        seen = tuple(observation.split(","))
+        setups = {agent: replace(setup, observation=seen) for agent, setup in chosen.agents.items()}
+        chosen = replace(chosen, agents=setups)
     agents = list(chosen.agents)
     spent: dict[str, float] = {}
     within = [0.0]  # what has been spent in parts of the part that is going on, and of those around it
@@ -216,6 +225,15 @@ def child_step(scenario: str) -> dict[str, float]:
         "bare": 1e6 * min(theirs for _, theirs, _ in rounds),
         **found,
     }
+
+
+def bench_observation() -> Iterator[Figure]:
+    """A whole step with the parts of a planner in a town, against a bare loop."""
+    for parts, target in (("ego,actors", 2.0), ("ego,actors,lanes,route,signals,right_of_way", 2.0)):
+        found = in_child("child_step", "intersection", parts)
+        note = f"{parts}; whole {found['whole']:.0f} µs, bare {found['bare']:.0f} µs"
+        name = f"observation_ratio_{parts.count(',') + 1}_parts"
+        yield Figure(name=name, value=found["ratio"], unit="x", better="lower", target=target, note=note)
 
 
 def bench_step() -> Iterator[Figure]:
@@ -1468,6 +1486,7 @@ def bench_training() -> Iterator[Figure]:
 
 
 BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
+    "observation": bench_observation,
     "step": bench_step,
     "core": bench_core,
     "isolation": bench_isolation,
