@@ -43,7 +43,7 @@ _PAGE_ORDER = [
     "kinds-of-crashes", "notes", "fault", "judge", "shrink", "film", "near-misses",
     "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
     "criticality", "determinism", "search", "counterfactuals", "crash-rates",
-    "commands", "api", "toml", "outcomes", "files", "json", "dashboard-api", "security",
+    "commands", "api", "toml", "actions", "outcomes", "files", "json", "dashboard-api", "security",
     "exec-protocol", "disturbance-kinds", "requirement-language", "forks", "minimization", "export", "clusters",
     "gallery", "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
@@ -180,18 +180,18 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
     """Return the text of a page, with its generated parts inserted.
 
     Args:
-        text: Markdown text, in which ``<!-- made from the code: commands -->`` is a placeholder; ``api``, ``json``,
-            ``keys``, ``modules`` and ``signals`` are further placeholders.
+        text: Markdown text, in which ``<!-- made from the code: commands -->`` is a placeholder; ``actions``, ``api``,
+            ``json``, ``keys``, ``modules`` and ``signals`` are further placeholders.
         parser: parser of the command line.
     """
     makers = {
         "commands": lambda: describe_commands(parser),
+        "actions": describe_actions,
         "api": describe_api,
         "json": describe_json,
         "keys": describe_keys,
         "modules": describe_modules,
         "observations": describe_observations,
-        "actions": describe_actions,
         "signals": describe_signals,
     }
     # Remove the text that follows a placeholder for readers of the raw file, up to the next blank line.
