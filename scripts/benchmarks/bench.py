@@ -17,6 +17,7 @@ from collections import deque
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from operator import truediv
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,9 @@ from rich.table import Table
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from types import ModuleType
+
+    import numpy as np
+    from numpy.typing import NDArray
 
     from crashhunt.episode import WorkerSettings
     from crashhunt.trial import TrialResult, TrialSpec
@@ -255,6 +259,73 @@ def bench_step() -> Iterator[Figure]:
                         better="lower",
                         target=None,
                     )
+
+
+class _HoldsSpeed:
+    """Holds 10 m/s straight ahead, in a form of actions.
+
+    Args:
+        form: name of the form.
+    """
+
+    def __init__(self, form: str) -> None:
+        self._form = form
+
+    def reset(self, seed: int) -> None:
+        """Do nothing."""
+
+    def act(self, observation: NDArray[np.float32]) -> object:
+        """Return the action."""
+        if self._form == "speed_and_lane":
+            return 10.0, 0
+        wanted = max(-4.0, min(2.0, 10.0 - float(observation[0, 3])))
+        return (wanted, 0) if self._form == "acceleration" else (wanted, 0.0)
+
+
+def child_actions(scenario: str) -> dict[str, float]:
+    """A whole step in each form of actions, in turns in one process."""
+    from crashhunt.episode import FastEpisode, Nearness, Recorder
+    from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
+    from crashhunt.recording import BlackBox
+    from crashhunt.scenario import argument_values, load_scenario, with_action
+    from crashhunt.sumo import SumoSimulator
+    from crashhunt.trial import TrialSpec
+
+    plain = load_scenario(scenario)
+    spent: dict[str, list[float]] = {}
+    with folder() as stage:
+        box = BlackBox(stage / "blackbox.bin")
+        spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments=argument_values(plain), max_steps=1000)
+        for _ in range(7):
+            for form in ("speed_and_lane", "acceleration", "acceleration_steering"):
+                simulator = SumoSimulator(with_action(plain, "ego", form), stage)
+                box.begin(pid=os.getpid(), trial=0, started=time.monotonic())
+                with FastEpisode(
+                    spec,
+                    simulator=simulator,
+                    make_agent=lambda *_, form=form: _HoldsSpeed(form),
+                    oracles=[ReportedCollision(), Overlap(), OffRoad()],
+                    crash_on=(),
+                    observers=[Recorder(box, simulator), Nearness(box.take_frames)],
+                ) as episode:
+                    result = episode.start()
+                    began = time.process_time()
+                    while result is None:
+                        result = episode.step()
+                    spent.setdefault(form, []).append((time.process_time() - began) / max(1, result.steps))
+    usual = spent.pop("speed_and_lane")
+    return {
+        **{form: statistics.median(map(truediv, seconds, usual)) for form, seconds in spent.items()},
+        "usual": 1e6 * min(usual),
+    }
+
+
+def bench_actions() -> Iterator[Figure]:
+    """A step in a form of actions against a step with a target speed."""
+    found = in_child("child_actions", "motorway")
+    for form, target in (("acceleration", 1.05), ("acceleration_steering", 1.3)):
+        note = f"against {found['usual']:.0f} µs with a target speed, on motorway"
+        yield Figure(name=f"step_{form}", value=found[form], unit="x", better="lower", target=target, note=note)
 
 
 def child_core(scenario: str) -> dict[str, float]:
@@ -1488,6 +1559,7 @@ def bench_training() -> Iterator[Figure]:
 BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "observation": bench_observation,
     "step": bench_step,
+    "actions": bench_actions,
     "core": bench_core,
     "isolation": bench_isolation,
     "projection": bench_projection,
