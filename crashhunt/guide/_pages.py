@@ -181,7 +181,7 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
 
     Args:
         text: Markdown text, in which ``<!-- made from the code: commands -->`` is a placeholder; ``actions``, ``api``,
-            ``json``, ``keys``, ``modules`` and ``signals`` are further placeholders.
+            ``json``, ``keys``, ``modules``, ``observations`` and ``signals`` are further placeholders.
         parser: parser of the command line.
     """
     makers = {
