@@ -232,7 +232,7 @@ def test_full_braking_stops_the_vehicle_in_its_lane_in_a_bend(start, form):
 
 
 @pytest.mark.parametrize("form", ["acceleration_steering", "throttle_brake_steering", "trajectory"])
-def test_steering_out_of_the_lane_is_told_and_corrected_for_a_reference_driver(start, form):
+def test_reference_driver_corrects_steering_out_of_the_lane(start, form):
     simulator, step = start(form, "motorway")
     motion = simulator._driving.moving["ego"]
     plain = simulator.actions["ego"].encode(motion._action(0.0, 0.0))

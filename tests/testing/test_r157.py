@@ -38,7 +38,7 @@ def test_answers_agree_with_the_published_implementation_in_each_half_of_the_cas
 
 @pytest.mark.parametrize("ego_kmh", [20, 60, 120])
 @pytest.mark.parametrize("slower_kmh", [10, 15])
-def test_driver_of_paragraph_5_2_5_2_avoids_what_the_formula_says(ego_kmh, slower_kmh):
+def test_regulation_driver_avoids_what_the_formula_of_5_2_5_2_allows(ego_kmh, slower_kmh):
     # Full lateral speed is reached 1.6 m beside the vehicle. The other vehicle is in the lane after another 1.1 m, or
     # five steps with 2.2 m/s.
     closing, lateral = slower_kmh / 3.6, 2.2
@@ -58,7 +58,7 @@ def test_no_model_reacts_to_a_vehicle_that_stays_in_its_lane():
         assert not solve("cut_in", {**cases, "gap_m": np.arange(1.0, 41.0, 2.0)}, model)[model].any()
 
 
-def test_cut_in_without_a_reaction_ends_as_plain_arithmetic_says():
+def test_cut_in_without_a_reaction_agrees_with_plain_arithmetic():
     # A vehicle 60 km/h slower cuts in with 1.7 m/s: after ten steps the sides meet. At 100 times 1/6 m the fronts meet.
     shared = {"ego_kmh": 70, "other_kmh": 10, "lateral_mps": 1.7}
     closed = 60 / 3.6 * 1.0
