@@ -417,7 +417,8 @@ class Action:
             return None
         if self._is_tuple:
             for place in self._whole_places:
-                values[place] = _whole_number(values[place])
+                if (value := values[place]).is_integer():  # another number is left to the check of all agents
+                    values[place] = int(value)
             return tuple(values[: self._size])
         if not self._shaped.shape:
             return _whole_number(values[0]) if self._is_whole[0] else values[0]

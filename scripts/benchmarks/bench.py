@@ -578,16 +578,68 @@ def child_agents(place: str) -> dict[str, float]:
     return bench_agents.measure(Path(place))
 
 
+def child_library(place: str) -> dict[str, float]:
+    """CPU time of a step on `loop`: with an agent in Python that does nothing, and with such a library, in turns."""
+    from dataclasses import replace
+
+    import bench_agents
+
+    from crashhunt.episode import WorkerSettings
+    from crashhunt.scenario import argument_values, load_scenario
+    from crashhunt.trial import TrialSpec
+
+    chosen, rounds, at_once, lengths = load_scenario("loop"), 10, 6, (100, 600)
+    (Path(place) / "nothing.py").write_text(
+        "class Nothing:\n    def reset(self, seed): ...\n\n    def act(self, observation):\n        return 8.0, 0\n"
+    )
+    sys.path.insert(0, place)
+    spent: dict[tuple[str, int], list[float]] = {}
+    with folder() as scratch:
+        slots: dict[str, Slot] = {}
+        for locator in ("nothing:Nothing", bench_agents.build_library(Path(place))):
+            (own := scratch / str(len(slots))).mkdir()
+            agents = {name: replace(setup, agent=locator, arguments={}) for name, setup in chosen.agents.items()}
+            oracles = ("reported-collision", "overlap", "off-road")
+            slots[locator] = Slot(
+                WorkerSettings(scenario=replace(chosen, agents=agents), oracles=oracles, crash_on=(), scratch=own)
+            )
+        for number in range(rounds + 1):
+            for steps in lengths:
+                for locator, slot in slots.items():
+                    began = slot.cpu_s()
+                    for again in range(at_once if number else 1):
+                        trial = number * at_once + again
+                        slot.run(
+                            TrialSpec(
+                                number=trial, seed=trial, arguments={"ego": {}}, max_steps=steps,
+                                scenario_arguments=argument_values(chosen),
+                            )
+                        )  # fmt: skip
+                    if number:  # the first warms everything up
+                        spent.setdefault((locator, steps), []).append((slot.cpu_s() - began) / at_once)
+    short, long = lengths
+    steps_s = [
+        [(whole - part) / (long - short) for whole, part in zip(spent[one, long], spent[one, short], strict=True)]
+        for one in slots
+    ]
+    ratios = [library_s / python_s for python_s, library_s in zip(*steps_s, strict=True)]
+    python_s, library_s = map(statistics.median, steps_s)
+    return {"python_s": python_s, "library_s": library_s, "ratio": statistics.median(ratios)}
+
+
 def bench_agents() -> Iterator[Figure]:
-    """A step and a start of an agent that is a program, an echo in C."""
+    """A step and a start of an agent that is a program, an echo in C; a step of a library that does nothing."""
     with folder() as place:
-        found = in_child("child_agents", str(place))
+        found = in_child("child_agents", str(place)) | in_child("child_library", str(place))
     pipes_us, step_us = 1e6 * found["pipes_s"], 1e6 * found["step_s"]
     yield Figure(
         "exec_step", step_us, "µs", "lower", 60.0, f"observe and act of an echo in C; {pipes_us:.3g} µs are its pipes"
     )
     start_ms = 1e3 * (found["start_s"] - found["step_s"])
     yield Figure("exec_start", start_ms, "ms", "lower", 3.0, "start, hello, reset and close of an echo in C")
+    python_us, library_us = 1e6 * found["python_s"], 1e6 * found["library_s"]
+    note = f"CPU time of a step on loop: {library_us:.3g} µs with a library, {python_us:.3g} µs with Python"
+    yield Figure("lib_step", found["ratio"], "x", "lower", 1.05, note)
 
 
 def bench_pool() -> Iterator[Figure]:

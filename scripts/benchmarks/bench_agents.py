@@ -1,4 +1,4 @@
-"""Agents that are programs: a step and a start, on an echo in C, against bare pipes to the same program."""
+"""Agents in C: a step and a start of a program, an echo, against bare pipes; a library that does nothing."""
 
 from __future__ import annotations
 
@@ -35,6 +35,18 @@ int main(void) {
         if (line[9] == 'c' || write(1, answer, strlen(answer)) < 0) return 0;
     }
 }
+"""
+_LIBRARY = r"""
+#include "crashhunt_agent.h"
+CRASHHUNT_AGENT()
+const char *crashhunt_create(const struct crashhunt_setup *setup, void **agent) { return 0; }
+const char *crashhunt_reset(void *agent, uint64_t seed) { return 0; }
+const char *crashhunt_act(void *agent, const struct crashhunt_observation *observation, double *action) {
+    action[0] = 8.0;
+    action[1] = 0.0;
+    return 0;
+}
+void crashhunt_destroy(void *agent) {}
 """
 _STEPS, _STARTS, _ROUNDS = 2000, 50, 9
 
@@ -95,6 +107,16 @@ def measure(folder: Path) -> dict[str, float]:
         agent.close()
         bare.stdin.close()
         bare.wait()
+
+
+def build_library(folder: Path) -> str:
+    """Compile a library that drives at 8 m/s into a folder, and return the locator of the agent."""
+    import crashhunt.agents
+
+    (folder / "nothing.c").write_text(_LIBRARY)
+    words = ["-O2", "-shared", "-fPIC", f"-I{crashhunt.agents.__path__[0]}", "-o", "libnothing.so", "nothing.c"]
+    subprocess.run(["cc", *words], cwd=folder, check=True)
+    return f"lib:{folder}/libnothing.so"
 
 
 def _least(call: Callable[[], object], times: int) -> float:

@@ -259,7 +259,7 @@ def results(folder):
     [
         ("toy", "60"),
         pytest.param("merge", "200", marks=pytest.mark.nightly),
-        pytest.param("roundabout", "60", marks=pytest.mark.nightly),
+        pytest.param("intersection", "60", marks=pytest.mark.nightly),
     ],
 )
 def test_a_hunt_with_a_library_has_the_digests_of_one_with_the_same_driver_in_python(toy, scenario, steps):
@@ -269,6 +269,7 @@ def test_a_hunt_with_a_library_has_the_digests_of_one_with_the_same_driver_in_py
         words = ("--agent", agent, "--arg", "speed=8.0:20.0", "--keep-going")
         toy.crashhunt("run", name, "1", "4", steps, "--scenario", scenario, "--seed", "5", *words)
     in_c, in_python = ([one["digest"] for one in results(toy.folder / name)] for name in ("in_c", "in_python"))
+    assert all(one["steps"] > 3 for one in results(toy.folder / "in_c"))
     assert in_c == in_python
     assert len(set(in_c)) == 4
 
