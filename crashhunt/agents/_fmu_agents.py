@@ -113,8 +113,9 @@ class FmuFactory:
             self._instance()  # so that what cannot be loaded is an error before the first trial
 
     def agent(
-        self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path, files: Mapping[str, str]
-    ) -> FmuAgent:
+        self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path,
+        files: Mapping[str, str], limit_s: float | None = None,
+    ) -> FmuAgent:  # fmt: skip
         """Return the agent of a vehicle; its instance of the FMU begins in the first step.
 
         Args:
@@ -123,6 +124,7 @@ class FmuFactory:
             arguments: arguments of the agent.
             folder: folder for the files of the FMU, if it has not been loaded.
             files: file of the snapshot by the text that names the original file.
+            limit_s: not used, because only the process of the trial can be ended.
 
         Raises:
             PluginError: the FMU cannot be used, or its variables do not fit the spaces of the vehicle.

@@ -135,7 +135,6 @@ def test_an_fmu_that_does_not_fit_is_refused_in_one_line(tmp_path, options, tabl
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.nightly
 def test_a_hunt_with_an_fmu_has_the_digests_of_one_with_the_same_driver_in_python(toy):
     build_fmu(toy.folder, 3)
     (toy.folder / "driver.py").write_text(DRIVER, encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import shutil
@@ -16,7 +17,7 @@ from compiled_libraries import IN_C, compile_library
 from gymnasium import spaces
 from programs import COMPILER, DRIVER
 
-from crashhunt.agents import LibraryFactory
+from crashhunt.agents import FmuFactory, LibraryFactory, ProgramFactory
 from crashhunt.base.errors import ActionError, CrashhuntError, PluginError, ProgramError
 from crashhunt.base.libraries import files_of
 from crashhunt.simulators import MetaAction, SpaceAction, SpeedAndLaneChange
@@ -244,6 +245,11 @@ def test_a_needed_library_comes_from_the_snapshot_or_is_refused(tmp_path):
     files = {f"lib:{built}/libnameless.so": str(tmp_path / "saved" / "libnameless.so"), str(nameless): str(nameless)}
     with pytest.raises(CrashhuntError, match=r"libnameless.so, which was not loaded from the snapshot"):
         LibraryFactory(f"lib:{nameless}").load(files, tmp_path)
+
+
+def test_trials_create_agents_of_every_kind_in_the_same_way():
+    kinds = [inspect.signature(kind.agent).parameters for kind in (ProgramFactory, LibraryFactory, FmuFactory)]
+    assert [list(parameters) for parameters in kinds] == [list(kinds[0])] * 3
 
 
 TOY = ("--scenario", "toy", "--seed", "5", "--set", "gap_m=5.0:25.0")
