@@ -71,6 +71,12 @@ def test_a_program_that_fails_at_once_is_an_error_of_the_agent_and_one_that_is_m
     assert f"exec:./fails has not declared its arguments: {failed} (its last output: no planner.yaml)" in done.err
     assert f"ego: {failed}" in done.err
     assert "last output: no planner.yaml" in done.err
+    program.write_text('#!/bin/sh\nread -r line\necho \'{"type": "ready", "arguments": {"speed": {"default": 12}}}\'\n')
+    words = ("run", "g", "1", "1", "20", "--agent", "exec:./fails", *RUN, "--arg", "speed=fast")
+    assert (
+        toy.crashhunt(*words, expect=2).err
+        == "crashhunt: --arg speed: 'fast' is not a number; give numbers, such as 12\n"
+    )
     refused = toy.crashhunt("run", "g", "1", "1", "20", "--agent", "exec:./nothing", *RUN, expect=2)
     assert refused.err == (
         "crashhunt: 'exec:./nothing': the program './nothing' is not a file; give the path of an executable file, "
