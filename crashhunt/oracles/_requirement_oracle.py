@@ -48,6 +48,8 @@ class RequirementOracle:
         self._title = title
         self._requirement = _parsed(formula)
         self._watched: list[_Watched] = []
+        self._has_begun = False
+        self._at_start: list[Finding] = []  # a trial cannot end before its first step, so they are returned after it
 
     def read_signals(self, source: SignalSource, agents: Sequence[str]) -> None:
         """Begin to monitor the requirement for each agent."""
@@ -64,7 +66,7 @@ class RequirementOracle:
 
     def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
         """Return a finding for each agent whose requirement is certainly violated."""
-        found = []
+        found, self._at_start = self._at_start, []
         for watched in self._watched:
             try:
                 row = watched.read()
@@ -75,6 +77,8 @@ class RequirementOracle:
                 raise self._unusable(error) from None
             if watched.is_violated:
                 found.append(self._finding(watched, scene))
+        if not self._has_begun:
+            self._has_begun, self._at_start, found = True, found, []
         return found
 
     def check_end(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:

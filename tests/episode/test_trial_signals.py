@@ -109,6 +109,12 @@ def test_a_violation_ends_the_trial_at_the_step_at_which_it_is_certain(requireme
     assert result.summary == f"ego violates requirement: {requirement}, at step {step}"
 
 
+def test_a_violation_before_the_first_step_ends_the_trial_after_it(tmp_path):
+    result = ramp("always (level > 0)", tmp_path=tmp_path)
+    assert (result.outcome, result.steps) == ("requirement", 1)
+    assert result.event.details == ("robustness 0", "(level > 0) is false at step 0 (0.0 s): level = 0")
+
+
 def test_what_only_the_end_decides_is_a_violation_at_the_end(tmp_path):
     result = ramp("eventually (level > 50)", tmp_path=tmp_path, steps=5)
     assert (result.outcome, result.steps, result.robustness) == ("requirement", 5, {"requirement": -45.0})
@@ -125,7 +131,6 @@ def test_a_satisfied_requirement_leaves_the_trial_as_it_is_and_takes_the_place_o
 def test_signals_without_a_value_before_the_first_step_begin_with_it(tmp_path):
     # The first sample is the first step, at which reward is -1.
     assert ramp("reward > -1.5 and level > 0", tmp_path=tmp_path, steps=3).robustness == {"requirement": 0.5}
-    assert ramp("level > 0", tmp_path=tmp_path, steps=3).outcome == "invalid"
     result = ramp("always (reward > -2)", tmp_path=tmp_path)
     assert result.event.details == ("robustness 0", "(reward > -2) is false at step 2 (1.0 s): reward = -2")
 
