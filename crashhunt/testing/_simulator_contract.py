@@ -18,6 +18,7 @@ from crashhunt.simulators import (
     FullBraking,
     HasMap,
     NamesObservations,
+    ObservesParts,
     ReportsEvents,
     ReportsNotices,
     RestoresObservations,
@@ -240,13 +241,29 @@ class SimulatorContract:
         simulator.close()
 
     def test_columns_have_a_name_each(self, make: Make) -> None:
-        """`NamesObservations`: each entry of an observation's last axis has a name, or no entry has one."""
+        """`NamesObservations`: each entry of an observation's last axis has a name, or no entry has one.
+
+        The names are not those of agents that observe parts (`ObservesParts`).
+        """
         simulator = make()
         observations, _ = simulator.reset(seed=1)
+        layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
+        observations = {agent: shown for agent, shown in observations.items() if agent not in layouts}
         names = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()
         assert all(isinstance(name, str) for name in names)
         assert len(set(names)) == len(names)
         assert not names or all(observation.shape[-1] == len(names) for observation in observations.values())
+        simulator.close()
+
+    def test_parts_are_those_of_the_layout(self, make: Make) -> None:
+        """`ObservesParts`: an agent that observes parts sees arrays in the spaces of its layout."""
+        simulator = make()
+        observations, _ = simulator.reset(seed=1)
+        for agent, layout in (simulator.observation_layouts if supports(simulator, ObservesParts) else {}).items():
+            assert simulator.observation_spaces[agent] == layout.flat_space
+            seen = layout.restore(observations[agent])
+            assert layout.space.contains(seen)
+            assert layout.flat(seen).tobytes() == observations[agent].tobytes()
         simulator.close()
 
     def test_only_events_that_it_looks_for_happen(self, make: Make) -> None:

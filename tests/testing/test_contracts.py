@@ -45,6 +45,14 @@ class TestToySimulator(SimulatorContract):
         return lambda: ToySimulator(TOY, tmp_path)
 
 
+class TestToySimulatorWithParts(SimulatorContract):
+    @pytest.fixture
+    def make(self, tmp_path):
+        parts = AgentSetup(observation=("ego", "actors", "lidar2d:rays=8", "history:steps=2"))
+        scenario = replace(TOY, agents=dict.fromkeys(TOY.agents, parts))
+        return lambda: ToySimulator(scenario, tmp_path)
+
+
 SUMO = """
 import sys, tempfile, pytest
 from pathlib import Path
