@@ -14,6 +14,7 @@ Cost: one run for each model that applies.
 
 from __future__ import annotations
 
+import math
 from contextlib import closing
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from crashhunt.base.codec import JsonObject
+    from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
     from crashhunt.reruns import EndedRun
     from crashhunt.trial import TrialResult, TrialSpec
@@ -46,6 +48,7 @@ PREVENTABILITY_RUNS = len(COMPETENT_DRIVERS)
 """The number of runs that the models need at most."""
 
 _CHANGE_S = 5.0  # a lane change that began earlier has not led to the collision
+_BESIDE_S = 10.0
 _GENTLE_MPS2 = 1.0
 _CUT_IN_MODEL = "reg157"
 _UNDECIDED = {
@@ -119,7 +122,24 @@ def _applies(rerun: Rerun) -> tuple[str, bool]:
         return f"{hit.agent} changed lanes, and the models do not decide about lanes", False
     if contact.follower != hit.agent and hit.other not in changers:
         return "neither a rear-end collision nor a cut-in", False
-    return "", hit.other in changers
+    return "", hit.other in changers and _was_beside(rerun.recorded, hit.agent, hit.other)
+
+
+def _was_beside(recording: Recording, agent: str, other: str) -> bool:
+    """Return whether another vehicle was beside the path of the agent within the last seconds."""
+    steps = round(_BESIDE_S / recording.prologue.step_length_s)
+    for scene in recording.scenes()[-steps:]:
+        rows = scene.roster.index
+        if agent not in rows or other not in rows:
+            continue
+        own, its = rows[agent], rows[other]
+        # Halfway between both headings, an arc from one vehicle to the other has no sideways part.
+        heading = scene.headings[own] + math.remainder(scene.headings[its] - scene.headings[own], math.tau) / 2
+        dx, dy = (scene.centers[its] - scene.centers[own]).tolist()
+        widths = scene.roster.actors[own].width + scene.roster.actors[its].width
+        if abs(dy * math.cos(heading) - dx * math.sin(heading)) > widths / 2:
+            return True
+    return False
 
 
 def _answer(rerun: Rerun, model: str, since: int, ended: EndedRun) -> DriverRun:
