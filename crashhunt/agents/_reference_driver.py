@@ -37,6 +37,7 @@ _COMFORT_MPS2 = 1.0  # acceleration of a follower. Source: the comparison of the
 _GENTLE_BRAKING_MPS2 = 2.0  # for a speed or gap that is no risk
 _ASIDE_M = 6.0  # vehicles further beside the path are ignored
 _SAME_VEHICLE_M = 2.0  # a vehicle seen this near to its expected position is the same one as in the last step
+_MAX_LATERAL_MPS = 5.0  # a vehicle that jumps to another lane has no greater lateral speed
 _SAME_DIRECTION = 0.5  # least cosine of the angle between the headings
 
 
@@ -48,11 +49,13 @@ class _Watched:
         ahead: where it is expected in the next observation, in m ahead.
         right: where it is expected in the next observation, in m to the right.
         model: the driver's reaction to this vehicle.
+        aside: its distance to the path in the last observation, in m.
     """
 
     ahead: float
     right: float
     model: ReferenceModel
+    aside: float
 
 
 class ReferenceDriver:
@@ -137,14 +140,16 @@ class ReferenceDriver:
             aside = off_path(row, lateral=0.0, curvature=curvature)
             if row[COS_H] < _SAME_DIRECTION or row[X] < -self.length or aside > _ASIDE_M:
                 continue
-            seen = self._recognize(known, row)
-            towards = math.copysign(1.0, -row[Y]) * row[VY]
+            seen = self._recognize(known, row, aside)
+            # The path of the vehicle and not its heading, because a vehicle that is moved exactly keeps its heading.
+            towards = (seen.aside - aside) / self.step_length_s
+            seen.aside = aside
             situation = Situation(
                 speed=np.array([speed]),
                 other_speed=np.array([speed + row[VX]]),
                 gap=np.array([row[X] - self.length]),
                 lateral_gap=np.array([aside - self.width]),
-                lateral_speed=np.array([max(0.0, towards) if aside > 0 else 0.0]),
+                lateral_speed=np.array([min(max(0.0, towards), _MAX_LATERAL_MPS)]),
                 length=np.array([self.length]),
                 other_length=np.array([self.length]),
                 visible=np.array([True]),
@@ -155,7 +160,7 @@ class ReferenceDriver:
             self._watched.append(seen)
         return hardest, at_risk
 
-    def _recognize(self, known: list[_Watched], row: list[float]) -> _Watched:
+    def _recognize(self, known: list[_Watched], row: list[float], aside: float) -> _Watched:
         """Return the watched vehicle that a row shows; remove it from the known vehicles."""
         best, nearest = None, _SAME_VEHICLE_M
         for one in known:
@@ -163,6 +168,7 @@ class ReferenceDriver:
             if distance < nearest:
                 best, nearest = one, distance
         if best is None:
-            return _Watched(row[X], row[Y], REFERENCE_MODELS[self.model](1, self.step_length_s))
+            model = REFERENCE_MODELS[self.model](1, self.step_length_s)
+            return _Watched(ahead=row[X], right=row[Y], model=model, aside=aside)
         known.remove(best)
         return best

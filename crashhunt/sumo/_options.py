@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -241,6 +241,8 @@ class SumoSetup:
         native: whether the compiled core may be used; results are bit-identical with and without it.
         fix_link_order: whether SUMO processes the links of the network in the order of their construction. Otherwise
             SUMO uses the order of the memory addresses of the links, which differs between processes.
+        manoeuvre: a manoeuvre of UN R157, ``cut_in``, ``cut_out`` or ``deceleration``: all other vehicles are moved
+            exactly, as the arguments of the scenario say. Empty for traffic that SUMO simulates.
         literal: whether ``${NAME}`` in a route or additional file stays unchanged instead of being replaced.
     """
 
@@ -251,3 +253,12 @@ class SumoSetup:
     literal: bool | None = None
     native: bool | None = None
     fix_link_order: bool | None = None
+    manoeuvre: Literal["", "cut_in", "cut_out", "deceleration"] = ""
+
+
+MANOEUVRE_ARGUMENTS = {
+    "cut_in": ("ego_kmh", "other_kmh", "gap_m", "lateral_mps", "side"),
+    "cut_out": ("ego_kmh", "front_m", "lateral_mps", "headway_s", "side"),
+    "deceleration": ("ego_kmh", "decel_mps2", "headway_s"),
+}
+"""The arguments that a scenario with a manoeuvre must have."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.scenario import refuse
 from crashhunt.sumo._files import read_xml
-from crashhunt.sumo._options import RESERVED, SumoSetup, canonical, is_true
+from crashhunt.sumo._options import MANOEUVRE_ARGUMENTS, RESERVED, SumoSetup, canonical, is_true
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,6 +35,12 @@ def check(scenario: Scenario, where: str) -> None:
             if name not in scenario.arguments:
                 message = f"has no {name!r}, which {file} asks for"
                 refuse(where, "arguments", sorted(scenario.arguments), message, "declare it")
+    for name in MANOEUVRE_ARGUMENTS.get(sumo.manoeuvre, ()):
+        if name not in scenario.arguments:
+            message = f"has no {name!r}, which the manoeuvre {sumo.manoeuvre!r} needs"
+            refuse(where, "arguments", sorted(scenario.arguments), message, "declare it")
+    if sumo.manoeuvre and len(scenario.agents) != 1:
+        refuse(where, "agents", sorted(scenario.agents), "must be one vehicle for a manoeuvre", "declare one agent")
     for agent, setup in scenario.agents.items():
         named = [key for key in ("existing", "route", "edges", "replaces") if getattr(setup, key)]
         if len(named) != 1:

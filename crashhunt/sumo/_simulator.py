@@ -39,6 +39,7 @@ from crashhunt.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.sumo._files import StagedFiles
 from crashhunt.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
 from crashhunt.sumo._loading import VERSION, Loading, keep_xml_ready
+from crashhunt.sumo._manoeuvres import manoeuvre_paths
 from crashhunt.sumo._observing import ObservedParts
 from crashhunt.sumo._omitted_demand import OmittedDemand
 from crashhunt.sumo._options import SumoSetup
@@ -181,7 +182,8 @@ class SumoSimulator:
         options = options or {}
         arguments = options.get("arguments", {})
         self.setup_steps = 0
-        self._begin(options.get("only"), options.get("script"), arguments)
+        script = options.get("script")
+        self._begin(options.get("only"), script, arguments)
         command = self._files.arguments(seed, arguments)
         try:
             self._demand.begin()
@@ -189,10 +191,13 @@ class SumoSimulator:
             _current = weakref.ref(self)
             if notice and notice not in self._notices:
                 self._notices.append(notice)
+            if script is None and (manoeuvre := self._scenario.table(SumoSetup).manoeuvre):
+                script = self._planned_paths(manoeuvre, arguments)
+                self._begin(options.get("only"), script, arguments)
             with steps_counted(self, self.step_length_s):
                 enter(self._scenario, self._setups, self._replaced, self._taking_part)
             self._demand.read()
-            if script := options.get("script"):
+            if script is not None:
                 place_agents(script)
         except InvalidEpisodeError as error:
             raise self._demand.explained(error, [*self._setups, *self._replaced]) from None
@@ -393,6 +398,12 @@ class SumoSimulator:
         self._moved = {**self._scenario.agents, **dict.fromkeys(script.names if script is not None else ())}
         stay = (*(only or ()), *setups, *self._replaced)
         self._taking_part = None if only is None else VehicleFilter(stay, self._sight.leaving)
+
+    def _planned_paths(self, manoeuvre: str, arguments: Mapping[str, Value]) -> Paths:
+        """Return the paths of the other vehicles in a manoeuvre with some arguments."""
+        defaults = {name: setup.default for name, setup in self._scenario.arguments.items()}
+        values = {name: value for name, value in {**defaults, **arguments}.items() if value is not None}
+        return manoeuvre_paths(manoeuvre, next(iter(self._scenario.agents)), values, self.step_length_s)
 
     def _stop_fast_path(self) -> None:
         """Stop the fast path of the last episode in this process, because another episode begins."""

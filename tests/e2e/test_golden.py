@@ -79,6 +79,9 @@ TRIALS: dict[str, tuple[tuple[str, ...], int, list[tuple[str, ...]]]] = {
     "intersection": (SUMO, 150, [(), ("--disturb", "ignore_priority=0.1")]),
     "merge": (SUMO, 150, [(), ("--seeds", "1")]),
     "motorway": (SUMO, 150, [()]),
+    "r157-cut-in": (SUMO, 100, [(), ("--arg", "model=fsm")]),
+    "r157-cut-out": (SUMO, 100, [()]),
+    "r157-deceleration": (SUMO, 100, [()]),
 }  # fmt: skip
 TABLE = ("number", "seed", "outcome", "steps", "sim_time_s", "digest")
 

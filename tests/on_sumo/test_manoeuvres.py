@@ -1,0 +1,113 @@
+"""Manoeuvres of UN R157 on SUMO: the paths of the other vehicles, and the agreement with the plain computation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from crashhunt.agents import REFERENCE_MODELS, ReferenceDriver
+from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
+from crashhunt.scenario import load_scenario
+from crashhunt.sumo import SumoSimulator
+from crashhunt.sumo._options import SumoSetup
+from crashhunt.testing._kinematic_cases import solve
+
+CUT_IN = {"ego_kmh": 60.0, "other_kmh": 40.0, "gap_m": 12.5, "lateral_mps": 0.9}
+
+
+@pytest.fixture
+def simulate(tmp_path):
+    made = []
+
+    def begin(name, **arguments):
+        simulator = SumoSimulator(load_scenario(name), tmp_path)
+        made.append(simulator)
+        observations, _ = simulator.reset(seed=1, options={"arguments": arguments})
+        return simulator, observations["ego"]
+
+    yield begin
+    for simulator in made:
+        simulator.close()
+
+
+def drive(simulator, observation, agent, steps):
+    """Drive until a contact; return the scenes."""
+    agent.reset(0)
+    scenes = [simulator.scene()]
+    for _ in range(steps):
+        action = simulator.actions["ego"].encode(agent.act(observation))
+        observations, *_ = simulator.step({"ego": action})
+        observation = observations["ego"]
+        scenes.append(simulator.scene())
+    return scenes
+
+
+class KeepsSpeed:
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return 60 / 3.6, 0
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_vehicle_cuts_in_at_the_gap_and_with_the_lateral_speed_of_the_arguments(simulate, side):
+    scenes = drive(*simulate("r157-cut-in", **CUT_IN, side=side), KeepsSpeed(), 60)
+    ego, other = (np.array([scene.points[scene.roster.index[name]] for scene in scenes]) for name in ("ego", "other"))
+    gaps, lateral = other[:, 0] - 4.3 - ego[:, 0], (other[:, 1] - ego[:, 1]) * side
+    assert gaps[6] == pytest.approx(12.5)  # after six steps of 0.15 m/s, the lateral speed is 0.9 m/s
+    assert lateral[6] == pytest.approx(3.5)
+    assert -np.diff(lateral)[6:40] == pytest.approx(0.09)
+    assert lateral[-1] == pytest.approx(0.0, abs=1e-6)
+    assert np.diff(gaps) == pytest.approx(-20 / 3.6 * 0.1)
+
+
+def test_vehicle_ahead_brakes_and_stands(simulate):
+    scenes = drive(*simulate("r157-deceleration", ego_kmh=60.0, decel_mps2=5.0, headway_s=2.0), KeepsSpeed(), 50)
+    speeds = [scene.speeds[scene.roster.index["leader"]] for scene in scenes]
+    assert speeds[:3] == pytest.approx([60 / 3.6, 60 / 3.6 - 0.5, 60 / 3.6 - 1.0])
+    assert speeds[-1] == 0.0
+
+
+def test_vehicle_ahead_shows_a_standing_vehicle(simulate):
+    values = {"ego_kmh": 60.0, "front_m": 60.0, "lateral_mps": 1.5, "headway_s": 2.0, "side": 1}
+    scenes = drive(*simulate("r157-cut-out", **values), KeepsSpeed(), 40)
+    first, last = scenes[0], scenes[-1]
+    ahead = [first.points[first.roster.index[name]][0] for name in ("ego", "leader", "standing")]
+    assert np.diff(ahead) == pytest.approx([60 / 3.6 * 2 + 4.3, 60.0 + 4.3])
+    assert last.points[last.roster.index["leader"]][1] == pytest.approx(-1.75)
+    assert last.speeds[last.roster.index["standing"]] == 0.0
+
+
+@pytest.mark.parametrize("model", REFERENCE_MODELS)
+def test_reference_driver_in_the_scenario_ends_as_in_the_plain_computation(simulate, model):
+    cases = [(40.0, 10.0, 8.0, 1.1), (60.0, 40.0, 3.0, 1.3), (70.0, 40.0, 25.0, 0.7), (90.0, 70.0, 30.0, 1.0)]
+    for values in cases:
+        arguments = dict(zip(CUT_IN, values, strict=True))
+        agent = ReferenceDriver(model=model, desired_speed=0, length=4.3, width=1.9)
+        scenes = drive(*simulate("r157-cut-in", **arguments, side=1), agent, 90)
+        touched = any(touch(scene) for scene in scenes)
+        columns = {name: np.array([value]) for name, value in arguments.items()}
+        assert touched == (solve("cut_in", columns, model)[model][0] > 0), (model, values)
+
+
+def touch(scene):
+    (x, y), (other_x, other_y) = (scene.points[scene.roster.index[name]] for name in ("ego", "other"))
+    return abs(x - other_x) < 4.3 and abs(y - other_y) < 1.9
+
+
+def test_invalid_arguments_of_a_manoeuvre_are_refused(simulate):
+    for value in (math.nan, -1.0, 1e9):
+        with pytest.raises(InvalidEpisodeError, match="the argument gap_m is"):
+            simulate("r157-cut-in", **{**CUT_IN, "gap_m": value})
+
+
+def test_scenario_with_a_manoeuvre_needs_its_arguments(tmp_path):
+    scenario = load_scenario("r157-cut-in")
+    assert scenario.table(SumoSetup).manoeuvre == "cut_in"
+    less = replace(scenario, arguments={name: one for name, one in scenario.arguments.items() if name != "side"})
+    with pytest.raises(ScenarioError, match="has no 'side', which the manoeuvre 'cut_in' needs"):
+        less.backend.check(less, "scenario.toml")
