@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _HEADWAY_S = 2.0  # time gap of the careful human driver of R157
 _COMFORT_MPS2 = 1.0  # acceleration of a follower. Source: the comparison of the models, see _reference_models.py
 _GENTLE_BRAKING_MPS2 = 2.0  # for a speed or gap that is no risk
-_ASIDE_M = 6.0  # vehicles further beside the path are ignored
+_ASIDE_M = 6.0  # vehicles that are further from the path are ignored
 _SAME_VEHICLE_M = 2.0  # a vehicle seen this near to its expected position is the same one as in the last step
 _MAX_LATERAL_MPS = 5.0  # a vehicle that jumps to another lane has no greater lateral speed
 _SAME_DIRECTION = 0.5  # least cosine of the angle between the headings

@@ -7,12 +7,12 @@ with one element per situation, in m, s, m/s and m/s².
 Sources:
 
 - R157: UN Regulation 157 (ALKS). Original series: Annex 4, appendix 3. 01 series: Annex 3.
-- FSM: Mattas et al.: Fuzzy Surrogate Safety Metrics for real-time assessment of rear-end collision risk, Accident
-  Analysis and Prevention 148 (2020), 105794; the same model is performance model 2 of R157, 01 series, Annex 3.
+- FSM: Mattas et al.: Fuzzy Surrogate Safety Metrics for real-time assessment of rear-end collision risk. Accident
+  Analysis and Prevention 148 (2020), 105794. The same model is performance model 2 of R157, 01 series, Annex 3.
 - RSS: Shalev-Shwartz, Shammah, Shashua: On a Formal Model of Safe and Scalable Self-driving Cars (2017),
   arXiv:1708.06374.
-- Comparison of the four models, with the parameters that R157 leaves open: Mattas et al.: Driver models for the
-  definition of safety requirements of automated vehicles in international regulations, Accident Analysis and Prevention
+- Comparison of the four models, with the parameters that R157 does not define. Mattas et al.: Driver models for the
+  definition of safety requirements of automated vehicles in international regulations. Accident Analysis and Prevention
   174 (2022), 106743.
 """
 
@@ -173,9 +173,9 @@ class CarefulHuman(_Model):
 
         TTC = gap / closing speed
 
-    R157 does not say when the driver reacts to a slower vehicle that is in the path already. It is perceived as a
-    risk if the time gap is at most `headway_s`, which is the boundary of the deceleration scenario, or `early_s` before
-    the last moment at which braking with `max_brake` equals the speeds in time:
+    R157 does not say when the driver reacts to a slower vehicle that is in the path already. It is perceived as a risk
+    if the time gap is at most `headway_s`, which is the boundary of the deceleration scenario. It is also perceived
+    `early_s` before the last moment at which braking with `max_brake` equals the speeds in time:
 
         gap <= headway_s · own speed, or gap <= early_s · closing speed + closing speed² / (2 · max_brake)
 
@@ -250,14 +250,24 @@ class FuzzySafety(_Model):
     With the speeds u (own) and v (other), the gap d, the reaction time t, comfortable and maximum braking c and m, and
     maximum braking of the other vehicle o:
 
-    - The driver reacts if the other vehicle may enter the path before the own vehicle has passed:
-      lateral gap / lateral speed < (d + lengths of both vehicles) / (u - v) + 0.1 s.
-    - PFS (proactive fuzzy surrogate) is 0 above safe = u t + u² / 2c - v² / 2o + margin, and 1 below
-      unsafe = u t + u² / 2m - v² / 2o, linear between; it is evaluated for d - margin.
-    - CFS (critical fuzzy surrogate), if u > v: with a = max(own acceleration, -c), the speed after the reaction time is
-      w = u + a t, and the gap shrinks by n = ((u + w) / 2 - v) t. If w <= v, safe = unsafe = (u - v)² / 2|a|. Otherwise
-      safe = n + (w - v)² / 2c, unsafe = n + (w - v)² / 2m. CFS is 1 below unsafe, 0 above safe, linear between.
-    - The driver brakes with CFS (m - c) + c if CFS > 0, otherwise with PFS c.
+    The driver reacts if the other vehicle may enter the path before the own vehicle has passed:
+
+        lateral gap / lateral speed < (d + lengths of both vehicles) / (u - v) + 0.1 s
+
+    PFS (proactive fuzzy surrogate) is 0 above ``safe``, 1 below ``unsafe``, and linear between. The gap is d - margin::
+
+        safe = u t + u² / 2c - v² / 2o + margin
+        unsafe = u t + u² / 2m - v² / 2o
+
+    CFS (critical fuzzy surrogate) is 0 if u <= v. Otherwise it is computed in the same way from the gap d::
+
+        a = max(own acceleration, -c)
+        w = u + a t
+        n = ((u + w) / 2 - v) t
+        safe = n + (w - v)² / 2c if w > v, otherwise (u - v)² / 2|a|
+        unsafe = n + (w - v)² / 2m if w > v, otherwise (u - v)² / 2|a|
+
+    The driver brakes with CFS (m - c) + c if CFS > 0, otherwise with PFS c.
 
     Args:
         count: number of situations.
@@ -353,8 +363,8 @@ class SafetyRules(_Model):
     """A driver who brakes as Responsibility-Sensitive Safety requires, named ``rss``.
 
     The situation is dangerous if the gap and the lateral gap are both shorter than the safe distances of definitions 1
-    and 6 of the paper. With the speeds u (own) and v (other), the response time t, the acceleration a, the deceleration
-    b and, across the road, the speed w of the other vehicle, its acceleration e and the deceleration f:
+    and 6 of the paper. The speeds are u (own), v (other) and w (other, across the road). The response time is t. The
+    acceleration and the deceleration are a and b along the road, and e and f across the road::
 
         safe gap = u t + a t² / 2 + (u + a t)² / 2b - v² / 2b
         safe lateral gap = margin + (2 w + e t) t / 2 + (w + e t)² / 2f
@@ -400,8 +410,9 @@ class SafetyRules(_Model):
     def following_distance(self, speed: Values) -> Values:
         """Return the safe gap if the other vehicle, too, brakes after the response time only.
 
-        The other vehicle's way in the response time is t² b / 2 shorter than at a constant speed:
-        u t + (a + b) t² / 2 + (u + a t)² / 2b - max(0, u - b t)² / 2b.
+        The other vehicle's way in the response time is t² b / 2 shorter than at a constant speed::
+
+            u t + (a + b) t² / 2 + (u + a t)² / 2b - max(0, u - b t)² / 2b
         """
         response = self._response_s
         later = np.maximum(0.0, speed - self._braking * response)

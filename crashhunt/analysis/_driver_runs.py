@@ -2,8 +2,8 @@
 
 A model watches the collision partner from the first step at which the agent could see it. The agent drives until the
 model perceives the risk. From then on, the model controls the speed, and the vehicle keeps its lane. A model prevents
-the collision if the run continues for at least 5 s after the recorded collision, and ends without any crash and without
-an approach that needs more than 1 m/s².
+the collision if its run has no crash and continues for at least 5 s after the recorded collision. The run must end
+without an approach that needs more than 1 m/s².
 
 The models describe traffic in one direction on a road. They do not apply to pedestrians, junctions, oncoming and
 crossing traffic, to a vehicle that is hit from behind, and to lane changes of the agent itself. ``reg157`` applies only
@@ -48,7 +48,7 @@ PREVENTABILITY_RUNS = len(COMPETENT_DRIVERS)
 """The number of runs that the models need at most."""
 
 _CHANGE_S = 5.0  # a lane change that began earlier has not led to the collision
-_BESIDE_S = 10.0
+_OUTSIDE_S = 10.0
 _GENTLE_MPS2 = 1.0
 _CUT_IN_MODEL = "reg157"
 _UNDECIDED = {
@@ -122,12 +122,12 @@ def _applies(rerun: Rerun) -> tuple[str, bool]:
         return f"{hit.agent} changed lanes, and the models do not decide about lanes", False
     if contact.follower != hit.agent and hit.other not in changers:
         return "neither a rear-end collision nor a cut-in", False
-    return "", hit.other in changers and _was_beside(rerun.recorded, hit.agent, hit.other)
+    return "", hit.other in changers and _was_in_other_lane(rerun.recorded, hit.agent, hit.other)
 
 
-def _was_beside(recording: Recording, agent: str, other: str) -> bool:
-    """Return whether another vehicle was beside the path of the agent within the last seconds."""
-    steps = round(_BESIDE_S / recording.prologue.step_length_s)
+def _was_in_other_lane(recording: Recording, agent: str, other: str) -> bool:
+    """Return whether another vehicle was outside the path of the agent within the last seconds."""
+    steps = round(_OUTSIDE_S / recording.prologue.step_length_s)
     for scene in recording.scenes()[-steps:]:
         rows = scene.roster.index
         if agent not in rows or other not in rows:

@@ -36,7 +36,8 @@ SECTIONS = {
 
 _PAGE_ORDER = [
     "find-a-crash", "watch-and-see-why", "prove-that-it-is-fixed", "how-often-does-it-crash",
-    "which-version-is-better", "cluster", "connect-your-planner", "your-town", "highway-env", "gymnasium",
+    "which-version-is-better", "as-good-as-a-competent-driver", "cluster",
+    "connect-your-planner", "your-town", "highway-env", "gymnasium",
     "planner-in-cpp", "ci",
     "agent", "exec", "lib", "fmu", "scenario", "map", "searching", "requirements", "disturbances",
     "probes", "branches", "look-into-a-crash",

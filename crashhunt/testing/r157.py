@@ -2,7 +2,7 @@
 
 KIND is ``cut_in``, ``cut_out`` or ``car_following``. OUT.csv has the columns of CASES.csv and the answers of each
 driver: 0 for no collision and 1 for a collision. In a cut-in, 2 is a collision with the rear of the other vehicle, and
-1 is a collision beside the other vehicle. The requirement ``reg157`` applies to cut-ins only.
+1 is a collision with its side. The requirement ``reg157`` applies to cut-ins only.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ MODELS = {"cc_human", "fsm", "rss", "reg157"}
 
 
 @pytest.mark.long
-def test_crash_of_a_blind_agent_is_preventable_and_every_text_says_so(shell):
+def test_crash_of_a_blind_agent_is_preventable_in_all_outputs(shell):
     shell.crashhunt("run", "h", "2", "40", "400", "--scenario", "loop", "--arg", "speed=22:25", "--seed", "1")
     few = ("--runs", "1", "--why", "0", "--reference", "0")
     (judged,) = shell.crashhunt("judge", "h", *few, "--json").json["judged"]
