@@ -229,7 +229,8 @@ PARTS: Mapping[str, Part] = {
         ),
         Part(
             name="lanes",
-            meaning="centre lines of the lanes around: the own lane, its left and its right neighbour, then others",
+            meaning="points on centre lines: the own lane along the route, its left and right neighbour, then the "
+            "nearest others within 50 m that the vehicle may use",
             axes=("lanes", "points"),
             columns=(
                 _PRESENT,
@@ -243,7 +244,10 @@ PARTS: Mapping[str, Part] = {
                 Setting("lanes", 8, 1, 200, "", "number of lanes"),
                 Setting("points", 40, 2, 1000, "", "number of points of each lane"),
                 Setting("spacing", 2.0, 0.1, 50.0, "m", "distance between two points"),
-                Setting("behind", 10.0, 0.0, 200.0, "m", "distance between the first point and the vehicle"),
+                Setting(
+                    "behind", 10.0, 0.0, 200.0, "m",
+                    "distance of the first point behind the point that is nearest to the vehicle",
+                ),
             ),
         ),
         Part(
@@ -274,8 +278,7 @@ PARTS: Mapping[str, Part] = {
                 ),
                 Column(
                     "distance_to_lane_change", "m", 0.0, _DISTANCE_M,
-                    "distance in which the lane changes must be complete; the distance to the end of the route if none "
-                    "is needed",
+                    "distance to where the own lane leaves the route; if it does not, to the end of the route",
                 ),
                 _position("goal_x", "x of the end of the route"),
                 _position("goal_y", "y of the end of the route"),
@@ -289,7 +292,7 @@ PARTS: Mapping[str, Part] = {
                 _PRESENT,
                 Column("state", "", 0.0, 3.0, "0 green, 1 yellow, 2 red, 3 off or blinking"),
                 _distance("distance", "distance of the front bumper to the stop line"),
-                _time("time_in_state", "time since the light has this state"),
+                _time("time_in_state", "time since the light has this state; a lower bound if its program adapts"),
             ),
             settings=(Setting("rows", 3, 1, 50, "", "number of traffic lights"),),
         ),
@@ -302,10 +305,13 @@ PARTS: Mapping[str, Part] = {
                 _PRESENT,
                 _flag("must_yield", "1 if the controlled vehicle must yield to the actor"),
                 _distance("stop_line_distance", "distance of the front bumper to the stop line of the junction"),
-                _distance("conflict_distance", "distance of the front bumper to the conflict area"),
+                _distance(
+                    "conflict_distance",
+                    "distance of the front bumper to the area where the paths are closer than 0.8 lane widths",
+                ),
                 _distance("other_distance", "distance of the actor's front bumper to the conflict area"),
                 _speed("other_speed", "speed of the actor"),
-                _time("other_arrival", "time until the actor reaches the conflict area"),
+                _time("other_arrival", "time until the actor reaches this area at its speed; 1000 if it stands"),
                 _flag("stop_sign", "1 if the controlled vehicle must stop at the stop line"),
             ),
             settings=(Setting("rows", 8, 1, 100, "", "number of rows"),),
@@ -325,7 +331,7 @@ PARTS: Mapping[str, Part] = {
         Part(
             name="speed_limit",
             meaning="speed limit of the controlled vehicle's lane",
-            columns=(Column("speed_limit", "m/s", 0.0, _SPEED_MPS, "speed limit of the lane for this vehicle"),),
+            columns=(Column("speed_limit", "m/s", 0.0, _SPEED_MPS, "speed limit of the lane at this time"),),
         ),
         Part(
             name="predictions",

@@ -43,6 +43,7 @@ def test_columns_are_those_of_the_documented_table():
         "signals": "present state distance time_in_state",
         "right_of_way": "present must_yield stop_line_distance conflict_distance other_distance other_speed "
         "other_arrival stop_sign",
+        "stop_line": "present distance must_yield stop_sign signal",
         "speed_limit": "speed_limit",
         "predictions": "x y yaw speed",
     }  # fmt: skip
