@@ -130,7 +130,7 @@ class Episodes:
             max_steps=sys.maxsize,
             disturbances=disturbances,
         )
-        self._episode = Episode(spec, simulator=self._simulator, make_agent=_make_agent, observers=(self._trail,))
+        self._episode = Episode(spec, simulator=self._simulator, make_agent=self._make_agent, observers=(self._trail,))
         self._episode.start()
         _raise_error(self._episode)
         self._crash_step, self._borders = -1, None
@@ -223,6 +223,10 @@ class Episodes:
         self._stage.remove()
         self._is_closed = True
 
+    def _make_agent(self, agent: str, simulator: Simulator, _arguments: Mapping[str, Value]) -> KeepLaneWithSpeed:
+        """Return the agent of a vehicle; the caller chooses the actions of the environment's own vehicle."""
+        return KeepLaneWithSpeed(_ASSUMED_SPEED_MPS, None if agent == self.agent else simulator.actions[agent].space)
+
     def _require_open(self) -> None:
         if self._is_closed:
             raise SimulatorError("the environment has been closed", fix="make a new environment")
@@ -275,11 +279,6 @@ def _disturber(scenario: Scenario, agent: str, disturb: Sequence[str], max_steps
 
 def _is_finite(value: Value) -> bool:
     return not isinstance(value, float) or math.isfinite(value)
-
-
-def _make_agent(agent: str, simulator: Simulator, _arguments: Mapping[str, Value]) -> KeepLaneWithSpeed:
-    """Return the agent of the scenario's other controlled vehicles; the caller drives the environment's vehicle."""
-    return KeepLaneWithSpeed(_ASSUMED_SPEED_MPS, simulator.actions[agent].space)
 
 
 def _raise_error(episode: Episode) -> None:

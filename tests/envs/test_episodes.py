@@ -255,3 +255,20 @@ def test_environment_with_parts_passes_the_checker_of_gymnasium_and_names_the_ac
         gymnasium.make("crashhunt:crashhunt/SUMO-v0", observation=["eggo"])
     with pytest.raises(UsageError, match="give the names of parts as text"):
         gymnasium.make("crashhunt:crashhunt/SUMO-v0", observation=[3])
+
+
+@pytest.mark.parametrize(
+    ("form", "action"),
+    [
+        ("acceleration", (0.5, 0)),
+        ("acceleration_steering", np.array([0.5, 0.0])),
+        ("throttle_brake_steering", (0.2, 0.0, 0.0)),
+        ("speed_and_lateral", (20.0, 0.1)),
+        ("sumo", None),
+    ],
+)
+def test_environment_takes_every_form_in_several_episodes(make, form, action):
+    env = make("motorway", action=form)
+    for seed in (1, 2):
+        env.reset(seed=seed)
+        assert not env.step(action)[2]
