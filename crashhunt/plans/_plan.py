@@ -750,11 +750,9 @@ def _spec(
     kind = (declared.kind if declared else None) or (known.kind if known else None)
     if asked is not None:
         distribution = parse_spec(asked, kind, where=f"--arg {name}")
-        # A program that declares 12 takes whole numbers and others, so its argument has no type.
-        is_number = declared is not None and kind is None and type(declared.default) is int
-        if is_number and any(isinstance(value, str) for value in distribution.grid(1)):
-            fix = f"give numbers, such as {declared.distribution or declared.default}" if declared else ""
-            raise ArgumentError(f"--arg {name}: {asked!r} is not a number", fix=fix)
+        # A program's 12 has no type, because JSON has one type of numbers.
+        if declared and kind is None and type(declared.default) is int and str in map(type, distribution.grid(1)):
+            raise ArgumentError(f"--arg {name}: {asked!r} is not a number", fix=f"give one, such as {declared.default}")
         return ArgumentSpec(spec=str(distribution), kind=kind)
     for argument in (known, declared) if hunted else ():
         if argument is not None and argument.distribution is not None:

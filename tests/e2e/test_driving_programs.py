@@ -74,8 +74,7 @@ def test_a_program_that_fails_at_once_is_an_error_of_the_agent_and_one_that_is_m
     program.write_text('#!/bin/sh\nread -r line\necho \'{"type": "ready", "arguments": {"speed": {"default": 12}}}\'\n')
     words = ("run", "g", "1", "1", "20", "--agent", "exec:./fails", *RUN, "--arg", "speed=fast")
     assert (
-        toy.crashhunt(*words, expect=2).err
-        == "crashhunt: --arg speed: 'fast' is not a number; give numbers, such as 12\n"
+        toy.crashhunt(*words, expect=2).err == "crashhunt: --arg speed: 'fast' is not a number; give one, such as 12\n"
     )
     refused = toy.crashhunt("run", "g", "1", "1", "20", "--agent", "exec:./nothing", *RUN, expect=2)
     assert refused.err == (
