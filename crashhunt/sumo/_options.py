@@ -242,7 +242,7 @@ class SumoSetup:
         fix_link_order: whether SUMO processes the links of the network in the order of their construction. Otherwise
             SUMO uses the order of the memory addresses of the links, which differs between processes.
         manoeuvre: a manoeuvre of UN R157, ``cut_in``, ``cut_out`` or ``deceleration``: all other vehicles are moved
-            exactly, as the arguments of the scenario say. Empty for traffic that SUMO simulates.
+            exactly, as the arguments of the scenario say. By default, SUMO simulates the traffic.
         literal: whether ``${NAME}`` in a route or additional file stays unchanged instead of being replaced.
     """
 
@@ -253,7 +253,7 @@ class SumoSetup:
     literal: bool | None = None
     native: bool | None = None
     fix_link_order: bool | None = None
-    manoeuvre: Literal["", "cut_in", "cut_out", "deceleration"] = ""
+    manoeuvre: Literal["cut_in", "cut_out", "deceleration"] | None = None
 
 
 MANOEUVRE_ARGUMENTS = {

@@ -35,7 +35,7 @@ def check(scenario: Scenario, where: str) -> None:
             if name not in scenario.arguments:
                 message = f"has no {name!r}, which {file} asks for"
                 refuse(where, "arguments", sorted(scenario.arguments), message, "declare it")
-    for name in MANOEUVRE_ARGUMENTS.get(sumo.manoeuvre, ()):
+    for name in MANOEUVRE_ARGUMENTS[sumo.manoeuvre] if sumo.manoeuvre else ():
         if name not in scenario.arguments:
             message = f"has no {name!r}, which the manoeuvre {sumo.manoeuvre!r} needs"
             refuse(where, "arguments", sorted(scenario.arguments), message, "declare it")
