@@ -46,7 +46,7 @@ from crashhunt.sumo._options import SumoSetup
 from crashhunt.sumo._range_of_sight import Sight
 from crashhunt.sumo._reader_protocol import Moment
 from crashhunt.sumo._scripted import ScriptedSight, place_agents
-from crashhunt.sumo._surroundings import surroundings_of
+from crashhunt.sumo._surroundings import surroundings_of, unregulated_junctions
 from crashhunt.sumo._traffic_events import SumoEvents
 from crashhunt.world import PERSON, Lane, is_person
 
@@ -109,6 +109,7 @@ class SumoSimulator:
         self._forms = {agent: setup.action_form for agent, setup in scenario.agents.items()}
         self.actions: dict[str, ActionForm] = {agent: _FORMS[form]() for agent, form in self._forms.items()}
         self.agents: list[str] = []
+        self._unregulated: frozenset[str] | None = None
         # Only with these options of SUMO, or by such an action, can a vehicle leave the centre line of its lane.
         options = scenario.table(SumoSetup).options
         self._drifts = "speed_and_lateral" in self._forms.values()
@@ -350,7 +351,9 @@ class SumoSimulator:
     def surroundings(self, agent: str) -> Surroundings:
         """Return what a careful driver of the vehicle would consider after the last step."""
         self.scene()  # brings SUMO to the current step
-        return surroundings_of(agent, self._driving.neighboring_lane)
+        if self._unregulated is None:  # the network is read at the first use; libsumo has no getter
+            self._unregulated = unregulated_junctions(self._scenario.folder / self._scenario.table(SumoSetup).net)
+        return surroundings_of(agent, self._driving.neighboring_lane, self._unregulated)
 
     def resolve_target(self, disturbance: Disturbance) -> str:
         """Return the actor that a disturbance names by a place, such as ``ahead``; empty if there is none."""

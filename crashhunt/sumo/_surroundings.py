@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
+from xml.sax.saxutils import unescape
 
 import libsumo
 from libsumo import _libsumo as sumo
 
+from crashhunt.sumo._files import read_xml
 from crashhunt.world import Crossing, Neighbor, Side, Surroundings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Collection, Sequence
+    from pathlib import Path
 
+_UNREGULATED_JUNCTION = re.compile(rb'<junction id="([^":][^"]*)" type="unregulated"')  # SUMO's order of attributes
 _MIN_LOOK_M, _LOOK_S = 60.0, 6.0  # further away, no safe distance of a road vehicle reaches
 _LEADERS, _RIGHT = 2, 1  # bits of the mode of getNeighbors
 _RED_STATES = frozenset("ruR")
@@ -19,12 +24,24 @@ _STOP_LINE_MARGIN_M = 1.0  # SUMO's vehicles stop this far before a line, too
 _MIN_BRAKING_MPS2 = 0.5  # a type may have a decel of 0, and a safe distance divides by it
 
 
-def surroundings_of(agent: str, neighboring_lane: Callable[[str, int], tuple[bool, int] | None]) -> Surroundings:
+def unregulated_junctions(network: Path) -> frozenset[str]:
+    """Return the identifiers of the junctions of a network that have no rules of right of way.
+
+    Raises:
+        ScenarioError: the file cannot be read.
+    """
+    return frozenset(unescape(found.decode()) for found in _UNREGULATED_JUNCTION.findall(read_xml(network)))
+
+
+def surroundings_of(
+    agent: str, neighboring_lane: Callable[[str, int], tuple[bool, int] | None], unregulated: Collection[str] = ()
+) -> Surroundings:
     """Return the surroundings of a vehicle in the current step. Only getters of libsumo are called.
 
     Args:
         agent: identifier of the vehicle, which is on the road.
         neighboring_lane: the method of `Driving` with this name.
+        unregulated: identifiers of the junctions without rules of right of way.
     """
     speed = max(0.0, float(sumo.vehicle_getSpeed(agent)))
     look_m = max(_MIN_LOOK_M, _LOOK_S * speed)
@@ -33,7 +50,7 @@ def surroundings_of(agent: str, neighboring_lane: Callable[[str, int], tuple[boo
         acceleration_mps2=float(sumo.vehicle_getAccel(agent)),
         braking_mps2=_braking(agent),
         ahead=(*_leaders(agent, look_m), *_red_lights(agent, look_m)),
-        crossing=tuple(_crossing(agent, look_m)),
+        crossing=tuple(_crossing(agent, _regulated_m(agent, look_m, unregulated))),
         sides={change: side for change in (1, -1) if (side := _side(agent, change, neighboring_lane)) is not None},
     )
 
@@ -74,8 +91,30 @@ def _red_lights(agent: str, look_m: float) -> list[Neighbor]:
     ]
 
 
+def _regulated_m(agent: str, look_m: float, unregulated: Collection[str]) -> float:
+    """Return how far ahead the rules of right of way are known, at most the given distance, in m."""
+    if not unregulated:
+        return look_m
+    lane = sumo.vehicle_getLaneID(agent)
+    if _junction_of(lane) in unregulated:
+        return 0.0
+    distance_m = float(sumo.lane_getLength(lane)) - float(sumo.vehicle_getLanePosition(agent))
+    for target, _, _, _, inside, _, _, length_m in sumo.vehicle_getNextLinks(agent):
+        if _junction_of(inside) in unregulated:
+            return min(look_m, distance_m - _STOP_LINE_MARGIN_M)
+        distance_m += float(length_m) + float(sumo.lane_getLength(target))
+    return look_m
+
+
+def _junction_of(lane: str) -> str:
+    """Return the junction of a lane inside a junction, such as ``A_1`` of ``:A_1_0_0``; empty for other lanes."""
+    return lane[1:].rpartition("_")[0].rpartition("_")[0] if lane.startswith(":") else ""
+
+
 def _crossing(agent: str, look_m: float) -> list[Crossing]:
     """Return the actors that SUMO counts as foes of the next links, unless neither actor has to yield."""
+    if look_m <= 0.0:
+        return []
     length = float(sumo.vehicle_getLength(agent))
     found = []
     for foe in sumo.vehicle_getJunctionFoes(agent, look_m):

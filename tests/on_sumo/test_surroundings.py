@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -87,3 +90,34 @@ def test_looking_changes_nothing_in_the_simulation(merge):
 def test_a_missing_lane_is_known(merge):
     around = merge.surroundings("ego")
     assert not around.sides[-1].exists
+
+
+_UNREGULATED_DRIVE = """
+import sys
+from pathlib import Path
+import libsumo
+from crashhunt.sumo._surroundings import surroundings_of, unregulated_junctions
+
+net, routes = sys.argv[1:]
+unregulated = unregulated_junctions(Path(net))
+libsumo.start(["sumo", "-n", net, "-r", routes, "--no-step-log", "true", "-W"])
+foes = inside = 0
+for _ in range(60):
+    libsumo.simulationStep()
+    for vehicle in libsumo.vehicle.getIDList():
+        foes += len(surroundings_of(vehicle, lambda *_: None, unregulated).crossing)
+        inside += libsumo.vehicle.getLaneID(vehicle).startswith(":A1")
+print(sorted(unregulated), foes > 0, inside > 0)
+"""
+
+
+def test_junctions_without_rules_end_no_process(tmp_path):
+    # libsumo's getJunctionFoes dies with a segmentation fault at such a junction, so another process calls it.
+    (tmp_path / "routes.rou.xml").write_text(
+        """<routes><route id="r" edges="C1B1 B1A1 A1B3 B3C3"/><route id="q" edges="C4B4 B4A1 A1B2 B2C2"/>
+        <flow id="a" route="r" begin="0" end="60" period="4"/><flow id="b" route="q" begin="0" end="60" period="3"/>
+        <flow id="c" begin="0" end="60" period="3"><route edges="B2B1 B1B4"/></flow></routes>"""
+    )
+    arguments = (Path(__file__).parent / "nets" / "spider.net.xml.gz", tmp_path / "routes.rou.xml")
+    done = subprocess.run([sys.executable, "-c", _UNREGULATED_DRIVE, *arguments], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip()) == (0, "['A1'] True True"), done.stderr
