@@ -22,7 +22,9 @@ ActionName = Literal[
 """What a scenario, ``--action`` and an agent's class may name; ``continuous`` is an older name of speed_and_lane."""
 
 DEFAULT_ACTION = "speed_and_lane"
-_OLDER_NAMES = {"continuous": DEFAULT_ACTION}
+FORMER_DEFAULT_ACTION = "continuous"
+"""The default in scenarios of format version 1, which state it also for simulators without forms of actions."""
+_OLDER_NAMES = {FORMER_DEFAULT_ACTION: DEFAULT_ACTION}
 
 
 @dataclass(frozen=True, slots=True)

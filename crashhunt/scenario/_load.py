@@ -20,6 +20,7 @@ from crashhunt.base.plugins import registered
 from crashhunt.base.programs import anchored, is_program, relative_to
 from crashhunt.base.text import any_of, did_you_mean, listed, near_path, one_of
 from crashhunt.base.validation import validate
+from crashhunt.scenario._action_forms import FORMER_DEFAULT_ACTION
 from crashhunt.scenario._scenario import (
     AgentSetup,
     ObservationSetup,
@@ -137,7 +138,7 @@ def _check_keys(scenario: Scenario, heeded: frozenset[str], where: str) -> None:
         for item in fields(AgentSetup):
             value = getattr(setup, item.name)
             common = item.name in ("agent", "arguments") or f"agents.{item.name}" in heeded
-            if not common and value != getattr(plain, item.name):
+            if not common and value not in (getattr(plain, item.name), FORMER_DEFAULT_ACTION):
                 refuse(where, f"agents.{agent}.{item.name}", value, _suggestion(f"agents.{item.name}"), "remove it")
     for key in ("warmup_s", "insertion_timeout_s"):
         value = getattr(scenario, key)

@@ -7,6 +7,7 @@ import gc
 import math
 import os
 import pickle
+import re
 import signal
 import sys
 from multiprocessing.connection import Pipe
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 
 from crashhunt.agents import KeepLaneWithSpeed
+from crashhunt.base.extras import install_command
 from crashhunt.base.forks import CannotForkError
 from crashhunt.envs import SumoEnv, _env_episodes as _episodes, _process, _sumo_env
 from crashhunt.envs._env_episodes import Episodes, _Trail
@@ -548,7 +550,7 @@ def test_picture_needs_its_mode_an_episode_and_pillow(environments, monkeypatch)
     plain.reset()
     assert plain.render() is None
     monkeypatch.setattr(_sumo_env.importlib.util, "find_spec", lambda name: None if name == "PIL" else name)
-    with pytest.raises(UsageError, match=r"render_mode needs Pillow; pip install 'crashhunt\[video\]'"):
+    with pytest.raises(UsageError, match=re.escape(f"render_mode needs Pillow; {install_command('video')}")):
         SumoEnv(render_mode="rgb_array")
     SumoEnv(process=False)
     with pytest.raises(UsageError, match="render_mode is 'human'; give rgb_array"):

@@ -13,6 +13,7 @@ import time
 import pytest
 
 from crashhunt.base.errors import PluginError, UsageError
+from crashhunt.base.extras import install_command
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors.ray import RayExecutor
 from crashhunt.executors.ray._cluster import OLDEST_RAY_VERSION, cluster_of, require_ray
@@ -156,7 +157,7 @@ def test_a_token_goes_to_no_one_but_a_cluster_that_runs_here(monkeypatch, tmp_pa
 
 def test_without_ray_it_states_how_to_get_it(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(PluginError, match=r"which is not installed; pip install 'crashhunt\[ray\]'"):
+    with pytest.raises(PluginError, match=re.escape(f"which is not installed; {install_command('ray')}")):
         require_ray()
 
 

@@ -331,7 +331,7 @@ def test_the_form_of_action_of_a_bare_configuration(town):
 quoted = st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs"), exclude_characters="<&\"'"), max_size=9)
 # What SUMO takes for no file is left as it is.
 names = quoted.filter(
-    lambda name: name.strip() and name not in ("NUL", "nul", "stdout", "STDOUT", "-", "stderr", "STDERR")
+    lambda name: name.strip() and name not in ("NUL", "nul", "/dev/null", "stdout", "STDOUT", "-", "stderr", "STDERR")
 )
 
 

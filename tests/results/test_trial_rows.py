@@ -39,7 +39,7 @@ RESULT = TrialResult(
     worker=99,
     kept=True,
     escape=Escape(4, 5, 7.5, "by braking"),
-    event=Event("teleport", "ego", "car was moved", ("car",), "b_0", 3.5, 4.5, 14.5),
+    event=Event("teleport", "ego", "car was moved", ("car",), "b_0", 3.5, 4.5, 14.5, "slow", ("a > 1 is false",)),
     events={"teleport": 2},
     danger=0.875,
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 import time
 from dataclasses import replace
@@ -14,6 +15,7 @@ from hypothesis import HealthCheck, example, given, settings, strategies as st
 from spaces import are_inside, ask, spaces, spec_of
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from crashhunt.base.extras import install_command
 from crashhunt.errors import UsageError
 from crashhunt.samplers import (
     CmaEsSampler,
@@ -181,7 +183,7 @@ def test_only_what_the_hunt_is_after_is_a_crash():
 
 def test_a_hunt_without_the_package_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "cmaes", None)
-    with pytest.raises(UsageError, match=r"needs the package cmaes; pip install 'crashhunt\[search\]'"):
+    with pytest.raises(UsageError, match=re.escape(f"needs the package cmaes; {install_command('search')}")):
         CmaEsSampler(UNIT)
 
 
