@@ -5,7 +5,7 @@ something, such as ``vehicle.setSpeed`` of another vehicle, ``simulationStep`` o
 agent's action. Such a call raises an `ActionError` in the agent, and SUMO does not receive it.
 
 Calls of crashhunt, of a user's simulator, oracle or disturbance, and of a program that uses the environment of
-Gymnasium, are not restricted. The nearest function of crashhunt on the stack tells whether an agent calls. Only
+Gymnasium, are not restricted. The nearest function of crashhunt on the stack shows whether an agent calls. Only
 functions that change something are wrapped, so reading costs nothing.
 """
 

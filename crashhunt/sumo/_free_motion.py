@@ -33,7 +33,7 @@ _MAX_YAW_RATE_RADPS = 1.5
 _OVER_M = 1.0  # a vehicle so far over the side of its lane is in the way of the next lane
 _LOOK_S, _MIN_LOOK_M = 0.5, 4.0  # how far ahead a vehicle that keeps its lane looks
 _MAX_LANES_AHEAD = 10
-_MAX_SLIDE_M, _MAX_TURN_RAD = 0.2, 0.05  # by which a trajectory may begin beside the vehicle, as plans are predictions
+_MAX_SLIDE_M, _MAX_TURN_RAD = 0.2, 0.05  # distance of a trajectory's start from the vehicle, as plans predict
 
 
 class FreeMotion:
@@ -117,7 +117,7 @@ class FreeMotion:
         """Return what an encoded action does: the speed after the step, and whether the vehicle leaves its lane."""
         after = self._next(action.tolist())
         path = self._path(_LOOK_S * after.speed)
-        aside, direction = _beside(path, after.x, after.y)
+        aside, direction = _offset_from(path, after.x, after.y)
         moves = after.speed * math.sin(after.heading - direction) * _LOOK_S
         border = sumo.lane_getWidth(sumo.vehicle_getLaneID(self._vehicle)) / 2 - _OVER_M if path else math.inf
         leaves = abs(aside + moves) > border and moves * (aside + moves) > 0
@@ -311,7 +311,7 @@ class DrivableArea:
         return found
 
 
-def _beside(path: Sequence[tuple[float, float]], x: float, y: float) -> tuple[float, float]:
+def _offset_from(path: Sequence[tuple[float, float]], x: float, y: float) -> tuple[float, float]:
     """Return how far a point is to the left of the nearest part of a path, in m, and the direction of this part."""
     nearest = (math.inf, 0.0, 0.0)
     for (ax, ay), (bx, by) in pairwise(path):

@@ -33,8 +33,8 @@ class ReaderSetup:
         step_length_s: Length of a step, in s.
         start_m: The vehicle's odometer (`vehicle.getDistance`) at the start of the episode, in m.
         start_s: Simulation time at the start of the episode, in s.
-        steering: Function that returns the steering angle of the vehicle, in rad, positive to the left; None if the
-            vehicle's actions contain no steering angle, so that the angle follows from the yaw rate.
+        steering: Function that returns the steering angle of the vehicle, in rad, positive to the left. None if the
+            vehicle's actions contain no steering angle. The angle then follows from the yaw rate.
     """
 
     agent: str
