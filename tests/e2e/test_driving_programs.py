@@ -41,6 +41,7 @@ def test_a_hunt_varies_what_a_program_declares_and_its_crash_replays_where_the_p
     assert toy.crashhunt("replay", "elsewhere", "--json").json["verdict"] == "reproduced"
 
 
+@pytest.mark.nightly
 def test_each_harm_costs_its_own_trial_with_a_message_that_names_the_vehicle_and_the_step(toy):
     write_program(toy.folder)
     harms = {
@@ -188,6 +189,7 @@ def same_driver(shell, trials, scenario, *, max_steps=200):
     return found
 
 
+@pytest.mark.nightly
 @pytest.mark.long
 def test_one_driver_in_python_and_as_a_program_has_equal_digests(toy):
     first, *others = same_driver(toy, 3, "toy")

@@ -80,7 +80,7 @@ def test_path_of_the_last_4_s_is_in_the_picture(make):
     env.reset(seed=3)
     for _ in range(60):
         env.step((5.0, 0))
-    pale = tuple((part + 255) // 2 for part in (224, 138, 0))
+    pale = tuple((part + 255) // 2 for part in (255, 179, 26))
     columns = np.nonzero((env.render() == pale).all(axis=2))[1]
     # 20 m at 8 pixels per metre, of which the rear half of a car of 5 m covers some.
     assert np.ptp(columns) == pytest.approx(20 * 8 - 40, abs=12)

@@ -303,7 +303,7 @@ def test_film_page_and_views_show_trains_and_persons(drive, tmp_path):
     step = next(number for number, scene in enumerate(recording.scenes()) if scene.spines) + 40
     scene = recording.scene(step)
     picture = SceneView(recording, [], agent="ego", scale=1.5).draw(step)
-    orange = (np.abs(picture.astype(int) - (224, 138, 0)) < 40).all(axis=2)
+    orange = (np.abs(picture.astype(int) - (255, 179, 26)) < 40).all(axis=2)
     assert orange.sum() == pytest.approx(200 * 2.84 * 1.5**2, rel=0.25)
     spine = np.array(scene.spines[0])[:, :2]
     place = (spine - scene.centers[0]) * (1.5, -1.5) + (480, 270)
@@ -321,7 +321,7 @@ def test_film_page_and_views_show_trains_and_persons(drive, tmp_path):
     traffic += '<person id="0" type="ghost" depart="0" departPos="30"><walk edges="wc ce"/></person>'
     _, recording, _ = drive("street", traffic, steps=2)
     picture = SceneView(recording, [], agent="ego", other="person 0").draw(1)
-    assert (np.abs(picture.astype(int) - (198, 40, 40)) < 40).all(axis=2).sum() > 40
+    assert (np.abs(picture.astype(int) - (143, 15, 63)) < 40).all(axis=2).sum() > 40
 
 
 def test_lanes_of_any_length_have_a_height(drive):

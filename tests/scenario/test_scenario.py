@@ -58,7 +58,9 @@ def test_every_shipped_scenario_is_valid_and_complete(name):
             if argument.kind == "str":  # the name of a model, or a file in the folder
                 assert argument.name == "model" or Path(argument.default).is_file()
                 continue
-            assert argument.distribution is not None
+            if argument.distribution is None:  # the models of a competent driver do not vary
+                assert name.startswith("r157-")
+                continue
             assert argument.distribution.contains(argument.default), argument
 
 
