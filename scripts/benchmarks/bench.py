@@ -633,7 +633,7 @@ def bench_agents() -> Iterator[Figure]:
         found = in_child("child_agents", str(place)) | in_child("child_library", str(place))
     pipes_us, step_us = 1e6 * found["pipes_s"], 1e6 * found["step_s"]
     yield Figure(
-        "exec_step", step_us, "µs", "lower", 60.0, f"observe and act of an echo in C; {pipes_us:.3g} µs are its pipes"
+        "exec_step", step_us, "µs", "lower", 60.0, f"observe and act of an echo in C; bare pipes took {pipes_us:.3g} µs"
     )
     start_ms = 1e3 * (found["start_s"] - found["step_s"])
     yield Figure("exec_start", start_ms, "ms", "lower", 3.0, "start, hello, reset and close of an echo in C")

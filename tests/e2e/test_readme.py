@@ -14,11 +14,11 @@ from pages import PAGES, ROOT, Page, prepare, tree
 ROOTS = [topic for topic in PAGES if not Page(topic).before and Page(topic).commands]
 # The dearest pages; what they show is asked by day elsewhere, without their words.
 AT_NIGHT = (
-    "agent", "api", "ci", "compare", "connect-your-planner",
-    "disturbances", "exec", "executor", "film", "files", "find-a-crash", "gymnasium",
-    "hand-over", "highway-env", "how-often-does-it-crash", "lib", "look-into-a-crash", "oracle", "planner-in-cpp",
-    "prove-that-it-is-fixed", "requirements", "sampler", "scenario", "simulator", "suites", "train",
-    "watch-and-see-why", "which-version-is-better", "your-town",
+    "actions", "agent", "api", "ci", "compare", "connect-your-planner", "disturbances", "exec", "executor", "film",
+    "files", "find-a-crash", "gymnasium", "hand-over", "highway-env", "how-often-does-it-crash", "lib",
+    "look-into-a-crash", "observations", "oracle", "planner-in-cpp", "prove-that-it-is-fixed", "requirements",
+    "sampler", "scenario", "simulator", "suites", "train", "watch-and-see-why", "which-version-is-better",
+    "your-town",
 )  # fmt: skip
 BY_DAY = [root for root in ROOTS if root not in AT_NIGHT]
 # By day, the first hunt of the README and its replay; "all of README" runs the others at night. By day, tests of
