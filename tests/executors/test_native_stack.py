@@ -50,7 +50,7 @@ ctypes.CDLL(sys.argv[2]).act(int(sys.argv[3]))
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with the compiled library of crashhunt, and with two of somebody's."""
+    """A folder with the compiled library of crashhunt, and with two libraries of a user."""
     folder = tmp_path_factory.mktemp("native")
     interface = types.ModuleType("interface")
     interface.BuildHookInterface = object

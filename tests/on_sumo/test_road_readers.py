@@ -133,7 +133,7 @@ def test_signals_show_the_lights_that_traci_names_and_the_age_of_their_state(tmp
                 assert shown[:, 0].sum() == len(wanted)
                 for row, (light, link, distance, letter) in enumerate(wanted[:1]):
                     state, start = since[light, link]
-                    if start <= STEP_S:  # nobody looked when it changed
+                    if start <= STEP_S:  # the change came before the first observation
                         continue
                     assert shown[row] == pytest.approx((1, state, distance, time_s - start), abs=0.02), letter
                     seen += 1
