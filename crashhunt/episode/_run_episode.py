@@ -177,6 +177,9 @@ def setrecursionlimit(limit: int, /) -> None:
 # What a trial is put together from: simulator, agents and oracles, as the settings name them.
 
 
+_FOREIGN = ProgramFactory | LibraryFactory | FmuFactory  # they create agents that are not in Python
+
+
 class Parts:
     """Creates the parts of trials (oracles, simulator, agents) in this process, from the code that the settings name.
 
@@ -256,7 +259,7 @@ class Parts:
         """
         try:
             factory, given = self._prepared(agent, simulator, arguments)
-            if _is_foreign(factory):
+            if isinstance(factory, _FOREIGN):
                 stage, files = stage_of(self._settings.scratch, os.getpid()), self._settings.argument_files
                 limit_s = self._settings.step_timeout_s or None
                 return factory.agent(agent, simulator, given, folder=stage, files=files, limit_s=limit_s)
@@ -310,17 +313,12 @@ class Parts:
             factory = locate("agents", self._settings.scenario.agents[agent].agent)
             if isinstance(factory, LibraryFactory | FmuFactory):
                 factory.load(self._settings.argument_files, self._settings.scratch)
-            if _is_foreign(factory):  # it would have to run to report its arguments
+            if isinstance(factory, _FOREIGN):  # it would have to run to report its arguments
                 return self._factories.setdefault(agent, (factory, Signature({}, open=True, given=())))
             if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
                 require_origin(factory.__module__, self._settings.code)
             found = self._factories[agent] = factory, signature_of(factory)
         return found
-
-
-def _is_foreign(factory: object) -> bool:
-    """Return whether a factory creates agents that are not in Python."""
-    return isinstance(factory, ProgramFactory | LibraryFactory | FmuFactory)
 
 
 def stage_of(scratch: Path, pid: int) -> Path:
