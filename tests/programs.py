@@ -95,7 +95,7 @@ for line in iter(sys.stdin.readline, ""):
     elif message["type"] == "hello":
         answer(type="ready", format="json", arguments={
             "speed": {"range": "8.0:20.0", "unit": "m/s", "default": 12.0}, "kind": {"default": kind},
-        })
+        }, revision="1.4-3-gabc")
     elif message["type"] == "reset":
         answer(type="ok")
     elif message["type"] == "observe":

@@ -11,6 +11,7 @@ import importlib
 import math
 import re
 import tempfile
+import time
 import tomllib
 import zipfile
 from collections import defaultdict
@@ -114,7 +115,7 @@ class FmuFactory:
 
     def agent(
         self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path,
-        files: Mapping[str, str], limit_s: float | None = None,
+        files: Mapping[str, str], limit_s: float | None = None, is_forked: bool = False,
     ) -> FmuAgent:  # fmt: skip
         """Return the agent of a vehicle; its instance of the FMU begins in the first step.
 
@@ -124,7 +125,8 @@ class FmuFactory:
             arguments: arguments of the agent.
             folder: folder for the files of the FMU, if it has not been loaded.
             files: file of the snapshot by the text that names the original file.
-            limit_s: not used, because only the process of the trial can be ended.
+            limit_s: time limit for each step of the FMU, in s; None if only that of the trial applies.
+            is_forked: not used, because a fork of the process contains the agent.
 
         Raises:
             PluginError: the FMU cannot be used, or its variables do not fit the spaces of the vehicle.
@@ -133,7 +135,7 @@ class FmuFactory:
         assert self._model is not None
         return FmuAgent(
             self._instance, self._model, self._wired(self._model, name, simulator), name=name,
-            step_length_s=simulator.step_length_s, arguments=arguments,
+            step_length_s=simulator.step_length_s, arguments=arguments, limit_s=limit_s,
         )  # fmt: skip
 
     def _instance(self) -> _Instance:
@@ -403,12 +405,14 @@ class FmuAgent:
         name: identifier of the vehicle.
         step_length_s: time from one step to the next, in s.
         arguments: values of parameters.
+        limit_s: time limit for each step of the FMU, in s; None if only that of the trial applies.
     """
 
     def __init__(
         self, create: Callable[[], _Instance], model: _Model, wiring: _Wiring, *, name: str, step_length_s: float,
-        arguments: Mapping[str, Value],
+        arguments: Mapping[str, Value], limit_s: float | None = None,
     ) -> None:  # fmt: skip
+        self._limit_s = limit_s
         self._create, self._model, self._wiring, self._name = create, model, wiring, name
         self._step_length_s, self._arguments = step_length_s, dict(arguments)
         self._instance: _Instance | None = None
@@ -433,9 +437,14 @@ class FmuAgent:
             instance = self._instance
             self._set_inputs()
             wiring.action.clear()
+            began = time.monotonic()
             instance.doStep(step * self._step_length_s, self._step_length_s)  # type: ignore[union-attr]
             for group in wiring.outputs:
                 self._get(group)
+            if self._limit_s is not None and time.monotonic() > began + self._limit_s:
+                raise ProgramError(
+                    f"{self._name}: doStep of the FMU has not returned within {self._limit_s:g} s in step {step + 1}"
+                )
         except ProgramError:
             raise
         except Exception as error:  # FMPy raises an exception without a class of its own too

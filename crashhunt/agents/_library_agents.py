@@ -6,6 +6,7 @@ import ctypes
 import json
 import math
 import os
+import time
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -132,7 +133,7 @@ class LibraryFactory:
 
     def agent(
         self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path,
-        files: Mapping[str, str], limit_s: float | None = None,
+        files: Mapping[str, str], limit_s: float | None = None, is_forked: bool = False,
     ) -> LibraryAgent:  # fmt: skip
         """Return the agent of a vehicle; the library creates it in the first step.
 
@@ -142,7 +143,8 @@ class LibraryFactory:
             arguments: arguments of the agent.
             folder: not used, because a library runs in the process of the trial.
             files: file of the snapshot by the text that names the original file.
-            limit_s: not used, because only the process of the trial can be ended.
+            limit_s: time limit for each call of ``crashhunt_act``, in s; None if only that of the trial applies.
+            is_forked: not used, because a fork of the process contains the agent.
         """
         self.load(files, folder)
         assert self._library is not None
@@ -150,7 +152,7 @@ class LibraryFactory:
         return LibraryAgent(
             self._library, name=name, parts=Parts.of(simulator, name),
             action=Action(form.space, form.names), step_length_s=simulator.step_length_s,
-            arguments={**self._defaults, **arguments},
+            arguments={**self._defaults, **arguments}, limit_s=limit_s,
         )  # fmt: skip
 
     def _signature(self, declaration: str) -> Signature:
@@ -202,12 +204,15 @@ class LibraryAgent:
         action: the array of an action.
         step_length_s: time from one step to the next, in s.
         arguments: arguments of the agent.
+        limit_s: time limit for each call of ``crashhunt_act``, in s; None if only that of the trial applies. A call
+            cannot be interrupted, so a call that never returns is a hang of the trial.
     """
 
     def __init__(
         self, library: ctypes.CDLL, *, name: str, parts: Parts, action: Action, step_length_s: float,
-        arguments: Mapping[str, Value],
+        arguments: Mapping[str, Value], limit_s: float | None = None,
     ) -> None:  # fmt: skip
+        self._limit_s = limit_s
         self._library, self._name, self._parts, self._action = library, name, parts, action
         self._step_length_s = step_length_s
         self._seed = self._step = 0
@@ -242,7 +247,11 @@ class LibraryAgent:
         seen.step, seen.time_s = step, step * self._step_length_s
         self._parts.write(observation)
         self._action.clear()
+        limit_s = self._limit_s
+        latest = 0.0 if limit_s is None else time.monotonic() + limit_s
         why = self._call(self._handle, self._seen_at, self._action_at)
+        if limit_s is not None and time.monotonic() > latest:
+            raise ProgramError(f"{self._name}: crashhunt_act has not returned within {limit_s:g} s in step {step + 1}")
         if why is not None:
             raise self._error(f"crashhunt_act failed in step {step + 1}", why)
         self._step = step + 1

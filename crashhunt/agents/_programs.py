@@ -23,7 +23,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 import numpy as np
 from pydantic_core import from_json, to_json
 
-from crashhunt.base import layout
+from crashhunt.base import forks, layout
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError, ProgramError
 from crashhunt.base.processes import descendants_of, kill
@@ -48,6 +48,7 @@ _FORMATS: Final = ("json", "msgpack")
 _LENGTH_BYTES: Final = 4  # before each message of MessagePack
 _CHUNK_BYTES: Final = 1 << 16
 _MAX_MESSAGE_BYTES: Final = 16 << 20
+_MAX_REPEATED_BYTES: Final = 256 << 20  # of the observations that a fork of the trial sends again
 _MAX_FILE_BYTES: Final = 64 << 20  # of each file that the program writes, such as its log
 _MAX_SHOWN_CHARACTERS: Final = 80
 _DESCRIPTION_S: Final = 60.0  # as long as a module may take to import
@@ -55,6 +56,7 @@ _CLOSING_S: Final = 1.0  # from `close` to the end of the program
 _TERMINATION_S: Final = 0.2  # from SIGTERM to SIGKILL
 _MAX_REPORT_BYTES: Final = 1 << 20  # of the end of the log, which may have the report of a sanitizer
 _MAX_REASON_CHARACTERS: Final = 300
+_MAX_REVISION_CHARACTERS: Final = 100
 _REASONS: Final = tuple(
     re.compile(pattern, re.MULTILINE)
     for pattern in (
@@ -68,6 +70,9 @@ _REASONS: Final = tuple(
 """What the log of a program names as the reason of its end: sanitizers, assert, exceptions of C++."""
 _UNITS: Final = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "heading": "rad", "target_speed": "m/s"}
 _DECLARATION_KEYS: Final = ("range", "unit", "default")
+
+_inherited: list[subprocess.Popen[bytes]] = []
+"""Programs of the process of which this one is a fork. Their pipes are closed here, so nothing may close them again."""
 
 
 class ProgramFactory:
@@ -107,7 +112,7 @@ class ProgramFactory:
 
     def agent(
         self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path,
-        files: Mapping[str, str], limit_s: float | None = None,
+        files: Mapping[str, str], limit_s: float | None = None, is_forked: bool = False,
     ) -> ProgramAgent:  # fmt: skip
         """Return the agent of a vehicle; its program starts in the first step.
 
@@ -118,13 +123,15 @@ class ProgramFactory:
             folder: scratch folder of the trial, in which the program gets a folder of its own.
             files: file of the snapshot by the word that names the original file.
             limit_s: time limit for the answer to each observation, in s; None if only that of the trial applies.
+            is_forked: whether the trial is forked while it runs.
         """
         given = {key: _absolute(value) for key, value in arguments.items()}
         hello = _hello(name, simulator, given)
         is_scalar = simulator.actions[name].space.shape == ()
         process = _Process(
-            command_of(self._locator, files), folder / f"agent-{name}", libraries=library_path(self._locator, files)
-        )
+            command_of(self._locator, files), folder / f"agent-{name}", libraries=library_path(self._locator, files),
+            is_forked=is_forked,
+        )  # fmt: skip
         return ProgramAgent(process, hello, is_scalar=is_scalar, limit_s=limit_s)
 
 
@@ -169,10 +176,9 @@ class ProgramAgent:
     def _act(self, observation: Any) -> Any:
         process, step = self._process, self._step
         if step == 0:
-            if not process.is_started:
-                process.start()
-                _signature_in(process.ask(self._hello, "hello"))
-            process.ask({"type": "reset", "seed": self._seed}, "reset")
+            self._begin()
+        elif process.is_inherited:
+            self._repeat()
         message: Observe = {
             "type": "observe", "step": step, "time_s": round(step * self._step_length_s, 9),
             "observation": _plain(observation),
@@ -185,6 +191,31 @@ class ProgramAgent:
         self._step, self._panels = step + 1, answer.get("panels")
         action = answer["action"]
         return action[0] if self._is_scalar and isinstance(action, list) and len(action) == 1 else action
+
+    def _begin(self) -> None:
+        process = self._process
+        if not process.is_started or process.is_inherited:
+            process.start()
+            _signature_in(process.ask(self._hello, "hello"))
+        process.ask({"type": "reset", "seed": self._seed}, "reset")
+
+    def _repeat(self) -> None:
+        """Start the program for this fork of the trial, and have it answer all earlier observations again.
+
+        A fork whose program answers otherwise ends without an answer, because it is no copy of the trial.
+        """
+        exchanges = self._process.exchanges
+        try:
+            self._begin()
+            for step, (data, action) in enumerate(exchanges):
+                answer = self._process.exchange(data, "act", f"observe of step {step}", self._limit_s)
+                if answer.get("action") != action:
+                    raise ProgramError(
+                        f"it answered observe of step {step} with {_shown(answer.get('action'))}, and before with "
+                        f"{_shown(action)}"
+                    )
+        except ProgramError as error:
+            forks.abandon(f"could not repeat the program of {self._hello['agent']}: {error.message}")
 
     def panels(self) -> dict[str, Panel]:
         """Return the panels in the last answer of the program; see `panels_in`."""
@@ -205,9 +236,16 @@ class _Process:
         folder: the folder in which the program runs; it is created.
         log: file descriptor for its standard error; None for that of this process.
         libraries: folder with copies of the libraries that the program loads; empty if there are none.
+        is_forked: whether this process is forked while the program runs. A fork then starts the program again.
+
+    Attributes:
+        exchanges: each observation that was sent, and the action in its answer; empty if this process is not forked.
     """
 
-    def __init__(self, command: Sequence[str], folder: Path, log: int | None = None, *, libraries: str = "") -> None:
+    def __init__(
+        self, command: Sequence[str], folder: Path, log: int | None = None, *, libraries: str = "",
+        is_forked: bool = False,
+    ) -> None:  # fmt: skip
         self._command = command
         self._libraries = libraries
         self._folder = folder
@@ -217,6 +255,15 @@ class _Process:
         self._packer: Any = None  # of MessagePack; None as long as messages are lines of JSON
         self._unpack: Any = None
         self._process: subprocess.Popen[bytes] | None = None
+        self._owner = 0  # the process that has started the program
+        self._is_forked = is_forked
+        self.exchanges: list[tuple[bytes, Any]] = []
+        self._exchanged_bytes = 0
+
+    @property
+    def is_inherited(self) -> bool:
+        """Return whether this process is a fork of the process that has started the program."""
+        return self._process is not None and self._owner != os.getpid()
 
     @property
     def is_started(self) -> bool:
@@ -229,13 +276,19 @@ class _Process:
         Raises:
             ProgramError: the operating system cannot run it.
         """
+        folder = self._folder
+        if self._process is not None:  # of the process of which this one is a fork, which uses its pipes
+            _inherited.append(self._process)
+            folder = folder.with_name(f"{folder.name}-{os.getpid()}")
+        self._owner, self._received, self._packer, self._unpack = os.getpid(), bytearray(), None, None
+        self.exchanges, self._exchanged_bytes = [], 0
         with suppress(OSError):
             status = os.fstat(self._log)
             self._log_begin = status.st_size if stat.S_ISREG(status.st_mode) else None
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
             self._process = process = subprocess.Popen(
-                self._command, cwd=self._folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                self._command, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 stderr=self._log, bufsize=0, env=self._environment(),
             )  # fmt: skip
         except OSError as error:
@@ -243,6 +296,8 @@ class _Process:
             raise ProgramError(f"the program does not start: {error.strerror}: {self._command[0]}", fix=fix) from None
         assert process.stdin is not None
         os.set_blocking(process.stdin.fileno(), False)
+        if self._is_forked:
+            forks.withhold(process.pid, self._descriptors())
         with suppress(OSError, ValueError, AttributeError):  # it has ended already, or the system has no such call
             soft, hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
             if soft == resource.RLIM_INFINITY or soft > _MAX_FILE_BYTES:
@@ -268,27 +323,52 @@ class _Process:
         Raises:
             ProgramError: the program has ended, or its answer is not the one that the protocol defines.
         """
-        if self._received:
-            raise ProgramError(f"it has sent something before {shown}: {_shown(self._received)}", fix=_LOGS_FIX)
-        deadline = None if limit_s is None else time.monotonic() + limit_s
-        try:
-            self._write(self._encoded(message), shown, deadline)
-            data = self._read(shown, deadline)
-        except TimeoutError:
-            raise ProgramError(f"it has not answered {shown} within {limit_s:g} s") from None
-        answer = self._decoded(data, shown)
-        expected = _ANSWERS[message["type"]]
-        if not isinstance(answer, dict) or answer.get("type") != expected:
-            fix = f'send {{"type": "{expected}", …}}'
-            raise ProgramError(f"its answer to {shown} is not of type {expected!r}: {_shown(data)}", fix=fix)
+        data, expected = self._encoded(message), _ANSWERS[message["type"]]
+        answer = self.exchange(data, expected, shown, limit_s)
         if expected == "ready" and answer.get("format") == "msgpack":
             import msgpack
 
             self._packer, self._unpack = msgpack.Packer(), msgpack.unpackb
+        elif expected == "act" and self._is_forked:
+            self._keep(data, answer.get("action"))
         return answer
+
+    def exchange(self, data: bytes, expected: str, shown: str, limit_s: float | None) -> dict[str, Any]:
+        """Send an encoded message, and return the answer, which must be of the expected type; see `ask`."""
+        if self._received:
+            raise ProgramError(f"it has sent something before {shown}: {_shown(self._received)}", fix=_LOGS_FIX)
+        deadline = None if limit_s is None else time.monotonic() + limit_s
+        try:
+            self._write(data, shown, deadline)
+            received = self._read(shown, deadline)
+        except TimeoutError:
+            raise ProgramError(f"it has not answered {shown} within {limit_s:g} s") from None
+        answer = self._decoded(received, shown)
+        if not isinstance(answer, dict) or answer.get("type") != expected:
+            fix = f'send {{"type": "{expected}", …}}'
+            raise ProgramError(f"its answer to {shown} is not of type {expected!r}: {_shown(received)}", fix=fix)
+        return answer
+
+    def _keep(self, data: bytes, action: Any) -> None:
+        """Keep an observation for forks; without it, this process can no longer be forked while the program runs."""
+        self.exchanges.append((data, action))
+        self._exchanged_bytes += len(data)
+        if self._exchanged_bytes > _MAX_REPEATED_BYTES:
+            assert self._process is not None
+            forks.stop_withholding(self._process.pid, self._descriptors())
+            self._is_forked, self.exchanges = False, []
+
+    def _descriptors(self) -> list[int]:
+        """Return the descriptors of the pipes to the program."""
+        assert self._process is not None
+        return [stream.fileno() for stream in (self._process.stdin, self._process.stdout) if stream is not None]
 
     def close(self) -> None:
         """Send ``close``, wait for the end of the program, and kill what is left of it."""
+        if self.is_inherited:
+            return
+        if self._is_forked and self._process is not None:
+            forks.stop_withholding(self._process.pid, self._descriptors())
         process, self._process = self._process, None
         if process is None:
             return
@@ -474,13 +554,16 @@ def _signature_in(ready: Mapping[str, Any]) -> Signature:
     arguments = {name: _argument(name, facts) for name, facts in declared.items()}
     required = tuple(name for name, one in arguments.items() if one.default is None)
     observation, action = ready.get("observation") or [], ready.get("action") or ""
+    revision = ready.get("revision") or ""
+    if not isinstance(revision, str):
+        raise ProgramError(f"its revision is {_shown(revision)}, not a text")
     if not isinstance(observation, list) or not all(isinstance(part, str) for part in observation):
         raise ProgramError(f"its observation is {_shown(observation)}, not a list of names", fix=_PARTS_FIX)
     if not isinstance(action, str):
         raise ProgramError(f"its action is {_shown(action)}, not a name", fix="see crashhunt list actions")
     return Signature(
         arguments=arguments, open=not arguments, given=(), required=required, action=action,
-        observation=tuple(observation),
+        observation=tuple(observation), revision=one_line(revision)[:_MAX_REVISION_CHARACTERS],
     )  # fmt: skip
 
 

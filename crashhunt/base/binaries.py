@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import struct
 import subprocess
 import sys
 import tempfile
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypedDict
+from typing import TYPE_CHECKING, Final, NotRequired, TypedDict
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,6 +21,7 @@ _SYSTEM_FOLDERS = ("/lib", "/lib32", "/lib64", "/usr/lib", "/usr/lib32", "/usr/l
 _NOTES_TYPE, _BUILD_ID_TYPE = 4, 3  # of a segment, and of a note
 _MAX_NOTES_BYTES: Final = 1 << 16
 _LDD_TIMEOUT_S: Final = 10.0
+_PACKAGES_TIMEOUT_S: Final = 10.0
 _LOADED = re.compile(r"^\s*(\S+) => (/.+) \(0x[\da-f]+\)$", re.MULTILINE)
 _MISSING = re.compile(r"^\s*(\S+) => not found$", re.MULTILINE)
 
@@ -28,13 +31,16 @@ class BinaryFacts(TypedDict):
 
     ``machine`` is the processor architecture, as `platform.machine` names it. ``build_id`` is empty if the linker wrote
     none. ``system`` lists the libraries of the operating system that the binary loads, and ``missing`` those that are
-    not found.
+    not found. ``packages`` has the package of the distribution and its version for each library, if a package manager
+    knows it. ``revision`` is the version of the sources, if a program reports it.
     """
 
     machine: str
     build_id: str
     system: list[str]
     missing: list[str]
+    packages: NotRequired[dict[str, str]]
+    revision: NotRequired[str]
 
 
 def describe_binary(file: Path) -> BinaryFacts | None:
@@ -43,8 +49,52 @@ def describe_binary(file: Path) -> BinaryFacts | None:
     if head is None:
         return None
     loaded, missing = _loaded_by(file, {})
-    system = sorted(name for name, path in loaded.items() if is_of_system(Path(path)))
-    return {"machine": head[0], "build_id": head[1], "system": system, "missing": missing}
+    system = {name: path for name, path in sorted(loaded.items()) if is_of_system(Path(path))}
+    found: BinaryFacts = {"machine": head[0], "build_id": head[1], "system": [*system], "missing": missing}
+    packages = _packages(tuple(system.values()))
+    if named := {name: packages[path] for name, path in system.items() if path in packages}:
+        found["packages"] = named
+    return found
+
+
+@cache
+def _packages(libraries: tuple[str, ...]) -> dict[str, str]:
+    """Return the package and version that contains each library, as dpkg or rpm knows it; empty without both."""
+    # The database of dpkg may know a file of /usr/lib only by its path in /lib, which is a link to it.
+    paths = {name: path for path in libraries for name in _names_of(path)}
+    if shutil.which("dpkg-query"):
+        owners = [line.rpartition(": ") for line in _lines("dpkg-query", "--search", *paths)]
+        names = {paths[path]: owner.partition(",")[0] for owner, _, path in owners if path in paths}
+        shown = _lines(
+            "dpkg-query", "--show", "--showformat=${binary:Package}\t${Version}\n", *sorted({*names.values()})
+        )
+        versions = dict(line.split("\t", 1) for line in shown if "\t" in line)
+        versions |= {name.partition(":")[0]: version for name, version in versions.items()}
+        return {path: f"{name} {versions[name]}" for path, name in names.items() if name in versions}
+    if shutil.which("rpm"):
+        found = {
+            path: _lines("rpm", "--query", "--file", "--queryformat=%{NAME} %{VERSION}-%{RELEASE}\n", path)
+            for path in libraries
+        }
+        return {path: lines[0] for path, lines in found.items() if lines}
+    return {}
+
+
+def _names_of(path: str) -> set[str]:
+    real = os.path.realpath(path)
+    return {path, real, *(name.removeprefix("/usr") for name in (path, real) if name.startswith("/usr/lib"))}
+
+
+def _lines(*command: str) -> list[str]:
+    """Return the output of a command as lines; empty if it fails or takes too long."""
+    try:
+        done = subprocess.run(
+            command, capture_output=True, stdin=subprocess.DEVNULL, check=False, timeout=_PACKAGES_TIMEOUT_S,
+            env={**os.environ, "LC_ALL": "C"},
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    return os.fsdecode(done.stdout).splitlines()
 
 
 def machine_of(file: Path) -> str:

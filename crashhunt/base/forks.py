@@ -79,9 +79,11 @@ def parse_answer(received: bytes | bytearray) -> tuple[Plain | None, str, NoAnsw
     """
     try:
         said = json.loads(received)
-        found, raised = said.get("answer"), str(said.get("raised", ""))
+        found, raised, abandoned = said.get("answer"), str(said.get("raised", "")), str(said.get("abandoned", ""))
     except (ValueError, AttributeError):
         return None, "", NoAnswer("sent data that are no answer")
+    if abandoned:
+        return None, raised, NoAnswer(abandoned)
     if not isinstance(found, dict):
         return None, raised, NoAnswer(f"raised {raised}" if raised else "sent data that are no answer")
     return found, raised, None
@@ -117,7 +119,8 @@ _PIPE_CHUNK_BYTES = 1 << 16  # bytes per read: the capacity of a pipe on Linux
 _copying = False
 ends: set[int] = set()
 """Descriptors of pipes to the forks of this process and, inside a fork, to its parent. Forks do not inherit them."""
-_alive: set[int] = set()  # copies of this process
+_alive: set[int] = set()  # copies of this process, and processes that its copies do without
+_answers_to: list[int] = []  # the pipe to the process that awaits the answer of this fork
 
 # Keep references: an agent may replace these functions.
 _fork, _leave, _dumps = os.fork, os._exit, json.dumps
@@ -231,6 +234,30 @@ def shared_memory() -> frozenset[str]:
     return frozenset(os.fsdecode(name.strip()) for name in names if MEMORY.encode() not in name)
 
 
+def withhold(pid: int, descriptors: Collection[int]) -> None:
+    """Allow forks of this process although a child process runs; a fork does not inherit the pipes to that process."""
+    _alive.add(pid)
+    ends.update(descriptors)
+
+
+def stop_withholding(pid: int, descriptors: Collection[int]) -> None:
+    """Undo `withhold`: as long as the child process runs, this process cannot be forked."""
+    _alive.discard(pid)
+    ends.difference_update(descriptors)
+
+
+def abandon(why: str) -> NoReturn:
+    """End this fork without an answer.
+
+    Args:
+        why: the reason as a clause without a subject, such as "could not start the planner".
+    """
+    end_descendants()
+    for pipe in _answers_to:
+        os.write(pipe, _dumps({"abandoned": why}).encode() + b"\n")
+    _leave(0)
+
+
 def copying() -> bool:
     """Return whether this module is currently forking; fork handlers then ignore the fork."""
     return _copying
@@ -260,6 +287,7 @@ class Copy:
         ends.add(self._end)
 
         def answer() -> None:
+            _answers_to[:] = [theirs]
             try:
                 said: Plain = {"answer": work()}
             except BaseException as error:

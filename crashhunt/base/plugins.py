@@ -120,6 +120,7 @@ class ImportedModules:
         agents: the files of the modules that contain agents.
         variables: the environment variables, which modules may have changed.
         read: the files that the modules have read when they were imported, including their own.
+        revisions: version of the sources of agents that are programs, by locator, as they report it.
     """
 
     places: Mapping[str, tuple[str | None, tuple[str, ...]]]
@@ -128,6 +129,7 @@ class ImportedModules:
     agents: tuple[str, ...] = ()
     variables: Mapping[str, str] = field(default_factory=dict)
     read: tuple[str, ...] = ()
+    revisions: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def here(cls, locators: Iterable[str] = (), modules: Iterable[str] = ()) -> ImportedModules:

@@ -260,9 +260,12 @@ class Parts:
         try:
             factory, given = self._prepared(agent, simulator, arguments)
             if isinstance(factory, _FOREIGN):
-                stage, files = stage_of(self._settings.scratch, os.getpid()), self._settings.argument_files
-                limit_s = self._settings.step_timeout_s or None
-                return factory.agent(agent, simulator, given, folder=stage, files=files, limit_s=limit_s)
+                settings = self._settings
+                return factory.agent(
+                    agent, simulator, given, folder=stage_of(settings.scratch, os.getpid()),
+                    files=settings.argument_files, limit_s=settings.step_timeout_s or None,
+                    is_forked=bool(settings.probe_s or settings.branch or settings.force),
+                )  # fmt: skip
         except CrashhuntError:
             raise
         except Exception as error:

@@ -57,12 +57,16 @@ def split_native_calls(stack: str) -> tuple[str, str]:
     Args:
         stack: the text that the dying process has written.
     """
-    found = _BLOCK.match(stack)
+    found = _BLOCK.search(stack)
     if found is None:
         return "", stack
     calls = _calls(found[1])
+    if found.start() and not calls:  # a process that hung, but not in native code of an agent
+        return "", stack[: found.start()]
     lines = [f'  File "{file}", line {line} in {function}\n' for file, line, function in calls]
-    return "".join(["Native stack (most recent call first):\n", *lines, "\n"]), stack[found.end() :]
+    native = "".join(["Native stack (most recent call first):\n", *lines, "\n"])
+    # A process that hung has written its Python calls before, and writes them again when it is killed.
+    return native, stack[: found.start()] or stack[found.end() :]
 
 
 def _calls(text: str) -> list[tuple[str, int, str]]:

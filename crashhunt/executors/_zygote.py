@@ -10,6 +10,7 @@ import json
 import os
 import select
 import shutil
+import signal
 import sys
 import time
 from collections import OrderedDict
@@ -25,6 +26,7 @@ from crashhunt.base.exceptions import message_of
 from crashhunt.base.forks import ended
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.processes import adopt_orphans, children_of, die_with, end_descendants, kill
+from crashhunt.base.programs import is_native
 from crashhunt.base.resources import FREE, free_memory, limit_behind
 from crashhunt.base.temporary import SharedMemoryWatch
 from crashhunt.episode import Parts, generators, options_of, seed_everything, set_generators, stage_of
@@ -283,6 +285,7 @@ def _traffic_key(spec: TrialSpec) -> str:
 
 
 _SEGMENTS_EVERY_S = 0.1  # whether the trial uses new shared memory, which its death would hide
+_NATIVE_STACK_S = 2.0  # in which a process that hangs writes its native stack
 _LOOK_EVERY_S = 0.005  # where the kernel does not report when a process ends
 
 
@@ -396,6 +399,7 @@ class _Zygote:
         self._stage = stage_of(settings.scratch, os.getpid())
         self._staged = 0  # when the folder was last changed
         self._makes_simulator = imported.makes_simulator
+        self._settings = settings
         self._segments = SharedMemoryWatch()
 
     def serve(self) -> None:
@@ -446,7 +450,7 @@ class _Zygote:
             if self._warm is not None:
                 self._warm.forget()
             self._trial.run(job)
-        killed = lambda: kill(pid)  # noqa: E731
+        killed = partial(self._kill, pid)
         try:
             end = os.pidfd_open(pid)
         except (AttributeError, OSError):
@@ -461,6 +465,16 @@ class _Zygote:
         if not self._makes_simulator:
             shutil.rmtree(stage_of(self._scratch, pid), ignore_errors=True)
         return pid, code
+
+    def _kill(self, pid: int) -> None:
+        """Kill a trial that hangs; if native code of an agent may be the reason, its process writes its stack first."""
+        if any(is_native(setup.agent) for setup in self._settings.scenario.agents.values()):
+            with suppress(OSError):
+                os.kill(pid, signal.SIGABRT)
+            until = time.monotonic() + _NATIVE_STACK_S
+            while time.monotonic() < until and os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
+                time.sleep(_LOOK_EVERY_S)
+        kill(pid)
 
     def _end_descendants(self, spared: frozenset[int]) -> None:
         """Kill the processes that a trial has left behind, and remove their shared memory."""

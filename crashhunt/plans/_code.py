@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.base.errors import ProgramError
 from crashhunt.base.isolation import files_read_apart, work_apart
 from crashhunt.base.plugins import ImportedModules, is_foreign, is_foreign_module, locate
-from crashhunt.base.programs import is_program
+from crashhunt.base.programs import can_fork, is_program
 from crashhunt.base.temporary import temporary_folder
+from crashhunt.base.text import listed
 from crashhunt.disturbances import described_model, modules_of_models, parse_rates
 from crashhunt.oracles import described_oracle, modules_of, oracle_name
 from crashhunt.plans._settings import executor_name
@@ -104,9 +105,10 @@ def describe_code(
     declared, notes = _declared(programs, scenario, IMPORT_S + timeout_s) if programs else ({}, [])
     data: Any = work_apart(described, task="what it names cannot be imported", timeout_s=IMPORT_S + timeout_s)
     signatures = {locator: Signature.from_json(found) for locator, found in data["signatures"].items()} | declared
+    revisions = {locator: one.revision for locator, one in declared.items() if one.revision}
     return CodeFacts(
         signatures=signatures, oracles=data["oracles"], disturbances=data["disturbances"],
-        imported=ImportedModules.from_json(data["imported"]), notes=tuple(notes),
+        imported=replace(ImportedModules.from_json(data["imported"]), revisions=revisions), notes=tuple(notes),
     )  # fmt: skip
 
 
@@ -169,3 +171,17 @@ def _import(locators: Sequence[str], modules: Sequence[str], report: Callable[[s
 
 def _is_of_optuna(name: str) -> bool:
     return name.lower().startswith("optuna:")
+
+
+def notes_on_programs(settings: HuntSettings) -> Iterator[str]:
+    """Yield the price of forks of trials in which a program drives, and the agents without a time limit per step."""
+    in_python = [name for name, chosen in settings.agents.items() if not is_program(chosen.agent)]
+    if settings.run.step_timeout_s and in_python:
+        yield f"--step-timeout does not limit {listed(in_python)}, an agent in Python; --timeout limits the trial"
+    names = [name for name, chosen in settings.agents.items() if not can_fork(chosen.agent)]
+    forking = {"--probe": settings.probe, "--branch": settings.branch, "--rare": settings.rare}
+    for option in [flag for flag, value in forking.items() if value and names]:
+        yield (
+            f"each fork of {option} starts the program of {listed(names)} again and sends it the observations of all "
+            "earlier steps, because a running program cannot be copied"
+        )

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, UsageError
 from crashhunt.base.plugins import is_foreign, locate, registered
-from crashhunt.base.programs import can_fork, is_program
+from crashhunt.base.programs import is_program
 from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import ModelApart, disturber_of, locate_model, parse_fixed, parse_rates, word_of
 from crashhunt.native import HOW_TO_REBUILD, outdated_modules
@@ -25,7 +25,7 @@ from crashhunt.oracles import ORACLES_OF_ACTORS, chosen_oracles, oracle_name, ou
 from crashhunt.plans._chosen_actions import chosen_actions, notes_on_actions, refuse_late_plans
 from crashhunt.plans._chosen_observations import chosen_observations
 from crashhunt.plans._chosen_requirements import chosen_requirements
-from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code
+from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code, notes_on_programs
 from crashhunt.plans._run_options import TrialOptions
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
@@ -358,6 +358,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
         settings, scenario = replace(settings, agents=agents), with_observations(scenario, observations)
     scenario = _with_notes_on_crashes(_with_notes(scenario, request.run), settings, request, code.oracles)
     notes = (*code.notes, *_notes_on_statistics(settings, signatures), *notes_on_actions(scenario, signatures))
+    notes += (*notes_on_programs(settings),)
     scenario = replace(scenario, notes=(*scenario.notes, *notes))
     refuse_late_plans(
         scenario, [*parse_rates(disturb), *(one.what for one in parse_fixed(disturb, tuple(scenario.agents)))]
@@ -365,7 +366,6 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     find = partial(_model_apart, code, request.run.timeout_s)
     with _name_scenario_in_errors(request, scenario):
         disturber(scenario, settings.disturb, tuple(settings.agents), find=find)  # it refuses what cannot be meant
-    _check_programs(settings)
     _check_branch(settings)
     _check_rare(settings, scenario, find)
     sampler_of(settings)  # it refuses what it cannot sample
@@ -528,16 +528,6 @@ def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
         *(f"{name}={rate!r}" for name, rate in parse_rates(words).items()),
         *(word_of(one, agents) for one in begun),
     )
-
-
-def _check_programs(settings: HuntSettings) -> None:
-    """Refuse forks of running trials in which a program drives: a fork of the trial has no copy of the program."""
-    agent = next((name for name, chosen in settings.agents.items() if not can_fork(chosen.agent)), None)
-    forking = {"--probe": settings.probe, "--branch": settings.branch, "--rare": settings.rare}
-    option = next((flag for flag, value in forking.items() if value), None)
-    if agent is not None and option is not None:
-        message = f"{option} forks running trials, and the program that drives {agent} cannot be forked"
-        raise UsageError(message, fix=f"omit {option}, or name an agent in Python")
 
 
 def _check_branch(settings: HuntSettings) -> None:

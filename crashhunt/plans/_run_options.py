@@ -268,9 +268,10 @@ class RunOptions(_Options):
         check=above_zero("give seconds above 0"),
     )  # fmt: skip
     step_timeout_s: float = option(
-        0.0, "wall-clock limit of an observation's answer by the program of an agent (``exec:``), in s; 0: no limit",
-        help="time limit for each answer of an agent's program (exec:) to an observation, in s; a later answer is an "
-        "error of the agent, which names the step; 0: no limit",
+        0.0, "wall-clock limit of a step of an agent that is a program, a library or an FMU, in s; 0: no limit",
+        help="time limit for each action of an agent that is a program, a library or an FMU, in s; a later action is "
+        "an error of the agent, which names the step. A call of a library or FMU that never returns is a hang. "
+        "0: no limit",
         flag="--step-timeout", group="run", metavar="S", check=within(0, 1e6, "give seconds (0: no limit)"),
     )  # fmt: skip
     keep_trials: bool = option(

@@ -6,6 +6,7 @@ import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
+from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.text import count_of, format_time, in_lines
 from crashhunt.crashes import (
     Encounter,
@@ -16,6 +17,7 @@ from crashhunt.crashes import (
     last_escape,
     most_dangerous,
     read_notes,
+    snapshot_of,
     subject_of,
 )
 from crashhunt.recording import describe_value, is_opaque
@@ -53,6 +55,7 @@ if TYPE_CHECKING:
 
 _MAX_ACTION_CHARACTERS = 60  # of an action that is no array of numbers
 _MAX_TABLE_ROWS = 20  # of the table; of more steps, the table shows a selection
+_BUILD_ID_DIGITS = 12
 _WIDTH = 80  # characters of a line of the table, as on an ordinary terminal
 
 
@@ -171,6 +174,7 @@ class Story:
         """Return the sentences and the table of the story."""
         lines = [f"{self.bundle.id}  ({self.bundle.result.outcome.category})"]
         lines.append(f"  {format_inputs(self.bundle.result)}")
+        lines += [f"  {line}" for line in describe_programs(self.bundle)]
         lines += _shrunk(self.bundle)
         lines += [f"  {describe_note(note)}" for note in self.notes]
         verdict = verdict_of(self)
@@ -428,6 +432,23 @@ def _words(action: Sequence[float] | None, names: Sequence[str]) -> str:
     if action is None:
         return "not recorded"
     return ", ".join(f"{name} {value:.4g}" for name, value in zip(names, action, strict=False))
+
+
+def describe_programs(bundle: Bundle) -> list[str]:
+    """Return a line for each program or library of an agent: revision, architecture, build id and missing libraries."""
+    try:
+        programs = snapshot_of(bundle).environment().get("programs", {})
+    except CrashhuntError:  # there is no snapshot, or it is damaged
+        return []
+    lines = []
+    for word, facts in programs.items():
+        known = [
+            f"revision {facts['revision']}" if facts.get("revision") else "",
+            facts["machine"],
+            f"build id {facts['build_id'][:_BUILD_ID_DIGITS]}" if facts["build_id"] else "",
+        ]
+        lines.append(f"program {word}: {', '.join(filter(None, known))}")
+    return lines
 
 
 def _shrunk(bundle: Bundle) -> list[str]:

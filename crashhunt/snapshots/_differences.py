@@ -76,6 +76,13 @@ def program_warnings(snapshot: Snapshot, locators: Iterable[str]) -> list[str]:
         facts = describe_binary(Path(files[word])) if word in files else None
         if facts is None:
             continue
+        recorded = snapshot.environment().get("programs", {}).get(word, facts)
+        then, now = recorded.get("packages", {}), facts.get("packages", {})
+        found += [
+            f"the library {name} was of {package} and is of {now[name]}"
+            for name, package in then.items()
+            if now.get(name, package) != package
+        ]
         if facts["machine"] != here:
             found.append(f"the program {word} is for {facts['machine']}, and this machine is {here}, so it cannot run")
             continue

@@ -21,7 +21,15 @@ from crashhunt.base.files import put_in_place, sync_folder, sync_tree
 from crashhunt.base.git import query
 from crashhunt.base.integrity import describe_files, digest_of_content, digest_of_data, digest_of_file
 from crashhunt.base.opened_files import output_files
-from crashhunt.base.programs import files_of, is_program, libraries_folder, libraries_of, neighbouring_modules
+from crashhunt.base.programs import (
+    can_fork,
+    files_of,
+    is_program,
+    libraries_folder,
+    libraries_of,
+    neighbouring_modules,
+    words_of,
+)
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, load_order_of, write_settings
 from crashhunt.scenario import Scenario, as_plain_data
@@ -384,7 +392,10 @@ def take_snapshot(
         snapshots.mkdir(exist_ok=True)
         remove_ended(snapshots)
         with temporary_beside(snapshots / layout.MANIFEST, name=f"{layout.BUILDING}{this_process().token}") as building:
-            return _build(building, files, found, argument_files, scenario, settings, environment(imported), conditions)
+            around = environment(imported)
+            if programs := _described_programs(settings, imported.revisions):
+                around["programs"] = programs
+            return _build(building, files, found, argument_files, scenario, settings, around, conditions)
     except OSError as error:
         raise _cannot_make(error, snapshots) from error
 
@@ -442,8 +453,6 @@ def _build(
     facts: Environment = {
         **around, "git": _describe_trees(found.trees, building / layout.GIT_DIFF), "origins": found.origins,
     }  # fmt: skip
-    if programs := _described_programs(settings):
-        facts["programs"] = programs
     if (core := core_of(scenario, settings.run)) is not None:
         facts["core"] = core
     if (load_order := load_order_of(scenario)) is not None:
@@ -528,11 +537,22 @@ def _program_files(settings: HuntSettings, found: Sources, takes_code: bool, hun
     return places
 
 
-def _described_programs(settings: HuntSettings) -> dict[str, BinaryFacts]:
-    """Return what identifies the binary programs of agents, by their words in the command lines."""
+def _described_programs(settings: HuntSettings, revisions: Mapping[str, str]) -> dict[str, BinaryFacts]:
+    """Return what identifies the programs of agents, by the words that name them.
+
+    Args:
+        settings: the settings of the hunt.
+        revisions: version of a program's sources by locator.
+    """
     locators = {agent.agent for agent in settings.agents.values() if is_program(agent.agent)}
     files = {word: path for locator in sorted(locators) for word, path in files_of(locator).items()}
-    return {word: found for word, path in files.items() if (found := describe_binary(path)) is not None}
+    described = {word: found for word, path in files.items() if (found := describe_binary(path)) is not None}
+    for locator, revision in revisions.items():
+        if is_program(locator) and not can_fork(locator):
+            word = words_of(locator)[0]
+            without: BinaryFacts = {"machine": "", "build_id": "", "system": [], "missing": []}
+            described[word] = {**described.get(word, without), "revision": revision}
+    return described
 
 
 def _training_records(modules: Sequence[str], argument_files: dict[str, str]) -> dict[str, str]:

@@ -424,6 +424,7 @@ class Signature:
         action: name of the form of actions that the factory prefers; empty if it names none.
         actions: names of all forms of actions that the factory's agents can return; empty if it names none.
         observation: parts that the factory's agents observe, from its attribute ``observation``.
+        revision: version of the sources of a program, as the program reports it.
     """
 
     arguments: dict[str, Argument]
@@ -433,6 +434,7 @@ class Signature:
     action: str = ""
     actions: tuple[str, ...] = ()
     observation: tuple[str, ...] = ()
+    revision: str = ""
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Signature:
@@ -452,7 +454,7 @@ class Signature:
         given, required, actions = (tuple(data[key]) for key in ("given", "required", "actions"))
         return cls(
             names, open=bool(data["open"]), given=given, required=required, action=data["action"], actions=actions,
-            observation=tuple(data["observation"]),
+            observation=tuple(data["observation"]), revision=str(data["revision"]),
         )  # fmt: skip
 
     def to_json(self) -> dict[str, Any]:
@@ -467,7 +469,7 @@ class Signature:
         return {
             "arguments": arguments, "open": self.open, "given": self.given, "required": self.required,
             "action": self.action, "actions": self.actions,
-            "observation": self.observation,
+            "observation": self.observation, "revision": self.revision,
         }  # fmt: skip
 
     def check(self, names: Iterable[str], *, where: str) -> None:

@@ -17,6 +17,7 @@ IN_C = r"""
 #include <math.h>
 #include <stdlib.h>
 #include <stddef.h>
+#include <unistd.h>
 
 typedef struct { double v[128]; } instance;
 typedef unsigned int reference;
@@ -31,6 +32,7 @@ static int step(instance *c) {
     if (c->v[101] == 1) return 3;
     if (c->v[101] == 2) c->v[110] = NAN;
     if (c->v[101] == 3) *(volatile int *)8 = 1;
+    if (c->v[101] == 4) usleep(60000);
     return 0;
 }
 

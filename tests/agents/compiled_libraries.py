@@ -53,6 +53,7 @@ static const char *harm(const char *kind, double *action) {
     if (strcmp(kind, "abort") == 0) { fprintf(stderr, "the plan is inconsistent\n"); abort(); }
     if (strcmp(kind, "exit") == 0) exit(0);
     if (strcmp(kind, "deadlock") == 0) for (;;) pause();
+    if (strcmp(kind, "slow") == 0) usleep(60000);
     return NULL;
 }
 

@@ -34,8 +34,9 @@ class Simulated:
         self.actions = {"ego": SpeedAndLaneChange()}
 
 
-def agent_of(fmu, **arguments):
-    agent = FmuFactory(f"fmu:{fmu}").agent("ego", Simulated(), arguments, folder=fmu.parent, files={})
+def agent_of(fmu, *, limit_s=None, **arguments):
+    factory = FmuFactory(f"fmu:{fmu}")
+    agent = factory.agent("ego", Simulated(), arguments, folder=fmu.parent, files={}, limit_s=limit_s)
     agent.reset(2**63 + 5)
     return agent
 
@@ -155,3 +156,10 @@ def test_a_file_that_is_no_fmu_is_refused(tmp_path):
     for name, message in {"a.fmu": "it is not an FMU", "b.fmu": "it is not an FMU", "c.fmu": "is not a file"}.items():
         with pytest.raises(PluginError, match=message):
             signature_of(FmuFactory(f"fmu:{tmp_path / name}"))
+
+
+def test_a_step_that_takes_too_long_is_an_error_of_the_agent(tmp_path):
+    agent = agent_of(build_fmu(tmp_path, 2), limit_s=0.05, harm=4)
+    with pytest.raises(ProgramError, match=r"^ego: doStep of the FMU has not returned within 0\.05 s in step 1$"):
+        agent.act(observations(1)[0])
+    agent.close()

@@ -71,9 +71,10 @@ class Simulated:
             self.observation_names = ()
 
 
-def agent_of(library, *, form=None, space=SPACE, seed=2**64 - 1, **arguments):
+def agent_of(library, *, form=None, space=SPACE, seed=2**64 - 1, limit_s=None, **arguments):
     simulator = Simulated(form or SpeedAndLaneChange(), space)
-    agent = LibraryFactory(f"lib:{library}").agent("ego", simulator, arguments, folder=library.parent, files={})
+    factory = LibraryFactory(f"lib:{library}")
+    agent = factory.agent("ego", simulator, arguments, folder=library.parent, files={}, limit_s=limit_s)
     agent.reset(seed)
     return agent
 
@@ -102,6 +103,17 @@ def test_a_library_acts_like_the_agent_in_python(planner):
     assert {speed for speed, _ in answers} == {0.0, 9.125}
     assert [type(part) for part in answers[0]] == [float, int]
     agent.close()
+    agent.close()
+
+
+def test_a_call_that_takes_too_long_is_an_error_of_the_agent_that_names_the_step(planner):
+    agent = agent_of(planner, harm="slow", at=1, limit_s=0.05)
+    seen = observations(2)
+    agent._limit_s = 1000  # of the first step, which a busy machine may delay
+    agent.act(seen[0])
+    agent._limit_s = 0.05
+    with pytest.raises(ProgramError, match=r"^ego: crashhunt_act has not returned within 0\.05 s in step 2$"):
+        agent.act(seen[1])
     agent.close()
 
 
@@ -308,7 +320,7 @@ def test_harm_has_the_right_outcome_and_names_the_agent(toy, harm, words, outcom
     result = hunted(toy, harm, *words)
     assert (result["outcome"], result["failure"]["agent"]) == (outcome, "ego")
     assert result["failure"]["message"].startswith(message)
-    if harm == "SIGSEGV" and find_spec("_crashhunt_native_stack") and shutil.which("addr2line"):
+    if harm in ("SIGSEGV", "deadlock") and find_spec("_crashhunt_native_stack") and shutil.which("addr2line"):
         assert re.search(
             r'libplanner.so.c", line \d+ in harm\n.*line \d+ in crashhunt_act\n', result["failure"]["traceback"]
         )

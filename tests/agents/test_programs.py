@@ -17,6 +17,7 @@ from programs import COMPILER, DRIVER, compile_program, write_binary_program, wr
 
 import crashhunt
 from crashhunt.agents import ProgramFactory
+from crashhunt.base import forks
 from crashhunt.base.errors import ActionError, PluginError, ProgramError
 from crashhunt.base.programs import command_of, files_of
 from crashhunt.panels import labelled
@@ -44,9 +45,11 @@ class Simulated:
         self.actions = {"ego": form}
 
 
-def agent_of(locator, folder, *, form=None, limit_s=None, **arguments):
+def agent_of(locator, folder, *, form=None, limit_s=None, is_forked=False, **arguments):
     simulator = Simulated(form or SpeedAndLaneChange())
-    return ProgramFactory(locator).agent("ego", simulator, arguments, folder=folder, files={}, limit_s=limit_s)
+    return ProgramFactory(locator).agent(
+        "ego", simulator, arguments, folder=folder, files={}, limit_s=limit_s, is_forked=is_forked
+    )
 
 
 @pytest.mark.parametrize(
@@ -266,6 +269,63 @@ def test_a_program_does_not_import_from_the_code_of_a_snapshot(tmp_path, monkeyp
     program.chmod(0o755)
     with pytest.raises(ProgramError, match=r"\(its last output: /my/modules\)"):
         ProgramFactory(f"exec:{program}").declared_signature()
+
+
+@pytest.mark.parametrize("is_binary", [False, True])
+def test_a_fork_continues_with_a_program_that_has_answered_all_earlier_observations(tmp_path, planner, is_binary):
+    agent = agent_of(f"exec:{write_binary_program(tmp_path) if is_binary else planner}", tmp_path, is_forked=True)
+    known = replace(forks.held(), threads=forks.threads())
+    agent.reset(1)
+    seen = observations()
+    before = [agent.act(each) for each in seen[:8]]
+    twice = [forks.Copy(lambda: {"actions": [agent.act(each) for each in seen[8:]]}, known) for _ in range(2)]
+    answers = [one.answer(20)["actions"] for one in twice]
+    actions = [agent.act(each) for each in seen[8:]]
+    agent.close()
+    assert answers == [actions, actions]
+    assert len({tuple(action) for action in before + actions}) > 1
+    assert not list(tmp_path.glob("agent-ego*/*"))
+    forks.Copy(dict, known).end()  # nothing is left that cannot be forked
+
+
+MOODY = """\
+#!/bin/sh
+read -r hello; echo '{"type": "ready"}'
+read -r reset; echo '{"type": "ok"}'
+while read -r line && [ "$line" != '{"type":"close"}' ]; do echo "{\\"type\\": \\"act\\", \\"action\\": [$$, 0]}"; done
+"""
+
+
+def test_a_fork_whose_program_answers_otherwise_ends_without_an_answer(tmp_path):
+    program = tmp_path / "moody"
+    program.write_text(MOODY, encoding="utf-8")
+    program.chmod(0o755)
+    agent = agent_of(f"exec:{program}", tmp_path, is_forked=True)
+    known = replace(forks.held(), threads=forks.threads())
+    agent.reset(1)
+    seen = observations(3)
+    first = agent.act(seen[0])
+    copy = forks.Copy(lambda: {"action": agent.act(seen[1])}, known)
+    assert copy.answer(20) is None
+    assert re.fullmatch(
+        rf"could not repeat the program of ego: it answered observe of step 0 with \[\d+,0\], and before with "
+        rf"\[{first[0]},0\]",
+        copy.no_answer.why,
+    )
+    assert agent.act(seen[2]) == first
+    agent.close()
+
+
+def test_a_process_cannot_be_forked_if_its_program_has_seen_too_much(tmp_path, planner, monkeypatch):
+    monkeypatch.setattr("crashhunt.agents._programs._MAX_REPEATED_BYTES", 2_000)
+    agent = agent_of(f"exec:{planner}", tmp_path, is_forked=True)
+    known = replace(forks.held(), threads=forks.threads())
+    agent.reset(1)
+    for each in observations(9):
+        agent.act(each)
+    with pytest.raises(forks.CannotForkError, match="a process with child processes cannot be forked"):
+        forks.Copy(dict, known)
+    agent.close()
 
 
 @pytest.mark.parametrize("kind", ["NaN", "shape"])

@@ -41,6 +41,13 @@ def test_a_program_is_identified_as_binutils_identifies_it(program):
     assert facts["machine"] == platform.machine()
     assert facts["missing"] == []
     assert any(name.startswith("libc.so") for name in facts["system"])
+    if shutil.which("dpkg-query"):
+        (name,) = [name for name in facts["system"] if name.startswith("libc.so")]
+        package, version = facts["packages"][name].split()
+        listed = subprocess.run(["dpkg-query", "-L", package], capture_output=True, text=True, check=True).stdout
+        assert any(line.endswith(f"/{name}") for line in listed.splitlines())
+        status = subprocess.run(["dpkg-query", "-s", package], capture_output=True, text=True, check=True).stdout
+        assert f"\nVersion: {version}\n" in status
     if shutil.which("readelf"):
         notes = subprocess.run(["readelf", "-n", file], capture_output=True, text=True, check=True).stdout
         assert facts["build_id"] == re.search(r"Build ID: (\w+)", notes)[1]
@@ -63,8 +70,13 @@ def test_other_files_have_no_facts_or_none_that_matter(tmp_path, content):
 def test_programs_that_cannot_run_here_are_reported_in_one_line_each(program, tmp_path):
     file = program("--enable-new-dtags")
     copies = {"./main": str(file)}
-    snapshot = SimpleNamespace(argument_files=copies)
+    recorded = {}
+    snapshot = SimpleNamespace(argument_files=copies, environment=lambda: {"programs": recorded})
     assert program_warnings(snapshot, ["exec:./main", "crashhunt.agents:RandomAgent"]) == []
+    for name, package in describe_binary(file).get("packages", {}).items():
+        recorded["./main"] = {"packages": {name: "libc 1"}}
+        assert program_warnings(snapshot, ["exec:./main"]) == [f"the library {name} was of libc 1 and is of {package}"]
+    recorded.clear()
     (tmp_path / "libtop.so").unlink()
     assert program_warnings(snapshot, ["exec:./main"]) == [
         "the program ./main needs the library libtop.so, which this machine lacks"

@@ -31,6 +31,7 @@ def test_a_hunt_varies_what_a_program_declares_and_its_crash_replays_where_the_p
     assert all(8.0 <= speed <= 20.0 for speed in speeds)
     (shown,) = [toy.crashhunt("show", "h", "--json").json]
     assert shown["summary"].startswith("ego drove into")
+    assert "\n  program ./planner: revision 1.4-3-gabc\n" in toy.crashhunt("show", "h").out
     toy.crashhunt("report", "h")
     planner.write_text(planner.read_text().replace("else speed", "else speed / 2"))
     changed = toy.crashhunt("replay", "h", "--code", "current", "--json", expect=None).json
@@ -84,16 +85,27 @@ def test_a_program_that_fails_at_once_is_an_error_of_the_agent_and_one_that_is_m
     )
 
 
-@pytest.mark.parametrize("option", [("--probe", "1"), ("--rare",), ("--branch",)])
-def test_options_that_fork_trials_are_refused_in_one_line(toy, option):
+@pytest.mark.parametrize(
+    ("option", "part"),
+    [
+        (("--probe", "1"), "probes"),
+        pytest.param(("--branch",), "branches", marks=pytest.mark.nightly),
+        pytest.param(("--rare",), "rare", marks=pytest.mark.nightly),
+    ],
+)
+def test_forks_of_trials_give_equal_results_with_a_program_and_the_same_agent_in_python(toy, option, part):
+    (toy.folder / "driver.py").write_text(DRIVER)
     write_program(toy.folder)
-    done = toy.crashhunt(
-        "run", "h", "1", "1", "20", "--agent", "exec:./planner", *RUN, "--disturb", "brake=0.01", *option, expect=2
-    )
-    assert done.err == (
-        f"crashhunt: {option[0]} forks running trials, and the program that drives ego cannot be forked; "
-        f"omit {option[0]}, or name an agent in Python\n"
-    )
+    found = []
+    for name, agent in (("python", "driver:Driver"), ("program", "exec:./planner")):
+        done = toy.crashhunt(
+            "run", name, "1", "4", "40", "--agent", agent, "--arg", "speed=8.0:9.0", "--set", "gap_m=30.0", *RUN,
+            "--disturb", "brake=0.02,late_observation=0.02", *option, "--keep-going", "--json",
+        )  # fmt: skip
+        assert (f"each fork of {option[0]} starts the program of ego again" in done.err) == (name == "program")
+        crashes = [crash["digest"] for crash in done.json[part]["crashes"]]
+        found.append({**done.json[part], "crashes": crashes})
+    assert found[0] == found[1]
 
 
 def test_a_scenario_names_its_program_relative_to_its_own_folder(toy):

@@ -109,8 +109,18 @@ def test_without_debug_information_or_tools_the_exported_functions_are_known(fol
 
 
 def test_a_stack_without_native_calls_stays_as_it_is():
-    text = "Fatal Python error: Aborted\n\nnative stack\nend of the native stack\n"
+    text = "Timeout (0:00:01)!\nThread 0x1 (most recent call first):\n"
     assert split_native_calls(text) == ("", text)
+    assert split_native_calls(f"{text}native stack\nend of the native stack\nFatal Python error: Aborted\n") == (
+        "",
+        text,
+    )
+
+
+def test_the_native_calls_of_a_process_that_was_killed_come_before_its_python_calls(folder):
+    stack = stack_of(folder, "libdebug.so", 2)
+    native, rest = split_native_calls(f"Timeout (0:00:01)!\n{stack}")
+    assert (native, rest) == (split_native_calls(stack)[0], "Timeout (0:00:01)!\n")
 
 
 def test_names_of_functions_have_neither_parameters_nor_spaces():
