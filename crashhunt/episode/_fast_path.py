@@ -32,7 +32,7 @@ from crashhunt.oracles import (
     TrafficEvents,
     WrongWay,
 )
-from crashhunt.simulators import FlattensObservations, SupportsFastSteps
+from crashhunt.simulators import SupportsFastSteps
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -135,8 +135,6 @@ def make_fast_path(
     if not isinstance(first, Recorder) or type(first) is not Recorder or not supports(simulator, SupportsFastSteps):
         return None
     if simulator.at_once is None or not simulator.at_once.is_unpatched(simulator):
-        return None
-    if supports(simulator, FlattensObservations):
         return None
     rest = [one for one in observers[1:] if type(one) is not Nearness]
     if any(overrides_hook(one, "observation") or overrides_hook(one, "action") for one in rest):

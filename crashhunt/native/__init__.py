@@ -14,6 +14,8 @@ if TYPE_CHECKING:
         SIMULATED as SIMULATED,
         Columns as Columns,
         Core as Core,
+        Draft as Draft,
+        LaneBlock as LaneBlock,
         Part as Part,
         UsualSteps as UsualSteps,
         Vehicles as Vehicles,

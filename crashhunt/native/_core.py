@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    import numpy as np
+    from numpy.typing import NDArray
+
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 10
+_INTERFACE = 11
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -101,6 +104,20 @@ class UsualSteps(Protocol):
             record_roster: function called when these vehicles are recorded; it provides a recording buffer again.
         """
 
+    def perceive(
+        self,
+        make: Callable[[Columns, float, int, str, int], NDArray[np.generic]],
+        restore: Callable[[NDArray[np.generic]], object],
+        /,
+    ) -> None:
+        """Set the functions for observations that consist of parts.
+
+        Args:
+            make: function that receives the columns of a scene, its time (s), the row and the lane of the agent, and
+                the number of the step, and returns the recorded array.
+            restore: function that returns what the agent receives, from the recorded array.
+        """
+
     def judge(self, overlaps: bool, hardest: float, always: bool, last: int, now_and_then: int, /) -> None:
         """Set the conditions under which oracles examine a step.
 
@@ -167,6 +184,79 @@ class UsualSteps(Protocol):
         """Return the values that are read only by this object, for a comparison with libsumo's getters."""
 
 
+class LaneBlock(Protocol):
+    """The candidates of the lanes around a vehicle."""
+
+
+class Draft(Protocol):
+    """An observation that is being written, part by part. A place is the index of a part's first value."""
+
+    def put(self, place: int, values: tuple[float, ...], /) -> None:
+        """Write numbers."""
+
+    def put_array(self, place: int, array: object, /) -> None:
+        """Write an array of float64."""
+
+    def actors(
+        self,
+        place: int,
+        columns: Columns,
+        row: int,
+        who: tuple[list[float], tuple[str, ...]],
+        limits: tuple[float, int, float],
+        last_speeds: dict[str, float],
+        path: tuple[frozenset[str], dict[str, bool], Callable[[str], bool]],
+        /,
+    ) -> tuple[tuple[int, ...], dict[str, float]] | None:
+        """Write the part ``actors``; return the rows of the actors in the scene, and their speeds by id.
+
+        The result is None, and nothing is written, if only the equivalent Python code can read the scene.
+
+        Args:
+            place: The place of the part.
+            columns: The columns of the scene.
+            row: The row of the agent's vehicle in the scene.
+            who: The value of ``kind`` and the id of each actor of the scene.
+            limits: The radius (m), the number of rows, and the step length (s).
+            last_speeds: The speeds after the last step, by id.
+            path: The lanes on the path of the vehicle; the known answers of the function by lane; a function that
+                returns whether a lane leads into the lane of the vehicle.
+        """
+
+    def lanes(
+        self, place: int, block: LaneBlock, x: float, y: float, limit: float, shape: tuple[int, int, int, int], /
+    ) -> None:
+        """Write the part ``lanes``.
+
+        Args:
+            place: The place of the part.
+            block: The candidates.
+            x: x of the vehicle, in m.
+            y: y of the vehicle, in m.
+            limit: Largest squared distance, without the term that all points have in common, in m².
+            shape: The numbers of lanes and of points, the points behind, and the prepared points per point.
+        """
+
+    def route(
+        self, place: int, rows: object, window: tuple[int, int], x: float, y: float, shape: tuple[int, int], /
+    ) -> None:
+        """Write the part ``route``.
+
+        Args:
+            place: The place of the part.
+            rows: The points of a path.
+            window: The first and the last row that can be the nearest.
+            x: x of the vehicle, in m.
+            y: y of the vehicle, in m.
+            shape: The number of points, and the prepared points per point.
+        """
+
+    def take(self) -> bytes:
+        """Return the values, all of which are 0 from then on."""
+
+
+_Draft = Draft
+_LaneBlock = LaneBlock
 _Vehicles = Vehicles  # `Core` has methods with the names of these classes
 _UsualSteps = UsualSteps
 
@@ -215,6 +305,20 @@ class Core(Protocol):
                 range (m²).
             start_m: The distance that the agent had driven at the start, in m.
         """
+
+    def Draft(self, size: int, /) -> _Draft:  # noqa: N802 - a class
+        """Return an observation of this number of values, all of which are 0."""
+
+    def LaneBlock(  # noqa: N802 - a class
+        self, arrays: tuple[object, ...], middle_x: float, middle_y: float, /,
+    ) -> _LaneBlock:  # fmt: skip
+        """Return candidates of lanes: arrays in the order of `LanesReader`, and the middle of their square."""
+
+    def rows_on_lanes(self, columns: Columns, lanes: Mapping[str, object], /) -> list[tuple[int, str]] | None:
+        """Return the row and the lane of each vehicle on one of these lanes; None if the scene has other actors."""
+
+    def vehicle_states(self, vehicles: _Vehicles, /) -> list[tuple[str, float, float, int]] | None:
+        """Return the lane, lateral position, acceleration and signals of vehicles; None if libsumo fails."""
 
     def columns(
         self, vehicles: _Vehicles, points: Sequence[object], headings: Sequence[float], speeds: Sequence[float], /

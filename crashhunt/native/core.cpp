@@ -69,8 +69,8 @@ typedef const void *(*Singleton)();
 struct Sumo {
     PositionOf position;
     NumberOf angle, speed;
-    NumberOf driven, aside, aside_speed, along, decel;
-    WholeOf lane_index, stop_state;
+    NumberOf driven, aside, aside_speed, along, decel, acceleration;
+    WholeOf lane_index, stop_state, signals;
     NameOf road, lane;
     NumberAt lane_angle;
     NeighborOf follower;
@@ -132,6 +132,8 @@ PyObject *bind(PyObject *, PyObject *path) {
                  find(library, "_ZN7libsumo7Vehicle15getLateralSpeedE" STRING, found.aside_speed) &&
                  find(library, "_ZN7libsumo7Vehicle15getLanePositionE" STRING, found.along) &&
                  find(library, "_ZN7libsumo7Vehicle8getDecelE" STRING, found.decel) &&
+                 find(library, "_ZN7libsumo7Vehicle15getAccelerationE" STRING, found.acceleration) &&
+                 find(library, "_ZN7libsumo7Vehicle10getSignalsE" STRING, found.signals) &&
                  find(library, "_ZN7libsumo7Vehicle12getLaneIndexE" STRING, found.lane_index) &&
                  find(library, "_ZN7libsumo7Vehicle12getStopStateE" STRING, found.stop_state) &&
                  find(library, "_ZN7libsumo7Vehicle9getRoadIDE" STRING, found.road) &&
@@ -1530,6 +1532,7 @@ PyObject *write_step(PyObject *, PyObject *const *given, Py_ssize_t count) {
 }
 
 #include "fast_step.hpp"
+#include "observed_parts.hpp"
 
 // ---------------------------------------------------------------------------------------------------------- the module
 
@@ -1573,6 +1576,8 @@ PyMethodDef functions[] = {
     {"is_coming_or_going", is_coming_or_going, METH_NOARGS, "Whether a vehicle has entered or left in the last step."},
     {"in_sight", FAST(in_sight), "Return who is near some vehicles, and where these are; None where libsumo refuses."},
     {"columns", FAST(columns), "Return lists as columns; None where they are none of numbers."},
+    {"rows_on_lanes", FAST(rows_on_lanes), "Return the vehicles on some lanes; None where Python has to do it."},
+    {"vehicle_states", vehicle_states, METH_O, "Return what is read of vehicles for observations, to be compared."},
     {"observe", FAST(observe), "Return an observation as bytes."},
     {"within_reach", FAST(within_reach), "Return the rows of those that an actor may have touched."},
     {"least_change", FAST(least_change), "Return the least change of speed between two scenes."},
@@ -1584,7 +1589,7 @@ PyMethodDef functions[] = {
 };
 
 int fill(PyObject *module) {
-    for (PyType_Spec *spec : {&vehicles_spec, &columns_spec, &usual_spec}) {
+    for (PyType_Spec *spec : {&vehicles_spec, &columns_spec, &usual_spec, &draft_spec, &lane_block_spec}) {
         PyObject *type = PyType_FromSpec(spec);
         if (!type || PyModule_AddObjectRef(module, strrchr(spec->name, '.') + 1, type) < 0) {
             Py_XDECREF(type);
@@ -1595,6 +1600,8 @@ int fill(PyObject *module) {
             vehicles_type = reinterpret_cast<PyTypeObject *>(type);
         } else if (spec == &columns_spec) {
             columns_type = reinterpret_cast<PyTypeObject *>(type);
+        } else if (spec == &lane_block_spec) {
+            lane_block_type = reinterpret_cast<PyTypeObject *>(type);
         }
     }
     return PyModule_AddIntConstant(module, "INTERFACE", CRASHHUNT_INTERFACE);

@@ -36,6 +36,7 @@ struct Steps {
     std::string agent;
     PyObject *name = nullptr, *libsumo = nullptr, *array = nullptr, *shape = nullptr, *dtype = nullptr;
     PyObject *act = nullptr, *simulate = nullptr; // what these methods are called
+    PyObject *perceive = nullptr, *restore = nullptr; // of an observation that consists of parts
     Vehicles *eyes = nullptr;
     size_t others = 0;
     double step_s = 0, start_m = 0, hardest = 0, within = 0;
@@ -74,7 +75,7 @@ struct Steps {
     Steps() = default;
     Steps(const Steps &) = delete;
     ~Steps() {
-        for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, reinterpret_cast<PyObject *>(eyes),
+        for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, perceive, restore, reinterpret_cast<PyObject *>(eyes),
                               limits, stood, reinterpret_cast<PyObject *>(sight.vehicles), sight.ids,
                               reinterpret_cast<PyObject *>(entered.vehicles), entered.ids,
                               reinterpret_cast<PyObject *>(before_vehicles), enter, record_roster, observation, answer,
@@ -221,7 +222,16 @@ struct Steps {
     }
 
     // What the agent will be shown; null with or without an exception.
-    PyObject *shown(const Scene &present, size_t row) const {
+    PyObject *shown(const Scene &present, const Sight &who) const {
+        const size_t row = who.row;
+        if (perceive) {
+            Columns *columns = new_columns(who.vehicles, std::vector<double>(next.values));
+            PyObject *made = columns ? PyObject_CallFunction(perceive, "OdnsL", columns, next.time_s,
+                                                             static_cast<Py_ssize_t>(row), lane.c_str(), step + 1)
+                                     : nullptr;
+            Py_XDECREF(reinterpret_cast<PyObject *>(columns));
+            return made;
+        }
         double right = from_left, drift = 0.0;
         const double distance = sumo.driven(agent) - start_m;
         if (lateral) {
@@ -356,8 +366,11 @@ struct Steps {
             if (offset + records > reserved) {
                 return SIMULATED;
             }
-            seen = shown(present, who.row);
+            seen = shown(present, who);
             if (!seen) {
+                if (PyErr_Occurred() && !PyErr_ExceptionMatches(PyExc_Exception)) {
+                    return -1; // such as Ctrl-C
+                }
                 PyErr_Clear(); // Python says it again
                 return SIMULATED;
             }
@@ -504,6 +517,17 @@ PyObject *usual_listen(PyObject *object, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
+// perceive(make, restore): an observation is an array that the first makes, and the agent receives what the second returns
+PyObject *usual_perceive(PyObject *object, PyObject *arguments) {
+    PyObject *perceive, *restore;
+    if (!PyArg_ParseTuple(arguments, "OO", &perceive, &restore)) {
+        return nullptr;
+    }
+    keep(steps_of(object).perceive, perceive);
+    keep(steps_of(object).restore, restore);
+    Py_RETURN_NONE;
+}
+
 // judge(overlaps, hardest, always_ask, last, now_and_then): when somebody has to be asked about a step
 PyObject *usual_judge(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
@@ -615,11 +639,12 @@ PyObject *usual_take(PyObject *object, PyObject *agents) {
         return PyErr_Occurred() ? nullptr : PyLong_FromLong(REFUSED);
     }
     // Whatever the agent does, both stay what they are for as long as it does it.
-    PyObject *observation = Py_NewRef(steps.observation);
     Py_INCREF(agent);
-    PyObject *answer = PyObject_CallMethodOneArg(agent, steps.act, observation);
+    PyObject *observation =
+        steps.restore ? PyObject_CallOneArg(steps.restore, steps.observation) : Py_NewRef(steps.observation);
+    PyObject *answer = observation ? PyObject_CallMethodOneArg(agent, steps.act, observation) : nullptr;
     Py_DECREF(agent);
-    Py_DECREF(observation);
+    Py_XDECREF(observation);
     if (!answer) {
         return nullptr;
     }
@@ -728,6 +753,7 @@ PyMethodDef usual_methods[] = {
     {"go_on", usual_go_on, METH_O, "Simulate, and look where nothing has happened yet; return what has come of it."},
     {"heed", usual_heed, METH_VARARGS, "Take what is counted of braking and of standing."},
     {"listen", usual_listen, METH_VARARGS, "Take who is called where others than before are in sight."},
+    {"perceive", usual_perceive, METH_VARARGS, "Take what makes and restores observations that consist of parts."},
     {"judge", usual_judge, METH_VARARGS, "Take when somebody has to be asked about a step."},
     {"resume", usual_resume, METH_VARARGS, "Go on from a step that is complete."},
     {"borrow", usual_borrow, METH_VARARGS, "Record into a buffer from now on."},

@@ -546,6 +546,11 @@ class ObservationLayout:
             self._places.append((name, slice(begin, end), shape, np.dtype(one.part.dtype)))
             begin = end
 
+    @property
+    def begins(self) -> dict[str, int]:
+        """The index of the first value of every part in the recorded array."""
+        return {name: place.start for name, place, *_ in self._places}
+
     def flat(self, arrays: Mapping[str, NDArray[np.generic]]) -> NDArray[np.generic]:
         """Return the recorded array of an observation."""
         import numpy as np

@@ -11,13 +11,18 @@ import numpy as np
 from libsumo import _libsumo as sumo
 
 from crashhunt.simulators import WHEELBASE_SHARE, bicycle_steering, center_of, kind_number, nearest_actors, wrapped
+from crashhunt.sumo._reader_protocol import Reader
 from crashhunt.world import PERSON, VehicleData, is_person
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
+    from crashhunt.native import Draft
     from crashhunt.sumo._lane_graph import LaneGraph
     from crashhunt.sumo._reader_protocol import Moment, ReaderSetup
+    from crashhunt.world import Actor
 
 _BRAKE_LIGHT, _RIGHT, _LEFT, _HAZARD = 8, 1, 2, 4  # bits of SUMO's signals
 _NO_VALUE = -1073741824.0  # of SUMO's getters, as in `libsumo.INVALID_DOUBLE_VALUE`
@@ -45,7 +50,7 @@ def _known(value: float) -> float:
     return 0.0 if value == _NO_VALUE else value
 
 
-class EgoReader:
+class EgoReader(Reader):
     """Reads the controlled vehicle.
 
     Args:
@@ -53,13 +58,20 @@ class EgoReader:
     """
 
     def __init__(self, setup: ReaderSetup) -> None:
-        self._setup = setup
+        super().__init__(setup)
         self._last: tuple[float, float] | None = None  # heading and speed
         self._place: tuple[float, float] | None = None
         self._driven_m = 0.0
 
     def observe(self, moment: Moment) -> NDArray[np.float64]:
         """Return the columns of ``ego``."""
+        return np.array(self._values(moment))
+
+    def write(self, draft: Draft, place: int, moment: Moment) -> None:
+        """Write the columns of ``ego``."""
+        draft.put(place, self._values(moment))
+
+    def _values(self, moment: Moment) -> tuple[float, ...]:
         setup, scene, row = self._setup, moment.scene, moment.row
         agent, actor = setup.agent, scene.roster.actors[row]
         heading, speed = scene.headings[row], scene.speeds[row]
@@ -74,18 +86,16 @@ class EgoReader:
         if setup.steering is not None:  # SUMO measures along the lane, even if the vehicle crosses it
             self._driven_m += math.dist((x, y), self._place) if self._place is not None else 0.0
             self._place, distance = (x, y), self._driven_m
-        return np.array(
-            (
-                x, y, wrapped(heading), speed,
-                acceleration, yaw_rate, steering, actor.length, actor.width,
-                float(moment.lane.rpartition("_")[2] or 0),
-                _known(sumo.vehicle_getLateralLanePosition(agent)),
-                distance, scene.time_s - setup.start_s,
-            )
+        return (
+            x, y, wrapped(heading), speed,
+            acceleration, yaw_rate, steering, actor.length, actor.width,
+            float(moment.lane.rpartition("_")[2] or 0),
+            _known(sumo.vehicle_getLateralLanePosition(agent)),
+            distance, scene.time_s - setup.start_s,
         )  # fmt: skip
 
 
-class ActorsReader:
+class ActorsReader(Reader):
     """Reads the actors around the controlled vehicle.
 
     Args:
@@ -93,11 +103,33 @@ class ActorsReader:
     """
 
     def __init__(self, setup: ReaderSetup) -> None:
-        self._setup = setup
+        super().__init__(setup)
         self._path = PathAhead(setup.agent, setup.graph, setup.settings["radius"])
+        self._limits = setup.settings["radius"], setup.limit, setup.step_length_s
         self._speeds: dict[str, float] = {}
-        self.ids: tuple[str, ...] = ()
+        self._actors: tuple[Actor, ...] = ()
+        self._who: tuple[list[float], tuple[str, ...]] = [], ()
+        self._rows: tuple[int, ...] = ()
+
+    @property
+    def ids(self) -> tuple[str, ...]:
         """Identifiers of the actors in the rows, as in scenes."""
+        return tuple([self._actors[row].id for row in self._rows])
+
+    def write(self, draft: Draft, place: int, moment: Moment) -> None:
+        """Write the columns of ``actors``."""
+        scene, actors = moment.scene, moment.scene.roster.actors
+        if actors is not self._actors:
+            self._who = [kind_number(actor.kind) for actor in actors], tuple([actor.id for actor in actors])
+        found = None
+        if scene.columns is not None and not (scene.heights or moment.hidden):
+            path = self._path.update(moment.lane).facts
+            found = draft.actors(place, scene.columns, moment.row, self._who, self._limits, self._speeds, path)
+        if found is None:
+            draft.put_array(place, self.observe(moment))
+        else:
+            self._rows, self._speeds = found
+        self._actors = actors
 
     def observe(self, moment: Moment) -> NDArray[np.float64]:
         """Return the columns of ``actors``."""
@@ -127,7 +159,7 @@ class ActorsReader:
                     ahead, offset, float(bool(signals & _BRAKE_LIGHT)), indicator,
                 )
             )  # fmt: skip
-        self.ids = tuple([actors[other].id for _, other, _, _ in near])
+        self._actors, self._rows = actors, tuple([other for _, other, _, _ in near])
         rows = np.zeros(self._setup.shape)
         if found:
             rows[: len(found)] = found
@@ -164,7 +196,7 @@ class PathAhead:
     def __init__(self, vehicle: str, graph: LaneGraph, reach_m: float) -> None:
         self._vehicle, self._graph, self._reach_m = vehicle, graph, reach_m
         self._paths: dict[tuple[str, int, str], frozenset[str]] = {}
-        self._entered: dict[tuple[str, str], bool] = {}
+        self._entered: dict[str, dict[str, bool]] = {}  # by the vehicle's lane, and the other lane
         self._lane = ""
         self._lanes: frozenset[str] = frozenset()
 
@@ -176,6 +208,7 @@ class PathAhead:
             edges = sumo.vehicle_getRoute(self._vehicle)[max(key[1], 0) :]
             found = self._paths[key] = frozenset(self._reached(lane, frozenset(edges)))
         self._lane, self._lanes = lane, found
+        self._entered.setdefault(lane, {})
         return self
 
     def has(self, lane: str) -> bool:
@@ -184,10 +217,16 @@ class PathAhead:
 
     def is_entered_from(self, lane: str) -> bool:
         """Return whether a lane leads into the vehicle's lane within the reach."""
-        found = self._entered.get((lane, self._lane))
+        known = self._entered[self._lane]
+        found = known.get(lane)
         if found is None:
-            found = self._entered[lane, self._lane] = self._lane in self._reached(lane)
+            found = known[lane] = self._lane in self._reached(lane)
         return found
+
+    @property
+    def facts(self) -> tuple[frozenset[str], dict[str, bool], Callable[[str], bool]]:
+        """The lanes that the route continues to, the known answers of `is_entered_from`, and this method."""
+        return self._lanes, self._entered[self._lane], self.is_entered_from
 
     def _reached(self, lane: str, edges: frozenset[str] | None = None) -> set[str]:
         """Return the lanes that can be reached from a lane, within the reach and on the given edges."""

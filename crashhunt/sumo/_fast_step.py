@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.native import Core, Vehicles
+    from crashhunt.native import Columns, Core, Vehicles
     from crashhunt.simulators import Kinematics, Observations, Simulator, StepResult
     from crashhunt.sumo._range_of_sight import Sight
     from crashhunt.sumo._traffic_events import SumoEvents
@@ -76,6 +76,8 @@ class UsualSteps:
         step_length_s: Step length, in s.
         lateral: Whether vehicles may leave the centre line of a lane.
         takes_speed: Whether actions are `SpeedAndLaneChange`.
+        perceive: Function that makes an observation that consists of parts; None for the default observation.
+        restore: Function that returns what the agent receives, from such an observation.
         instead_of: Attributes of the simulator that the core bypasses, by name.
     """
 
@@ -98,6 +100,8 @@ class UsualSteps:
         step_length_s: float,
         lateral: bool,
         takes_speed: bool,
+        perceive: Callable[[Scene, int, str, int], NDArray[np.generic]] | None,
+        restore: Callable[[NDArray[np.generic]], object],
         instead_of: Mapping[str, object],
     ) -> None:
         self._core, self._agent = core, agent
@@ -109,6 +113,9 @@ class UsualSteps:
             agent, SimpleNamespace(simulationStep=simulate), (np.ndarray, shape, _FLOAT32), shape[0] - 1,
             step_length_s, lateral, takes_speed, sight.around, start_m,
         )  # fmt: skip
+        self._perceive = perceive
+        if perceive is not None:
+            self.core.perceive(self._make_observation, restore)
         self._from_left, self._instead_of = from_left, instead_of
         self._last: StepResult = ({}, {}, {}, {}, {})
         self._rosters: dict[Vehicles, Roster] = {}  # of the scenes that `catch_up` may need
@@ -137,6 +144,11 @@ class UsualSteps:
             del self._rosters[next(iter(self._rosters))]
         self._rosters[seen[0]] = self.roster
         return *seen, row, self._controlled
+
+    def _make_observation(self, columns: Columns, time_s: float, row: int, lane: str, step: int) -> NDArray[np.generic]:
+        assert self._perceive is not None
+        scene = Scene(time_s, self.roster, swept=True, core=self._core, columns=columns)
+        return self._perceive(scene, row, lane, step)
 
     def resume(self) -> Scene | None:
         """Bring the core to the state of the simulator; return the scene, or None if that is not possible yet."""

@@ -311,13 +311,10 @@ class _PointIndex:
             return []
         rows = np.concatenate(parts)
         squared = ((self._points[rows] - (x, y)) ** 2).sum(axis=1)
-        inside = squared <= radius_m * radius_m
-        rows, squared = rows[inside], squared[inside]
-        order = np.argsort(squared, kind="stable")
-        found: dict[int, float] = {}
-        for owner, value in zip(self._owner[rows[order]].tolist(), squared[order].tolist(), strict=True):
-            found.setdefault(owner, value)
-        return sorted((math.sqrt(value), self._names[owner]) for owner, value in found.items())
+        nearest = np.full(len(self._names), math.inf)
+        np.minimum.at(nearest, self._owner[rows], squared)
+        found = np.flatnonzero(nearest <= radius_m * radius_m).tolist()
+        return sorted((math.sqrt(nearest[owner]), self._names[owner]) for owner in found)
 
 
 def lane_graph(scenario: Scenario) -> LaneGraph:

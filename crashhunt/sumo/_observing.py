@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from crashhunt.simulators import History, layouts_of
 from crashhunt.sumo._conflicts import Conflicts
@@ -24,12 +27,14 @@ from crashhunt.sumo._scene_readers import GridReader, ImageReader, PredictionsRe
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    import numpy as np
     from numpy.typing import NDArray
 
+    from crashhunt.native import Core, Draft
     from crashhunt.scenario import Scenario
     from crashhunt.sumo._lane_graph import LaneGraph
     from crashhunt.sumo._reader_protocol import Moment, Reader
+
+_DRAFTED = "<f8"  # the type of the values that the compiled core writes
 
 READERS: Mapping[str, type[Reader]] = {
     "actors": ActorsReader,
@@ -54,13 +59,16 @@ class ObservedParts:
 
     Args:
         scenario: The scenario.
+        core: The compiled core; None if it is not used.
 
     Attributes:
+        core: The compiled core, which `begin` gives to the readers; None if it is not used.
         layouts: The layout of each such agent's observation.
         reach_m: Largest distance at which a part shows actors, in m; 0 if no part shows actors.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, core: Core | None = None) -> None:
+        self.core = core
         self.layouts = layouts_of(scenario.agents, READERS)
         self.reach_m = max((layout.reach_m for layout in self.layouts.values()), default=0.0)
         self._step_length_s = scenario.step_length_s
@@ -70,6 +78,7 @@ class ObservedParts:
             self.graph  # noqa: B018 - the zygote makes the simulator, so the processes of all trials share the graph
         self._readers: dict[str, dict[str, Reader]] = {}
         self._histories: dict[str, History] = {}
+        self._drafts: dict[str, tuple[Draft, list[tuple[int, Reader]]]] = {}
 
     @cached_property
     def graph(self) -> LaneGraph:
@@ -114,6 +123,7 @@ class ObservedParts:
                         start_m=starts[agent],
                         start_s=time_s,
                         steering=known.get(agent),
+                        core=self.core,
                     )
                 )
                 for name, request in layout.parts.items()
@@ -121,9 +131,23 @@ class ObservedParts:
             for agent, layout in self.layouts.items()
             if agent in starts
         }
+        self._drafts = {}
+        for agent, readers in self._readers.items():
+            layout = self.layouts[agent]
+            if self.core is None or layout.history:
+                continue
+            if all(one.part.dtype == _DRAFTED for one in layout.parts.values()):
+                places = [(layout.begins[name], reader) for name, reader in readers.items()]
+                self._drafts[agent] = self.core.Draft(math.prod(layout.flat_space.shape)), places
 
     def observe(self, agent: str, moment: Moment) -> NDArray[np.generic]:
         """Return the recorded array of an agent's observation."""
+        drafted = self._drafts.get(agent)
+        if drafted is not None:
+            draft, places = drafted
+            for place, reader in places:
+                reader.write(draft, place, moment)
+            return np.frombuffer(draft.take())
         arrays = {name: reader.observe(moment) for name, reader in self._readers[agent].items()}
         return self.layouts[agent].flat(self._histories[agent].add(arrays))
 

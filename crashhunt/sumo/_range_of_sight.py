@@ -193,7 +193,9 @@ class Sight:
         else:
             quiet = not (found[1] or sumo.person_getIDCount() or sumo.simulation_getCollisions())
             right = at_once is None or (quiet and self._ids == found[2][0] and repr(_lists(at_once)) == repr(found[0]))
-        return right and repr(read) == repr(found)  # repr() has all digits of each number
+        if not right or repr(read) != repr(found):  # repr() has all digits of each number
+            return False
+        return repr(self.core.vehicle_states(self._vehicles)) == repr([*map(_state, self._ids)])
 
     def distrust(self) -> None:
         """Stop using the core, and delete the state of the episode."""
@@ -336,6 +338,16 @@ class Sight:
                 low = z if low is None or z < low else low
                 high = z if high is None or z > high else high
         return low is not None and high is not None and high - low > _FLAT_M
+
+
+def _state(vehicle: str) -> tuple[str, float, float, int]:
+    """Return the values that the core reads for the observation ``actors``."""
+    return (
+        sumo.vehicle_getLaneID(vehicle),
+        sumo.vehicle_getLateralLanePosition(vehicle),
+        sumo.vehicle_getAcceleration(vehicle),
+        sumo.vehicle_getSignals(vehicle),
+    )
 
 
 def _lists(columns: Columns) -> Lists:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import cos, sin
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from libsumo import _libsumo as sumo
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from crashhunt.native import Core, Draft
     from crashhunt.simulators import RequestedPart
     from crashhunt.sumo._conflicts import Conflicts
     from crashhunt.sumo._lane_graph import GraphLane, LaneGraph, RouteGuide
@@ -35,6 +36,7 @@ class ReaderSetup:
         start_s: Simulation time at the start of the episode, in s.
         steering: Function that returns the steering angle of the vehicle, in rad, positive to the left. None if the
             vehicle's actions contain no steering angle. The angle then follows from the yaw rate.
+        core: The compiled core; None if it is not used.
     """
 
     agent: str
@@ -46,6 +48,7 @@ class ReaderSetup:
     start_m: float
     start_s: float
     steering: Callable[[], float] | None = None
+    core: Core | None = None
 
     @property
     def settings(self) -> Mapping[str, float]:
@@ -165,13 +168,23 @@ def _position_on(graph: LaneGraph, lane: GraphLane, x: float, y: float) -> float
     return along / float(length.sum()) * lane.data.length_m
 
 
-class Reader(Protocol):
-    """Reads one part of an agent's observation. A reader may keep state from step to step of one episode."""
+class Reader:
+    """Reads one part of an agent's observation. A reader may keep state from step to step of one episode.
 
-    def __init__(self, setup: ReaderSetup, /) -> None: ...
+    Args:
+        setup: The part, the vehicle and the network.
+    """
 
-    def observe(self, moment: Moment, /) -> NDArray[np.generic]:
+    def __init__(self, setup: ReaderSetup) -> None:
+        self._setup = setup
+
+    def observe(self, moment: Moment) -> NDArray[np.generic]:
         """Return the part after the last step, as a new array; crashhunt calls this method once per step, from step 0.
 
         The array has the shape and the data type of the part. The method changes nothing in the simulation.
         """
+        raise NotImplementedError
+
+    def write(self, draft: Draft, place: int, moment: Moment) -> None:
+        """Write the same values into a draft of the compiled core, which replaces a call of `observe`."""
+        draft.put_array(place, self.observe(moment))

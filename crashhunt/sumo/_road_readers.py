@@ -13,13 +13,15 @@ from libsumo import _libsumo as sumo
 
 from crashhunt.sumo._lane_graph import is_open
 from crashhunt.sumo._lane_paths import LanePaths, Sampling, straight_ahead, straight_behind
+from crashhunt.sumo._reader_protocol import Reader
 from crashhunt.world import PERSON, is_person
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
+    from crashhunt.native import Draft, LaneBlock
     from crashhunt.sumo._conflicts import Approach, Conflict
     from crashhunt.sumo._lane_graph import GraphLane, LaneLink, RouteGuide, Signal
     from crashhunt.sumo._lane_paths import LanePath
@@ -39,7 +41,7 @@ _ALLWAY_STOP = "w"
 _FIXED_TIMES = 0  # type of a traffic light program
 
 
-class LanesReader:
+class LanesReader(Reader):
     """Reads the lanes around the controlled vehicle.
 
     Args:
@@ -47,7 +49,8 @@ class LanesReader:
     """
 
     def __init__(self, setup: ReaderSetup) -> None:
-        self._setup, self._graph = setup, setup.graph
+        super().__init__(setup)
+        self._graph = setup.graph
         self._lanes, points, self._columns = setup.shape
         spacing = setup.settings["spacing"]
         self._sampling = Sampling(
@@ -59,23 +62,21 @@ class LanesReader:
         self._others: LanePaths | None = None
         self._key: tuple[object, ...] = ()
         self._block: _Block
+        self._in_core: tuple[_Block, LaneBlock] | None = None
+        self._size = self._lanes, points, self._sampling.before, self._sampling.stride
 
     def observe(self, moment: Moment) -> Array:
         """Return the columns of ``lanes``."""
         place = self._setup.places.find(moment)
         if place is None:
             return np.zeros(self._setup.shape)
-        square = math.floor(place.x / _SQUARE_M), math.floor(place.y / _SQUARE_M)
-        key = place.lane, id(place.guide), place.number, square
-        if key != self._key:
-            self._key, self._block = key, self._made(place, square)
-        block = self._block
+        block = self._block_at(place)
         # The squared distances, except for a term that all points have in common.
         squared = block.x * (-2.0 * (place.x - block.middle_x))
         squared += block.y * (-2.0 * (place.y - block.middle_y))
         squared += block.squared
         nearest = squared.argmin(axis=1)
-        limit = _NEAR_M * _NEAR_M - (place.x - block.middle_x) ** 2 - (place.y - block.middle_y) ** 2
+        limit = block.limit(place)
         chosen = list(range(min(3, self._lanes)))
         if self._lanes > 3:
             best = squared[3:].min(axis=1).tolist()
@@ -87,6 +88,24 @@ class LanesReader:
         found = np.zeros(self._setup.shape)
         block.rows.take(rows, axis=0, out=found[: len(chosen)], mode="clip")
         return found
+
+    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+        """Write the columns of ``lanes``."""
+        core, place = self._setup.core, self._setup.places.find(moment)
+        if place is None or core is None:
+            return
+        block = self._block_at(place)
+        if self._in_core is None or self._in_core[0] is not block:
+            arrays = tuple([np.ascontiguousarray(one) for one in block[:-2]])
+            self._in_core = block, core.LaneBlock(arrays, block.middle_x, block.middle_y)
+        draft.lanes(at, self._in_core[1], place.x, place.y, block.limit(place), self._size)
+
+    def _block_at(self, place: Place) -> _Block:
+        square = math.floor(place.x / _SQUARE_M), math.floor(place.y / _SQUARE_M)
+        key = place.lane, id(place.guide), place.number, square
+        if key != self._key:
+            self._key, self._block = key, self._made(place, square)
+        return self._block
 
     def _made(self, place: Place, square: tuple[int, int]) -> _Block:
         graph, places, lane = self._graph, self._setup.places, place.lane
@@ -167,6 +186,11 @@ class _Block(NamedTuple):
     middle_x: float
     middle_y: float
 
+    def limit(self, place: Place) -> float:
+        """Return the largest squared distance of a lane, without the term that all points have in common, in m²."""
+        dx, dy = place.x - self.middle_x, place.y - self.middle_y
+        return _NEAR_M * _NEAR_M - dx * dx - dy * dy
+
 
 _EMPTY = np.zeros((1, 6))
 
@@ -195,7 +219,7 @@ def _block_of(paths: list[LanePath | None], middle_x: float, middle_y: float, wi
     )  # fmt: skip
 
 
-class RouteReader:
+class RouteReader(Reader):
     """Reads points along the route.
 
     Args:
@@ -203,7 +227,7 @@ class RouteReader:
     """
 
     def __init__(self, setup: ReaderSetup) -> None:
-        self._setup = setup
+        super().__init__(setup)
         self._sampling = Sampling(setup.settings["spacing"], setup.shape[0], 0)
         self._steps = np.arange(setup.shape[0]) * self._sampling.stride
         self._paths: dict[tuple[int, int], LanePaths] = {}
@@ -214,16 +238,27 @@ class RouteReader:
         place = self._setup.places.find(moment)
         if place is None or place.number < 0:
             return found
-        key = id(place.guide), place.number
-        paths = self._paths.get(key)
-        if paths is None:
-            paths = self._paths[key] = self._made(place)
-        path = paths.path(place.lane)
+        path = self._path(place)
         part = path.rows[path.begin : path.last + 1]
         nearest = path.begin + int(((part[:, 1] - place.x) ** 2 + (part[:, 2] - place.y) ** 2).argmin())
         rows = path.rows[nearest + self._steps[self._steps < len(path.rows) - nearest]]
         found[: len(rows)] = rows[:, _ROUTE_COLUMNS]
         return found
+
+    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+        """Write the columns of ``route``."""
+        place = self._setup.places.find(moment)
+        if place is not None and place.number >= 0:
+            path = self._path(place)
+            size = self._setup.shape[0], self._sampling.stride
+            draft.route(at, path.rows, (path.begin, path.last), place.x, place.y, size)
+
+    def _path(self, place: Place) -> LanePath:
+        key = id(place.guide), place.number
+        paths = self._paths.get(key)
+        if paths is None:
+            paths = self._paths[key] = self._made(place)
+        return paths.path(place.lane)
 
     def _made(self, place: Place) -> LanePaths:
         guide, number = place.guide, place.number
@@ -240,15 +275,12 @@ class RouteReader:
 _ROUTE_COLUMNS = (0, 1, 2, 3, 5, 6)
 
 
-class RouteStateReader:
+class RouteStateReader(Reader):
     """Reads the state of the controlled vehicle on its route.
 
     Args:
         setup: The part and the vehicle.
     """
-
-    def __init__(self, setup: ReaderSetup) -> None:
-        self._setup = setup
 
     def observe(self, moment: Moment) -> Array:
         """Return the columns of ``route_state``."""
@@ -273,7 +305,7 @@ class RouteStateReader:
         return np.array((max(0.0, rest + left), changes, max(0.0, run + left), *guide.goal))
 
 
-class SignalsReader:
+class SignalsReader(Reader):
     """Reads the next traffic lights on the route.
 
     Args:
@@ -281,23 +313,33 @@ class SignalsReader:
     """
 
     def __init__(self, setup: ReaderSetup) -> None:
-        self._setup = setup
+        super().__init__(setup)
         self._ahead: dict[tuple[int, int, str], list[Signal]] = {}
         self._seen: dict[tuple[str, int], tuple[float, float]] = {}  # state of the lights ahead, and since when
 
     def observe(self, moment: Moment) -> Array:
         """Return the columns of ``signals``."""
         found = np.zeros(self._setup.shape)
+        for row, values in enumerate(self._rows(moment)):
+            found[row] = values
+        return found
+
+    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+        """Write the columns of ``signals``."""
+        draft.put(at, tuple([value for row in self._rows(moment) for value in row]))
+
+    def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
         seen, self._seen = self._seen, {}
+        found: list[tuple[float, ...]] = []
         place = self._setup.places.find(moment)
         if place is None or place.number < 0:
             return found
         key = id(place.guide), place.number, place.lane.id
         ahead = self._ahead.get(key)
         if ahead is None:
-            ahead = self._ahead[key] = place.guide.signals(place.number, place.lane, len(found))
+            ahead = self._ahead[key] = place.guide.signals(place.number, place.lane, self._setup.limit)
         time_s = moment.scene.time_s
-        for row, (distance, light, link) in enumerate(ahead):
+        for distance, light, link in ahead:
             state = _STATES.get(sumo.trafficlight_getRedYellowGreenState(light)[link], _OFF)
             last = seen.get((light, link))
             if last is None:
@@ -305,7 +347,7 @@ class SignalsReader:
             elif last[0] != state:  # it changed when the step began
                 last = state, time_s - self._setup.step_length_s
             self._seen[light, link] = last
-            found[row] = 1.0, state, distance - place.position_m, time_s - last[1]
+            found.append((1.0, state, distance - place.position_m, time_s - last[1]))
         return found
 
 
@@ -325,7 +367,7 @@ def _time_in_state(light: str, link: int, state: float) -> float:
     return found
 
 
-class RightOfWayReader:
+class RightOfWayReader(Reader):
     """Reads the actors on streams that conflict with the route at the next junction.
 
     Args:
@@ -333,32 +375,46 @@ class RightOfWayReader:
     """
 
     def __init__(self, setup: ReaderSetup) -> None:
-        self._setup, self._graph = setup, setup.graph
+        super().__init__(setup)
+        self._graph = setup.graph
         self._routes: dict[str, tuple[str, tuple[str, ...]]] = {}
 
     def observe(self, moment: Moment) -> Array:
         """Return the columns of ``right_of_way``."""
         found = np.zeros(self._setup.shape)
+        for number, values in enumerate(self._rows(moment)):
+            found[number] = values
+        return found
+
+    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+        """Write the columns of ``right_of_way``."""
+        draft.put(at, tuple([value for row in self._rows(moment) for value in row]))
+
+    def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
         place = self._setup.places.find(moment)
         path = path_across(place) if place is not None else None
         if place is None or path is None:
-            return found
+            return []
         link, line = path
         approaches = self._setup.conflicts.around(link)
         if not approaches:
-            return found
-        scene, row = moment.scene, moment.row
+            return []
+        scene, row, core = moment.scene, moment.row, self._setup.core
         actors = scene.roster.actors
+        present: Iterable[tuple[int, str]] | None = None
+        if core is not None and scene.columns is not None:
+            present = core.rows_on_lanes(scene.columns, approaches)
         front = -line
         rear = front - actors[row].length
         stop_sign = float(link.state in _STOP_STATES)
         rows = []
-        for other, actor in enumerate(actors):
+        for other, lane in ((number, "") for number in range(len(actors))) if present is None else present:
+            actor = actors[other]
             if other == row or actor.id in moment.hidden:
                 continue
             speed = max(0.0, scene.speeds[other])
             best = None
-            for conflict, place_m in self._taken(actor.id, scene.headings[other], approaches):
+            for conflict, place_m in self._taken(actor.id, lane, scene.headings[other], approaches):
                 if rear > conflict.end_m or place_m - actor.length > conflict.other_end_m:
                     continue  # one of them has passed
                 away = conflict.other_begin_m - place_m
@@ -369,9 +425,10 @@ class RightOfWayReader:
             if best is not None:
                 rows.append(best)
         rows.sort()
-        for number, (arrival, away, _, must_yield, distance, speed) in enumerate(rows[: len(found)]):
-            found[number] = 1.0, must_yield, line, distance, away, speed, arrival, stop_sign
-        return found
+        return [
+            (1.0, must_yield, line, distance, away, speed, arrival, stop_sign)
+            for arrival, away, _, must_yield, distance, speed in rows[: self._setup.limit]
+        ]
 
     def _on_crossing(self, conflict: Conflict, lane: str, position: float, heading: float) -> tuple[Conflict, float]:
         """Return the conflict with a person on a crossing and its position, both in the direction of the person."""
@@ -383,9 +440,16 @@ class RightOfWayReader:
         return conflict._replace(other_begin_m=begin, other_end_m=end), length - position
 
     def _taken(
-        self, name: str, heading: float, approaches: Mapping[str, list[Approach]]
+        self, name: str, lane: str, heading: float, approaches: Mapping[str, list[Approach]]
     ) -> Iterator[tuple[Conflict, float]]:
-        """Yield the conflicting paths that an actor takes, and its front's distance behind their stop lines, in m."""
+        """Yield the conflicting paths that an actor takes, and its front's distance behind their stop lines, in m.
+
+        Args:
+            name: identifier of the actor.
+            lane: lane of the actor; empty if it is not known yet.
+            heading: heading of the actor, in rad.
+            approaches: the lanes from which actors come into conflict with the path of the vehicle.
+        """
         try:
             if is_person(name):
                 person = name.removeprefix(PERSON)
@@ -393,7 +457,7 @@ class RightOfWayReader:
                 for one in approaches.get(lane, ()):
                     yield self._on_crossing(one.conflict, lane, sumo.person_getLanePosition(person), heading)
                 return
-            found = approaches.get(sumo.vehicle_getLaneID(name))
+            found = approaches.get(lane or sumo.vehicle_getLaneID(name))
             if found is None:
                 return
             number, position = sumo.vehicle_getRouteIndex(name), sumo.vehicle_getLanePosition(name)
@@ -443,15 +507,12 @@ def path_across(place: Place) -> tuple[LaneLink, float] | None:
     return entry, -(entry.length_m - link.length_m - lane.data.length_m) - place.position_m
 
 
-class StopLineReader:
+class StopLineReader(Reader):
     """Reads the stop line of the next junction.
 
     Args:
         setup: The part and the vehicle.
     """
-
-    def __init__(self, setup: ReaderSetup) -> None:
-        self._setup = setup
 
     def observe(self, moment: Moment) -> Array:
         """Return the columns of ``stop_line``."""
@@ -465,15 +526,12 @@ class StopLineReader:
         return np.array((1.0, line, yields, link.state in _STOP_STATES, bool(link.signal)), float)
 
 
-class SpeedLimitReader:
+class SpeedLimitReader(Reader):
     """Reads the speed limit of the controlled vehicle's lane.
 
     Args:
         setup: The part and the vehicle.
     """
-
-    def __init__(self, setup: ReaderSetup) -> None:
-        self._setup = setup
 
     def observe(self, moment: Moment) -> Array:
         """Return the speed limit, which can differ from that of the network file while a sign changes it."""

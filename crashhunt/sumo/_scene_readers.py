@@ -8,6 +8,7 @@ import numpy as np
 from libsumo import _libsumo as sumo
 
 from crashhunt.simulators import Raster, RayCaster, center_of, nearest_actors, picture, predictions_of
+from crashhunt.sumo._reader_protocol import Reader
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,15 +18,12 @@ if TYPE_CHECKING:
 _MAX_HALF_WIDTH_M = 10.0  # of a lane, and half the distance of two points of its centre line
 
 
-class PredictionsReader:
+class PredictionsReader(Reader):
     """Predicts the actors at constant velocity.
 
     Args:
         setup: The part.
     """
-
-    def __init__(self, setup: ReaderSetup) -> None:
-        self._setup = setup
 
     def observe(self, moment: Moment) -> NDArray[np.float64]:
         """Return the columns of ``predictions``."""
@@ -36,7 +34,7 @@ class PredictionsReader:
         return predictions_of(moment.scene, near, shape=self._setup.shape, interval=settings["interval"])
 
 
-class RangesReader:
+class RangesReader(Reader):
     """Casts rays to the outlines of the actors.
 
     Args:
@@ -44,6 +42,7 @@ class RangesReader:
     """
 
     def __init__(self, setup: ReaderSetup) -> None:
+        super().__init__(setup)
         self._reach_m = setup.settings["range"]
         self._caster = RayCaster(int(setup.settings["rays"]), self._reach_m)
 
@@ -55,7 +54,7 @@ class RangesReader:
         return self._caster.cast(scene, row, [one.row for one in near])
 
 
-class _RasterReader:
+class _RasterReader(Reader):
     """Finds the cells around the vehicle that are on lanes or inside outlines.
 
     Args:
@@ -63,6 +62,7 @@ class _RasterReader:
     """
 
     def __init__(self, setup: ReaderSetup) -> None:
+        super().__init__(setup)
         settings = setup.settings
         self._graph, self._vehicle_class = setup.graph, sumo.vehicle_getVehicleClass(setup.agent)
         self._raster = Raster(int(settings["rows"]), int(settings["columns"]), settings["resolution"])

@@ -8,6 +8,7 @@ from types import MethodType
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import libsumo
+import numpy as np
 
 # The package's own functions each wrap one of these in a Python call, which doubles the cost of a getter; a step reads
 # some two hundred values.
@@ -54,7 +55,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.base.errors import EpisodeError
@@ -101,7 +101,9 @@ class SumoSimulator:
         self._kinematics = Kinematics(scenario.observation or ObservationSetup())
         self.observation_names = self._kinematics.features
         self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
-        self._parts = ObservedParts(scenario)
+        native = scenario.table(SumoSetup).native is not False
+        core = core_for(VERSION, sumo.__file__) if native else None
+        self._parts = ObservedParts(scenario, core)
         self.observation_layouts = self._parts.layouts
         self.observation_spaces |= {agent: layout.flat_space for agent, layout in self.observation_layouts.items()}
         if self.observation_layouts:
@@ -118,8 +120,6 @@ class SumoSimulator:
         self._driving = Driving(scenario.agents, scenario.step_length_s)
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s, self._driving)
         self._loading = Loading(fix_link_order=scenario.table(SumoSetup).fix_link_order is not False)
-        native = scenario.table(SumoSetup).native is not False
-        core = core_for(VERSION, sumo.__file__) if native else None
         self._sight = Sight(
             tuple(scenario.agents),
             scenario.step_length_s,
@@ -213,6 +213,7 @@ class SumoSimulator:
         self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
         self._last_lanes: dict[str, tuple[str, int]] = {}
         self._steps = 0
+        self._perceived: tuple[int, NDArray[np.generic]] = -1, np.zeros(0)
         self._kinematics.hidden.clear()
         self._off_road: list[str] = []
         steering = {agent: motion.steering for agent, motion in self._driving.moving.items()}
@@ -222,6 +223,8 @@ class SumoSimulator:
         usual = self._usual_steps()
         if self._sight.core is not None and self._is_core_wrong(observations, usual):
             self._sight.distrust()
+            self._parts.core = None
+            self._parts.begin(self._start, sumo.simulation_getTime(), steering)
             self._notices.append(_CORE_DISABLED_NOTICE)
             self._read_scene()
             observations, usual = self._observe_all(), None
@@ -418,9 +421,10 @@ class SumoSimulator:
     def _usual_steps(self) -> UsualSteps | None:
         """Return the fast path of this episode; None if the core cannot run whole steps of it."""
         core, plain = self._sight.core, type(self) is SumoSimulator and not self.scripted and self._taking_part is None
-        if core is None or not plain or len(self.agents) != 1 or not self._kinematics.usual or self._drifts:
+        if core is None or not plain or len(self.agents) != 1 or self._drifts:
             return None
-        if self.observation_layouts:
+        has_parts = self.agents[0] in self.observation_layouts
+        if not (has_parts or self._kinematics.usual):
             return None
         if self._lateral and self._driving.left_hand:
             return None  # the core computes lateral offsets for right-hand traffic only
@@ -428,7 +432,12 @@ class SumoSimulator:
         # Take the methods of the class, because a caller may have replaced attributes of this object.
         own = {
             method.__name__: MethodType(method, self)
-            for method in (SumoSimulator.reset, SumoSimulator.step, SumoSimulator.scene)
+            for method in (
+                SumoSimulator.reset,
+                SumoSimulator.step,
+                SumoSimulator.scene,
+                SumoSimulator.restore_observation,
+            )
         }
         return UsualSteps(
             core,
@@ -447,8 +456,17 @@ class SumoSimulator:
             step_length_s=self.step_length_s,
             lateral=self._lateral,
             takes_speed=type(self.actions[agent]) is SpeedAndLaneChange,
+            perceive=self._perceive if has_parts else None,
+            restore=partial(self.restore_observation, agent),
             instead_of={"actions": self.actions, **own},
         )
+
+    def _perceive(self, scene: Scene, row: int, lane: str, step: int) -> NDArray[np.generic]:
+        """Return the parts that the only agent observes after a step, which the core may yet leave to this object."""
+        moment = Moment(scene=scene, row=row, lane=lane, hidden=frozenset())
+        found = self._parts.observe(self.agents[0], moment)
+        self._perceived = step, found
+        return found
 
     def _infos(self, agents: Iterable[str]) -> dict[str, Info]:
         """Return the info of each agent: the identifiers of the actors in the rows of ``actors``, if it has them."""
@@ -504,6 +522,8 @@ class SumoSimulator:
         self._last_lanes[agent] = edge, lane
         self._scene.agent_lanes[agent] = f"{edge}_{lane}"
         if agent in self.observation_layouts:
+            if self._perceived[0] == self._steps:  # readers keep state, so they read each step once
+                return self._perceived[1]
             moment = Moment(
                 scene=self._scene, row=row, lane=f"{edge}_{lane}", hidden=self._kinematics.hidden_from(agent)
             )

@@ -536,6 +536,9 @@ LIES = {
     "Vehicles, seen at once": _Hasty,
     "Vehicles, others than before": _Crowded,
     "is_coming_or_going": lambda: not core.is_coming_or_going(),
+    "vehicle_states": lambda vehicles: [
+        (lane, aside, 1.0, bits) for lane, aside, _, bits in core.vehicle_states(vehicles)
+    ],
 }
 
 
@@ -543,8 +546,13 @@ LIES = {
 def run(tmp_path):
     from crashhunt.sumo import SumoSimulator
 
-    def trial(scenario, *, native, steps=60, lie=None, speed=15.0, seed=5):
+    def trial(scenario, *, native, steps=60, lie=None, speed=15.0, seed=5, parts=(), agent=None):
         chosen = load_scenario(scenario)
+        if parts:
+            agents = {
+                agent: replace(setup, observation=parts, action="continuous") for agent, setup in chosen.agents.items()
+            }
+            chosen = replace(chosen, agents=agents)
         chosen = chosen.with_table(replace(chosen.table(SumoSetup), native=native))
         stage = tmp_path / f"stage-{native}-{lie}"
         stage.mkdir()
@@ -554,7 +562,7 @@ def run(tmp_path):
             simulator._sight.core = _Lies(lie.partition(",")[0], LIES[lie])
         box = BlackBox(stage / "box.bin")
         box.begin(pid=1, trial=0, started=0.0)
-        agents = {"make_agent": lambda *_: KeepLaneWithSpeed(speed), "crash_on": CRASHES}
+        agents = {"make_agent": lambda *_: agent or KeepLaneWithSpeed(speed), "crash_on": CRASHES}
         spec = TrialSpec(0, seed, {}, argument_values(chosen), max_steps=steps)
         oracles = [ReportedCollision(), Overlap(), OffRoad()]
         result = run_episode(spec, simulator=simulator, box=box, oracles=oracles, **agents)
@@ -563,6 +571,42 @@ def run(tmp_path):
         return replace(result, setup_s=0.0, wall_s=0.0), simulator
 
     return trial
+
+
+PARTS = ("ego", "actors", "lanes", "route", "route_state", "signals", "right_of_way", "stop_line", "lidar2d")
+
+
+class _StopsAndGoes:
+    """Stops again and again, with which steps are handed back to Python after they have been observed."""
+
+    def reset(self, seed):
+        self.steps = 0
+
+    def act(self, observation):
+        self.steps += 1
+        return (0.0 if self.steps % 50 > 20 else 12.0), 0
+
+
+@pytest.mark.parametrize(
+    ("scenario", "parts"),
+    [
+        ("intersection", PARTS),
+        ("motorway", ("actors:rows=3:radius=60", "lanes:lanes=2:points=9:spacing=3.3", "route:points=200", "ego")),
+        ("loop-two-agents", ("ego", "actors", "lanes:lanes=30:behind=0")),
+        ("loop", ("ego", "actors", "grid:rows=9:columns=9", "history:steps=2")),
+    ],
+)
+def test_parts_of_observations_are_the_same_bit_by_bit(run, scenario, parts):
+    (ours, simulator), (theirs, _) = (
+        run(scenario, native=native, steps=160, parts=parts, agent=_StopsAndGoes()) for native in (None, False)
+    )
+    assert simulator._sight.core is core
+    assert not simulator.notices
+    assert ours == theirs
+    assert ours.steps > 30
+    # An episode with one agent runs its uneventful steps in the core.
+    assert (simulator.at_once is not None) == (scenario != "loop-two-agents")
+    assert simulator.at_once is None or simulator.at_once.core.step > 30
 
 
 @pytest.mark.parametrize("scenario", ["loop", "loop-two-agents"])
