@@ -133,6 +133,7 @@ class Trials:
         self._proposed: dict[int, TrialSpec] = {}  # by a run before this one, and not ended
         self._open: set[int] = set()
         self._has_origins = False
+        self._told: tuple[int, ...] = ()  # reported since the last proposal
         self._untold: list[int] = []  # a heap of the trials that have ended
         self._results: dict[int, TrialResult] = {}  # of those, what has ended in this run
         if sampler.learns:
@@ -171,9 +172,18 @@ class Trials:
                 if self._must_wait(self._next):
                     break
                 self._refuse_other_version()
-                told = self._report_to_sampler(self._next - self._lag_of(self._next))
-                spec = spec_of(self._next, self._settings, self._sampler, self._disturber)
-                turns.append(Turn(told, spec))
+                self._told += self._report_to_sampler(self._next - self._lag_of(self._next))
+                spec = _proposed(self._next, self._settings, self._sampler, self._disturber)
+                if spec is None and self._open:
+                    break
+                if spec is None:
+                    self._told += self._report_to_sampler(self._next)
+                    spec = _proposed(self._next, self._settings, self._sampler, self._disturber)
+                if spec is None:
+                    self._next = None
+                    break
+                turns.append(Turn(self._told, spec))
+                self._told = ()
             elif spec is None:
                 forcing = None
                 if self._forcings is not None:
@@ -309,16 +319,33 @@ def spec_of(
     Raises:
         CrashhuntError: the sampler failed.
     """
+    spec = _proposed(number, settings, sampler, disturber, forcing)
+    assert spec is not None  # only a sampler that learns may propose no trial, and not its first
+    return spec
+
+
+def _proposed(
+    number: int,
+    settings: HuntSettings,
+    sampler: NamedSampler,
+    disturber: DisturbanceSampler | None = None,
+    forcing: Forcing | None = None,
+) -> TrialSpec | None:
+    """Return the trial as `spec_of`; None if the sampler proposes none before it receives further results."""
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
     seed = int(rng.integers(2**31))
     proposal = sampler.ask(number, rng)
+    if proposal is None:
+        return None
     values = dict(proposal.arguments)
     if settings.seeds:
         turn = number % settings.seeds
         rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(turn, _TRAFFIC_STREAM)))
         seed = int(rng.integers(2**31))
         if sampler.independent:
-            values |= {key: value for key, value in sampler.ask(turn, rng).arguments.items() if not key[0]}
+            traffic = sampler.ask(turn, rng)
+            assert traffic is not None  # only a sampler that learns may propose no trial
+            values |= {key: value for key, value in traffic.arguments.items() if not key[0]}
     arguments: dict[str, dict[str, Value]] = {agent: {} for agent in settings.agents}
     scenario_arguments: dict[str, Value] = {}
     for (agent, name), value in sorted(values.items()):

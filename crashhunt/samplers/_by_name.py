@@ -88,8 +88,8 @@ class NamedSampler:
         """The version of the sampler's proposals, by default 1; another version may propose other trials."""
         return self._sampler.version if isinstance(self._sampler, Versioned) else 1
 
-    def ask(self, number: int, rng: np.random.Generator) -> Proposal:
-        """Return the sampler's proposal for a trial.
+    def ask(self, number: int, rng: np.random.Generator) -> Proposal | None:
+        """Return the sampler's proposal for a trial; None if a sampler that learns has no proposal for now.
 
         Raises:
             PluginError: the sampler failed, or did not return a valid proposal.
@@ -101,8 +101,10 @@ class NamedSampler:
             raise
         except BaseException as error:
             self._blame(f"fails when it is asked for trial {number}", error)
-        proposal = answer if isinstance(answer, Proposal) else Proposal(answer)
-        wrong = self._wrong_with(proposal)
+        if answer is None and self.learns:
+            return None
+        proposal = answer if isinstance(answer, Proposal) else Proposal(answer or {})
+        wrong = "NoneType, not arguments" if answer is None else self._wrong_with(proposal)
         if wrong:
             raise PluginError(
                 f"the sampler {self._name!r} proposes for trial {number} {wrong}", fix="correct the sampler"

@@ -70,14 +70,16 @@ class Sampler(Protocol):
     - A hunt with ``--deterministic`` waits: the sampler receives exactly the results up to n - lag. The lag is 4 + n /
       8, rounded down. The lag is at most 32, or the number of parallel trials of the first run if that is greater. The
       trials are then the same at any speed.
+    - A sampler may propose None. It is then asked again after all running trials have ended and been reported. If it
+      proposes None again, the hunt ends.
     - The ledger stores proposals, and the results reported before each, before their trials start. A resumed hunt runs
       the same trials, and reports results in the same order.
     """
 
     learns: bool
 
-    def ask(self, number: int, rng: np.random.Generator) -> Proposal | Mapping[Key, Value]:
-        """Return a proposal, or only its arguments.
+    def ask(self, number: int, rng: np.random.Generator) -> Proposal | Mapping[Key, Value] | None:
+        """Return a proposal, or only its arguments; None if the sampler learns and has no proposal for now.
 
         Args:
             number: number of the trial, counted from 0.

@@ -114,6 +114,21 @@ def specs(path):
 KILLS = st.lists(st.integers(0, 40), max_size=4)
 
 
+@how(max_examples=examples(10))
+@given(st.integers(0, 2**32), KILLS, st.integers(1, 8))
+def test_hunt_whose_sampler_ends_it_runs_the_same_trials_however_often_it_is_killed(
+    tmp_path_factory, seed, kills, parallel
+):
+    folder = tmp_path_factory.mktemp("hunt")
+    chosen = replace(settings("boundary", trials=1000), points=10, crash_on=(Outcome.INVALID,))
+    hunt(folder / "whole.sqlite", chosen, random.Random(1))
+    path, _ = killed_again_and_again(
+        folder, replace(chosen, run=RunSettings(parallel=parallel)), random.Random(seed), kills
+    )
+    assert specs(path) == specs(folder / "whole.sqlite")
+    assert 16 < len(specs(path)) <= 100
+
+
 @how(max_examples=examples(25))
 @given(st.integers(0, 2**32), KILLS, st.integers(1, 8), st.booleans())
 def test_a_deterministic_hunt_runs_the_same_trials_however_often_it_is_killed(
