@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
 
 DEFAULT_OPTIONS = {"time-to-teleport": "-1"}  # otherwise a jam removes vehicles; a scenario may want just that
@@ -227,6 +227,13 @@ def is_true(value: object) -> bool:
 # The table ``[sumo]``.
 
 
+Manoeuvre = Literal[
+    "cut_in", "cut_out", "deceleration", "lane_keeping", "following", "blocked_lane", "multiple_targets", "pedestrian",
+    "detection_range",
+]  # fmt: skip
+"""The manoeuvres of UN R157."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SumoSetup:
     """The table ``[sumo]``: files, relative to the scenario's folder, and further options of SUMO.
@@ -241,8 +248,8 @@ class SumoSetup:
         native: whether the compiled core may be used; results are bit-identical with and without it.
         fix_link_order: whether SUMO processes the links of the network in the order of their construction. Otherwise
             SUMO uses the order of the memory addresses of the links, which differs between processes.
-        manoeuvre: a manoeuvre of UN R157, ``cut_in``, ``cut_out`` or ``deceleration``: all other vehicles are moved
-            exactly, as the arguments of the scenario say. By default, SUMO simulates the traffic.
+        manoeuvre: a manoeuvre of UN R157, such as ``cut_in``: all other road users are moved exactly, as the arguments
+            of the scenario say. By default, SUMO simulates the traffic.
         literal: whether ``${NAME}`` in a route or additional file stays unchanged instead of being replaced.
     """
 
@@ -253,12 +260,18 @@ class SumoSetup:
     literal: bool | None = None
     native: bool | None = None
     fix_link_order: bool | None = None
-    manoeuvre: Literal["cut_in", "cut_out", "deceleration"] | None = None
+    manoeuvre: Manoeuvre | None = None
 
 
-MANOEUVRE_ARGUMENTS = {
+MANOEUVRE_ARGUMENTS: Mapping[str, tuple[str, ...]] = {
     "cut_in": ("ego_kmh", "other_kmh", "gap_m", "lateral_mps", "side"),
     "cut_out": ("ego_kmh", "front_m", "lateral_mps", "headway_s", "side"),
     "deceleration": ("ego_kmh", "decel_mps2", "headway_s"),
+    "lane_keeping": ("ego_kmh", "headway_s", "swerve_m", "period_s", "beside_m", "side"),
+    "following": ("ego_kmh", "headway_s", "offset_m", "slower_kmh", "period_s"),
+    "blocked_lane": ("ego_kmh", "distance_m", "offset_m"),
+    "multiple_targets": ("ego_kmh", "distance_m", "between_m", "offset_m"),
+    "pedestrian": ("ego_kmh", "distance_m", "walk_kmh", "impact_m", "from_side"),
+    "detection_range": ("ego_kmh", "seen_m", "distance_m", "offset_m"),
 }
 """The arguments that a scenario with a manoeuvre must have."""

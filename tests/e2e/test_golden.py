@@ -82,6 +82,12 @@ TRIALS: dict[str, tuple[tuple[str, ...], int, list[tuple[str, ...]]]] = {
     "r157-cut-in": (SUMO, 100, [(), ("--arg", "model=fsm")]),
     "r157-cut-out": (SUMO, 100, [()]),
     "r157-deceleration": (SUMO, 100, [()]),
+    "r157-lane-keeping": (SUMO, 100, [()]),
+    "r157-following": (SUMO, 100, [()]),
+    "r157-blocked-lane": (SUMO, 100, [()]),
+    "r157-multiple-targets": (SUMO, 100, [()]),
+    "r157-pedestrian": (SUMO, 100, [()]),
+    "r157-detection-range": (SUMO, 100, [()]),
 }  # fmt: skip
 TABLE = ("number", "seed", "outcome", "steps", "sim_time_s", "digest")
 

@@ -94,6 +94,60 @@ def test_reference_driver_in_the_scenario_ends_as_in_the_plain_computation(simul
         assert touched == (solve("cut_in", columns, model)[model][0] > 0), (model, values)
 
 
+STRAIGHT = {
+    "lane-keeping": {"swerve_m": 0.5, "period_s": 8.0, "beside_m": 5.0, "headway_s": 2.0, "side": 1},
+    "following": {"offset_m": 0.5, "slower_kmh": 20.0, "period_s": 10.0, "headway_s": 2.0},
+    "blocked-lane": {"distance_m": 100.0, "offset_m": -0.5},
+    "multiple-targets": {"distance_m": 100.0, "between_m": 10.0, "offset_m": 0.5},
+    "pedestrian": {"distance_m": 100.0, "walk_kmh": 5.0, "impact_m": 0.2, "from_side": -1},
+    "detection-range": {"seen_m": 46.0, "distance_m": 150.0, "offset_m": 5.25},
+}
+
+
+def tracks(simulate, name, steps):
+    scenes = drive(*simulate(f"r157-{name}", ego_kmh=60.0, **STRAIGHT[name]), KeepsSpeed(), steps)
+    found = {}
+    for step, scene in enumerate(scenes):
+        for actor, row in scene.roster.index.items():
+            found.setdefault(actor, {})[step] = (*scene.points[row], scene.speeds[row])
+    return found
+
+
+def test_vehicle_ahead_swerves_in_its_lane_next_to_another_vehicle(simulate):
+    found = tracks(simulate, "lane-keeping", 80)
+    leader, beside = (np.array(list(found[name].values())) for name in ("leader", "beside"))
+    assert leader[:, 1].max() == pytest.approx(-5.25 + 0.5, abs=0.01)
+    assert leader[:, 1].min() == pytest.approx(-5.25 - 0.5, abs=0.01)
+    assert beside[0, :2] == pytest.approx([305.0, -1.75])
+    assert {60 / 3.6} == set(leader[:, 2]) | set(beside[:, 2])
+
+
+def test_speed_of_the_vehicle_ahead_varies(simulate):
+    leader = np.array(list(tracks(simulate, "following", 100)["leader"].values()))
+    assert leader[:, 1] == pytest.approx(-1.25)
+    assert leader[[0, 50, 100], 2] * 3.6 == pytest.approx([60, 40, 60])
+
+
+def test_vehicles_that_stand_in_the_lane_are_where_the_arguments_say(simulate):
+    standing = tracks(simulate, "blocked-lane", 1)["standing"]
+    assert standing[0] == standing[1] == pytest.approx((404.3, -2.25, 0.0))
+    found = tracks(simulate, "multiple-targets", 1)
+    assert found["motorcycle"][1] == pytest.approx((402.2, -1.25, 0.0))
+    assert found["standing"][1] == pytest.approx((416.5, -1.75, 0.0))
+
+
+def test_person_is_at_the_middle_of_the_lane_when_a_constant_speed_arrives(simulate):
+    person = tracks(simulate, "pedestrian", 60)["person walker"]
+    assert person[60][:2] == pytest.approx((400.0, -1.75 - 0.2))  # 100 m with 60 km/h take 60 steps
+    assert person[60][1] - person[59][1] == pytest.approx(5 / 36)
+
+
+def test_target_appears_when_a_constant_speed_has_come_near(simulate):
+    motorcycle = tracks(simulate, "detection-range", 80)["motorcycle"]
+    assert min(motorcycle) == math.ceil((150 - 46) / (60 / 3.6) / 0.1)
+    assert motorcycle[80] == pytest.approx((452.2, 3.5, 0.0))
+
+
 def touch(scene):
     (x, y), (other_x, other_y) = (scene.points[scene.roster.index[name]] for name in ("ego", "other"))
     return abs(x - other_x) < 4.3 and abs(y - other_y) < 1.9
