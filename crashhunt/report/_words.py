@@ -442,7 +442,7 @@ def _omitted(omission: Omission, agent: str, ago: Callable[[int], str], *, had_t
     if omission.speed_mps <= (omission.safe or 0.0):  # not too fast yet, but its action would make it so
         safe = f"{omission.safe:.1f} m/s are safe, and it was about to drive faster"
     if omission.instead == "braked too little":
-        how = f"for {actor}" if kind == "vehicle" else f"to {what}"
+        how = what.removeprefix("brake ") if what.startswith("brake ") else f"to {what}"
         return f"{agent} braked too little {how} ({gap}{safe}){seen}"
     instead = describe_instead(omission)
     return f"{agent} did not {what} ({gap}{safe}){seen}{f', and {instead}' if instead else ''}"
