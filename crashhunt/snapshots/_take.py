@@ -104,7 +104,7 @@ def find_sources(imported: ImportedModules, *, roots: Sequence[Path] = (), witho
         place = places.get(name)
         if place is None:
             continue
-        if _is_installed(place) and (place / f"{name}.libs").is_dir():
+        if (place / f"{name}.libs").is_dir():
             # Its compiled code loads libraries from there, and a copy would not find them. Its version identifies it.
             continue
         tree = None if _is_installed(place) else work_tree_of(place)
