@@ -33,6 +33,7 @@ _MAX_YAW_RATE_RADPS = 1.5
 _OVER_M = 1.0  # a vehicle so far over the side of its lane is in the way of the next lane
 _LOOK_S, _MIN_LOOK_M = 0.5, 4.0  # how far ahead a vehicle that keeps its lane looks
 _MAX_LANES_AHEAD = 10
+_STANDING_M = 0.01  # a vehicle that moves by less in a step does not turn
 _MAX_SLIDE_M, _MAX_TURN_RAD = 0.2, 0.05  # distance of a trajectory's start from the vehicle, as plans predict
 
 
@@ -242,10 +243,17 @@ class FreeMotion:
         return self._reached(at[0], at[1], state.heading + turned, speed)
 
     def _reached(self, x: float, y: float, heading: float, speed: float) -> MotionState:
-        """Return a state at a pose, with the acceleration and the steering angle that lead to it."""
+        """Return a state at a pose, with the acceleration and the steering angle that lead to it.
+
+        A vehicle that stands keeps its heading: planners take headings from differences of points, and where points
+        are a millimetre apart, the heading is arbitrary.
+        """
         state = self.state
-        turned, moved = heading - state.heading, math.hypot(x - state.x, y - state.y)
-        steering = math.atan2(turned * self.model.wheelbase, moved) if moved > 0.01 else 0.0
+        moved = math.hypot(x - state.x, y - state.y)
+        if moved <= _STANDING_M:
+            heading = state.heading
+        turned = heading - state.heading
+        steering = math.atan2(turned * self.model.wheelbase, moved) if moved > _STANDING_M else 0.0
         acceleration = (speed - state.speed) / self._dt
         return MotionState(x=x, y=y, heading=heading, speed=speed, acceleration=acceleration, steering=steering)
 

@@ -247,3 +247,15 @@ def test_reference_driver_corrects_steering_out_of_the_lane(start, form):
     kept = simulator.action_with("ego", left, speed_mps=motion.state.speed - 0.2, keeps_lane=True)
     assert motion._next(kept.tolist()).steering < motion.state.steering
     assert simulator.motion_of("ego", kept).speed_mps == pytest.approx(motion.state.speed - 0.2, abs=1e-6)
+
+
+def test_standing_vehicle_keeps_its_heading(start):
+    simulator, step = start("trajectory", **EMPTY)
+    motion = simulator._driving.moving["ego"]
+    while motion.state.speed > 0:
+        step(motion.brake())
+    x, y, heading = centre()
+    step([[0.0, x, y, heading, 0.01], [0.1, x - 6e-5, y, heading + 3.14, 0.01]])  # as FISS+ plans at a standstill
+    assert centre()[2] == heading
+    with pytest.raises(ActionError, match=r"turns the vehicle by 3\.14 rad"):
+        simulator.actions["ego"].encode([[0.1, x + 0.02, y, heading + 3.14, 0.2]])
