@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.base.text import one_of
-from crashhunt.scenario import ACTIONS, canonical_action, check_action, is_action_name
+from crashhunt.scenario import action_settings, canonical_action, check_action
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -33,9 +32,8 @@ def chosen_actions(asked: str, scenario: Scenario, signatures: Mapping[str, Sign
     found = {}
     for agent, setup in scenario.agents.items():
         signature = signatures[agent]
-        if signature.action and not is_action_name(signature.action):
-            fix = one_of(signature.action, ACTIONS, give="set it to one of")
-            raise UsageError(f"the attribute action of {setup.agent} is {signature.action!r}", fix=fix)
+        action_settings(signature.action, where=f"action of {setup.agent}")
+        action_settings(asked, where="--action")
         if asked:
             found[agent] = asked
         elif signature.action and setup.action is None:

@@ -9,9 +9,9 @@ if TYPE_CHECKING:
         ACTIONS as ACTIONS,
         ActionComponent as ActionComponent,
         ActionDescription as ActionDescription,
+        action_settings as action_settings,
         canonical_action as canonical_action,
         check_action as check_action,
-        is_action_name as is_action_name,
     )
     from ._load import (
         copy_shipped_scenario as copy_shipped_scenario,

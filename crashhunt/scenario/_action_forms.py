@@ -7,19 +7,13 @@ spaces take their bounds from it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.base.text import any_of
+from crashhunt.base.text import any_of, one_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-ActionName = Literal[
-    "speed_and_lane", "speed_and_lateral", "meta", "acceleration", "acceleration_steering", "throttle_brake_steering",
-    "trajectory", "target_pose", "sumo", "continuous",
-]  # fmt: skip
-"""What a scenario, ``--action`` and an agent's class may name; ``continuous`` is an older name of speed_and_lane."""
 
 DEFAULT_ACTION = "speed_and_lane"
 FORMER_DEFAULT_ACTION = "continuous"
@@ -56,6 +50,41 @@ class ActionComponent:
 
 
 @dataclass(frozen=True, slots=True)
+class ActionSetting:
+    """A setting of a form of actions: a number within a range, or one of some words.
+
+    Args:
+        name: name of the setting.
+        default: value without the setting.
+        help: meaning of the setting in one line.
+        high: largest value of a number; the smallest value is 0.
+        unit: unit of a number.
+        choices: the words, if the setting is no number.
+    """
+
+    name: str
+    default: float | str
+    help: str
+    high: float = 0.0
+    unit: str = ""
+    choices: tuple[str, ...] = ()
+
+    @property
+    def range(self) -> str:
+        """The allowed values as text."""
+        return "|".join(self.choices) or f"0:{self.high:g}"
+
+    def parse(self, text: str) -> float | str | None:
+        """Return the value that a text states; None if the value is not allowed."""
+        if self.choices:
+            return text if text in self.choices else None
+        try:
+            return value if 0.0 <= (value := float(text)) <= self.high else None
+        except ValueError:
+            return None
+
+
+@dataclass(frozen=True, slots=True)
 class ActionDescription:
     """One form of actions.
 
@@ -65,6 +94,7 @@ class ActionDescription:
         shape: shape of an action; empty for a tuple of the components.
         second_changes_lane: whether the second number moves the vehicle to another lane, and 0 does not.
         moves_freely: whether the vehicle moves in the plane, and not along lanes.
+        settings: the settings of the form, as in ``trajectory:frame=ego``.
     """
 
     title: str
@@ -72,6 +102,7 @@ class ActionDescription:
     shape: str = ""
     second_changes_lane: bool = False
     moves_freely: bool = False
+    settings: tuple[ActionSetting, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -123,12 +154,32 @@ _SPEED_OVERRIDE = ActionComponent(
 _LANE_OVERRIDE = ActionComponent(
     name="lane_change_override", low=-1, high=1, help="1 to the left, -1 to the right, 0 leaves it to SUMO", whole=True
 )
+_LANE_CHANGE_DURATION = ActionSetting(
+    name="lane_change_duration_s",
+    default=0.0,
+    high=20.0,
+    unit="s",
+    help="time in which the vehicle drifts to the next lane; 0 for a change in one step",
+)
+_FRAME = ActionSetting(
+    name="frame",
+    default="map",
+    choices=("map", "ego"),
+    help="ego: positions and headings are relative to the vehicle, x ahead and y to the left",
+)
+_TRACKER = ActionSetting(
+    name="tracker",
+    default="interpolation",
+    choices=("interpolation", "pure_pursuit"),
+    help="pure_pursuit: a kinematic bicycle model steers to a point ahead on the trajectory",
+)
 
 ACTIONS: dict[str, ActionDescription] = {
     "speed_and_lane": ActionDescription(
         title="Target speed, and a lane change that takes one step. The default.",
         components=(_TARGET_SPEED, _LANE_CHANGE),
         second_changes_lane=True,
+        settings=(_LANE_CHANGE_DURATION,),
     ),
     "speed_and_lateral": ActionDescription(
         title="Target speed, and speed across the lane: the vehicle drifts into the next lane gradually.",
@@ -140,6 +191,7 @@ ACTIONS: dict[str, ActionDescription] = {
         title="Acceleration, and a lane change that takes one step.",
         components=(_ACCELERATION, _LANE_CHANGE),
         second_changes_lane=True,
+        settings=(_LANE_CHANGE_DURATION,),
     ),
     "acceleration_steering": ActionDescription(
         title="Acceleration and steering angle of a kinematic bicycle model; the vehicle moves freely.",
@@ -156,11 +208,13 @@ ACTIONS: dict[str, ActionDescription] = {
         components=(_TIME, _X, _Y, _HEADING, _SPEED),
         shape="K rows of time, x, y, heading, speed; K up to 64",
         moves_freely=True,
+        settings=(_FRAME, _TRACKER),
     ),
     "target_pose": ActionDescription(
         title="A pose to reach at a time, on a smooth curve; the vehicle moves freely.",
         components=(_X, _Y, _HEADING, _TIME),
         moves_freely=True,
+        settings=(_FRAME,),
     ),
     "sumo": ActionDescription(
         title="SUMO's driver model drives. None leaves the whole step to it; a speed or lane change overrides it.",
@@ -172,13 +226,42 @@ ACTIONS: dict[str, ActionDescription] = {
 
 
 def canonical_action(name: str | None) -> str:
-    """Return the present name of a form of actions; the default form for None."""
-    return DEFAULT_ACTION if not name else _OLDER_NAMES.get(name, name)
+    """Return the present name of a form of actions, without settings; the default form for None."""
+    form = (name or DEFAULT_ACTION).partition(":")[0]
+    return _OLDER_NAMES.get(form, form)
 
 
-def is_action_name(name: str) -> bool:
-    """Return whether a form of actions has this name, or an older name of it."""
-    return name in get_args(ActionName)
+def action_settings(name: str | None, where: str = "") -> dict[str, float | str]:
+    """Return the value of every setting of a form of actions, such as ``trajectory:frame=ego``.
+
+    Args:
+        name: name of the form and its settings; None for the default form.
+        where: the option or key that contains the name, for messages.
+
+    Raises:
+        UsageError: the form or a setting does not exist, or a value is not allowed.
+    """
+    form, *given = (name or DEFAULT_ACTION).split(":")
+    if _OLDER_NAMES.get(form, form) not in ACTIONS:
+        raise UsageError(f"{where}: {form!r} is not a form of actions", fix=one_of(form, ACTIONS))
+    known = {one.name: one for one in ACTIONS[canonical_action(form)].settings}
+    values = {one.name: one.default for one in known.values()}
+    for text in given:
+        setting, _, word = text.partition("=")
+        if setting not in known:
+            fix = one_of(setting, known, give="it has", none="no settings")
+            raise UsageError(f"{where}: {form} has no setting {setting!r}", fix=fix)
+        value = known[setting].parse(word)
+        if value is None:
+            one = known[setting]
+            fix = (
+                f"give {any_of(one.choices)}"
+                if one.choices
+                else f"give a number in {one.unit} within 0 and {one.high:g}"
+            )
+            raise UsageError(f"{where}: {form}:{setting} is {word!r}", fix=fix)
+        values[setting] = value
+    return values
 
 
 def check_action(name: str | None, returned: Sequence[str], agent: str) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
 from crashhunt.base.codec import known_part
-from crashhunt.base.errors import ArgumentError, HuntDirectoryError, ScenarioError
+from crashhunt.base.errors import ArgumentError, HuntDirectoryError, ScenarioError, UsageError
 from crashhunt.base.files import cannot_write
 from crashhunt.base.integrity import read_bounded
 from crashhunt.base.layout import PACKAGE, SCENARIO
@@ -20,7 +20,7 @@ from crashhunt.base.plugins import registered
 from crashhunt.base.programs import anchored, is_program, relative_to
 from crashhunt.base.text import any_of, did_you_mean, listed, near_path, one_of
 from crashhunt.base.validation import validate
-from crashhunt.scenario._action_forms import FORMER_DEFAULT_ACTION
+from crashhunt.scenario._action_forms import FORMER_DEFAULT_ACTION, action_settings
 from crashhunt.scenario._scenario import (
     AgentSetup,
     ObservationSetup,
@@ -78,6 +78,11 @@ def check(scenario: Scenario, where: str, *, kept: bool) -> None:
         refuse(where, "warmup_s", scenario.warmup_s, "is not a time", "give seconds, such as 20.0")
     if scenario.observation is not None and scenario.observation.vehicles < 1:
         refuse(where, "observation.vehicles", scenario.observation.vehicles, "is below 1", "give at least 1")
+    for agent, setup in scenario.agents.items():
+        try:
+            action_settings(setup.action, where=f"agents.{agent}.action")
+        except UsageError as error:
+            raise ScenarioError(error.message, fix=error.fix, where=where) from None
     _check_tables(scenario, where, kept=kept)
     for name, backend in scenario.backends.items():
         _check_files(scenario, name, backend, where)

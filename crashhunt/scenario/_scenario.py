@@ -32,8 +32,8 @@ from crashhunt.base import layout
 from crashhunt.base.errors import PluginError, ScenarioError
 from crashhunt.base.integrity import digest_of_file
 from crashhunt.base.plugins import load_attribute, registered
-from crashhunt.base.text import listed, one_of
-from crashhunt.scenario._action_forms import ACTIONS, ActionName, canonical_action, is_action_name
+from crashhunt.base.text import listed
+from crashhunt.scenario._action_forms import action_settings, canonical_action
 from crashhunt.trial import Argument, Kind, kind_of, parse_spec
 
 if TYPE_CHECKING:
@@ -101,8 +101,9 @@ class AgentSetup:
         depart_lane: lane of departure, as in SUMO's departLane.
         depart_pos: position of departure, as in SUMO's departPos.
         depart_speed: speed at departure, as in SUMO's departSpeed.
-        action: form of the actions, a name that ``crashhunt list actions`` shows; by default the form that the class
-            of the agent declares, or else ``speed_and_lane``.
+        action: form of the actions, a name that ``crashhunt list actions`` shows, with settings such as
+            ``trajectory:frame=ego``; by default the form that the class of the agent declares, or else
+            ``speed_and_lane``.
         target_speeds: the target speeds that the actions FASTER and SLOWER of ``meta`` select in order, in m/s.
         observation: parts that the agent observes, such as ``ego`` or ``actors:rows=8``; ``crashhunt list
             observations`` prints all parts. Without this key, the agent's class chooses the parts, or else the agent
@@ -121,7 +122,7 @@ class AgentSetup:
     depart_lane: str = "best"
     depart_pos: str = "base"
     depart_speed: str = "max"
-    action: ActionName | None = None
+    action: str | None = None
     target_speeds: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
     speed_mode: int = 6
     observation: tuple[str, ...] | None = None
@@ -131,6 +132,11 @@ class AgentSetup:
     def action_form(self) -> str:
         """The name of the form of the actions."""
         return canonical_action(self.action)
+
+    @property
+    def action_settings(self) -> dict[str, float | str]:
+        """The value of every setting of the form of the actions, by name."""
+        return action_settings(self.action)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,11 +305,10 @@ def with_action(scenario: Scenario, agent: str, action: str) -> Scenario:
     """Return the scenario with another form of actions for one agent.
 
     Raises:
-        ScenarioError: the form of actions does not exist.
+        UsageError: the form of actions or a setting of it does not exist.
     """
-    if not is_action_name(action):
-        raise ScenarioError(f"{action!r} is not a form of actions", fix=one_of(action, ACTIONS))
-    setup = replace(scenario.agents[agent], action=action)  # type: ignore[arg-type]
+    action_settings(action, where="action")
+    setup = replace(scenario.agents[agent], action=action)
     return replace(scenario, agents={**scenario.agents, agent: setup})
 
 

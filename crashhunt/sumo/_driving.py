@@ -45,6 +45,10 @@ class Driving:
         self._closed_lanes: dict[tuple[str, str], bool] = {}
         self._targets: dict[str, int] = {}
         self._is_left_hand: bool | None = None
+        self._durations = {
+            agent: float(setup.action_settings.get("lane_change_duration_s", 0.0)) for agent, setup in setups.items()
+        }
+        self._changes: dict[str, float] = {}  # the rest of each lane change under way, in m to the left
         ways: dict[str, Callable[[str, NDArray[np.generic]], bool]] = {
             "speed_and_lane": self._apply_speed,
             "speed_and_lateral": self._apply_drift,
@@ -64,6 +68,7 @@ class Driving:
         """Reset the state of the last episode, but keep data that was read from the network."""
         self._targets = dict.fromkeys(agents, -1)
         self._lateral_speeds.clear()
+        self._changes.clear()
         self._overridden.clear()
         self.moving.clear()
         for agent in self._targets:
@@ -85,29 +90,67 @@ class Driving:
     def _apply_speed(self, agent: str, action: NDArray[np.generic]) -> bool:
         speed, change = action.tolist()
         sumo.vehicle_setSpeed(agent, speed)
-        return not change or self._change_lane(agent, int(change))
+        return self._change_or_go_on(agent, int(change))
 
     def _apply_acceleration(self, agent: str, action: NDArray[np.generic]) -> bool:
         """Set the speed that the vehicle has after a step of this acceleration; SUMO applies the limits of its type."""
         acceleration, change = action.tolist()
         sumo.vehicle_setSpeed(agent, max(0.0, sumo.vehicle_getSpeed(agent) + acceleration * self._step_length_s))
-        return not change or self._change_lane(agent, int(change))
+        return self._change_or_go_on(agent, int(change))
+
+    def _change_or_go_on(self, agent: str, change: int) -> bool:
+        """Change lanes at once, or drift for the duration that the setting of the form states.
+
+        A new lane change is ignored until the last one has ended. Where the road ends before, the vehicle drifts to the
+        middle of the lane that it is on.
+        """
+        duration = self._durations[agent]
+        if not duration:
+            return not change or self._change_lane(agent, change)
+        edge, lane = sumo.vehicle_getRoadID(agent), sumo.vehicle_getLaneIndex(agent)
+        if edge.startswith(":") or lane < 0:
+            if agent in self._changes:
+                self._changes[agent] = -self._side * sumo.vehicle_getLateralLanePosition(agent)
+                self._lateral_speeds[agent] = 0.0
+            return True
+        rest = self._changes.get(agent, 0.0)
+        widths = self._widths(edge)
+        if not rest and change:
+            found = self.neighboring_lane(agent, change)
+            if found is None or not found[0]:
+                return found is None
+            rest = change * (widths[lane] + widths[lane + found[1]]) / 2
+        if not rest:
+            self._lateral_speeds[agent] = 0.0
+            return True
+        most = widths[lane] / duration * self._step_length_s
+        left = max(-most, min(most, rest))
+        self._changes[agent] = rest - left if abs(rest) > abs(left) else 0.0
+        return self._drift(agent, left)
 
     def _apply_drift(self, agent: str, action: NDArray[np.generic]) -> bool:
-        """Set the speed, and move the vehicle across its lane, or into the next lane when its centre is over the line.
+        """Set the speed, and move the vehicle across its lane at a speed."""
+        speed, left = action.tolist()
+        sumo.vehicle_setSpeed(agent, speed)
+        return self._drift(agent, left * self._step_length_s)
+
+    def _drift(self, agent: str, left: float) -> bool:
+        """Move the vehicle across its lane, or into the next lane when its centre is over the line.
 
         SUMO without its sublane model moves no vehicle across a lane, but keeps a lateral position that is set. Inside
         a junction, where lanes have no neighbours, the vehicle keeps its lateral position.
+
+        Args:
+            agent: identifier of the vehicle.
+            left: distance to the left in the next step, in m.
         """
-        speed, left = action.tolist()
-        sumo.vehicle_setSpeed(agent, speed)
         edge, lane = sumo.vehicle_getRoadID(agent), sumo.vehicle_getLaneIndex(agent)
         inside = edge.startswith(":") or lane < 0
-        self._lateral_speeds[agent] = 0.0 if inside else left
+        self._lateral_speeds[agent] = 0.0 if inside else left / self._step_length_s
         if inside or not left:
             return True
-        widths, sign = self._widths(edge), -1.0 if self.left_hand else 1.0  # SUMO mirrors left-hand traffic
-        offset = sign * sumo.vehicle_getLateralLanePosition(agent) + left * self._step_length_s
+        widths = self._widths(edge)
+        offset = self._side * sumo.vehicle_getLateralLanePosition(agent) + left
         change = 0 if abs(offset) <= widths[lane] / 2 else 1 if offset > 0 else -1
         if change:
             found = self.neighboring_lane(agent, change)
@@ -116,8 +159,13 @@ class Driving:
             target = lane + found[1]
             offset -= change * (widths[lane] + widths[target]) / 2
             sumo.vehicle_moveTo(agent, f"{edge}_{target}", sumo.vehicle_getLanePosition(agent))
-        sumo.vehicle_setLateralLanePosition(agent, sign * offset)
+        sumo.vehicle_setLateralLanePosition(agent, self._side * offset)
         return True
+
+    @property
+    def _side(self) -> float:
+        """The sign of SUMO's lateral positions: SUMO mirrors left-hand traffic."""
+        return -1.0 if self.left_hand else 1.0
 
     def _apply_override(self, agent: str, action: NDArray[np.generic]) -> bool:
         """Let SUMO drive, except for what the agent overrides in this step."""

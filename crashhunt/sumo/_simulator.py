@@ -114,7 +114,8 @@ class SumoSimulator:
         self._unregulated: frozenset[str] | None = None
         # Only with these options of SUMO, or by such an action, can a vehicle leave the centre line of its lane.
         options = scenario.table(SumoSetup).options
-        self._drifts = "speed_and_lateral" in self._forms.values()
+        durations = (one.action_settings.get("lane_change_duration_s") for one in scenario.agents.values())
+        self._drifts = "speed_and_lateral" in self._forms.values() or any(durations)
         moves = not set(FREE_FORMS).isdisjoint(self._forms.values())
         self._lateral = self._drifts or moves or "lateral-resolution" in options or "lanechange.duration" in options
         self._driving = Driving(scenario.agents, scenario.step_length_s)

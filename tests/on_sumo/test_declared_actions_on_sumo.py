@@ -73,6 +73,43 @@ def test_lateral_speed_moves_the_vehicle_gradually_into_the_next_lane_and_off_th
     assert abs(steps - (2 + 4 * (2 - lane)) / 0.1) <= 1
 
 
+@pytest.mark.parametrize("form", ["speed_and_lane", "acceleration"])
+def test_lane_change_with_a_duration_is_a_drift_over_this_time(start, form):
+    step = start(f"{form}:lane_change_duration_s=4", "motorway")
+    for vehicle in {*libsumo.vehicle.getIDList()} - {"ego"}:
+        libsumo.vehicle.remove(vehicle)
+    libsumo.vehicle.moveTo("ego", f"{libsumo.vehicle.getRoadID('ego')}_0", 100.0)
+    value = {"speed_and_lane": libsumo.vehicle.getSpeed("ego"), "acceleration": 0.0}[form]
+    y = libsumo.vehicle.getPosition("ego")[1]
+    for number in range(1, 60):
+        simulator = step((value, 1 if number in (1, 7, 20) else 0))  # the lane change under way ignores the others
+        assert libsumo.vehicle.getPosition("ego")[1] == pytest.approx(y + min(number, 40) * 0.1, abs=1e-6)
+        if number != 20:  # the middle is on the line, up to rounding
+            assert libsumo.vehicle.getLaneIndex("ego") == (number > 20)
+        assert simulator._driving.aside("ego")[1] == pytest.approx(-1.0 if number <= 40 else 0.0, abs=1e-9)
+    step((value, -1))
+    for _ in range(39):
+        step((value, 0))
+    assert libsumo.vehicle.getPosition("ego")[1] == pytest.approx(y, abs=1e-6)
+    assert simulator.agents == ["ego"]
+    assert step((value, -1)).scene().off_road == ("ego",)
+
+
+def test_lane_change_that_a_junction_interrupts_ends_in_the_middle_of_a_lane(start):
+    step = start("speed_and_lane:lane_change_duration_s=20", "intersection")
+    for vehicle in {*libsumo.vehicle.getIDList()} - {"ego"}:
+        libsumo.vehicle.remove(vehicle)
+    lane = libsumo.vehicle.getLaneIndex("ego")
+    change, asides = 1 if lane == 0 else -1, []
+    libsumo.vehicle.moveTo("ego", libsumo.vehicle.getLaneID("ego"), 150.0)
+    while (edge := libsumo.vehicle.getRoadID("ego")) != libsumo.vehicle.getRoute("ego")[-1] or len(asides) < 150:
+        asides.append(step((13.0, change if len(asides) == 20 else 0))._driving.aside("ego")[0])
+        if edge.startswith(":"):
+            assert asides[-1] == pytest.approx(asides[-2], abs=1e-9)
+    assert max(map(abs, asides)) > 0.1
+    assert asides[-1] == pytest.approx(0.0, abs=1e-9)
+
+
 def test_vehicle_that_sumo_drives_does_as_sumo_alone_does(start):
     def course(form, action):
         step = start(form)

@@ -322,7 +322,7 @@ def test_the_form_of_action_of_a_bare_configuration(town):
     assert [setup.action for setup in with_settings(load_scenario(path), settings).agents.values()] == ["meta"]
     _, other = plan(replace(asked, action="", seed=settings.seed))
     assert other.differences(settings) == ["agents.ego.action was None and is now meta"]
-    with pytest.raises(ScenarioError, match="give one of speed_and_lane"):
+    with pytest.raises(UsageError, match="give one of speed_and_lane"):
         plan(replace(asked, action="telepathic"))
     with pytest.raises(UsageError, match="is for SUMO"):
         plan(Request(trials=1, max_steps=1, scenario="merge-highway-env", action="meta"))

@@ -1,16 +1,13 @@
 """Tests of the table of action forms, and of the check that an agent can return a form."""
 
-from typing import get_args
-
 import pytest
 
 from crashhunt.base.errors import UsageError
-from crashhunt.scenario import ACTIONS, AgentSetup, canonical_action, check_action
-from crashhunt.scenario._action_forms import ActionName
+from crashhunt.scenario import ACTIONS, AgentSetup, action_settings, canonical_action, check_action
 
 
 def test_scenario_may_name_every_form_of_the_table_and_the_older_name():
-    assert {*get_args(ActionName)} == {*ACTIONS, "continuous"}
+    assert [AgentSetup(action=name).action_form for name in ACTIONS] == [*ACTIONS]
     assert [AgentSetup(action=name).action_form for name in (None, "continuous", "meta")] == [
         "speed_and_lane", "speed_and_lane", "meta",
     ]  # fmt: skip
@@ -36,3 +33,27 @@ def test_agent_that_names_its_forms_is_refused_with_another_form():
         check_action("continuous", ("meta", "sumo"), "my:Agent")
     assert it.value.fix == "choose the action meta or sumo, or another agent"
     assert canonical_action("trajectory") == "trajectory"
+
+
+def test_settings_follow_the_name_of_the_form():
+    assert action_settings("trajectory:frame=ego") == {"frame": "ego", "tracker": "interpolation"}
+    assert action_settings(None) == action_settings("continuous") == {"lane_change_duration_s": 0.0}
+    assert AgentSetup(action="speed_and_lane:lane_change_duration_s=3").action_settings == {"lane_change_duration_s": 3}
+    assert canonical_action("target_pose:frame=ego") == "target_pose"
+
+
+@pytest.mark.parametrize(
+    ("name", "message", "fix"),
+    [
+        ("fly", "--action: 'fly' is not a form of actions", "give one of"),
+        ("meta:frame=ego", "--action: meta has no setting 'frame'", "no settings"),
+        ("trajectory:frame=moon", "--action: trajectory:frame is 'moon'", "give map or ego"),
+        ("acceleration:lane_change_duration_s=-1", "lane_change_duration_s is '-1'", "a number in s within 0 and 20"),
+        ("acceleration:lane_change_duration_s", "lane_change_duration_s is ''", "a number in s within 0 and 20"),
+        ("acceleration:lane_change_duration_s=nan", "lane_change_duration_s is 'nan'", "within 0 and 20"),
+    ],
+)
+def test_setting_that_does_not_exist_or_fit_is_refused(name, message, fix):
+    with pytest.raises(UsageError, match=message) as caught:
+        action_settings(name, where="--action")
+    assert fix in caught.value.fix
