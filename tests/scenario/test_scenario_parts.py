@@ -12,11 +12,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.base.errors import UsageError, HuntDirectoryError, ScenarioError
+from crashhunt.base.errors import HuntDirectoryError, ScenarioError, UsageError
 from crashhunt.gym._descriptor import BACKEND as GYM, CrashRule, GymSetup
 from crashhunt.highway._descriptor import BACKEND as HIGHWAY, HighwaySetup
 from crashhunt.scenario import (
-    ACTIONS,
     AgentSetup,
     ArgumentSetup,
     Backend,
