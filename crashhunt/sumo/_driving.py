@@ -76,7 +76,8 @@ class Driving:
             if form == "sumo":
                 self._leave_to_sumo(agent)
             elif form in FREE_FORMS:
-                self.moving[agent] = FreeMotion(agent, form, self._step_length_s, self._area)
+                settings = self._setups[agent].action_settings
+                self.moving[agent] = FreeMotion(agent, form, self._step_length_s, self._area, settings)
 
     def apply(self, agent: str, action: NDArray[np.generic]) -> bool:
         """Apply an encoded action; return whether the vehicle stays on the road."""

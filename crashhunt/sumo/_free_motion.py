@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import libsumo
@@ -21,7 +22,7 @@ from crashhunt.simulators import MAX_STEERING_RAD, WHEELBASE_SHARE, BicycleModel
 from crashhunt.world import Motion
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -33,6 +34,7 @@ _MAX_YAW_RATE_RADPS = 1.5
 _OVER_M = 1.0  # a vehicle so far over the side of its lane is in the way of the next lane
 _LOOK_S, _MIN_LOOK_M = 0.5, 4.0  # how far ahead a vehicle that keeps its lane looks
 _MAX_LANES_AHEAD = 10
+_MAX_GAP_M = 5.0  # distance of a pursued trajectory from the vehicle
 _STANDING_M = 0.01  # a vehicle that moves by less in a step does not turn
 _MAX_SLIDE_M, _MAX_TURN_RAD = 0.2, 0.05  # distance of a trajectory's start from the vehicle, as plans predict
 
@@ -45,10 +47,20 @@ class FreeMotion:
         form: name of the form of its actions.
         step_length_s: step length, in s.
         area: the drivable area of the network.
+        settings: settings of the form, by name.
     """
 
-    def __init__(self, vehicle: str, form: str, step_length_s: float, area: DrivableArea) -> None:
+    def __init__(
+        self,
+        vehicle: str,
+        form: str,
+        step_length_s: float,
+        area: DrivableArea,
+        settings: Mapping[str, float | str] = MappingProxyType({}),
+    ) -> None:
         self._vehicle, self._form, self._dt, self._area = vehicle, form, step_length_s, area
+        self._is_relative = settings.get("frame") == "ego"
+        self._pursues = settings.get("tracker") == "pure_pursuit"
         self._half = sumo.vehicle_getLength(vehicle) / 2
         heading = math.radians(90.0 - sumo.vehicle_getAngle(vehicle))
         x, y = sumo.vehicle_getPosition(vehicle)
@@ -98,6 +110,12 @@ class FreeMotion:
         if self._form == "trajectory" and values[-1][0] < dt:
             message = f"the trajectory ends {values[-1][0]:g} s from now, before the step of {dt:g} s"
             raise ActionError(message, fix="return points beyond the end of the step")
+        if self._pursues:
+            gap = min(math.dist(point[1:3], (state.x, state.y)) for point in self._in_map(action).tolist())
+            if gap > _MAX_GAP_M:
+                message = f"the trajectory is {gap:.1f} m away from the vehicle"
+                raise ActionError(message, fix=f"return a point within {_MAX_GAP_M:g} m")
+            return
         following = self._next(values)
         dx, dy = following.x - state.x, following.y - state.y
         moved = math.hypot(dx, dy)
@@ -148,8 +166,32 @@ class FreeMotion:
         if self._form == "target_pose":  # whose speed after the step is that of the way to the pose
             dx, dy = after.x - state.x, after.y - state.y
             share = after.speed * self._dt / max(math.hypot(dx, dy), 1e-9)
-            return state.x + share * dx, state.y + share * dy, after.heading, self._dt
-        return [[self._dt, after.x, after.y, after.heading, after.speed]]
+            row = [self._dt, state.x + share * dx, state.y + share * dy, after.heading, after.speed]
+            return (*self._as_returned(row)[1:4], self._dt)
+        if self._pursues:  # whose acceleration follows from the speed, and whose steering from a point ahead
+            turned = math.tan(steering) * _MIN_LOOK_M / (2 * model.wheelbase)
+            bearing = state.heading + math.asin(max(-1.0, min(1.0, turned)))
+            x, y = state.x + _MIN_LOOK_M * math.cos(bearing), state.y + _MIN_LOOK_M * math.sin(bearing)
+            return [self._as_returned([self._dt, x, y, bearing, max(0.0, state.speed + acceleration * self._dt)])]
+        return [self._as_returned([self._dt, after.x, after.y, after.heading, after.speed])]
+
+    def _as_returned(self, row: list[float]) -> list[float]:
+        """Return a point of a trajectory in the frame in which the agent returns it."""
+        if not self._is_relative:
+            return row
+        state, (time, x, y, heading, speed) = self.state, row
+        dx, dy, cos, sin = x - state.x, y - state.y, math.cos(state.heading), math.sin(state.heading)
+        return [time, dx * cos + dy * sin, dy * cos - dx * sin, heading - state.heading, speed]
+
+    def _in_map(self, points: NDArray[np.generic]) -> NDArray[np.float64]:
+        """Return the points of a trajectory in the frame of the map."""
+        found = np.array(points, np.float64)
+        if self._is_relative:
+            state, (x, y) = self.state, found[:, 1:3].T.copy()
+            cos, sin = math.cos(state.heading), math.sin(state.heading)
+            found[:, 1], found[:, 2] = state.x + x * cos - y * sin, state.y + x * sin + y * cos
+            found[:, 3] += state.heading
+        return found
 
     def _lane_keeping_angle(self) -> float:
         """Return the steering angle to a point ahead on the middle of the lane, in rad (pure pursuit)."""
@@ -199,15 +241,36 @@ class FreeMotion:
     def _next(self, values: list[float]) -> MotionState:
         """Return the state after a step."""
         if self._form == "trajectory":
-            return self._on_trajectory(np.array(values))
+            points = self._in_map(np.array(values))
+            return self._pursue(points) if self._pursues else self._on_trajectory(points)
         if self._form == "target_pose":
-            return self._towards(*values)
+            x, y, heading, time_s = values
+            (pose,) = self._in_map(np.array([[0.0, x, y, heading, 0.0]])).tolist()
+            return self._towards(*pose[1:4], time_s)
         if self._form == "throttle_brake_steering":
             throttle, brake, share = values
             acceleration = throttle * self.model.max_acceleration - brake * self.model.max_deceleration
             return self.model.step(self.state, acceleration, share * MAX_STEERING_RAD, self._dt)
         acceleration, steering = values
         return self.model.step(self.state, acceleration, steering, self._dt)
+
+    def _pursue(self, points: NDArray[np.float64]) -> MotionState:
+        """Return the state after a step of a bicycle model that steers to a point ahead on a trajectory.
+
+        The acceleration is the one that reaches the trajectory's speed at the end of the step. The steering angle leads
+        on a circle to the first point behind the nearest one that is at least the look-ahead distance away (pure
+        pursuit; R. C. Coulter, Implementation of the pure pursuit path tracking algorithm, CMU-RI-TR-92-01, 1992).
+        """
+        state = self.state
+        speed = float(np.interp(self._dt, points[:, 0], points[:, 4]))
+        away = np.hypot(points[:, 1] - state.x, points[:, 2] - state.y)
+        nearest = int(away.argmin())
+        far = away[nearest:] >= _MIN_LOOK_M + _LOOK_S * state.speed
+        target = nearest + int(far.argmax()) if far.any() else len(points) - 1
+        bearing = math.atan2(points[target, 2] - state.y, points[target, 1] - state.x) - state.heading
+        curvature = 2 * math.sin(bearing) / max(1.0, float(away[target]))
+        steering = math.atan(curvature * self.model.wheelbase)
+        return self.model.step(state, (speed - state.speed) / self._dt, steering, self._dt)
 
     def _on_trajectory(self, points: NDArray[np.float64]) -> MotionState:
         """Return the state on a trajectory after a step; it leads from the present pose to its first point."""

@@ -213,13 +213,21 @@ def test_polygon_contains_what_it_winds_around():
         assert _is_inside(*point, corners) == (abs(winding) > 1.0)
 
 
-@pytest.mark.parametrize("form", ["acceleration_steering", "throttle_brake_steering", "trajectory", "target_pose"])
+@pytest.mark.parametrize(
+    "form",
+    [
+        "acceleration_steering", "throttle_brake_steering", "trajectory", "target_pose", "trajectory:frame=ego",
+        "target_pose:frame=ego", "trajectory:tracker=pure_pursuit", "trajectory:frame=ego:tracker=pure_pursuit",
+    ],
+)  # fmt: skip
 def test_full_braking_stops_the_vehicle_in_its_lane_in_a_bend(start, form):
     simulator, step = start(form, "loop", vehicles=10)
     for vehicle in {*libsumo.vehicle.getIDList()} - {"ego"}:
         libsumo.vehicle.remove(vehicle)
     libsumo.vehicle.moveTo("ego", "east_0", 5.0)  # on the half circle
-    simulator._driving.moving["ego"] = motion = FreeMotion("ego", form, 0.1, DrivableArea())
+    settings = AgentSetup(action=form).action_settings
+    motion = FreeMotion("ego", form.partition(":")[0], 0.1, DrivableArea(), settings)
+    simulator._driving.moving["ego"] = motion
     simulator.actions["ego"].check = motion.check if motion.is_planned else None
     speed, steps = motion.state.speed, 0
     while motion.state.speed > 0:
@@ -231,7 +239,10 @@ def test_full_braking_stops_the_vehicle_in_its_lane_in_a_bend(start, form):
     assert steps == pytest.approx(speed / motion.model.max_deceleration / 0.1, abs=2)
 
 
-@pytest.mark.parametrize("form", ["acceleration_steering", "throttle_brake_steering", "trajectory"])
+@pytest.mark.parametrize(
+    "form",
+    ["acceleration_steering", "throttle_brake_steering", "trajectory", "trajectory:frame=ego:tracker=pure_pursuit"],
+)
 def test_reference_driver_corrects_steering_out_of_the_lane(start, form):
     simulator, step = start(form, "motorway")
     motion = simulator._driving.moving["ego"]
@@ -259,3 +270,64 @@ def test_standing_vehicle_keeps_its_heading(start):
     assert centre()[2] == heading
     with pytest.raises(ActionError, match=r"turns the vehicle by 3\.14 rad"):
         simulator.actions["ego"].encode([[0.1, x + 0.02, y, heading + 3.14, 0.2]])
+
+
+def relative(points):
+    """Return points of a trajectory in the frame of the vehicle, by complex numbers."""
+    x, y, heading = centre()
+    moved = [((px + 1j * py) - (x + 1j * y)) * np.exp(-1j * heading) for _, px, py, *_ in points]
+    return [[t, z.real, z.imag, h - heading, v] for (t, _, _, h, v), z in zip(points, moved, strict=True)]
+
+
+@pytest.mark.parametrize("tracker", ["interpolation", "pure_pursuit"])
+def test_trajectory_in_the_frame_of_the_vehicle_is_the_same_motion(start, tracker):
+    courses = []
+    for frame, change in (("map", list), ("ego", relative)):
+        _, step = start(f"trajectory:frame={frame}:tracker={tracker}", **EMPTY)
+        x, y, heading = centre()
+        speed, course = libsumo.vehicle.getSpeed("ego"), []
+        for number in range(30):
+            times = np.arange(0.0, 3.0, 0.1)
+            s = (number * 0.1 + times) * speed
+            path = [[t, x + d, y + 0.02 * d, heading + 0.02, speed] for t, d in zip(times, s, strict=True)]
+            step(change(path))
+            course.append(centre())
+        courses.append(course)
+    assert np.allclose(*courses, rtol=0, atol=1e-6)
+
+
+def test_pose_in_the_frame_of_the_vehicle_is_the_same_motion(start):
+    courses = []
+    for frame, change in (("map", list), ("ego", relative)):
+        _, step = start(f"target_pose:frame={frame}", **EMPTY)
+        x, y, _ = centre()
+        v, course = libsumo.vehicle.getSpeed("ego"), []
+        for number in range(20):
+            ((_, *pose, _),) = change([[0.0, x + 2 * v, y + 1.5, 0.0, v]])
+            step((*pose, 2.0 - 0.1 * number))
+            course.append(centre())
+        courses.append(course)
+    assert np.allclose(*courses, rtol=0, atol=1e-6)
+
+
+def test_pure_pursuit_returns_to_a_line_within_the_limits_of_the_vehicle(start):
+    simulator, step = start("trajectory:tracker=pure_pursuit", **EMPTY)
+    x, y, _ = centre()
+    line = [[t, x + 14 * t, y + 1.2, 0.0, 13.0] for t in np.arange(0.0, 5.0, 0.1)]  # it jumps to the left
+    offsets, turns, before = [], [], 0.0
+    for number in range(60):
+        step([[t, px + 1.3 * number, *rest] for t, px, *rest in line])
+        offsets.append(centre()[1] - y - 1.2)
+        turns.append(simulator._driving.moving["ego"].steering() - before)
+        before += turns[-1]
+    assert max(map(abs, turns)) <= 0.1 + 1e-9  # 1 rad/s
+    assert max(offsets) < 0.2
+    assert abs(offsets[-1]) < 0.02
+
+
+def test_pursued_trajectory_that_is_elsewhere_is_refused(start):
+    simulator, _ = start("trajectory:frame=ego:tracker=pure_pursuit", **EMPTY)
+    simulator.actions["ego"].encode([[0.1, 4.0, 2.9, 0.0, 5.0]])
+    with pytest.raises(ActionError, match=r"the trajectory is 6\.0 m away from the vehicle") as caught:
+        simulator.actions["ego"].encode([[0.1, 6.0, 0.0, 0.0, 5.0]])
+    assert caught.value.fix == "return a point within 5 m"
