@@ -475,11 +475,11 @@ def _described_entries(entries: Iterable[ListingEntry]) -> Iterator[str]:
                 limits = one["range"].replace("|", "\\|")
                 yield f"| `{one['name']}` | {one['unit']} | {limits} | {_plain(one['help'])} |"
             yield ""
-        if "shape" in entry and entry["arguments"]:
+        if entry["arguments"]:
             yield "| setting | unit | range | default | meaning |\n| --- | --- | --- | --- | --- |"
             for given in entry["arguments"]:
-                facts = given["unit"], given["range"], given["default"], given["help"]
-                yield f"| `{given['name']}` | {' | '.join(map(str, facts))} |"
+                facts = (given["unit"], given["range"], given["default"], given["help"])
+                yield f"| `{given['name']}` | {' | '.join(str(fact).replace('|', '\\|') for fact in facts)} |"
             yield ""
 
 

@@ -114,7 +114,13 @@ def list_actions() -> list[ListingEntry]:
             "name": name,
             "locator": form.shape or ", ".join(form.names),
             "title": form.title,
-            "arguments": [],
+            "arguments": [
+                {
+                    "name": one.name, "kind": "str" if one.choices else "float", "default": one.default,
+                    "range": one.range, "unit": one.unit, "help": one.help,
+                }
+                for one in form.settings
+            ],
             "components": [
                 {
                     "name": one.name, "unit": one.unit, "range": one.range, "low": float(one.low),
@@ -182,7 +188,7 @@ def describe(entries: Sequence[ListingEntry]) -> str:
         lines += _columns(
             "    ", [(one["name"], one["range"], one["unit"], one["help"]) for one in entry.get("components", ())]
         )
-        if "shape" in entry and entry["arguments"]:
+        if "components" in entry and entry["arguments"]:
             first = entry["arguments"][0]
             lines.append(f"    settings, such as {entry['name']}:{first['name']}={first['default']}:")
         lines += _table("    ", entry["arguments"])
