@@ -478,8 +478,9 @@ def _described_entries(entries: Iterable[ListingEntry]) -> Iterator[str]:
         if entry["arguments"]:
             yield "| setting | unit | range | default | meaning |\n| --- | --- | --- | --- | --- |"
             for given in entry["arguments"]:
-                facts = (given["unit"], given["range"], given["default"], given["help"])
-                yield f"| `{given['name']}` | {' | '.join(str(fact).replace('|', '\\|') for fact in facts)} |"
+                facts = given["unit"], given["range"], given["default"], given["help"]
+                cells = (str(fact).replace("|", "\\|") for fact in facts)
+                yield f"| `{given['name']}` | {' | '.join(cells)} |"
             yield ""
 
 

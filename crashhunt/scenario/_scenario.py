@@ -101,8 +101,8 @@ class AgentSetup:
         depart_lane: lane of departure, as in SUMO's departLane.
         depart_pos: position of departure, as in SUMO's departPos.
         depart_speed: speed at departure, as in SUMO's departSpeed.
-        action: form of the actions, a name that ``crashhunt list actions`` shows, with settings such as
-            ``trajectory:frame=ego``; by default the form that the class of the agent declares, or else
+        action: form of the actions, a name that ``crashhunt list actions`` shows. Settings follow, such as
+            ``trajectory:frame=ego``. The default is the form that the agent's class declares, or else
             ``speed_and_lane``.
         target_speeds: the target speeds that the actions FASTER and SLOWER of ``meta`` select in order, in m/s.
         observation: parts that the agent observes, such as ``ego`` or ``actors:rows=8``; ``crashhunt list

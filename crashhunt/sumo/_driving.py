@@ -91,15 +91,15 @@ class Driving:
     def _apply_speed(self, agent: str, action: NDArray[np.generic]) -> bool:
         speed, change = action.tolist()
         sumo.vehicle_setSpeed(agent, speed)
-        return self._change_or_go_on(agent, int(change))
+        return self._move_to_lane(agent, int(change))
 
     def _apply_acceleration(self, agent: str, action: NDArray[np.generic]) -> bool:
         """Set the speed that the vehicle has after a step of this acceleration; SUMO applies the limits of its type."""
         acceleration, change = action.tolist()
         sumo.vehicle_setSpeed(agent, max(0.0, sumo.vehicle_getSpeed(agent) + acceleration * self._step_length_s))
-        return self._change_or_go_on(agent, int(change))
+        return self._move_to_lane(agent, int(change))
 
-    def _change_or_go_on(self, agent: str, change: int) -> bool:
+    def _move_to_lane(self, agent: str, change: int) -> bool:
         """Change lanes at once, or drift for the duration that the setting of the form states.
 
         A new lane change is ignored until the last one has ended. Where the road ends before, the vehicle drifts to the

@@ -245,8 +245,8 @@ class FreeMotion:
             return self._pursue(points) if self._pursues else self._on_trajectory(points)
         if self._form == "target_pose":
             x, y, heading, time_s = values
-            (pose,) = self._in_map(np.array([[0.0, x, y, heading, 0.0]])).tolist()
-            return self._towards(*pose[1:4], time_s)
+            _, x, y, heading, _ = self._in_map(np.array([[0.0, x, y, heading, 0.0]]))[0].tolist()
+            return self._towards(x, y, heading, time_s)
         if self._form == "throttle_brake_steering":
             throttle, brake, share = values
             acceleration = throttle * self.model.max_acceleration - brake * self.model.max_deceleration
