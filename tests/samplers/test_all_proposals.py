@@ -23,7 +23,7 @@ SPACE = {
     ("", "w"): Choice(("a", "b", "c")), ("", "fixed"): Constant(3),
 }  # fmt: skip
 PLAIN = {"random", "halton", "sobol", "grid", "sweep"}
-LEARN = {"guided", "mutation", "cross-entropy"} | ({"cma-es"} if importlib.util.find_spec("cmaes") else set())
+LEARN = {"guided", "mutation", "cross-entropy", "boundary"} | ({"cma-es"} if importlib.util.find_spec("cmaes") else set())
 TRIALS, SHOWN = 240, 12
 
 
