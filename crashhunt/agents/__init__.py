@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         StableBaselines3 as StableBaselines3,
         TorchPolicy as TorchPolicy,
     )
+    from ._program_processes import ReusedProgram as ReusedProgram, offer_reused as offer_reused
     from ._programs import ProgramAgent as ProgramAgent, ProgramFactory as ProgramFactory
     from ._protocol import (
         Agent as Agent,

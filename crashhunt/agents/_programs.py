@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import re
-import resource
 import select
 import signal
 import stat
@@ -23,7 +22,14 @@ from typing import IO, TYPE_CHECKING, Any, Final
 import numpy as np
 from pydantic_core import from_json, to_json
 
-from crashhunt.base import forks, layout
+from crashhunt.agents._program_processes import (
+    AttachedProgram,
+    ReusedProgram,
+    launch,
+    read_format,
+    reused_folder,
+)
+from crashhunt.base import forks
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError, ProgramError
 from crashhunt.base.processes import descendants_of, kill
@@ -37,6 +43,7 @@ if TYPE_CHECKING:
 
     from gymnasium import Space
 
+    from crashhunt.agents._program_processes import ProgramProcess
     from crashhunt.base.program_messages import Hello, Observe, ProgramRequest, SpaceDescription
     from crashhunt.panels import Panel
     from crashhunt.simulators import ActionForm, Simulator
@@ -49,7 +56,6 @@ _LENGTH_BYTES: Final = 4  # before each message of MessagePack
 _CHUNK_BYTES: Final = 1 << 16
 _MAX_MESSAGE_BYTES: Final = 16 << 20
 _MAX_REPEATED_BYTES: Final = 256 << 20  # of the observations that a fork of the trial sends again
-_MAX_FILE_BYTES: Final = 64 << 20  # of each file that the program writes, such as its log
 _MAX_SHOWN_CHARACTERS: Final = 80
 _DESCRIPTION_S: Final = 60.0  # as long as a module may take to import
 _CLOSING_S: Final = 1.0  # from `close` to the end of the program
@@ -71,7 +77,7 @@ _REASONS: Final = tuple(
 _UNITS: Final = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "heading": "rad", "target_speed": "m/s"}
 _DECLARATION_KEYS: Final = ("range", "unit", "default")
 
-_inherited: list[subprocess.Popen[bytes]] = []
+_inherited: list[ProgramProcess] = []
 """Programs of the process of which this one is a fork. Their pipes are closed here, so nothing may close them again."""
 
 
@@ -132,7 +138,16 @@ class ProgramFactory:
             command_of(self._locator, files), folder / f"agent-{name}", libraries=library_path(self._locator, files),
             is_forked=is_forked,
         )  # fmt: skip
-        return ProgramAgent(process, hello, is_scalar=is_scalar, limit_s=limit_s)
+        return ProgramAgent(process, hello, is_scalar=is_scalar, limit_s=limit_s, reused=reused_folder(name))
+
+    def reused(self, folder: Path, files: Mapping[str, str]) -> ReusedProgram:
+        """Return the program for several trials, which has not been started.
+
+        Args:
+            folder: the folder for the files of the program.
+            files: file of the snapshot by the word that names the original file.
+        """
+        return ReusedProgram(command_of(self._locator, files), folder, library_path(self._locator, files))
 
 
 class ProgramAgent:
@@ -146,10 +161,14 @@ class ProgramAgent:
         hello: the first message.
         is_scalar: whether an action is one number, which the program sends as a list of one.
         limit_s: time limit for the answer to each observation, in s; None if only that of the trial applies.
+        reused: folder of a program that has been started for several trials; None to start a program of its own.
     """
 
-    def __init__(self, process: _Process, hello: Hello, *, is_scalar: bool, limit_s: float | None) -> None:
+    def __init__(
+        self, process: _Process, hello: Hello, *, is_scalar: bool, limit_s: float | None, reused: Path | None = None
+    ) -> None:
         self._process = process
+        self._reused = reused
         self._limit_s = limit_s
         self._hello = hello
         self._is_scalar = is_scalar
@@ -195,8 +214,15 @@ class ProgramAgent:
     def _begin(self) -> None:
         process = self._process
         if not process.is_started or process.is_inherited:
-            process.start()
-            _signature_in(process.ask(self._hello, "hello"))
+            if self._reused is None or process.is_inherited:
+                process.start()
+            else:
+                process.attach(self._reused)
+            try:
+                _signature_in(process.ask(self._hello, "hello"))
+            except ProgramError as error:
+                fix = "answer hello before each reset, or omit reuse" if process.is_reused else error.fix
+                raise ProgramError(error.message, fix=fix) from None
         process.ask({"type": "reset", "seed": self._seed}, "reset")
 
     def _repeat(self) -> None:
@@ -254,7 +280,9 @@ class _Process:
         self._received = bytearray()
         self._packer: Any = None  # of MessagePack; None as long as messages are lines of JSON
         self._unpack: Any = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ProgramProcess | None = None
+        self._attached: AttachedProgram | None = None  # that same process, if it drives in several trials
+        self._is_idle = False  # whether the program has answered every message
         self._owner = 0  # the process that has started the program
         self._is_forked = is_forked
         self.exchanges: list[tuple[bytes, Any]] = []
@@ -270,6 +298,11 @@ class _Process:
         """Whether the process has been started."""
         return self._process is not None
 
+    @property
+    def is_reused(self) -> bool:
+        """Whether the program may have driven in earlier trials."""
+        return self._attached is not None
+
     def start(self) -> None:
         """Start the program.
 
@@ -281,16 +314,14 @@ class _Process:
             _inherited.append(self._process)
             folder = folder.with_name(f"{folder.name}-{os.getpid()}")
         self._owner, self._received, self._packer, self._unpack = os.getpid(), bytearray(), None, None
-        self.exchanges, self._exchanged_bytes = [], 0
+        self.exchanges, self._exchanged_bytes, self._attached = [], 0, None
         with suppress(OSError):
             status = os.fstat(self._log)
             self._log_begin = status.st_size if stat.S_ISREG(status.st_mode) else None
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._process = process = subprocess.Popen(
-                self._command, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                stderr=self._log, bufsize=0, env=self._environment(),
-            )  # fmt: skip
+            self._process = process = launch(
+                self._command, folder, self._log, self._libraries, (subprocess.PIPE, subprocess.PIPE)
+            )
         except OSError as error:
             fix = "make it executable here: with #! in its first line if it is a script, and for this machine"
             raise ProgramError(f"the program does not start: {error.strerror}: {self._command[0]}", fix=fix) from None
@@ -298,19 +329,27 @@ class _Process:
         os.set_blocking(process.stdin.fileno(), False)
         if self._is_forked:
             forks.withhold(process.pid, self._descriptors())
-        with suppress(OSError, ValueError, AttributeError):  # it has ended already, or the system has no such call
-            soft, hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
-            if soft == resource.RLIM_INFINITY or soft > _MAX_FILE_BYTES:
-                resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (_MAX_FILE_BYTES, hard))
 
-    def _environment(self) -> dict[str, str]:
-        # Python would write its caches next to the modules of the snapshot. A replay imports from the snapshot's code,
-        # and a program in Python must find the same modules there as in the hunt.
-        paths = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if not _is_of_snapshot(path)]
-        found = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": os.pathsep.join(paths)}
-        if self._libraries:
-            found["LD_LIBRARY_PATH"] = ":".join(filter(None, [self._libraries, os.environ.get("LD_LIBRARY_PATH")]))
-        return found
+    def attach(self, folder: Path) -> None:
+        """Use a program that has driven in earlier trials, if it still runs; otherwise start the program.
+
+        Args:
+            folder: the folder of the reused program.
+
+        Raises:
+            ProgramError: the program does not run, and cannot be started.
+        """
+        try:
+            self._process = attached = AttachedProgram(folder)
+        except (OSError, ValueError):
+            self._process = None
+            self.start()
+            return
+        self._owner, self._attached, self._log_begin = os.getpid(), attached, 0
+        if read_format(folder) == "msgpack":
+            self._use_msgpack()
+        if self._is_forked:
+            forks.withhold(attached.pid, self._descriptors())
 
     def ask(self, message: ProgramRequest, shown: str, limit_s: float | None = None) -> dict[str, Any]:
         """Send a message, and return the program's answer to it.
@@ -326,18 +365,24 @@ class _Process:
         data, expected = self._encoded(message), _ANSWERS[message["type"]]
         answer = self.exchange(data, expected, shown, limit_s)
         if expected == "ready" and answer.get("format") == "msgpack":
-            import msgpack
-
-            self._packer, self._unpack = msgpack.Packer(), msgpack.unpackb
+            self._use_msgpack()
+            if self._attached is not None:
+                self._attached.keep_format("msgpack")
         elif expected == "act" and self._is_forked:
             self._keep(data, answer.get("action"))
         return answer
+
+    def _use_msgpack(self) -> None:
+        import msgpack
+
+        self._packer, self._unpack = msgpack.Packer(), msgpack.unpackb
 
     def exchange(self, data: bytes, expected: str, shown: str, limit_s: float | None) -> dict[str, Any]:
         """Send an encoded message, and return the answer, which must be of the expected type; see `ask`."""
         if self._received:
             raise ProgramError(f"it has sent something before {shown}: {_shown(self._received)}", fix=_LOGS_FIX)
         deadline = None if limit_s is None else time.monotonic() + limit_s
+        self._is_idle = False
         try:
             self._write(data, shown, deadline)
             received = self._read(shown, deadline)
@@ -347,6 +392,7 @@ class _Process:
         if not isinstance(answer, dict) or answer.get("type") != expected:
             fix = f'send {{"type": "{expected}", …}}'
             raise ProgramError(f"its answer to {shown} is not of type {expected!r}: {_shown(received)}", fix=fix)
+        self._is_idle = not self._received
         return answer
 
     def _keep(self, data: bytes, action: Any) -> None:
@@ -371,6 +417,9 @@ class _Process:
             forks.stop_withholding(self._process.pid, self._descriptors())
         process, self._process = self._process, None
         if process is None:
+            return
+        if self._attached is not None:
+            self._attached.detach(is_idle=self._is_idle)
             return
         assert process.stdin is not None
         assert process.stdout is not None
@@ -456,7 +505,7 @@ class _Process:
             return ProgramError(
                 f"the program has closed its end instead of answering {shown}{half}, and is still running"
             )
-        code = process.returncode
+        code = process.returncode or 0
         end = f"died of {_signal_name(-code)}" if code < 0 else f"exited with {code}"
         return ProgramError(f"the program {end} instead of answering {shown}{half}{self._reason()}")
 
@@ -464,7 +513,8 @@ class _Process:
         """Return the reason that the program has written to its standard error, after a colon; empty if it has none."""
         if self._log_begin is None:
             return ""
-        with suppress(OSError), open(f"/proc/self/fd/{self._log}", "rb") as log:
+        source = self._log if self._attached is None else self._attached.log
+        with suppress(OSError), open(f"/proc/self/fd/{source}", "rb") as log:
             size = log.seek(0, os.SEEK_END)
             log.seek(max(self._log_begin, size - _MAX_REPORT_BYTES))
             text = log.read(_MAX_REPORT_BYTES).decode("utf-8", "replace")
@@ -473,7 +523,7 @@ class _Process:
         return ""
 
     @staticmethod
-    def _ends_within(process: subprocess.Popen[bytes], limit_s: float) -> bool:
+    def _ends_within(process: ProgramProcess, limit_s: float) -> bool:
         """Return whether a process ends within a time limit; its output is read, so that it can end."""
         assert process.stdout is not None
         until = time.monotonic() + limit_s
@@ -485,11 +535,6 @@ class _Process:
         except subprocess.TimeoutExpired:
             return False
         return True
-
-
-def _is_of_snapshot(path: str) -> bool:
-    code = layout.PACKAGE.parent
-    return code.name == layout.CODE and (code.parent / layout.MANIFEST).exists() and Path(path).is_relative_to(code)
 
 
 def _await(stream: IO[bytes], deadline: float | None, *, writing: bool = False) -> None:

@@ -64,7 +64,8 @@ class WorkerSettings(Serializable):
         branch: The rates of disturbances in branches, each as ``NAME=RATE``; empty for no branches.
         force: The rates of disturbances in forks with a forced first disturbance, each as ``NAME=RATE``; empty for
             none.
-        step_timeout_s: wall-clock limit of each answer of an agent's program to an observation, in s; 0 for none.
+        step_timeout_s: wall-clock limit of each action of a program, a library or an FMU, in s; 0 for none.
+        reuses: identifiers of the vehicles whose program drives in one trial after another.
     """
 
     scenario: Scenario
@@ -84,10 +85,12 @@ class WorkerSettings(Serializable):
     branch: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
     force: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
     step_timeout_s: float = field(default=0.0, metadata=OMIT_DEFAULT)
+    reuses: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
 
     json_keys: ClassVar[tuple[str, ...]] = (
         "oracles", "crash_on", "scratch", "code", "argument_files", "timeout_s", "keep_trials", "sealed",
         "find_escapes", "audit", "hunt_seed", "warm_copies", "probe_s", "branch", "force", "step_timeout_s",
+        "reuses",
     )  # fmt: skip
 
     def keeps(self, result: TrialResult) -> bool:

@@ -17,9 +17,11 @@ from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn, TypedDict, cast
 
-from crashhunt.base import forks
+from crashhunt.agents import ProgramFactory, offer_reused
+from crashhunt.base import forks, layout
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import DISK, CrashhuntError
 from crashhunt.base.exceptions import message_of
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
+    from crashhunt.agents import ReusedProgram
     from crashhunt.episode import WorkerSettings
     from crashhunt.executors._protocol import FromZygote, KillTrial
     from crashhunt.executors._trial_process import Job
@@ -400,6 +403,7 @@ class _Zygote:
         self._staged = 0  # when the folder was last changed
         self._makes_simulator = imported.makes_simulator
         self._settings = settings
+        self._reused: list[ReusedProgram] = []  # programs that drive in one trial after another
         self._segments = SharedMemoryWatch()
 
     def serve(self) -> None:
@@ -413,6 +417,7 @@ class _Zygote:
             self._report(_why_not(error))
             return
         self._staged = self._changed_at()
+        self._offer_reused()
         if remaining := self._trial.record_shared_state(self._control.fileno()):
             self._notices.append(f"trials are not wholly apart: a module shares {remaining} with every one of them")
         gc.freeze()  # a collection in a fork would copy the page of every object
@@ -425,6 +430,18 @@ class _Zygote:
                     said["notices"] = self._notices[:]
                     self._notices.clear()
                 self._report(said)
+        for program in self._reused:
+            program.end()
+
+    def _offer_reused(self) -> None:
+        """Prepare the programs of agents that drive in one trial after another; the first trial starts them."""
+        scenario, files, programs = self._settings.scenario, self._settings.argument_files, {}
+        for agent in self._settings.reuses:
+            factory = locate("agents", scenario.agents[agent].agent)
+            if isinstance(factory, ProgramFactory):
+                programs[agent] = factory.reused(self._scratch / f"program-{os.getpid()}-{agent}", files)
+        offer_reused(programs)
+        self._reused = [*programs.values()]
 
     def _changed_at(self) -> int:
         """Return when a file of the simulator was last added or removed, in ns; 0 if its folder was deleted."""
@@ -435,11 +452,19 @@ class _Zygote:
 
     def _run(self, job: Job) -> tuple[int, int]:
         """Run a trial, and return its process and the exit code, which is negative for a signal."""
-        spared = frozenset[int]()
+        for program in self._reused:
+            program.prepare()
+        try:
+            return self._run_trial(job, frozenset(program.pid for program in self._reused) - {0})
+        finally:
+            for program in self._reused:
+                program.move_log(Path(job["folder"]) / layout.RUN_LOG)
+
+    def _run_trial(self, job: Job, spared: frozenset[int]) -> tuple[int, int]:
         self._segments = SharedMemoryWatch()
         if self._warm is not None:
             found = self._warm.run(job, self._wait)
-            spared = self._warm.processes
+            spared |= self._warm.processes
             if found is not None:
                 self._end_descendants(spared)
                 return found
@@ -449,6 +474,8 @@ class _Zygote:
             os.close(self._control.detach())
             if self._warm is not None:
                 self._warm.forget()
+            for program in self._reused:
+                program.forget()
             self._trial.run(job)
         killed = partial(self._kill, pid)
         try:
@@ -492,6 +519,8 @@ class _Zygote:
                 message = self._next()
                 if message is None:  # the supervisor is gone
                     kill_trial()
+                    for program in self._reused:
+                        program.end()
                     self._end_descendants(frozenset())
                     self._leave(0)
                 elif "kill" in message:

@@ -19,7 +19,7 @@ from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.disturbances import FIRST_STEP
 from crashhunt.episode import WorkerSettings
 from crashhunt.ledger import Turn
-from crashhunt.plans import with_settings
+from crashhunt.plans import reused_agents, with_settings
 from crashhunt.results import trials_of_running
 from crashhunt.trial import KILLED, TrialSpec
 
@@ -388,6 +388,7 @@ def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Pat
         probe_s=settings.probe_s,
         branch=tuple(settings.disturb) if settings.branch else (),
         force=tuple(settings.disturb) if settings.rare else (),
+        reuses=reused_agents(settings) if run.reuse else (),
     )
 
 

@@ -458,7 +458,7 @@ class Audit:
         self._failed = failed
         self._scratch = settings.scratch / "audit"
         self._scratch.mkdir(exist_ok=True)
-        again = replace(settings, scratch=self._scratch, audit=0.0, keep_trials=True)
+        again = replace(settings, scratch=self._scratch, audit=0.0, keep_trials=True, reuses=())
         self._executor = FreshProcessExecutor(again)
         self._waiting: dict[int, TrialResult] = {}
         self._done = 0

@@ -5,7 +5,12 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._code import CodeFacts as CodeFacts, describe_code as describe_code, imported_by as imported_by
+    from ._code import (
+        CodeFacts as CodeFacts,
+        describe_code as describe_code,
+        imported_by as imported_by,
+        reused_agents as reused_agents,
+    )
     from ._declaration import Given as Given, HuntOption as HuntOption
     from ._durations import check_duration as check_duration, seconds_of as seconds_of
     from ._plan import (

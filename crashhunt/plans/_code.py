@@ -185,3 +185,28 @@ def notes_on_programs(settings: HuntSettings) -> Iterator[str]:
             f"each fork of {option} starts the program of {listed(names)} again and sends it the observations of all "
             "earlier steps, because a running program cannot be copied"
         )
+    if settings.run.reuse:
+        reused = reused_agents(settings)
+        yield (
+            f"the program of {listed(reused)} drives in one trial after another; {settings.run.audit:.0%} of the "
+            "trials without a crash run again with a new program"
+            if reused
+            else "--reuse has no effect: no agent is a program (exec:)"
+        )
+
+
+_REUSE_AUDIT = 0.05  # share of the trials without a crash that run again with a new program
+
+
+def with_reuse(settings: HuntSettings, scenario: Scenario) -> HuntSettings:
+    """Return the settings in which programs drive in several trials if the scenario says so, with an audit."""
+    agents = scenario.agents.items()
+    declared = any(setup.reuse and setup.agent == settings.agents[name].agent for name, setup in agents)
+    reuse = settings.run.reuse or declared
+    audit = settings.run.audit or (_REUSE_AUDIT if reuse and reused_agents(settings) else 0.0)
+    return replace(settings, run=replace(settings.run, reuse=reuse, audit=audit))
+
+
+def reused_agents(settings: HuntSettings) -> tuple[str, ...]:
+    """Return the vehicles whose program can drive in one trial after another."""
+    return tuple(name for name, chosen in settings.agents.items() if not can_fork(chosen.agent))

@@ -25,7 +25,7 @@ from crashhunt.oracles import ORACLES_OF_ACTORS, chosen_oracles, oracle_name, ou
 from crashhunt.plans._chosen_actions import chosen_actions, notes_on_actions, refuse_late_plans
 from crashhunt.plans._chosen_observations import chosen_observations
 from crashhunt.plans._chosen_requirements import chosen_requirements
-from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code, notes_on_programs
+from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code, notes_on_programs, with_reuse
 from crashhunt.plans._run_options import TrialOptions
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
@@ -356,6 +356,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
             agent: replace(chosen, observation=observations.get(agent)) for agent, chosen in settings.agents.items()
         }
         settings, scenario = replace(settings, agents=agents), with_observations(scenario, observations)
+    settings = with_reuse(settings, scenario)
     scenario = _with_notes_on_crashes(_with_notes(scenario, request.run), settings, request, code.oracles)
     notes = (*code.notes, *_notes_on_statistics(settings, signatures), *notes_on_actions(scenario, signatures))
     notes += (*notes_on_programs(settings),)

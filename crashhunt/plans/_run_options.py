@@ -274,6 +274,12 @@ class RunOptions(_Options):
         "0: no limit",
         flag="--step-timeout", group="run", metavar="S", check=within(0, 1e6, "give seconds (0: no limit)"),
     )  # fmt: skip
+    reuse: bool = option(
+        False, "whether the program of an agent (``exec:``) drives in one trial after another; replays start a new one",
+        help="let the program of an agent (exec:) drive in one trial after another, for programs that start slowly. "
+        "Replays start a new program, and an audit (--audit, 0.05 by default) compares trials with a new program",
+        flag="--reuse", group="run",
+    )  # fmt: skip
     keep_trials: bool = option(
         False, "keep the log of every trial, not only of crashes", flag="--keep-trials", group="kept",
     )  # fmt: skip

@@ -371,6 +371,11 @@ def _describe_audit(report: HuntReport) -> list[str]:
     if found.not_finished:
         lines.append(f"  {found.not_finished} more did not finish. Run the same command to replay them")
     lines += [f"  {difference}" for difference in found.differences[:_MAX_SHOWN]]
+    if found.differences and report.settings.run.reuse:
+        lines.append(
+            "  a program that drives in one trial after another may remember earlier trials; "
+            "have it forget them at reset, or omit reuse"
+        )
     if len(found.differences) > _MAX_SHOWN:
         lines.append(f"  … and {len(found.differences) - _MAX_SHOWN} more; for all of them, run: crashhunt logs")
     return lines

@@ -398,8 +398,9 @@ def _join_commands(data: Plain, where: str, folder: Path) -> None:
             is_list = isinstance(words, list) and all(isinstance(word, str) for word in words)
             if len(agent) == len(files) == 1 and isinstance(files[0][1], str) and files[0][1]:
                 table["agent"] = anchored(":".join(files[0]), folder)
-            elif isinstance(words, list) and is_list and any(words[:1]) and len(agent) == 1:
+            elif isinstance(words, list) and is_list and any(words[:1]) and agent.keys() <= {"exec", "reuse"}:
                 table["agent"] = relative_to(folder, words)
+                table |= {"reuse": agent["reuse"]} if "reuse" in agent else {}
             else:
                 fix = 'write agent = { exec = ["./planner", "--mode", "test"] } or agent = { lib = "./libplanner.so" }'
                 refuse(where, f"agents.{name}.agent", agent, "is neither a command nor a library or an FMU", fix)

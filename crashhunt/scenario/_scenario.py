@@ -85,7 +85,9 @@ class ArgumentSetup:
 
 @dataclass(frozen=True, kw_only=True)
 class AgentSetup:
-    """``[agents.ID]``: one controlled vehicle and its agent. All keys but the first and the last apply to SUMO only.
+    """``[agents.ID]``: one controlled vehicle and its agent.
+
+    All keys but ``agent``, ``reuse`` and ``arguments`` apply to SUMO only.
 
     Args:
         agent: the agent that drives, as ``module:attribute`` or by the name of a registered agent.
@@ -108,6 +110,7 @@ class AgentSetup:
         observation: parts that the agent observes, such as ``ego`` or ``actors:rows=8``; ``crashhunt list
             observations`` prints all parts. Without this key, the agent's class chooses the parts, or else the agent
             observes Kinematics.
+        reuse: whether the program of the agent (``exec``) drives in one trial after another; see ``--reuse``.
         speed_mode: SUMO's speed mode bits; 6 keeps physical limits and ignores the safe speed.
         arguments: the arguments of the agent that the scenario describes.
     """
@@ -126,6 +129,7 @@ class AgentSetup:
     target_speeds: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
     speed_mode: int = 6
     observation: tuple[str, ...] | None = None
+    reuse: bool = False
     arguments: dict[str, ArgumentSetup] = field(default_factory=dict)
 
     @property
