@@ -45,6 +45,7 @@ from crashhunt.cli._rate import add_rate
 from crashhunt.cli._replay import add_replay
 from crashhunt.cli._report import add_report
 from crashhunt.cli._run import add_run
+from crashhunt.cli._scorecard import add_scorecard
 from crashhunt.cli._show import add_show
 from crashhunt.cli._shrink import add_shrink
 from crashhunt.cli._signals import add_signals
@@ -82,7 +83,7 @@ _COMMANDS = {
     "see what happened": (add_replay, add_show, add_report, add_dashboard, add_export),
     "find out why": (add_judge, add_whatif, add_shrink, add_crashes, add_bisect),
     "keep them fixed": (add_corpus, add_gate, add_split),
-    "measure": (add_rate, add_compare, add_trials),
+    "measure": (add_rate, add_compare, add_scorecard, add_trials),
     "manage hunts": (add_status, add_logs, add_note_command, add_check, add_trust_command),
     "look things up": (add_guide, add_list, add_signals, add_agent_header, add_completion),
 }

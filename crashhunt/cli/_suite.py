@@ -110,10 +110,10 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
     cases = checked_cases(options)
     if options.directory.is_dir() and (kept := describe_finished(options.directory)):
         say(kept, as_json=options.json)
-    watch, finish = _watcher(as_json=options.json)
+    watch, finish = states_watcher(as_json=options.json)
     try:
         machine = chosen_of_machine(options)
-        states = _run_with_trust(
+        states = run_with_trust(
             lambda trusted: suite.run(
                 options.directory, options.parallel, watch=watch, machine=machine, trusted=trusted
             ),
@@ -146,10 +146,10 @@ def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.suites import rerun
 
     hunts = list(chosen_runs(options.directory, options.run))
-    watch, finish = _watcher(as_json=options.json)
+    watch, finish = states_watcher(as_json=options.json)
     try:
         changes, machine = pairs(options.sets, "--set"), chosen_of_machine(options)
-        states, replaced = _run_with_trust(
+        states, replaced = run_with_trust(
             lambda trusted: rerun(
                 hunts, everything=options.all, changes=changes, to=options.to, parallel=options.parallel, watch=watch,
                 machine=machine, trusted=trusted,
@@ -172,7 +172,7 @@ def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
     )
 
 
-def _run_with_trust(run: Callable[[bool], T], options: argparse.Namespace) -> T:
+def run_with_trust(run: Callable[[bool], T], options: argparse.Namespace) -> T:
     """Run hunts; ask at the terminal for each hunt that is not trusted, before the first hunt runs.
 
     Raises:
@@ -191,7 +191,7 @@ def _run_with_trust(run: Callable[[bool], T], options: argparse.Namespace) -> T:
             trust_hunt(Path(refusal.where), Path(refusal.where))
 
 
-def _watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Callable[[], None]]:
+def states_watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Callable[[], None]]:
     """Return a function that shows the progress as a table or as lines, and a function that ends the display."""
     from rich.live import Live
 

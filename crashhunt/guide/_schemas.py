@@ -15,7 +15,7 @@ from crashhunt.base.json_types import ErrorData, Plain
 from crashhunt.base.program_messages import ProgramAnswer, ProgramRequest
 from crashhunt.base.schemas import json_schema
 from crashhunt.corpus import Bisected, CaseReport
-from crashhunt.crashes import CrashSummary, Fault, Group, Judgement, Note, TrustedOrigin
+from crashhunt.crashes import COMPETENT_DRIVERS, CrashSummary, Fault, Group, Judgement, Note, TrustedOrigin
 from crashhunt.hunts import AuditReport, Checked, SignalList, StoppedBecause
 from crashhunt.ledger import KindData
 from crashhunt.replays import ReplayReport
@@ -163,6 +163,60 @@ _CASES = {
         }
     ]
 }
+_SCORED = {
+    "cases": int,
+    "share": float | None,
+    "interval": list[float] | None,
+    "random_cases": int,
+    "found": int,
+}
+_SCORED_BY_MODEL = dict.fromkeys(COMPETENT_DRIVERS, (_SCORED, None))
+_AXIS = {"name": str, "unit": str, "values": list[Any]}
+_SCORECARD_MAP = {
+    "fixed": JsonObject,
+    "x": _AXIS,
+    "y": _AXIS,
+    "ran": list[list[bool]],
+    "agent": list[list[bool]] | None,
+    "drivers": dict[str, list[list[bool]]],
+}
+_SCORECARD_HUNT = {
+    "dir": str,
+    "state": str,
+    "seed": int,
+    "scenario_digest": str,
+    "snapshot": str,
+    "trials": int,
+    "trials_digest": str,
+    "versions": dict[str, str],
+}
+_SCORECARD = {
+    "suite": str,
+    "agent": str,
+    "crashhunt": str,
+    "method": Literal["grid", "boundary"],
+    "steps": int,
+    "complete": bool,
+    "cases": int,
+    "ran": int,
+    "preventable_by": _SCORED_BY_MODEL,
+    "groups": [
+        {
+            "id": str,
+            "scenario": str,
+            "paragraph": str,
+            "cases": int,
+            "ran": int,
+            "invalid": int,
+            "crashes": int | None,
+            "crashes_of_drivers": dict[str, int | None],
+            "preventable_by": _SCORED_BY_MODEL,
+            "why_not": str,
+            "hunts": [_SCORECARD_HUNT],
+            "maps": [_SCORECARD_MAP],
+        }
+    ],
+}
 _LISTED_CRASHES = {
     "crashes": list[str],
     "crashes_found": int,
@@ -214,6 +268,7 @@ SCHEMAS: dict[str, object] = {
     "compare": Comparison,
     "gate": _GATE,
     "rate": {"rates": list[CrashRate]},
+    "scorecard": _SCORECARD,
     "list": {
         "agents?": list[ListingEntry],
         "disturbances?": list[ListingEntry],

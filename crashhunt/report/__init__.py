@@ -50,6 +50,11 @@ if TYPE_CHECKING:
         rates_page as rates_page,
         write_rates_csv as write_rates_csv,
     )
+    from ._scorecard_page import (
+        describe_scorecard as describe_scorecard,
+        scorecard_page as scorecard_page,
+        scorecard_table as scorecard_table,
+    )
     from ._status_screen import (
         Watcher as Watcher,
         describe_phase as describe_phase,

@@ -338,7 +338,7 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
     return sentences
 
 
-_DRIVER_NAMES = {"cc_human": "careful human", "fsm": "FSM", "rss": "RSS", "reg157": "R157 5.2.5.2"}
+DRIVER_NAMES = {"cc_human": "careful human", "fsm": "FSM", "rss": "RSS", "reg157": "R157 5.2.5.2"}
 _ANSWER_WORDS = {True: "yes", False: "no", None: "no answer"}
 
 
@@ -358,7 +358,7 @@ def about_drivers(drivers: Preventability, ago: Callable[[int], str], agent: str
     perceived = drivers.perceived
     if perceived is not None and perceived.perceived_step is not None:
         sentences.append(
-            f"The model {_DRIVER_NAMES[perceived.model]} perceives the risk first, {ago(perceived.perceived_step)}: "
+            f"The model {DRIVER_NAMES[perceived.model]} perceives the risk first, {ago(perceived.perceived_step)}: "
             f"{other} is {perceived.gap_m or 0.0:.1f} m ahead and drives {perceived.other_speed_mps or 0.0:.1f} m/s, "
             f"and {agent} drives {perceived.speed_mps or 0.0:.1f} m/s."
         )
@@ -370,11 +370,11 @@ def about_drivers(drivers: Preventability, ago: Callable[[int], str], agent: str
 def describe_drivers(drivers: Preventability) -> str:
     """Return the answers of the models in one line; empty if no model has answered."""
     known = [run for run in drivers.runs if run.prevented is not None]
-    return ", ".join(f"{_DRIVER_NAMES[run.model]}: {_ANSWER_WORDS[run.prevented]}" for run in known)
+    return ", ".join(f"{DRIVER_NAMES[run.model]}: {_ANSWER_WORDS[run.prevented]}" for run in known)
 
 
 def _driver_answer(run: DriverRun) -> str:
-    answer = f"{_DRIVER_NAMES.get(run.model, run.model)}: {_ANSWER_WORDS[run.prevented]}"
+    answer = f"{DRIVER_NAMES.get(run.model, run.model)}: {_ANSWER_WORDS[run.prevented]}"
     if run.prevented and run.margin_m is not None:
         return f"{answer}, by {run.margin_m:.1f} m"
     return f"{answer} because {run.why_not}" if run.why_not else answer

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         trust_hunt as trust_hunt,
     )
     from ._rerun import rerun as rerun
+    from ._scorecard_cases import Scorecard as Scorecard, run_scorecard as run_scorecard
     from ._suite_file import (
         Suite as Suite,
         SuiteEntry as SuiteEntry,

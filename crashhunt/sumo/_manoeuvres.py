@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 from libsumo import _libsumo as sumo
 
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.sumo._manoeuvre_motions import START_M, actor_of, motions
 from crashhunt.sumo._options import MANOEUVRE_ARGUMENTS
-from crashhunt.world import ActorState, Path, Paths
+from crashhunt.world import START_M, ActorState, Path, Paths, actor_of_manoeuvre, manoeuvre_motions
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -48,10 +47,12 @@ def manoeuvre_paths(manoeuvre: str, agent: str, arguments: Mapping[str, Value], 
     own, next_lane = (lanes[1], lanes[0]) if right_to_left else (lanes[0], lanes[1])
     own_y, next_y = (float(sumo.lane_getShape(lane)[0][1]) for lane in (own, next_lane))
     speed = values["ego_kmh"] / _KMH
-    states = motions(manoeuvre, values, own_y, next_y, step_s)
+    states = manoeuvre_motions(manoeuvre, values, own_y, next_y, step_s)
     rows = [next(states) for _ in range(_STEPS + 1)]
     others = tuple(_path(name, rows, {own: own_y, next_lane: next_y}) for name in dict.fromkeys(chain(*rows)))
-    start = Path(actor=actor_of(agent), first=0, states=(ActorState(START_M, own_y, 0.0, speed),), lanes=((0, own),))
+    start = Path(
+        actor=actor_of_manoeuvre(agent), first=0, states=(ActorState(START_M, own_y, 0.0, speed),), lanes=((0, own),)
+    )
     return Paths(time_s=0.0, steps=_STEPS, agents=(start,), others=others)
 
 
@@ -68,7 +69,7 @@ def _number(name: str, value: Value) -> float:
 def _path(name: str, rows: list[dict[str, ActorState]], lanes: Mapping[str, float]) -> Path:
     first = next(step for step, row in enumerate(rows) if name in row)
     states = tuple(row[name] for row in rows[first:])
-    return Path(actor=actor_of(name), first=first, states=states, lanes=tuple(_lanes(first, states, lanes)))
+    return Path(actor=actor_of_manoeuvre(name), first=first, states=states, lanes=tuple(_lanes(first, states, lanes)))
 
 
 def _lanes(first: int, states: tuple[ActorState, ...], lanes: Mapping[str, float]) -> Iterator[tuple[int, str]]:

@@ -47,6 +47,11 @@ if TYPE_CHECKING:
         rectangle_gap as rectangle_gap,
         time_to_contact as time_to_contact,
     )
+    from ._manoeuvre_motions import (
+        START_M as START_M,
+        actor_of_manoeuvre as actor_of_manoeuvre,
+        manoeuvre_motions as manoeuvre_motions,
+    )
     from ._road_map import (
         LaneLines as LaneLines,
         MapLane as MapLane,

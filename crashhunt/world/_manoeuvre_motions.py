@@ -10,7 +10,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from crashhunt.world import PERSON, Actor, ActorState
+from crashhunt.world._scene import PERSON, Actor
+from crashhunt.world._tracks import ActorState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -29,7 +30,7 @@ _OUTSIDE_M = 3.5  # from the middle of the outer lane to a person next to the ro
 _SHAPES = {"walker": ("pedestrian", 0.5, 0.5), "motorcycle": ("motorcycle", 2.2, 0.9)}
 
 
-def actor_of(name: str) -> Actor:
+def actor_of_manoeuvre(name: str) -> Actor:
     """Return a road user of a manoeuvre; every name that is no pedestrian or motorcycle is a car."""
     kind, length, width = _SHAPES.get(name.removeprefix(PERSON), ("passenger", LENGTH_M, WIDTH_M))
     return Actor(id=name, kind=kind, length=length, width=width)
@@ -57,7 +58,7 @@ class _Mover:
         self.y += lateral * step_s
 
 
-def motions(
+def manoeuvre_motions(
     manoeuvre: str, values: Mapping[str, float], own_y: float, next_y: float, step_s: float
 ) -> Iterator[dict[str, ActorState]]:
     """Yield the states of the other road users after each step, without end; a road user may appear later.
@@ -162,7 +163,7 @@ def _multiple_targets(
     values: Mapping[str, float], _speed: float, own_y: float, _next_y: float, _step_s: float
 ) -> Iterator[dict[str, ActorState]]:
     """Yield the states of a standing motorcycle, and of a standing car after it."""
-    motorcycle = actor_of("motorcycle")
+    motorcycle = actor_of_manoeuvre("motorcycle")
     first = _Mover(START_M + values["distance_m"] + motorcycle.length, own_y + values["offset_m"], 0.0)
     second = _Mover(first.x + values["between_m"] + LENGTH_M, own_y, 0.0)
     while True:
@@ -192,7 +193,7 @@ def _detection_range(
     values: Mapping[str, float], speed: float, own_y: float, _next_y: float, step_s: float
 ) -> Iterator[dict[str, ActorState]]:
     """Yield the state of a standing motorcycle that appears when a constant speed has come as near as `seen_m`."""
-    motorcycle = actor_of("motorcycle")
+    motorcycle = actor_of_manoeuvre("motorcycle")
     standing = _Mover(START_M + values["distance_m"] + motorcycle.length, own_y + values["offset_m"], 0.0)
     step = 0
     while True:
