@@ -12,7 +12,7 @@ from crashhunt.base.errors import CrashhuntError, FormulaError, UnusableValueErr
 from crashhunt.base.text import format_time
 from crashhunt.oracles._protocol import REQUIREMENT, Finding
 from crashhunt.requirements import Monitor, parse
-from crashhunt.trial import Argument, Outcome
+from crashhunt.trial import MAX_ROBUSTNESS, Argument, Outcome
 from crashhunt.world import Event
 
 if TYPE_CHECKING:
@@ -94,19 +94,22 @@ class RequirementOracle:
 
     def complete(self, result: TrialResult) -> TrialResult:
         """Add the least robustness of all agents to the result, and let it take the place of criticality."""
-        values = [
-            self._requirement.robustness(watched.monitor.trace(), watched.monitor.step_length_s)
+        rows = tuple(
+            row
             for watched in self._watched
             if watched.monitor.count
-        ]
-        if result.outcome is Outcome.INVALID or not values:
+            for row in self._requirement.parts(watched.monitor.trace(), watched.monitor.step_length_s)
+        )
+        if result.outcome is Outcome.INVALID or not rows:
             return result
-        least = min(values)
+        least = min(map(max, rows))
         danger = 1.0 if least <= 0 else 1 / (1 + least)
         if result.robustness is not None:  # of another requirement, which may be nearer to its violation
             danger = max(danger, result.danger or 0.0)
         robustness = {**(result.robustness or {}), self._title: least if math.isfinite(least) else None}
-        return replace(result, robustness=robustness, danger=danger)
+        limited = tuple(tuple(max(-MAX_ROBUSTNESS, min(MAX_ROBUSTNESS, one)) for one in row) for row in rows)
+        conjuncts = {**(result.conjuncts or {}), self._title: limited}
+        return replace(result, robustness=robustness, danger=danger, conjuncts=conjuncts)
 
     def _unusable(self, error: CrashhuntError) -> UnusableValueError:
         what = "the requirement" if self._title == REQUIREMENT else f"the requirement {self._title}"

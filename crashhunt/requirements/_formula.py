@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
@@ -165,6 +165,30 @@ def nodes_of(node: Node) -> Iterator[Node]:
     yield node
     for child in children(node):
         yield from nodes_of(child)
+
+
+def conjuncts(formula: Formula) -> list[Formula]:
+    """Return formulas whose conjunction is the formula: those of ``and``, also below ``always`` and negated ``or``."""
+    return _split(formula, "and", ("always", "historically"))
+
+
+def disjuncts(formula: Formula) -> list[Formula]:
+    """Return formulas whose disjunction is the formula: those of ``or``, also below ``eventually`` and negations."""
+    return _split(formula, "or", ("eventually", "once"))
+
+
+def _split(formula: Formula, operator: str, temporal: tuple[str, str]) -> list[Formula]:
+    match formula:
+        case Join(operator=found, parts=parts) if found == operator:
+            return [one for part in parts for one in _split(part, operator, temporal)]
+        case Not(span=span, formula=Join(operator=found, parts=parts)) if found != operator:
+            return [one for part in parts for one in _split(Not(span, part), operator, temporal)]
+        case Not(formula=Not(formula=inner)):
+            return _split(inner, operator, temporal)
+        case Temporal(operator=found, formula=inner) if found in temporal:
+            return [replace(formula, formula=part) for part in _split(inner, operator, temporal)]
+        case _:
+            return [formula]
 
 
 def is_pointwise(formula: Formula) -> bool:

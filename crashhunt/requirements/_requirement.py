@@ -19,6 +19,8 @@ from crashhunt.requirements._formula import (
     Temporal,
     Truth,
     Until,
+    conjuncts,
+    disjuncts,
     is_pointwise,
     least_horizon_s,
     nodes_of,
@@ -109,6 +111,17 @@ class Requirement:
     ) -> NDArray[np.float64]:
         """Return the robustness at each sample; with `truth`, positive infinity for true, negative for false."""
         return self._evaluation(signals, step_length_s, truth=truth).values(self.formula)
+
+    def parts(self, signals: Mapping[str, object], step_length_s: float) -> tuple[tuple[float, ...], ...]:
+        """Return the robustness of the disjuncts of each conjunct; arguments and errors as in `robustness`.
+
+        The least of the greatest value of each row is the robustness of the requirement.
+        """
+        evaluation = self._evaluation(signals, step_length_s, truth=False)
+        return tuple(
+            tuple(float(evaluation.values(part)[0]) for part in disjuncts(conjunct))
+            for conjunct in conjuncts(self.formula)
+        )
 
     def require_known(self, known: Collection[str]) -> None:
         """Check that all signals are known.

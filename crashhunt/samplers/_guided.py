@@ -27,16 +27,19 @@ import math
 from bisect import bisect_left, bisect_right, insort
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from crashhunt.samplers._model import TRIALS, Model
+from crashhunt.samplers._signal_shapes import SignalShapes
 from crashhunt.samplers._space_filling import HaltonSampler
-from crashhunt.samplers._strategy import CRASHED, Draft, Elites
+from crashhunt.samplers._strategy import CRASHED, NEAREST, Draft, Elites
+from crashhunt.trial import MAX_ROBUSTNESS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -48,7 +51,7 @@ if TYPE_CHECKING:
     Seeds = NDArray[np.int64]
 
 
-_EVEN, _MODEL = "halton", "model"
+_EVEN, _MODEL, _OTHER = "halton", "model", "other model"
 
 
 # Basins: a trial belongs to the basin of the nearest more critical trial, unless that is far away (nearest-better
@@ -219,6 +222,7 @@ class Portfolio:
     def __init__(self, cube: Cube, space: Space, hunt: HuntFacts) -> None:
         self._dimensions = cube.dimensions
         self._even = HaltonSampler(space, hunt=hunt)
+        self._shapes = SignalShapes(cube.signals) if cube.signals else None
         self._model = Model(cube)
         self._unguided: list[float] = []  # scores, in order
         self._best = Elites(TRIALS)  # most critical trials without a crash
@@ -235,7 +239,7 @@ class Portfolio:
         if is_guided:
             self._earned += self._own_payoff(trial)
             self._counted += 1.0
-        else:
+        elif trial.origin != _OTHER:
             insort(self._unguided, trial.score)
         types, trials = self._found[is_guided]
         self._found[is_guided] = (types + (trial.crashed and self._known.is_new(trial)), trials + 1.0)
@@ -250,8 +254,13 @@ class Portfolio:
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft:
         """Return a proposal of the model, or the next point of the even search."""
+        if self._shapes is not None and place < len(self._shapes.corners):
+            return Draft(self._shapes.with_corner(self._even.point(place), place), origin=_EVEN)
         draft = self._guided(rng) if self._is_worthwhile(rng) else None
-        return replace(draft, origin=_MODEL) if draft else Draft(self._even.point(place), origin=_EVEN)
+        if draft is not None:
+            return replace(draft, origin=_MODEL)
+        point = self._even.point(place)
+        return Draft(point if self._shapes is None else self._shapes.with_shapes(point, rng), origin=_EVEN)
 
     def _is_worthwhile(self, rng: np.random.Generator) -> bool:
         """Draw whether the model finds more than the even search."""
@@ -310,6 +319,133 @@ class Portfolio:
         below, at_most = bisect_left(self._unguided, score), bisect_right(self._unguided, score)
         above = len(self._unguided) - at_most + 0.5 * (at_most - below)
         return math.log((len(self._unguided) + 1.0) / (above + 0.5))
+
+
+# Requirements: each conjunct of each requirement has a portfolio of its own, and a bandit chooses the next one.
+#
+# Robustness has the unit of its signals, so a minimum over conjuncts searches for the violation of one of them only
+# (the scale problem). Zhang, Hasuo and Arcaini, "Multi-armed bandits for Boolean connectives in hybrid system
+# falsification", CAV 2019, choose between the conjuncts by their progress. In a disjunction all parts must be violated,
+# so its parts are divided by the range that was seen of each, and the greatest counts.
+
+_SCALED_AFTER = 20  # trials from which the ranges are computed
+_MOST_ARMS = 16
+_FORGET = 0.95  # factor of earlier rewards of a conjunct at each of its proposals
+
+
+class _Arm:
+    """The search for the violation of one conjunct.
+
+    Args:
+        make: function that creates a portfolio.
+    """
+
+    def __init__(self, make: Callable[[], Portfolio]) -> None:
+        self._make = make
+        self._portfolio = make()
+        self._early: list[tuple[ScoredTrial, tuple[float, ...]]] = []
+        self._scales: NDArray[np.float64] | None = None
+        self._best = -1.0
+        self._gained, self._lost = 1.0, 1.0  # as in a uniform prior of the probability of progress
+
+    def tell(self, trial: ScoredTrial, parts: tuple[float, ...], *, is_own: bool) -> None:
+        """Learn from a trial in which the conjunct has the given robustness, by disjunct."""
+        if is_own:
+            self._gained, self._lost = _FORGET * self._gained, _FORGET * self._lost
+        if self._scales is None:
+            self._early.append((trial, parts))
+            if len(self._early) < _SCALED_AFTER:
+                self._portfolio.tell(self._scored(trial, parts))
+                return
+            self._scales = _scales([one for _, one in self._early])
+            self._portfolio, self._best = self._make(), -1.0
+            for earlier, earlier_parts in self._early:
+                scored = self._scored(earlier, earlier_parts)
+                self._portfolio.tell(scored)
+                self._best = max(self._best, scored.score)
+            return
+        scored = self._scored(trial, parts)
+        if is_own:
+            self._gained += scored.score > self._best
+            self._lost += scored.score <= self._best
+        self._best = max(self._best, scored.score)
+        self._portfolio.tell(scored)
+
+    def propose(self, place: int, rng: np.random.Generator) -> Draft:
+        """Return a proposal of the conjunct's portfolio."""
+        return self._portfolio.propose(place, rng)
+
+    def draw(self, rng: np.random.Generator) -> float:
+        """Draw the probability of progress of the next proposal (Thompson 1933)."""
+        return float(rng.beta(self._gained + 1.0, self._lost + 1.0))
+
+    def _scored(self, trial: ScoredTrial, parts: tuple[float, ...]) -> ScoredTrial:
+        if trial.crashed:
+            return trial
+        scales = self._scales if self._scales is not None else np.ones(len(parts))
+        distance = max(0.0, float(np.max(np.array(parts) / scales)))
+        return replace(trial, score=min(1.0 / (1.0 + distance), NEAREST))
+
+
+def _scales(rows: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
+    """Return the median of the positive finite values of each column; 1 without any."""
+    columns = np.array(rows).T
+    medians = [np.median(kept) if len(kept := of[(of > 0) & (of < MAX_ROBUSTNESS)]) else 1.0 for of in columns]
+    return np.array(medians)
+
+
+class Arms:
+    """Divides the trials between the conjuncts of requirements; without requirements, one portfolio proposes all.
+
+    Args:
+        cube: as in `Portfolio`.
+        space: as in `Portfolio`.
+        hunt: as in `Portfolio`.
+    """
+
+    def __init__(self, cube: Cube, space: Space, hunt: HuntFacts) -> None:
+        self._make: Callable[[], Portfolio] = partial(Portfolio, cube, space, hunt)
+        self._whole = self._make()
+        self._arms: dict[str, _Arm] = {}
+        self._violated: set[str] = set()
+
+    def tell(self, trial: ScoredTrial) -> None:
+        """Learn from a trial."""
+        if not trial.conjuncts and not self._arms:
+            self._whole.tell(trial)
+            return
+        if trial.violated:
+            self._violated.add(trial.violated)
+        for number, conjunct in enumerate(trial.conjuncts):
+            name = f"{conjunct.requirement}#{number}"
+            if name not in self._arms:
+                if len(self._arms) >= _MOST_ARMS:
+                    continue
+                self._arms[name] = _Arm(self._make)
+            if (
+                trial.crashed
+                and trial.violated
+                and not (trial.violated == conjunct.requirement and max(conjunct.parts) <= 0)
+            ):
+                continue  # the trial ended at the violation of something else, so the values are not those of its end
+            is_own = len(trial.conjuncts) == 1 or trial.origin == f"{_MODEL} {name}"
+            origin = trial.origin
+            if origin.startswith(_MODEL):
+                origin = _MODEL if is_own else _OTHER
+            self._arms[name].tell(replace(trial, origin=origin), conjunct.parts, is_own=is_own and origin == _MODEL)
+
+    def propose(self, place: int, rng: np.random.Generator) -> Draft:
+        """Return a proposal of the portfolio whose conjunct is most likely to make progress."""
+        if not self._arms:
+            return self._whole.propose(place, rng)
+        names = [name for name in self._arms if name.rpartition("#")[0] not in self._violated] or [*self._arms]
+        if len(names) == 1:
+            name = names[0]
+        else:
+            chances = [self._arms[name].draw(rng) for name in names]
+            name = names[int(np.argmax(chances))]
+        draft = self._arms[name].propose(place, rng)
+        return replace(draft, origin=f"{_MODEL} {name}") if draft.origin == _MODEL and len(self._arms) > 1 else draft
 
 
 def _in_order(trials: Sequence[ScoredTrial]) -> list[ScoredTrial]:

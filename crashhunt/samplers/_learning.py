@@ -99,12 +99,12 @@ class CmaEsSampler(Learning):
 
 
 class GuidedSampler(Learning):
-    """Proposes trials by a model of criticality, whose share of the trials depends on its success (`Portfolio`)."""
+    """Proposes trials by models of criticality or robustness, whose share of the trials depends on their success."""
 
     origin = "guided"
     version = 5  # 2 excluded basins of known crashes, 3 had no mutation, 4 had no niches, 5 has another model
 
     def _make(self, space: Space) -> Strategy:
-        from crashhunt.samplers._guided import Portfolio  # its linear algebra takes a fifth of a second to import
+        from crashhunt.samplers._guided import Arms  # its linear algebra takes a fifth of a second to import
 
-        return Portfolio(self._cube, space, self._hunt)
+        return Arms(self._cube, space, self._hunt)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from crashhunt.samplers._signal_shapes import SignalShapes
 from crashhunt.samplers._strategy import Draft, reflected
 
 if TYPE_CHECKING:
@@ -123,6 +124,8 @@ _CANDIDATES = 384  # points from which a proposal is chosen: their worths take a
 
 _ANYWHERE, _AROUND, _NEAR = 1, 2, 3  # odds of candidates: anywhere, around all parents, near one parent
 _KEEP_SEED = 0.5  # probability that a candidate keeps the seed of its parent: a fair coin
+_KEEP_OTHERS = 0.5  # probability that such a candidate keeps the other arguments of its parent
+_SHAPED = 0.8  # share of candidates that change the signals of a parent, if the space has signals
 _AMBITION = 1.0  # greatest ambition, in standard deviations of scores; it is drawn from 0 on
 _FIRST_ODDS = -2.0  # logarithm of the odds of each share where the fit begins: a share of 0.12
 _STARTS = 5  # length scales at which the fit begins again, each half of the one before
@@ -187,6 +190,7 @@ class Model:
 
     def __init__(self, cube: Cube) -> None:
         self._cube = cube
+        self._shapes = SignalShapes(cube.signals) if cube.signals else None
         self._told = self._turn = 0
         self.parameters = _Parameters(np.zeros(cube.dimensions), _FIRST_ODDS, _FIRST_ODDS)
         self.trials: Sequence[ScoredTrial] = ()
@@ -296,4 +300,10 @@ class Model:
         around = np.where(categorical, others, reflected(around))
         how = rng.integers(_ANYWHERE + _AROUND + _NEAR, size=(_CANDIDATES, 1))
         points = np.where(how < _ANYWHERE, drawn, np.where(how < _ANYWHERE + _AROUND, around, points))
+        if self._shapes is not None:
+            shaped = round(_SHAPED * _CANDIDATES)
+            # Other arguments are those of the parent, or as drawn above.
+            others = self._shapes.with_signals_of(points[:shaped], centers[:shaped])
+            bases = np.where(rng.random((shaped, 1)) < _KEEP_OTHERS, centers[:shaped], others)
+            points[:shaped] = self._shapes.changed(bases, rng)
         return points, places, (rng.random(_CANDIDATES) < _KEEP_SEED) & (how[:, 0] >= _ANYWHERE)

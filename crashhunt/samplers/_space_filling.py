@@ -9,7 +9,7 @@ import numpy as np
 
 from crashhunt.base.errors import UsageError
 from crashhunt.samplers._protocol import HuntFacts, Proposal
-from crashhunt.trial import Choice
+from crashhunt.trial import Choice, point_of_signal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -124,6 +124,16 @@ class Cube:
         """Of which dimensions the values have no order."""
         self.options = tuple(len(known.options) if isinstance(known, Choice) else 0 for known in self._axes.values())
         """Of how many values a dimension is a choice; 0 of those that have an order."""
+        self.signals = self._find_signals()
+        """For each signal, the dimensions of its points, in the order of time."""
+
+    def _find_signals(self) -> tuple[tuple[int, ...], ...]:
+        found: dict[Key, list[tuple[int, int]]] = {}
+        for dimension, (agent, name) in enumerate(self._axes):
+            part = point_of_signal(name)
+            if part is not None and (agent, part[0]) in self._space:
+                found.setdefault((agent, part[0]), []).append((part[1], dimension))
+        return tuple(tuple(dimension for _, dimension in sorted(points)) for points in found.values())
 
     @property
     def dimensions(self) -> int:

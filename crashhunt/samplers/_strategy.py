@@ -6,7 +6,7 @@ import math
 import re
 from bisect import insort
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -58,8 +58,21 @@ def reflected(point: NDArray[np.float64]) -> NDArray[np.float64]:
 CRASHED = 1.0
 PLAIN_EVERY = 5
 """Of the trials of a hunt that learns, one of so many is plain random, for an unbiased crash rate."""
-_NEAREST = math.nextafter(CRASHED, 0.0)  # upper bound of the score of a trial without a crash
+NEAREST = math.nextafter(CRASHED, 0.0)
+"""Upper bound of the score of a trial without a crash."""
 _NUMBER_AT_END = re.compile(r"[\W_]*\d+\W*$")  # of a lane id: the lane's index on its road
+
+
+class Conjunct(NamedTuple):
+    """A conjunct of a requirement in a trial.
+
+    Args:
+        requirement: name of the requirement.
+        parts: robustness of its disjuncts; the conjunct is violated if all of them are negative.
+    """
+
+    requirement: str
+    parts: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +87,8 @@ class ScoredTrial:
         origin: the strategy that proposed the trial.
         parent: number of the trial from which it was derived; None if there is none.
         kind: type of the crash, as far as the result shows it; empty if it does not.
+        conjuncts: the conjuncts of the requirements of the hunt.
+        violated: name of the requirement that the trial violates; empty if there is none.
     """
 
     number: int
@@ -83,6 +98,8 @@ class ScoredTrial:
     origin: str = ""
     parent: int | None = None
     kind: str = ""
+    conjuncts: tuple[Conjunct, ...] = ()
+    violated: str = ""
 
     @property
     def crashed(self) -> bool:
@@ -97,7 +114,7 @@ def scored_trial(result: TrialResult, cube: Cube, hunt: HuntFacts) -> ScoredTria
     elif result.danger is None or result.outcome.category != "no crash":
         return None  # a crash that is not hunted says nothing about the crashes that are
     else:
-        score = min(max(result.danger, 0.0), _NEAREST)
+        score = min(max(result.danger, 0.0), NEAREST)
     spec = result.spec
     kind = _kind(result) if score == CRASHED else ""
     return ScoredTrial(
@@ -108,6 +125,10 @@ def scored_trial(result: TrialResult, cube: Cube, hunt: HuntFacts) -> ScoredTria
         origin=spec.origin,
         parent=spec.parent,
         kind=kind,
+        conjuncts=tuple(
+            Conjunct(requirement, parts) for requirement, rows in (result.conjuncts or {}).items() for parts in rows
+        ),
+        violated=result.event.name if kind and result.event is not None else "",
     )
 
 

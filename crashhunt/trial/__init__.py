@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         InputSignal as InputSignal,
         expand_signal as expand_signal,
         fold_signals as fold_signals,
+        point_of_signal as point_of_signal,
     )
     from ._outcome import (
         CRASHES as CRASHES,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
         outcome_of as outcome_of,
     )
     from ._result import (
+        MAX_ROBUSTNESS as MAX_ROBUSTNESS,
         Branch as Branch,
         Branches as Branches,
         Forced as Forced,

@@ -30,7 +30,7 @@ _KINDS: Final = ("constant", "linear", "pchip")
 _MAX_POINTS: Final = 200
 _DEFAULT_POINTS: Final = 5
 _STORED: Final = re.compile(r"signal:(constant|linear|pchip):(\d+):([0-9.e+-]+)")
-_POINT: Final = re.compile(r"(.+)\[\d+\]")
+_POINT: Final = re.compile(r"(.+)\[(\d+)\]")
 _NOTATION: Final = "write signal:LOW:HIGH:points=N:kind=constant|linear|pchip, such as signal:0:1:points=5"
 
 
@@ -110,6 +110,12 @@ def expand_signal(name: str, spec: str, duration_s: float, *, where: str) -> dic
     return {name: f"{_PREFIX}{settings['kind']}:{count}:{duration_s!r}", **points}
 
 
+def point_of_signal(name: str) -> tuple[str, int] | None:
+    """Return the signal and the number of a point, such as ``throttle`` and 2 for ``throttle[2]``; else None."""
+    match = _POINT.fullmatch(name)
+    return None if match is None else (match[1], int(match[2]))
+
+
 def fold_signals(arguments: Mapping[str, Value]) -> dict[str, object]:
     """Return arguments with an `InputSignal` in place of each signal and its points.
 
@@ -117,7 +123,7 @@ def fold_signals(arguments: Mapping[str, Value]) -> dict[str, object]:
     """
     found: dict[str, object] = {}
     for name, value in arguments.items():
-        if (point := _POINT.fullmatch(name)) is not None and point[1] in arguments:
+        if (point := point_of_signal(name)) is not None and point[0] in arguments:
             continue
         match = _STORED.fullmatch(value) if isinstance(value, str) else None
         if match is None or f"{name}[0]" not in arguments:

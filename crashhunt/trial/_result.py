@@ -18,6 +18,10 @@ _NOT_ALL_ANSWERED = written_if(lambda branches: branches.unanswered)
 _NOT_ALL_ASKED = written_if(lambda stress: stress.margin is None)
 
 
+MAX_ROBUSTNESS = 1e300
+"""Represents an infinite robustness of a part of a requirement."""
+
+
 # Branches: forks of a trial that continue with other disturbances.
 
 
@@ -251,6 +255,8 @@ class TrialResult(Serializable):
         forced: The results of forks with a forced first disturbance; None if there were none.
         robustness: The robustness of each requirement by name, negative if it is violated; None if it is infinite. The
             mapping is None if the trial had no requirements.
+        conjuncts: For each requirement, a row per conjunct with the robustness of its disjuncts. Infinite values are
+            `MAX_ROBUSTNESS`, with their sign.
     """
 
     spec: TrialSpec
@@ -280,12 +286,13 @@ class TrialResult(Serializable):
     step_length_s: float | None = field(default=None, metadata={**OMIT_DEFAULT, **null_is(None)})
     forced: Forced | None = field(default=None, metadata=OMIT_DEFAULT)
     robustness: Mapping[str, float | None] | None = field(default=None, metadata=OMIT_DEFAULT)
+    conjuncts: Mapping[str, tuple[tuple[float, ...], ...]] | None = field(default=None, metadata=OMIT_DEFAULT)
 
     json_keys = (
         "steps", "sim_time_s", "digest", "wall_s", "setup_s", "worker", "kept", "outcome", "category?", "spec",
         "closest", "collision", "failure", "escape", "event", "events", "disturbances", "log_likelihood", "danger",
         "stress", "branches", "setup_steps", "why_no_escape", "driven_m", "driven_s",
-        "step_length_s", "forced", "robustness",
+        "step_length_s", "forced", "robustness", "conjuncts",
     )  # fmt: skip
 
     @classmethod

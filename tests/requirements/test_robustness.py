@@ -30,6 +30,7 @@ def assert_as_defined(seed: int, depth: int = 3, count: int = 12, step_s: float 
     values = requirement.values(signals, step_s)
     assert np.broadcast_to(values, length).tolist() == [defined.value(tree, at)[0] for at in range(length)]
     assert requirement.robustness(signals, step_s) == values[0]
+    assert min(map(max, requirement.parts(signals, step_s))) == values[0]
     assert requirement.satisfied(signals, step_s) == (ByDefinition(trace, truth=True).value(tree, 0)[0] > 0)
 
 
@@ -156,3 +157,18 @@ def test_a_trace_that_cannot_be_evaluated_is_refused_in_one_line(text, signals, 
 def test_a_step_length_that_is_not_above_zero_is_refused(step_s):
     with pytest.raises(CrashhuntError, match="step_length_s is"):
         parse("x > 1").robustness({"x": [1.0]}, step_s)
+
+
+@pytest.mark.parametrize(
+    ("text", "sizes"),
+    [
+        ("always (a > 0 and b > 0)", [1, 1]),
+        ("(always (a > 0) -> always (b > 0)) and c > 0", [2, 1]),
+        ("not (a > 0 or eventually (b > 0 or c > 0))", [1, 1]),
+        ("eventually (a > 0 or (b > 0 and c > 0))", [2]),
+        ("a > 0 until b > 0", [1]),
+    ],
+)
+def test_conjuncts_and_disjuncts_are_those_that_a_minimum_would_mix(text, sizes):
+    signals = {"a": np.array([1.0, 2.0]), "b": np.array([-1.0, 3.0]), "c": np.array([0.5, -0.5])}
+    assert [len(row) for row in parse(text).parts(signals, 1.0)] == sizes
