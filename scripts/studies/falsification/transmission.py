@@ -4,32 +4,30 @@ A car with an engine, a torque converter and four gears is driven by throttle an
 Abbas and Fainekos, "Benchmarks for temporal logic requirements for automotive systems", ARCH 2014. Integration: Heun's
 method with a fixed step of 0.01 s, as long as the step of the competition's model.
 
-``info`` has the greatest speed (mph) and engine speed (1/min) since the last step. AT5, which compares gears at
-distances of 0.001 s, is not included.
+``info`` has speed (mph), engine speed (1/min) and gear after each step, which is a step of the integration. AT5 begins
+its windows at 0.01 s in place of 0.001 s: the gear is constant within a step.
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
+from chasing_cars import NUMBA, njit
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
 DURATION_S = 30.0
-STEP_S = 0.1
-_INTEGRATION_S = 0.01
+STEP_S = 0.01
 _SHIFT_S = 0.08
 _ENGINE_INERTIA, _VEHICLE_INERTIA = 0.0219914882835559, 12.09414785731247
 _FINAL_DRIVE, _FRICTION, _DRAG = 3.23, 40.0, 0.02
 _MPH = 2 * math.pi * 60 / 5280
 _MIN_ENGINE_RPM, _MAX_ENGINE_RPM = 600.0, 6000.0
+_MAX_THROTTLE, _MAX_BRAKE = 100.0, 325.0
 _RATIOS = (2.393, 1.450, 1.000, 0.677)
 
 _THROTTLES = (0, 20, 30, 40, 50, 60, 70, 80, 90, 100)
@@ -64,13 +62,101 @@ _UP_THROTTLES, _DOWN_THROTTLES = (0, 25, 35, 50, 90, 100), (0, 5, 40, 50, 90, 10
 _UP = ((10, 10, 15, 23, 40, 40), (30, 30, 30, 41, 70, 70), (50, 50, 50, 60, 100, 100))
 _DOWN = ((5, 5, 5, 5, 30, 30), (20, 20, 25, 30, 50, 50), (35, 35, 40, 50, 80, 80))
 
+_TABLES = tuple(
+    np.array(table, float) if NUMBA else table
+    for table in (
+        _RATIOS, _THROTTLES, _ENGINE_RPM, _TORQUE, _SPEED_RATIOS, _K_FACTORS, _TORQUE_RATIOS, _UP_THROTTLES, _UP,
+        _DOWN_THROTTLES, _DOWN,
+    )
+)  # fmt: skip
+
+_AT6 = {"a": (4, 35), "b": (8, 50), "c": (20, 65)}
 REQUIREMENTS = {
     "AT1": "always[0:20] (speed < 120)",
     "AT2": "always[0:10] (rpm < 4750)",
-    "AT6a": "always[0:30] (rpm < 3000) -> always[0:4] (speed < 35)",
-    "AT6b": "always[0:30] (rpm < 3000) -> always[0:8] (speed < 50)",
-    "AT6c": "always[0:30] (rpm < 3000) -> always[0:20] (speed < 65)",
+    **{
+        f"AT5{gear}": f"always[0:30] ((gear != {gear} and eventually[0.01:0.1] (gear == {gear})) -> "
+        f"eventually[0.01:0.1] always[0:2.5] (gear == {gear}))"
+        for gear in range(1, 5)
+    },
+    **{
+        f"AT6{name}": f"always[0:30] (rpm < 3000) -> always[0:{end_s}] (speed < {limit})"
+        for name, (end_s, limit) in _AT6.items()
+    },
 }
+REQUIREMENTS["AT6abc"] = " and ".join(f"({REQUIREMENTS[f'AT6{name}']})" for name in _AT6)
+
+SIGNALS = ("speed", "rpm", "gear")
+
+
+@njit
+def _at(places, values, place):  # type: ignore[no-untyped-def]
+    """Return a value between those of a table, or beyond its ends, by a straight line."""
+    number = 0
+    while number < len(places) - 2 and places[number + 1] <= place:
+        number += 1
+    share = (place - places[number]) / (places[number + 1] - places[number])
+    return values[number] + share * (values[number + 1] - values[number])
+
+
+@njit
+def _slopes(engine, wheel, gear, throttle, brake, tables):  # type: ignore[no-untyped-def]
+    """Return the derivatives of the engine's speed and of the wheel's speed."""
+    ratios, throttles, engine_rpm, torques, speed_ratios, k_factors, torque_ratios = tables[:7]
+    ratio = ratios[gear - 1]
+    speed_ratio = _FINAL_DRIVE * ratio * wheel / engine
+    impeller = (engine / _at(speed_ratios, k_factors, speed_ratio)) ** 2
+    output = impeller * _at(speed_ratios, torque_ratios, speed_ratio) * ratio
+    row = 0
+    while row < len(throttles) - 2 and throttles[row + 1] <= throttle:
+        row += 1
+    below, above = _at(engine_rpm, torques[row], engine), _at(engine_rpm, torques[row + 1], engine)
+    share = (throttle - throttles[row]) / (throttles[row + 1] - throttles[row])
+    torque = below + share * (above - below)
+    speed = wheel * _MPH
+    sign = (1.0 if speed > 0 else 0.0) - (1.0 if speed < 0 else 0.0)
+    load = sign * (brake + _FRICTION + _DRAG * speed * speed)
+    return (torque - impeller) / _ENGINE_INERTIA, (_FINAL_DRIVE * output - load) / _VEHICLE_INERTIA
+
+
+@njit
+def _advance(state, throttle, brake, tables):  # type: ignore[no-untyped-def]
+    """Shift, and integrate one step: the state is engine, wheel, gear, direction of a pending shift and its time."""
+    engine, wheel, gear, direction, since_s = state[0], state[1], int(state[2]), state[3], state[4]
+    up_throttles, up, down_throttles, down = tables[7:]
+    speed, wanted, dt = wheel * _MPH, 0.0, STEP_S
+    if gear < 4 and speed > _at(up_throttles, up[gear - 1], throttle):
+        wanted = 1.0
+    elif gear > 1 and speed < _at(down_throttles, down[gear - 2], throttle):
+        wanted = -1.0
+    since_s = since_s + dt if wanted != 0 and wanted == direction else 0.0
+    direction = wanted
+    if wanted != 0 and since_s >= _SHIFT_S - 1e-9:
+        gear += int(wanted)
+        direction, since_s = 0.0, 0.0
+    first = _slopes(engine, wheel, gear, throttle, brake, tables)
+    second = _slopes(engine + dt * first[0], wheel + dt * first[1], gear, throttle, brake, tables)
+    engine += dt / 2 * (first[0] + second[0])
+    state[0] = min(_MAX_ENGINE_RPM, max(_MIN_ENGINE_RPM, engine))
+    state[1] = wheel + dt / 2 * (first[1] + second[1])
+    state[2], state[3], state[4] = float(gear), direction, since_s
+
+
+@njit
+def _simulate(throttle, brake, tables, found):  # type: ignore[no-untyped-def]
+    """Integrate a whole trial; each row of `found` is a sample."""
+    state = np.array([1000.0, 0.0, 1.0, 0.0, 0.0])
+    found[0] = np.array([0.0, 1000.0, 1.0])
+    for step in range(len(throttle)):
+        _advance(state, throttle[step], brake[step], tables)
+        found[step + 1, 0], found[step + 1, 1], found[step + 1, 2] = state[1] * _MPH, state[0], state[2]
+
+
+def simulate(throttle: NDArray[np.float64], brake: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Return the trace of a trial with the given inputs in each step, as the environment produces it."""
+    found = np.empty((len(throttle) + 1, 3))
+    _simulate(_MAX_THROTTLE * throttle, _MAX_BRAKE * brake, _TABLES, found)
+    return dict(zip(SIGNALS, found.T.copy(), strict=True))
 
 
 class Transmission(gymnasium.Env[Any, Any]):
@@ -84,64 +170,16 @@ class Transmission(gymnasium.Env[Any, Any]):
     ) -> tuple[NDArray[np.float64], dict[str, float]]:
         """Put the car at rest, in the first gear."""
         super().reset(seed=seed)
-        self._engine, self._wheel, self._gear = 1000.0, 0.0, 1
-        self._direction, self._since_s = 0, 0.0
-        return self._observation(), {"speed": 0.0, "rpm": 1000.0}
+        state = [1000.0, 0.0, 1.0, 0.0, 0.0]
+        self._state = np.array(state) if NUMBA else state
+        return self._seen()
 
     def step(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, float]]:
         """Integrate one step with constant throttle and brake."""
-        throttle, brake = 100 * float(action[0]), 325 * float(action[1])
-        speed = rpm = -math.inf
-        for _ in range(round(STEP_S / _INTEGRATION_S)):
-            self._shift(throttle)
-            self._integrate(throttle, brake)
-            speed, rpm = max(speed, self._wheel * _MPH), max(rpm, self._engine)
-        return self._observation(), 0.0, False, False, {"speed": speed, "rpm": rpm}
+        _advance(self._state, _MAX_THROTTLE * float(action[0]), _MAX_BRAKE * float(action[1]), _TABLES)
+        observation, info = self._seen()
+        return observation, 0.0, False, False, info
 
-    def _observation(self) -> NDArray[np.float64]:
-        return np.array([self._wheel * _MPH, self._engine, self._gear])
-
-    def _shift(self, throttle: float) -> None:
-        """Change the gear after the speed was beyond a threshold for some time."""
-        speed, gear = self._wheel * _MPH, self._gear
-        if gear < 4 and speed > _at(_UP_THROTTLES, _UP[gear - 1], throttle):
-            wanted = 1
-        elif gear > 1 and speed < _at(_DOWN_THROTTLES, _DOWN[gear - 2], throttle):
-            wanted = -1
-        else:
-            wanted = 0
-        self._since_s = self._since_s + _INTEGRATION_S if wanted and wanted == self._direction else 0.0
-        self._direction = wanted
-        if wanted and self._since_s >= _SHIFT_S - 1e-9:
-            self._gear += wanted
-            self._direction, self._since_s = 0, 0.0
-
-    def _integrate(self, throttle: float, brake: float) -> None:
-        engine, wheel, dt = self._engine, self._wheel, _INTEGRATION_S
-        first = self._slopes(engine, wheel, throttle, brake)
-        second = self._slopes(engine + dt * first[0], wheel + dt * first[1], throttle, brake)
-        engine += dt / 2 * (first[0] + second[0])
-        self._engine = min(_MAX_ENGINE_RPM, max(_MIN_ENGINE_RPM, engine))
-        self._wheel = wheel + dt / 2 * (first[1] + second[1])
-
-    def _slopes(self, engine: float, wheel: float, throttle: float, brake: float) -> tuple[float, float]:
-        """Return the derivatives of the engine's speed and of the wheel's speed."""
-        ratio = _RATIOS[self._gear - 1]
-        speed_ratio = _FINAL_DRIVE * ratio * wheel / engine
-        impeller = (engine / _at(_SPEED_RATIOS, _K_FACTORS, speed_ratio)) ** 2
-        output = impeller * _at(_SPEED_RATIOS, _TORQUE_RATIOS, speed_ratio) * ratio
-        row = min(len(_THROTTLES) - 2, max(0, bisect_right(_THROTTLES, throttle) - 1))
-        below, above = (_at(_ENGINE_RPM, _TORQUE[number], engine) for number in (row, row + 1))
-        share = (throttle - _THROTTLES[row]) / (_THROTTLES[row + 1] - _THROTTLES[row])
-        torque = below + share * (above - below)
-        speed = wheel * _MPH
-        sign = (speed > 0) - (speed < 0)
-        load = sign * (brake + _FRICTION + _DRAG * speed * speed)
-        return (torque - impeller) / _ENGINE_INERTIA, (_FINAL_DRIVE * output - load) / _VEHICLE_INERTIA
-
-
-def _at(places: Sequence[float], values: Sequence[float], place: float) -> float:
-    """Return a value between those of a table, or beyond its ends, by a straight line."""
-    number = min(len(places) - 2, max(0, bisect_right(places, place) - 1))
-    share = (place - places[number]) / (places[number + 1] - places[number])
-    return values[number] + share * (values[number + 1] - values[number])
+    def _seen(self) -> tuple[NDArray[np.float64], dict[str, float]]:
+        values = [float(self._state[1]) * _MPH, float(self._state[0]), float(self._state[2])]
+        return np.array(values), dict(zip(SIGNALS, values, strict=True))
