@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
-from crashhunt.oracles import check_requirement, requirement_oracles
+from crashhunt.oracles import REQUIREMENT, check_requirement, requirement_oracles
 
 if TYPE_CHECKING:
     from crashhunt.plans._settings import Request
@@ -35,3 +36,19 @@ def chosen_requirements(request: Request, scenario: Scenario) -> list[str]:
     for oracle in found:
         check_requirement(oracle, step_s, request.max_steps, option)
     return found
+
+
+def without_refuted_notes(scenario: Scenario, requirements: list[str]) -> Scenario:
+    """Return the scenario without the notes that do not apply if there is a requirement.
+
+    Args:
+        scenario: the scenario; if it has requirements itself, no such note was made.
+        requirements: the requirements of the hunt.
+    """
+    if not requirements or scenario.requirement:
+        return scenario
+    with_one = replace(scenario, requirement={REQUIREMENT: "true"})
+    made, apply = (
+        {note for backend in one.backends.values() for note in backend.notes(one)} for one in (scenario, with_one)
+    )
+    return replace(scenario, notes=tuple(note for note in scenario.notes if note in apply or note not in made))

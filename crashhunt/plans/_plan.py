@@ -24,7 +24,7 @@ from crashhunt.native import HOW_TO_REBUILD, outdated_modules
 from crashhunt.oracles import ORACLES_OF_ACTORS, chosen_oracles, oracle_name, outcomes_brought
 from crashhunt.plans._chosen_actions import chosen_actions, notes_on_actions, refuse_late_plans
 from crashhunt.plans._chosen_observations import chosen_observations
-from crashhunt.plans._chosen_requirements import chosen_requirements
+from crashhunt.plans._chosen_requirements import chosen_requirements, without_refuted_notes
 from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code, notes_on_programs, with_reuse
 from crashhunt.plans._run_options import TrialOptions
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
@@ -324,7 +324,9 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     signatures = {agent: code.signatures[setup.agent] for agent, setup in scenario.agents.items()}
     acting = chosen_actions(request.action, scenario, signatures)
     scenario = _agents_in(scenario, acting)
-    oracles = chosen_oracles([*request.oracles, *chosen_requirements(request, scenario)], code.oracles)
+    requirements = chosen_requirements(request, scenario)
+    oracles = chosen_oracles([*request.oracles, *requirements], code.oracles)
+    scenario = without_refuted_notes(scenario, requirements)
     brought = outcomes_brought(oracles, code.oracles)
     crash_on, limits = parse_crash_on(request.crash_on, brought)
     if crash_on == CRASHES:  # the default

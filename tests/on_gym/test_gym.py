@@ -19,6 +19,7 @@ from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, S
 from crashhunt.gym import GymSimulator
 from crashhunt.gym._descriptor import BACKEND, CrashRule, GymSetup
 from crashhunt.oracles import ReportedCollision
+from crashhunt.plans import Request, plan
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.testing import SimulatorContract
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
@@ -275,6 +276,16 @@ def test_scenario_without_a_crash_rule_has_a_note():
         assert (
             found == ["gym.crash has no rule, so only failures of the agent and of the environment are crashes"] * count
         )
+
+
+def test_a_hunt_for_a_requirement_has_no_note_on_a_missing_crash_rule(tmp_path):
+    (tmp_path / "scenario.toml").write_text(
+        'schema = 1\nsimulator = "gym"\ngym.id = "CartPole-v1"\nagents.cart.agent = "random"\n'
+    )
+    request = Request(scenario=tmp_path, trials=1, max_steps=9)
+    assert [note for note in plan(request)[0].notes if "gym.crash" in note]
+    calm = replace(request, requirements=("always (observation[0] < 1)",))
+    assert not [note for note in plan(calm)[0].notes if "gym.crash" in note]
 
 
 def test_keys_that_the_scenario_names_are_reported_as_present_or_absent(tmp_path):

@@ -126,8 +126,8 @@ def result_of(
 
 def is_confirmed(name: str, spec: TrialSpec) -> bool:
     """Return whether the inputs violate a requirement of the cars in a simulation with finer steps, too."""
-    inputs = inputs_of(spec, chasing_cars.STEP_S, chasing_cars.DURATION_S)
-    trace = chasing_cars.simulate(*inputs, integration_s=_FINER_S)
+    throttle, brake = inputs_of(spec, chasing_cars.STEP_S, chasing_cars.DURATION_S)
+    trace = chasing_cars.simulate(throttle, brake, integration_s=_FINER_S)
     return not parse(chasing_cars.REQUIREMENTS[name]).satisfied(trace, chasing_cars.STEP_S)
 
 

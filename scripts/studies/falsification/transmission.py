@@ -75,7 +75,7 @@ REQUIREMENTS = {
     "AT1": "always[0:20] (speed < 120)",
     "AT2": "always[0:10] (rpm < 4750)",
     **{
-        f"AT5{gear}": f"always[0:30] ((gear != {gear} and eventually[0.01:0.1] (gear == {gear})) -> "
+        f"AT5{gear}": f"always ((gear != {gear} and eventually[0.01:0.1] (gear == {gear})) -> "
         f"eventually[0.01:0.1] always[0:2.5] (gear == {gear}))"
         for gear in range(1, 5)
     },
