@@ -61,7 +61,13 @@ if TYPE_CHECKING:
         most_dangerous as most_dangerous,
         visible_from as visible_from,
     )
-    from ._fault import Fault as Fault, Verdict as Verdict, fault_of as fault_of
+    from ._fault import (
+        Fault as Fault,
+        Verdict as Verdict,
+        fault_of as fault_of,
+        stop_lines_of as stop_lines_of,
+        yielding_actor as yielding_actor,
+    )
     from ._judgement import (
         INTERRUPTED as INTERRUPTED,
         Attempt as Attempt,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.crashes._contact_record import ContactRecord
     from crashhunt.recording import Recording
-    from crashhunt.world import RightOfWay
+    from crashhunt.world import RightOfWay, StopLine
 
 
 # The rules that assign the fault of a collision. A rule returns a finding only if it is certain.
@@ -302,6 +302,28 @@ def _standing(case: ContactRecord) -> FaultFinding | None:
 
 def _right_of_way(case: ContactRecord) -> FaultFinding | None:
     """Blame the vehicle that had to yield according to the map, at junctions without traffic lights."""
+    found = _yielding(case)
+    if found is None:
+        return None
+    yields, junction = found
+    goes = case.partner(yields)
+    if float(case.way(goes).speeds.min()) < STANDS_MPS or case.drifted(yields) or case.drifted(goes):
+        return None  # who had stood in the junction may have been let through
+    if float(case.way(yields).speeds[case.times <= _CLEARS_S].max(initial=0.0)) < STANDS_MPS:
+        return None  # who has stood there for so long could be seen
+    if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKING_SPEED_MPS:
+        return None  # a vehicle that starts off must let the vehicle inside the junction clear it first
+    words = f"{yields} had to give way to {goes} at the junction {junction}"
+    return FaultFinding(
+        rule="right of way",
+        blames=_name_of(case, yields),
+        words=words,
+        source="the map of the scenario; Vienna, article 18; StVO § 8",
+    )
+
+
+def _yielding(case: ContactRecord) -> tuple[str, str] | None:
+    """Return the actor that the map's rules order to yield to the other one, and the junction; None if unknown."""
     rights = case.right_of_way
     if rights is None or case.turn < _MAX_MERGE_ANGLE_RAD or not case.before:
         return None
@@ -315,20 +337,7 @@ def _right_of_way(case: ContactRecord) -> FaultFinding | None:
     gives = {(pair in rights.gives_way, pair[::-1] in rights.gives_way) for pair in pairs}
     if gives not in ({(True, False)}, {(False, True)}):
         return None  # both, neither, or it depends on where they were going
-    yields, goes = (case.agent, case.other) if gives == {(True, False)} else (case.other, case.agent)
-    if float(case.way(goes).speeds.min()) < STANDS_MPS or case.drifted(yields) or case.drifted(goes):
-        return None  # who had stood in the junction may have been let through
-    if float(case.way(yields).speeds[case.times <= _CLEARS_S].max(initial=0.0)) < STANDS_MPS:
-        return None  # who has stood there for so long could be seen
-    if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKING_SPEED_MPS:
-        return None  # a vehicle that starts off must let the vehicle inside the junction clear it first
-    words = f"{yields} had to give way to {goes} at the junction {links[0].junction}"
-    return FaultFinding(
-        rule="right of way",
-        blames=_name_of(case, yields),
-        words=words,
-        source="the map of the scenario; Vienna, article 18; StVO § 8",
-    )
+    return (case.agent if gives == {(True, False)} else case.other), links[0].junction
 
 
 RULES: tuple[Callable[[ContactRecord], FaultFinding | None], ...] = (
@@ -431,3 +440,21 @@ def _right_of_way_of(bundle: Bundle) -> RightOfWay | None:
         return ask(scenario) if ask is not None else None
     except (BundleError, CrashhuntError, OSError):
         return None
+
+
+def yielding_actor(bundle: Bundle, contact: ContactRecord | None) -> str:
+    """Return the actor of a contact that had to yield by the map; empty if the map does not decide it."""
+    if contact is None or contact.is_disputed or len(contact.before) < 2:
+        return ""
+    found = _yielding(replace(contact, right_of_way=_right_of_way_of(bundle)))
+    return found[0] if found is not None else ""
+
+
+def stop_lines_of(bundle: Bundle) -> tuple[StopLine, ...]:
+    """Return the stop lines of a crash's map; none if the simulator has none, or the scenario is not in the hunt."""
+    try:
+        scenario = Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot).scenario()
+        ask = scenario.backend.stop_lines
+        return ask(scenario) if ask is not None else ()
+    except (BundleError, CrashhuntError, OSError):
+        return ()

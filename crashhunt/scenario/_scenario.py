@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.json_types import Json, Plain
     from crashhunt.trial import Value
-    from crashhunt.world import RightOfWay
+    from crashhunt.world import RightOfWay, StopLine
 
 
 # The tables of a ``scenario.toml`` that every simulator has.
@@ -518,6 +518,7 @@ class Backend:
             refused.
         right_of_way: function that returns which vehicles must yield at the junctions of the map; None if this is
             unknown.
+        stop_lines: function that returns the stop lines of the map; None if the simulator has none.
         shows_actors: whether scenes may contain actors. If this value is False, modes that compare the distances of
             actors are refused before the first trial.
         plays_paths: whether the simulator can move other actors along recorded paths.
@@ -556,6 +557,7 @@ class Backend:
     explained: Callable[[str, str, Scenario], ScenarioError | None] | None = None
     side_effect: Callable[[Scenario, Mapping[str, Value], Iterable[str]], str] | None = None
     right_of_way: Callable[[Scenario], RightOfWay | None] | None = None
+    stop_lines: Callable[[Scenario], tuple[StopLine, ...]] | None = None
     shows_actors: bool = True
     plays_paths: bool = False
     one_per_process: bool = False

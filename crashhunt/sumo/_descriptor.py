@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.base.json_types import Json
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Value
-    from crashhunt.world import RightOfWay
+    from crashhunt.world import RightOfWay, StopLine
 
 _VEHICLE_KEYS = (
     "existing",
@@ -115,6 +115,12 @@ def _right_of_way(scenario: Scenario) -> RightOfWay | None:
     from crashhunt.sumo._right_of_way import right_of_way
 
     return right_of_way(scenario)
+
+
+def _stop_lines(scenario: Scenario) -> tuple[StopLine, ...]:
+    from crashhunt.sumo._right_of_way import stop_lines
+
+    return stop_lines(scenario)
 
 
 def _side_effect(scenario: Scenario, values: Mapping[str, Value], specifications: Iterable[str]) -> str:
@@ -216,5 +222,6 @@ BACKEND: Backend = Backend(
     explained=_explained,
     side_effect=_side_effect,
     right_of_way=_right_of_way,
+    stop_lines=_stop_lines,
     survey=TrafficSurvey(module="crashhunt.sumo._traffic_survey", refine=_refined, restore=_restored),
 )

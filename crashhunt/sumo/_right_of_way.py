@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.sumo._files import read_xml
+from crashhunt.sumo._lane_graph import LaneGraph
 from crashhunt.sumo._options import SumoSetup
 from crashhunt.sumo.maps import read_network
 from crashhunt.world import Link, RightOfWay
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from crashhunt.scenario import Scenario
     from crashhunt.sumo.maps import RoadNetwork
+    from crashhunt.world import StopLine
 
 _MAX_NETWORK_BYTES = 50_000_000  # a larger network is not worth the wait
+_UNREADABLE = (OSError, ScenarioError, ET.ParseError, ValueError, KeyError)
 _UNREGULATED_TYPES = ("unregulated", "internal", "dead_end", "rail_signal", "rail_crossing")
 
 
@@ -26,17 +30,34 @@ def right_of_way(scenario: Scenario) -> RightOfWay | None:
     """Return the right of way at the junctions of a scenario; None if its network cannot be read."""
     path = scenario.folder / scenario.table(SumoSetup).net
     try:
-        return _read(path, path.stat().st_mtime_ns)
-    except (OSError, ScenarioError, ET.ParseError, ValueError, KeyError):
+        return _read(path, path.stat().st_mtime_ns, right_of_way_in)
+    except _UNREADABLE:
         return None
 
 
-@lru_cache(maxsize=4)
-def _read(path: Path, _changed: int) -> RightOfWay | None:
+def stop_lines(scenario: Scenario) -> tuple[StopLine, ...]:
+    """Return the stop lines of a scenario's network; none if the network cannot be read."""
+    path = scenario.folder / scenario.table(SumoSetup).net
+    try:
+        return _read(path, path.stat().st_mtime_ns, stop_lines_in) or ()
+    except _UNREADABLE:
+        return ()
+
+
+Found = TypeVar("Found")
+
+
+@lru_cache(maxsize=8)
+def _read(path: Path, _changed: int, derive: Callable[[RoadNetwork], Found]) -> Found | None:
     content = read_xml(path)
     if len(content) > _MAX_NETWORK_BYTES or b"<!DOCTYPE" in content:
         return None
-    return right_of_way_in(read_network(path, with_junctions=True))
+    return derive(read_network(path, with_junctions=True))
+
+
+def stop_lines_in(network: RoadNetwork) -> tuple[StopLine, ...]:
+    """Return the stop lines of a network that was read with its junctions."""
+    return LaneGraph(network).stop_lines
 
 
 def right_of_way_in(network: RoadNetwork) -> RightOfWay:
