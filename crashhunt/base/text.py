@@ -7,6 +7,7 @@ letters. Files keep the original text. Printed text is made visible first.
 from __future__ import annotations
 
 import difflib
+import math
 import re
 import shlex
 import unicodedata
@@ -28,6 +29,7 @@ _INVISIBLE_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 # Words of some languages, and emoji, are spelled with these two; they only join.
 _JOINERS = "\u200c\u200d"
 _ASCII = re.compile(r"[ -~\n\t]*")
+_FOUR_DIGITS = 999.5  # from here on, three significant digits would be no whole number
 _LINE_BREAKS = re.compile(r"[^\S\n]*(?:\r\n|[\n\r\v\f\x1c-\x1e\x85\u2028\u2029])\s*")
 
 
@@ -62,6 +64,34 @@ def format_time(seconds: float, step_length_s: float) -> str:
     """
     tenths = 10 * step_length_s
     return f"{seconds:.{1 if abs(tenths - round(tenths)) < 1e-6 else 2}f} s"
+
+
+def format_number(value: float) -> str:
+    """Return a number for users with three significant digits; a whole number in full, with commas.
+
+    >>> [format_number(value) for value in (0.012345, 12.0, 15.4509, 12345.6, 0.9996, 0.0000123)]
+    ['0.0123', '12', '15.5', '12,346', '1', '1.23e-5']
+    """
+    if not math.isfinite(value):
+        return "unlimited" if value == math.inf else str(value)
+    if value == round(value) or abs(value) >= _FOUR_DIGITS:
+        return f"{round(value):,}"
+    text = f"{value:.3g}"
+    if "e" not in text:
+        return text
+    digits, _, power = text.partition("e")
+    return f"{digits}e{int(power)}"
+
+
+def format_percent(share: float) -> str:
+    """Return a share from 0 to 1 as percent: ``12.3 %``."""
+    return f"{format_number(100 * share)} %"
+
+
+def format_points(difference: float) -> str:
+    """Return a difference of two shares as percentage points with its sign: ``+1.2 points``."""
+    text = format_number(100 * difference)
+    return f"{text if text.startswith('-') or text == '0' else f'+{text}'} points"
 
 
 def count_of(number: int, noun: str) -> str:

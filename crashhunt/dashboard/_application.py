@@ -357,7 +357,7 @@ def _assets() -> dict[str, bytes]:
     return {
         **found,
         "player.js": player.script.encode(),
-        "bars.js": player.bars.encode(),
+        "numbers.js": player.numbers.encode(),
         "player.css": player.style.encode(),
     }
 

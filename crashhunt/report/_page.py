@@ -6,10 +6,8 @@ one crash.
 
 from __future__ import annotations
 
-import base64
 import json
 import math
-import zlib
 from dataclasses import asdict
 from importlib import resources
 from typing import TYPE_CHECKING, NamedTuple, TypedDict
@@ -25,6 +23,7 @@ from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import is_opaque, read_lanes
 from crashhunt.report._crash_text import Story
+from crashhunt.report._player_layers import packed_floats, player_layers
 from crashhunt.report._rate_text import describe_running
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._step_table import argument_units
@@ -183,6 +182,7 @@ def lineage_of(number: int, trial: Callable[[int], TrialResult | None]) -> list[
     return found
 
 
+_MAX_SHOWN_ACTIONS = 12  # numbers of an action
 _MAX_PLOTTED_TRIALS = 4000  # trials in a plot; more cannot be distinguished
 _GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 
@@ -225,7 +225,7 @@ def write_report(
     )
     player = player_parts()
     page = _read("page.html").replace("/*STYLE*/", player.style).replace("<!--PLAYER-->\n", player.controls)
-    page = page.replace("/*BARS*/\n", player.bars).replace("/*PLAYER*/\n", player.script)
+    page = page.replace("/*NUMBERS*/\n", player.numbers).replace("/*PLAYER*/\n", player.script)
     # Inside a script element, only "</" and "<!--" mean something to HTML.
     text = page.replace("/*DATA*/", json.dumps(data, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c"))
     with whole_file(target) as temporary:
@@ -241,18 +241,18 @@ class PlayerParts(NamedTuple):
         controls: HTML of the scene, the controls and the curves.
         script: JavaScript for the end of the page; its functions ``load`` and ``show`` take the data that `player_data`
             returns.
-        bars: JavaScript with the function ``importanceBars``, which returns the nodes of a chart.
+        numbers: JavaScript with ``formatNumber``, ``formatPercent`` and ``importanceBars``, the nodes of a chart.
     """
 
     style: str
     controls: str
     script: str
-    bars: str
+    numbers: str
 
 
 def player_parts() -> PlayerParts:
     """Return the player that the report and the dashboard use."""
-    return PlayerParts(*map(_read, ("page.css", "player.html", "player.js", "bars.js")))
+    return PlayerParts(*map(_read, ("page.css", "player.html", "player.js", "numbers.js")))
 
 
 def _read(name: str) -> str:
@@ -492,6 +492,7 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
         **_scenes(recording, story.agent),
         **(_to_closest(story) if story.encounter is None else _to_other(story.encounter, recording)),
         "lanes": _lanes(bundle, recording),
+        **player_layers(bundle, recording, story.agent, story.contact, _origin(recording)),
         "disturbances": [
             [one.step, one.step + steps_of(one.how_long, recording.prologue.step_length_s) - 1, one.words, one.vehicle]
             for one in result.disturbances
@@ -518,7 +519,7 @@ def _badges(story: Story) -> list[str]:
 def _danger(story: Story) -> dict[str, object]:
     """Return the agent's own criticality and the rear criticality over time."""
     course = story.danger
-    return {"danger": _packed(course.own), "behind": _packed(course.behind)} if course is not None else {}
+    return {"danger": packed_floats(course.own), "behind": packed_floats(course.behind)} if course is not None else {}
 
 
 def _disturbances(result: TrialResult) -> dict[str, str]:
@@ -559,6 +560,8 @@ def _scenes(recording: Recording, agent: str) -> dict[str, object]:
     if channel is not None and not is_opaque(channel.action_shape):
         size = math.prod(channel.action_shape)
         action_names = list(channel.action_names) or [f"action[{n}]" for n in range(size)]
+        size = size if size <= _MAX_SHOWN_ACTIONS else 0  # a trajectory is drawn, and not listed
+        action_names = action_names[:size]
         actions = np.full((len(scenes), size), np.nan)
     for number, (step, scene) in enumerate(zip(recording.all_steps, scenes, strict=False)):
         table[number, [place[actor.id] for actor in scene.roster.actors]] = scene.data
@@ -574,11 +577,11 @@ def _scenes(recording: Recording, agent: str) -> dict[str, object]:
         "actors": [[actor.id, actor.kind, actor.length, actor.width] for actor in names.values()],
         "bends": bends,
         "steps": len(scenes),
-        "table": _packed(table),
-        "ttc": _packed(times),
-        "gap": _packed(gaps),
+        "table": packed_floats(table),
+        "ttc": packed_floats(times),
+        "gap": packed_floats(gaps),
         "actionNames": action_names,
-        "actions": _packed(actions),
+        "actions": packed_floats(actions),
     }
 
 
@@ -588,7 +591,7 @@ def _to_other(encounter: Encounter, recording: Recording) -> dict[str, str]:
     steps = range(len(recording.scenes()))
     found = {"gap": "gap_m", "ttc": "time_to_collision_s"}
     return {
-        key: _packed(np.array([getattr(moments[step], name) if step in moments else np.nan for step in steps]))
+        key: packed_floats(np.array([getattr(moments[step], name) if step in moments else np.nan for step in steps]))
         for key, name in found.items()
     }
 
@@ -602,7 +605,7 @@ def _to_closest(story: Story) -> dict[str, object]:
 def _lanes(bundle: Bundle, recording: Recording) -> list[list[str]]:
     origin = _origin(recording)
     return [
-        [_packed(right - origin), _packed(left - origin)]
+        [packed_floats(right - origin), packed_floats(left - origin)]
         for right, left in read_lanes(bundle.path / layout.LOG)
         if len(right) > 1
     ]
@@ -615,8 +618,3 @@ def _origin(recording: Recording) -> NDArray[np.float64]:
             if agent in scene.roster.index:
                 return np.round(np.array(scene.points[scene.roster.index[agent]]))
     return np.zeros(2)
-
-
-def _packed(array: NDArray[np.float64]) -> str:
-    """Return an array as text: little-endian float32, compressed by deflate, encoded as base64."""
-    return base64.b64encode(zlib.compress(np.ascontiguousarray(array, "<f4").tobytes(), 6)).decode("ascii")

@@ -1,13 +1,23 @@
-/* The bars of the report and of the dashboard: the share that each argument explains, with its interval. */
+/* Numbers of the report and of the dashboard, in the form of `format_number` in Python, and the bars of arguments. */
+function formatNumber(value) {
+  if (typeof value !== "number" || !Number.isFinite(value)) return "-";
+  const size = Math.abs(value);
+  if (Number.isInteger(value) || size >= 999.5) return Math.round(value).toLocaleString("en");
+  if (size >= 0.0001) return String(Number(value.toPrecision(3)));
+  const [digits, power] = value.toExponential(2).split("e");
+  return `${Number(digits)}e${Number(power)}`;
+}
+function formatPercent(share) { return `${formatNumber(100 * share)} %`; }
+
+/* The share that each argument explains, with its interval. */
 function importanceBars(importance) {
   const part = (tag, className, text = "") => Object.assign(document.createElement(tag), { className, textContent: text });
-  const percent = (value) => (100 * value).toFixed(0);
   return importance.flatMap(({ name, share, low, high }) => {
     const box = part("div", "weight"), bar = part("div", "bar"), span = part("div", "span");
     bar.style.width = `${100 * share}%`;
     span.style.left = `${100 * low}%`;
     span.style.width = `${100 * (high - low)}%`;
     box.append(bar, span);
-    return [part("span", "", name), box, part("span", "", `${percent(share)} % (${percent(low)} to ${percent(high)} %)`)];
+    return [part("span", "", name), box, part("span", "", `${formatPercent(share)} (${formatPercent(low)} to ${formatPercent(high)})`)];
   });
 }

@@ -60,7 +60,7 @@ function showTip(x, y, text) {
 function hideTip() { $("tip").hidden = true; }
 
 /* What is shown of the crash */
-const view = { crash: null, step: 0, playing: false, follow: true, ids: false, scale: 6, x: 0, y: 0, last: 0, clock: 0, frames: 0 };
+const view = { crash: null, step: 0, playing: false, follow: true, ids: false, observed: true, picked: "", scale: 6, x: 0, y: 0, last: 0, clock: 0, frames: 0 };
 window.crashhuntView = view;
 
 /* Unpacks what a crash came with; once. */
@@ -69,6 +69,7 @@ async function load(crash) {
   const [values, ttc, gap, actions] = await Promise.all([crash.table, crash.ttc, crash.gap, crash.actions].map(unpack));
   const [own, behind] = crash.danger ? await Promise.all([crash.danger, crash.behind].map(unpack)) : [null, null];
   Object.assign(crash, { values, ttcs: ttc, gaps: gap, acts: actions, dangers: own, behinds: behind });
+  for (const layer of [crash.plan, ...Object.values(crash.observed?.layers ?? {})].filter(Boolean)) layer.array = await unpack(layer.values);
   crash.bent = new Map((crash.bends || []).map(([step, actor, line]) => [step * crash.actors.length + actor, line]));
   crash.road = new Path2D();
   crash.marks = new Path2D();
@@ -109,12 +110,16 @@ function show(crash, rows) {
   $("key-other").textContent = crash.other;
   $("key-other-box").hidden = !crash.other;
   $("key-agents-box").hidden = crash.agents.length < 2;
+  $("key-observed").hidden = !crash.observed;
+  $("key-plan").hidden = !crash.plan;
   $("scrub").max = Math.max(0, crash.steps - 1);
   view.crash = crash;
   view.agent = crash.actors.findIndex((actor) => actor[0] === crash.agent);
   view.other = crash.actors.findIndex((actor) => actor[0] === crash.other);
   view.follow = true;
+  view.picked = "";
   view.step = begin(crash);
+  $("observed").hidden = !crash.observed;
   crash.rows ??= rowsOf(crash);
   $("plot").style.height = `${HEAD + crash.rows.length * ROW + BELOW}px`;
   $("avoidable").hidden = $("avoidable-words").hidden = !crash.avoidable;
@@ -195,6 +200,137 @@ function contactPoint(step) {
   return found;
 }
 
+/* The values of a layer at the present step. The agent observes and plans at each scene but the last one, where the
+   values of the scene before are drawn. */
+function layerAt(layer, first, step = view.step) {
+  if (!layer) return null;
+  const size = layer.size.reduce((all, one) => all * one, 1), number = Math.min(step, view.crash.steps - 2) - first;
+  return number < 0 || (number + 1) * size > layer.array.length ? null : layer.array.subarray(number * size, (number + 1) * size);
+}
+const seenAt = (name) => layerAt(view.crash.observed?.layers[name], view.crash.observed?.first);
+function wordsAt(step) {
+  const { first, words } = view.crash.observed ?? { first: 0, words: [] };
+  return words[Math.min(step, view.crash.steps - 2) - first] ?? [];
+}
+function lightsAt(step, id) {
+  const { first, lights } = view.crash.observed ?? { first: 0 };
+  return lights?.[Math.min(step, view.crash.steps - 2) - first]?.find(([name]) => name === id);
+}
+
+/* Stop lines, by the rule at them: solid where a vehicle has to stop, dashed where it has to yield, dotted at traffic lights. */
+const RULES = { stop: [], allway_stop: [], yield: [1.2, 0.6], right_before_left: [1.2, 0.6], traffic_light: [0.4, 0.4] };
+function drawStopLines(context) {
+  for (const [kind, [x0, y0, x1, y1]] of view.crash.stopLines ?? []) {
+    context.strokeStyle = css("--text");
+    context.lineWidth = Math.max(0.4, 2 / view.scale);
+    context.setLineDash(RULES[kind] ?? []);
+    context.beginPath();
+    context.moveTo(x0, y0);
+    context.lineTo(x1, y1);
+    context.stroke();
+  }
+  context.setLineDash([]);
+}
+
+/* What the agent observed, in its own colour: the route, lanes, boxes, predictions and points of lidar. */
+function drawObserved(context) {
+  const thin = 1.5 / view.scale, crash = view.crash, own = state(Math.min(view.step, crash.steps - 2), view.agent);
+  const lines = (values, points) => {
+    context.beginPath();
+    for (let begin = 0; begin < values.length; begin += 2 * points) {
+      let down = false;
+      for (let at = begin; at < begin + 2 * points; at += 2) {
+        const there = Number.isFinite(values[at]);
+        if (there) context[down ? "lineTo" : "moveTo"](values[at], values[at + 1]);
+        down = there;
+      }
+    }
+    context.stroke();
+  };
+  context.strokeStyle = context.fillStyle = css("--observed");
+  for (const [name, width, dash] of [["lanes", 1, [2, 4]], ["route", 3, [8, 5]], ["predictions", 1.5, [2, 2]]]) {
+    const values = seenAt(name);
+    if (!values) continue;
+    context.lineWidth = width / view.scale;
+    context.setLineDash(dash.map((one) => one / view.scale));
+    lines(values, crash.observed.layers[name].size.at(-2));
+  }
+  context.setLineDash([]);
+  context.lineWidth = thin;
+  const boxes = seenAt("actors") ?? [];
+  for (let at = 0; at < boxes.length; at += 5) {
+    if (!Number.isFinite(boxes[at])) continue;
+    context.save();
+    context.translate(boxes[at], boxes[at + 1]);
+    context.rotate(boxes[at + 2]);
+    context.strokeRect(-boxes[at + 3] / 2 - 0.3, -boxes[at + 4] / 2 - 0.3, boxes[at + 3] + 0.6, boxes[at + 4] + 0.6);
+    context.restore();
+  }
+  const rays = seenAt("lidar2d");
+  if (!rays || !own) return;
+  const half = crash.actors[view.agent][2] / 2, x = own[0] - half * Math.cos(own[2]), y = own[1] - half * Math.sin(own[2]);
+  const reach = rays.reduce((most, one) => Math.max(most, one), 0), dot = 2 / view.scale;
+  rays.forEach((distance, place) => {
+    if (!(distance < reach - 0.01)) return;
+    const angle = own[2] + (2 * Math.PI * place) / rays.length;
+    context.fillRect(x + distance * Math.cos(angle) - dot, y + distance * Math.sin(angle) - dot, 2 * dot, 2 * dot);
+  });
+}
+
+/* The poses that the agent planned at this scene: a line with a dot for each. */
+function drawPlan(context) {
+  const values = layerAt(view.crash.plan, view.crash.plan?.first), own = state(Math.min(view.step, view.crash.steps - 2), view.agent);
+  if (!values || !own) return;
+  context.strokeStyle = context.fillStyle = css("--plan");
+  context.lineWidth = 2.5 / view.scale;
+  context.beginPath();
+  context.moveTo(own[0] - (view.crash.actors[view.agent][2] / 2) * Math.cos(own[2]), own[1] - (view.crash.actors[view.agent][2] / 2) * Math.sin(own[2]));
+  for (let at = 0; at < values.length; at += 2) if (Number.isFinite(values[at])) context.lineTo(values[at], values[at + 1]);
+  context.stroke();
+  for (let at = 0; at < values.length; at += 2) {
+    context.beginPath();
+    if (Number.isFinite(values[at])) context.arc(values[at], values[at + 1], 3 / view.scale, 0, 7);
+    context.fill();
+  }
+}
+
+/* The vehicle under the pointer; the nearest one within a few pixels. */
+function vehicleAt(event) {
+  const crash = view.crash, box = $("scene").getBoundingClientRect();
+  const x = view.x + (event.clientX - box.left - box.width / 2) / view.scale, y = view.y - (event.clientY - box.top - box.height / 2) / view.scale;
+  let found = "", least = Infinity;
+  crash.actors.forEach(([id, , length, breadth], actor) => {
+    const pose = state(view.step, actor);
+    if (!pose) return;
+    const [dx, dy] = [x - pose[0], y - pose[1]], along = dx * Math.cos(pose[2]) + dy * Math.sin(pose[2]), across = dy * Math.cos(pose[2]) - dx * Math.sin(pose[2]);
+    const apart = Math.max(Math.abs(along + length / 2) - length / 2, Math.abs(across) - breadth / 2);
+    if (apart < Math.min(least, 8 / view.scale)) [least, found] = [apart, id];
+  });
+  return found;
+}
+
+/* The facts of the chosen vehicle at this step. */
+function showPicked() {
+  const crash = view.crash, actor = crash.actors.findIndex(([id]) => id === view.picked), pose = actor < 0 ? null : state(view.step, actor);
+  $("vehicle").hidden = actor < 0;
+  if (actor < 0) return;
+  const [id, kind, length, breadth] = crash.actors[actor], rows = [["vehicle", id], ["kind", `${kind}, ${formatNumber(length)} m long, ${formatNumber(breadth)} m wide`]];
+  if (pose) {
+    const own = id === crash.agent ? null : state(view.step, view.agent), light = lightsAt(view.step, id), pull = accelerationOf(view.step, actor);
+    rows.push(["speed", `${formatNumber(pose[3])} m/s`], ["acceleration", Number.isFinite(pull) ? `${formatNumber(pull)} m/s²` : "-"]);
+    const [since, lane] = (crash.actorLanes ?? []).filter(([step, lanes]) => step <= view.step && lanes[id]).map(([step, lanes]) => [step, lanes[id]]).at(-1) ?? [];
+    if (lane) rows.push(["lane", since === view.step ? lane : `${lane} (at step ${since})`]);
+    if (light) rows.push(["lights", [light[1] ? "brake" : "", { 1: "left indicator", "-1": "right indicator", 2: "hazard lights" }[light[2]]].filter(Boolean).join(", ")]);
+    if (own) {
+      const [dx, dy] = [pose[0] - own[0], pose[1] - own[1]], ahead = dx * Math.cos(own[2]) + dy * Math.sin(own[2]), left = dy * Math.cos(own[2]) - dx * Math.sin(own[2]);
+      rows.push([`seen from ${crash.agent}`, `${formatNumber(Math.abs(ahead))} m ${ahead < 0 ? "behind" : "ahead"}, ${formatNumber(Math.abs(left))} m to the ${left < 0 ? "right" : "left"} (front bumpers)`]);
+    }
+  } else rows.push(["at this step", "not in the scene"]);
+  const roles = [id === crash.agent ? "agent" : crash.agents.includes(id) ? "another agent" : "", id === crash.other ? "collision partner" : "", crash.yields ? { [crash.yields]: "must yield by the map", [[crash.agent, crash.other].find((one) => one !== crash.yields)]: "has priority by the map" }[id] : ""].filter(Boolean);
+  if (roles.length) rows.push(["role", roles.join(", ")]);
+  $("vehicle-facts").replaceChildren(...rows.flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
+}
+
 /* Words with a halo, which can be read on any ground. */
 function label(context, text, x, y) {
   context.font = "12px system-ui";
@@ -220,6 +356,7 @@ function drawScene() {
   context.strokeStyle = css("--mark");
   context.lineWidth = Math.max(0.12, 0.8 / view.scale);
   context.stroke(crash.marks);
+  drawStopLines(context);
   /* where the two have been */
   for (const id of [crash.agent, crash.other]) {
     const actor = crash.actors.findIndex((entry) => entry[0] === id);
@@ -273,8 +410,20 @@ function drawScene() {
       context.fillStyle = css("--brake");
       for (const side of [-0.5, 0.2]) context.fillRect(-length, side * breadth, Math.max(0.5, 3 / view.scale), 0.3 * breadth);
     }
+    const indicator = lightsAt(view.step, id)?.[2] ?? 0, light = Math.max(0.6, 4 / view.scale);
+    context.fillStyle = css("--indicator");
+    for (const side of indicator === 2 ? [1, -1] : indicator ? [indicator] : []) {
+      for (const along of [-light, -length]) context.fillRect(along, side > 0 ? breadth / 2 - light / 2 : -breadth / 2 - light / 2, light, light);
+    }
+    if (id === view.picked) {
+      context.strokeStyle = css("--accent");
+      context.lineWidth = 3 / view.scale;
+      context.strokeRect(-length - 0.5, -breadth / 2 - 0.5, length + 1, breadth + 1);
+    }
     context.restore();
   }
+  if (view.observed) drawObserved(context);
+  drawPlan(context);
   drawGhost(context);
   context.restore();
   context.textAlign = "center";
@@ -285,7 +434,8 @@ function drawScene() {
     if (x < 0 || x > width || y < 0 || y > height) continue;
     const reach = (Math.abs(length * Math.sin(pose[2])) + Math.abs(breadth * Math.cos(pose[2]))) / 2 * view.scale;
     /* The two may touch, so that the label of one is above it and that of the other below. */
-    label(context, id, x, id === crash.other ? y + reach + 15 : y - reach - 5);
+    const priority = !crash.yields || ![crash.agent, crash.other].includes(id) ? "" : id === crash.yields ? " (must yield)" : " (has priority)";
+    label(context, `${id}${priority}`, x, id === crash.other ? y + reach + 15 : y - reach - 5);
   }
   context.textAlign = "start";
   const since = view.step - crash.nearest;
@@ -320,6 +470,16 @@ function drawScene() {
     context.arc(width / 2 + (x - view.x) * view.scale, height / 2 - (y - view.y) * view.scale, Math.max(4, half * view.scale) + 5, 0, 7);
     context.stroke();
   });
+  const signal = wordsAt(view.step).find(([name]) => name === "signal")?.[1];
+  if (signal) {
+    context.textAlign = "right";
+    label(context, `signal ${signal}`, width - 30, 24);
+    context.textAlign = "start";
+    context.fillStyle = { green: "#2e9e5b", yellow: "#e0a800", red: "#d50000" }[signal.split(" ")[0]] ?? css("--faint");
+    context.beginPath();
+    context.arc(width - 18, 20, 7, 0, 7);
+    context.fill();
+  }
   const meters = [5, 10, 20, 50, 100, 200, 500].find((length) => length * view.scale > 60) || 1000;
   context.strokeStyle = context.fillStyle = css("--faint");
   context.lineWidth = 1.5;
@@ -400,8 +560,6 @@ function rowsOf(crash) {
   });
   return rows.filter((row) => row.series.some((one) => one.values.some(Number.isFinite)));
 }
-const shortNumber = (value) => String(Number(value.toPrecision(3)));
-
 function drawPlot() {
   const crash = view.crash, [context, width, height] = fit($("plot"));
   if (!crash) return;
@@ -452,7 +610,7 @@ function drawRow(context, row, top, bottom, x, right) {
   context.fillStyle = css("--faint");
   context.textAlign = "right";
   const middle = low < 0 && high > 0 ? 0 : (low + high) / 2, ticks = [high, ...(Math.abs(y(middle) - top) > 11 && Math.abs(y(middle) - bottom) > 11 ? [middle] : []), low];
-  for (const tick of ticks) context.fillText(shortNumber(tick), LEFT - 5, Math.min(bottom, Math.max(top + 8, y(tick) + 4)));
+  for (const tick of ticks) context.fillText(formatNumber(tick), LEFT - 5, Math.min(bottom, Math.max(top + 8, y(tick) + 4)));
   context.textAlign = "left";
   context.fillStyle = css("--text");
   const title = `${row.title}${row.unit ? ` (${row.unit})` : ""}`, isCut = row.series.some((one) => one.values.some((value) => Number.isFinite(value) && (value > high || value < low)));
@@ -511,8 +669,6 @@ function drawCursor(context, x, top, bottom) {
   context.stroke();
 }
 
-const share = (value) => (Number.isFinite(value) ? value.toFixed(2) : "-");
-
 /* The actors to which time to collision and gap of a step belong: the collision partner, or the closest ones. */
 function partners(crash, step) {
   if (crash.other) return [crash.other, crash.other];
@@ -521,21 +677,21 @@ function partners(crash, step) {
 
 /* What the rows of curves say at a step, and its actions: for the line below the scene and for the tip on the curves. */
 function valuesAt(crash, step) {
-  const number = (value, unit) => (Number.isFinite(value) ? `${value.toFixed(1)} ${unit}` : "-");
+  const number = (value, unit) => (Number.isFinite(value) ? `${formatNumber(value)} ${unit}` : "-");
   const [ttcWith, gapTo] = partners(crash, step), other = crash.other ? [[`speed of ${crash.other}`, number(crash.otherSpeeds[step], "m/s")]] : [];
   const parts = [["time", `${(crash.time0 + step * crash.dt).toFixed(Math.abs(10 * crash.dt - Math.round(10 * crash.dt)) < 1e-6 ? 1 : 2)} s`], ["speed", number(crash.speeds[step], "m/s")], ...other, ["acceleration", number(crash.pulls[step], "m/s²")]];
   if (crash.other) parts.push([`acceleration of ${crash.other}`, number(crash.otherPulls[step], "m/s²")]);
   parts.push([`TTC${ttcWith && ` with ${ttcWith}`}`, number(crash.ttcs[step], "s")], [`gap${gapTo && ` to ${gapTo}`}`, number(crash.gaps[step], "m")]);
-  if (crash.dangers) parts.push(["criticality", share(crash.dangers[step])], ["rear criticality", share(crash.behinds[step])]);
+  if (crash.dangers) parts.push(["criticality", formatNumber(crash.dangers[step])], ["rear criticality", formatNumber(crash.behinds[step])]);
   crash.actionNames.forEach((name, place) => {
     const value = crash.acts[step * crash.actionNames.length + place];
-    parts.push([name, Number.isNaN(value) ? "-" : String(Number(value.toPrecision(4)))]);
+    parts.push([name, formatNumber(value)]);
   });
   return parts;
 }
 
 function showNow() {
-  const crash = view.crash, parts = [["step", `${view.step} of ${crash.steps - 1}`], ...valuesAt(crash, view.step)];
+  const crash = view.crash, parts = [["step", `${view.step} of ${crash.steps - 1}`], ...valuesAt(crash, view.step), ...wordsAt(view.step)];
   $("now").replaceChildren(...parts.map(([name, value]) => {
     const span = make("span", `${name} `, "faint");
     span.append(make("b", value));
@@ -551,7 +707,7 @@ function go(step) {
   $("scrub").setAttribute("aria-valuetext", `step ${view.step}`);
   draw();
 }
-function draw() { if (view.crash) { drawScene(); drawPlot(); showNow(); $("ids").setAttribute("aria-pressed", String(view.ids)); $("follow").setAttribute("aria-pressed", String(view.follow)); } }
+function draw() { if (view.crash) { drawScene(); drawPlot(); showNow(); showPicked(); $("observed").setAttribute("aria-pressed", String(view.observed)); $("ids").setAttribute("aria-pressed", String(view.ids)); $("follow").setAttribute("aria-pressed", String(view.follow)); } }
 function pause() { view.playing = false; $("play").textContent = "Play"; }
 function play() {
   if (view.step >= view.crash.steps - 1) go(view.crash.nearest === null ? 0 : begin(view.crash));
@@ -582,6 +738,13 @@ $("out").onclick = () => zoom(1 / 1.4);
 $("follow").onclick = () => { view.follow = !view.follow; draw(); };
 $("fit").onclick = () => { fitEncounter(); draw(); };
 $("ids").onclick = () => { view.ids = !view.ids; draw(); };
+$("observed").onclick = () => { view.observed = !view.observed; draw(); };
+function pickNext() {
+  const there = view.crash.actors.map(([id], actor) => [id, state(view.step, actor)]).filter(([, pose]) => pose), own = there.find(([id]) => id === view.crash.agent)?.[1] ?? [view.x, view.y];
+  there.sort(([, one], [, two]) => Math.hypot(one[0] - own[0], one[1] - own[1]) - Math.hypot(two[0] - own[0], two[1] - own[1]));
+  view.picked = there[(there.findIndex(([id]) => id === view.picked) + 1) % Math.max(1, there.length)]?.[0] ?? "";
+  draw();
+}
 $("avoidable").onclick = () => { pause(); go(view.crash.avoidable[0]); };
 /* A page with several crashes sets this: 1 shows the next crash, -1 the previous one. */
 window.anotherCrash = () => {};
@@ -589,17 +752,23 @@ $("previous").onclick = () => window.anotherCrash(-1);
 $("next").onclick = () => window.anotherCrash(1);
 $("scrub").oninput = (event) => { pause(); go(Number(event.target.value)); };
 $("scene").addEventListener("wheel", (event) => { event.preventDefault(); zoom(event.deltaY < 0 ? 1.15 : 1 / 1.15); }, { passive: false });
-let drag = null;
-$("scene").onpointerdown = (event) => { drag = [event.clientX, event.clientY]; $("scene").setPointerCapture(event.pointerId); };
+let drag = null, moved = 0;
+$("scene").onpointerdown = (event) => { drag = [event.clientX, event.clientY]; moved = 0; $("scene").setPointerCapture(event.pointerId); };
 $("scene").onpointermove = (event) => {
   if (!drag) return;
+  moved += Math.abs(event.clientX - drag[0]) + Math.abs(event.clientY - drag[1]);
+  if (moved < 4) return;
   view.follow = false;
   view.x -= (event.clientX - drag[0]) / view.scale;
   view.y += (event.clientY - drag[1]) / view.scale;
   drag = [event.clientX, event.clientY];
   draw();
 };
-$("scene").onpointerup = $("scene").onpointercancel = () => { drag = null; };
+$("scene").onpointercancel = () => { drag = null; };
+$("scene").onpointerup = (event) => {
+  if (drag && moved < 4 && view.crash) { view.picked = vehicleAt(event); draw(); }
+  drag = null;
+};
 {
   const stepAt = (event) => {
     const box = $("plot").getBoundingClientRect(), last = view.crash.steps - 1;
@@ -627,6 +796,6 @@ document.addEventListener("keydown", (event) => {
   if (!view.crash || event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
   if (event.target.tagName === "BUTTON" && [" ", "Enter"].includes(event.key)) return;
   const count = event.shiftKey ? 10 : 1;
-  const actions = { " ": toggle, ArrowLeft: () => step(-count), ArrowRight: () => step(count), Home: () => step(-Infinity), End: () => step(Infinity), "+": () => zoom(1.4), "=": () => zoom(1.4), "-": () => zoom(1 / 1.4), f: $("follow").onclick, i: $("ids").onclick, "[": () => window.anotherCrash(-1), "]": () => window.anotherCrash(1) };
+  const actions = { " ": toggle, ArrowLeft: () => step(-count), ArrowRight: () => step(count), Home: () => step(-Infinity), End: () => step(Infinity), "+": () => zoom(1.4), "=": () => zoom(1.4), "-": () => zoom(1 / 1.4), f: $("follow").onclick, i: $("ids").onclick, v: pickNext, o: $("observed").onclick, Escape: () => { view.picked = ""; draw(); }, "[": () => window.anotherCrash(-1), "]": () => window.anotherCrash(1) };
   if (actions[event.key]) { event.preventDefault(); actions[event.key](); }
 });

@@ -344,3 +344,24 @@ def test_mistakes_are_one_line(hunt):
 def shortest(hunt) -> str:
     bundles = list_bundles(hunt.folder / "<b>bold&")
     return min(bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number)).id
+
+
+def test_click_on_vehicle_shows_its_facts_and_click_on_road_hides_them(hunt, browser):
+    opened(browser, hunt.folder / hunt.crashhunt("report", "<b>bold&", "--json").json["file"])
+    click = (
+        "const box = document.getElementById('scene').getBoundingClientRect();"
+        "for (const kind of ['pointerdown', 'pointerup'])"
+        "document.getElementById('scene').dispatchEvent(new PointerEvent("
+        "kind, {clientX: box.left + box.width / 2 + arguments[0], clientY: box.top + box.height / 2 + arguments[1],"
+        "pointerId: 1, bubbles: true}));"
+    )
+    browser.execute_script("document.getElementById('scene').setPointerCapture = () => {}; view.follow = true; go(9)")
+    browser.execute_script(click, 0, 0)
+    words = text(browser, "vehicle-facts").split("\n")
+    assert words[:2] == ["vehicle", "ego"]
+    speed = browser.execute_script("return state(view.step, view.agent)[3]")
+    assert words[words.index("speed") + 1] == f"{speed:.3g} m/s"
+    browser.execute_script(click, 0, 150)
+    assert not browser.find_element(By.ID, "vehicle").is_displayed()
+    browser.find_element(By.ID, "scene").send_keys("v")
+    assert text(browser, "vehicle-facts").split("\n")[1] == "ego"  # the nearest vehicle first

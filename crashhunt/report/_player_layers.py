@@ -1,0 +1,227 @@
+"""What the player draws in addition to the actors: observation, plan, lights and stop lines, all from the recording.
+
+The observation and the action of step n belong to the scene of step n - 1, from which the agent made its decision.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import zlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crashhunt.base.text import count_of, format_number
+from crashhunt.crashes import stop_lines_of, yielding_actor
+from crashhunt.recording import is_opaque
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from crashhunt.crashes import Bundle, ContactRecord
+    from crashhunt.recording import AgentChannel, Recording
+
+    Rows = list[dict[str, float]]
+
+_MAX_VALUES = 400_000  # of all layers of a crash, the last steps first
+_MATCH_M = 0.3  # an observed actor is the actor of the scene whose centre is nearer
+_MAX_LANE_STEPS = 100  # steps with the lanes of actors, the last ones
+_REACH_M = 60.0  # stop lines are drawn within this distance of the path of the agent
+_PREDICTION_STRIDE = 5
+_PLAN_SHAPE, _POSE_NAMES = 5, ("x", "y", "heading", "time")
+_STATES = ("green", "yellow", "red", "off or blinking")
+_LAYERS: Mapping[str, tuple[str, ...]] = {
+    "actors": ("x", "y", "heading", "length", "width"),
+    "lanes": ("x", "y"),
+    "route": ("x", "y"),
+    "predictions": ("x", "y"),
+}
+"""The columns that the player draws, by part of the observation."""
+
+
+def packed_floats(array: NDArray[np.float64]) -> str:
+    """Return an array as text: little-endian float32, compressed by deflate, encoded as base64."""
+    return base64.b64encode(zlib.compress(np.ascontiguousarray(array, "<f4").tobytes(), 6)).decode("ascii")
+
+
+def player_layers(
+    bundle: Bundle, recording: Recording, agent: str, contact: ContactRecord | None, origin: NDArray[np.float64]
+) -> dict[str, object]:
+    """Return the layers of a crash for the player; a layer whose data are missing is missing as well.
+
+    Args:
+        bundle: the crash or near miss.
+        recording: its recording.
+        agent: the agent in the centre of the picture.
+        contact: record of the contact; None if there is none.
+        origin: position that becomes (0, 0), in m.
+    """
+    found: dict[str, object] = {"stopLines": _stop_lines(bundle, recording, agent, origin)}
+    found["actorLanes"] = [
+        [number, dict(zip((actor.id for actor in scene.roster.actors), scene.lanes, strict=True))]
+        for number, scene in enumerate(recording.scenes())
+        if scene.lanes
+    ][-_MAX_LANE_STEPS:]
+    if yields := yielding_actor(bundle, contact):
+        found["yields"] = yields
+    channel = next((one for one in recording.prologue.agents if one.id == agent), None)
+    if channel is None:
+        return found
+    plan = _plan(recording, channel, origin)
+    return {**found, **({"plan": plan} if plan else {}), **_observed(recording, channel, origin)}
+
+
+def _stop_lines(
+    bundle: Bundle, recording: Recording, agent: str, origin: NDArray[np.float64]
+) -> list[tuple[str, list[float]]]:
+    """Return the kind and the ends of each stop line near the path of the agent."""
+    scenes = recording.scenes()
+    lines = stop_lines_of(bundle) if len(scenes) else ()
+    path = np.array([scene.points[scene.roster.index[agent]] for scene in scenes if agent in scene.roster.index])
+    if not lines or not len(path):
+        return []
+    low, high = path.min(axis=0) - _REACH_M, path.max(axis=0) + _REACH_M
+    middles = np.array([line.ends.mean(axis=0) for line in lines])
+    near = ((middles >= low) & (middles <= high)).all(axis=1)
+    return [
+        (line.kind, np.round(line.ends - origin, 2).ravel().tolist())
+        for line, is_near in zip(lines, near.tolist(), strict=True)
+        if is_near
+    ]
+
+
+def _plan(recording: Recording, channel: AgentChannel, origin: NDArray[np.float64]) -> dict[str, object]:
+    """Return the planned poses at each scene, as packed x and y with their number; empty if the agent plans none."""
+    is_pose = channel.action_names == _POSE_NAMES
+    is_trajectory = len(channel.action_shape) == 2 and channel.action_shape[1] == _PLAN_SHAPE and not is_pose
+    if is_opaque(channel.action_shape) or not (is_pose or (is_trajectory and not channel.action_names)):
+        return {}
+    count = 1 if is_pose else channel.action_shape[0]
+    first = _first_step(recording, 2 * count)
+    steps = recording.all_steps
+    points = np.full((recording.steps + 1 - first, count, 2), np.nan)
+    for number in range(first, min(recording.steps + 1, len(steps) - 1)):
+        action = steps[number + 1].actions.get(channel.id)
+        if action is not None:
+            columns = slice(0, 2) if is_pose else slice(1, 3)
+            points[number - first] = np.asarray(action, float).reshape(count, -1)[:, columns]
+    repeated = np.zeros(points.shape[:2], bool)
+    repeated[:, 1:] = (points[:, 1:] == points[:, :-1]).all(axis=2)  # an encoded trajectory repeats its last point
+    points[repeated] = np.nan
+    used = int(max(np.flatnonzero(np.isfinite(points[:, :, 0]).any(axis=0)), default=-1)) + 1
+    return {"first": first, "size": [used, 2], "values": packed_floats(points[:, :used] - origin)} if used else {}
+
+
+def _first_step(recording: Recording, size: int) -> int:
+    """Return the first step that is shown, if each step has a number of values."""
+    return max(0, recording.steps + 1 - _MAX_VALUES // max(size, 1))
+
+
+def _observed(recording: Recording, channel: AgentChannel, origin: NDArray[np.float64]) -> dict[str, object]:
+    """Return the observed parts that can be drawn, their values in words, and the lights of actors."""
+    parts = {part.name: part for part in channel.observation_parts}
+    if not parts:
+        return {}
+    shown = {name: columns for name, columns in _LAYERS.items() if name in parts}
+    strides = {name: _PREDICTION_STRIDE if name == "predictions" else 1 for name in shown}
+    sizes = {name: parts[name].size // len(parts[name].columns) * len(columns) // strides[name]
+             for name, columns in shown.items()}  # fmt: skip
+    rays = parts["lidar2d"].shape[-1] if "lidar2d" in parts else 0
+    first = _first_step(recording, sum(sizes.values()) + rays + 1)
+    layers: dict[str, list[NDArray[np.float64]]] = {name: [] for name in shown}
+    lidar: list[NDArray[np.float64]] = []
+    words: list[list[tuple[str, str]]] = []
+    lights: list[list[tuple[str, int, int]]] = []
+    steps = recording.all_steps
+    for number in range(first, min(recording.steps + 1, len(steps) - 1)):
+        observation = steps[number + 1].observations.get(channel.id)
+        seen = {} if observation is None else {name: _present(channel, name, observation) for name in parts}
+        for name, columns in shown.items():
+            layers[name].append(
+                _columns_of(seen.get(name), parts[name].columns, columns, origin)[..., :: strides[name], :]
+            )
+        if rays:
+            lidar.append(seen["lidar2d"].ravel() if "lidar2d" in seen else np.full(rays, np.nan))
+        rows = {name: _rows(values, parts[name].columns) for name, values in seen.items() if parts[name].columns}
+        words.append(_in_words(rows))
+        lights.append(_lights(recording, number, rows.get("actors", [])))
+    packed = {
+        name: {"size": list(values[0].shape), "values": packed_floats(np.round(np.array(values, float), 2))}
+        for name, values in layers.items()
+        if values
+    }
+    if lidar:
+        packed["lidar2d"] = {"size": [rays], "values": packed_floats(np.round(np.array(lidar, float), 2))}
+    lit = {"lights": lights} if "actors" in parts else {}
+    return {"observed": {"first": first, "layers": packed, "words": words, **lit}}
+
+
+def _present(channel: AgentChannel, name: str, observation: NDArray[np.generic]) -> NDArray[np.float64]:
+    """Return the present values of a part: the last entry of a history."""
+    part = next(one for one in channel.observation_parts if one.name == name)
+    values = np.asarray(channel.part(name, observation), float)
+    usual = {"actors": 2, "lanes": 3, "route": 2, "predictions": 3, "lidar2d": 1, "signals": 2, "right_of_way": 2}
+    return values[-1] if len(part.shape) > usual.get(name, 1) else values
+
+
+def _columns_of(
+    values: NDArray[np.float64] | None, names: Sequence[str], columns: Sequence[str], origin: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return some columns of a part; rows without content are NaN, and positions begin at the origin."""
+    assert values is not None
+    found = values[..., [names.index(name) for name in columns]].copy()
+    found[~values.any(axis=-1)] = np.nan
+    found[..., :2] -= origin
+    return found
+
+
+def _rows(values: NDArray[np.float64], columns: Sequence[str]) -> Rows:
+    """Return the rows with content as mappings from columns to values."""
+    flat = values.reshape(-1, len(columns))
+    return [dict(zip(columns, row, strict=True)) for row in flat[flat.any(axis=1)].tolist()]
+
+
+def _in_words(rows: Mapping[str, Rows]) -> list[tuple[str, str]]:
+    """Return what the agent observed of traffic lights, right of way and its route, as pairs of a name and a value."""
+    found = []
+    for signal in rows.get("signals", [])[:1]:
+        state = _STATES[int(signal["state"])]
+        since = format_number(signal["time_in_state"])
+        found.append(("signal", f"{state} for {since} s, in {_meters(signal['distance'])}"))
+    for line in rows.get("stop_line", []):
+        rules = [word for key, word in (("stop_sign", "stop sign"), ("must_yield", "must yield")) if line[key]]
+        where = "inside the junction" if line["distance"] < 0 else f"in {_meters(line['distance'])}"
+        found.append(("stop line", ", ".join([where, *rules])))
+    if "right_of_way" in rows:
+        first = [row for row in rows["right_of_way"] if row["must_yield"]]
+        words = f"must yield to {count_of(len(first), 'actor')}" if first else "no actor to yield to"
+        arrival = min((row["other_arrival"] for row in first), default=math.inf)
+        found.append(("priority", f"{words}, the next in {format_number(arrival)} s" if arrival < 1000 else words))
+    for route in rows.get("route_state", []):
+        changes = int(route["lane_changes_needed"])
+        side = "left" if changes > 0 else "right"
+        within = _meters(route["distance_to_lane_change"])
+        words = f"{count_of(abs(changes), 'lane')} to the {side} within {within}" if changes else "this lane"
+        found += [("lane goal", words), ("goal", f"in {_meters(route['distance_left'])}")]
+    return found
+
+
+def _meters(value: float) -> str:
+    return f"{format_number(round(value, 1))} m"
+
+
+def _lights(recording: Recording, step: int, actors: Rows) -> list[tuple[str, int, int]]:
+    """Return the identifier, brake light and indicator of each actor of the scene that the agent observed."""
+    scene = recording.scene(step)
+    if not actors or not len(scene.roster):
+        return []
+    centers, found = scene.centers, []
+    for actor in actors:
+        apart = np.hypot(*(centers - (actor["x"], actor["y"])).T)
+        row = int(apart.argmin())
+        if apart[row] < _MATCH_M and (actor["brake_light"] or actor["indicator"]):
+            found.append((scene.roster.actors[row].id, int(actor["brake_light"]), int(actor["indicator"])))
+    return found

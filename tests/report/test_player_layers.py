@@ -1,0 +1,116 @@
+"""What the player draws besides the actors: what the agent observed and planned, lights, stop lines."""
+
+from __future__ import annotations
+
+import base64
+import xml.etree.ElementTree as ET
+import zlib
+
+import numpy as np
+import pytest
+from conftest import add_toy
+
+from crashhunt.crashes import list_bundles
+from crashhunt.recording import AgentChannel, ObservedPart
+from crashhunt.report import player_data
+from crashhunt.report._player_layers import _in_words, _present, _rows
+from crashhunt.scenario import load_scenario
+from crashhunt.simulators import PARTS
+
+
+def unpacked(layer) -> np.ndarray:
+    values = np.frombuffer(zlib.decompress(base64.b64decode(layer["values"])), "<f4")
+    return values.reshape(-1, *layer["size"])
+
+
+def hunted(shell):
+    words = ("--arg", "speed=14:20", "--seed", "1", "--keep-going", "--observe", "ego,actors,predictions,lidar2d")
+    add_toy(shell).crashhunt("run", "seen", "1", "3", "99", "--scenario", "toy", *words)
+
+
+@pytest.fixture
+def hunt(shell, made_once):
+    return made_once(hunted, shell)
+
+
+def test_boxes_of_a_scene_are_where_its_actors_are_and_the_rays_end_at_outlines(hunt):
+    bundle = list_bundles(hunt.folder / "seen")[0]
+    data = player_data(bundle)
+    seen, recording = data["observed"], bundle.recording()
+    boxes, rays = unpacked(seen["layers"]["actors"]), unpacked(seen["layers"]["lidar2d"])
+    assert seen["first"] == 0
+    assert len(boxes) == len(rays) == recording.steps  # the agent observes every scene but the last one
+    for step in (0, recording.steps - 1):
+        scene = recording.scene(step)
+        ego = scene.roster.index["ego"]
+        others = [row for row in range(len(scene.roster)) if row != ego]
+        found = boxes[step][np.isfinite(boxes[step][:, 0])]
+        assert sorted(found[:, 0].tolist()) == pytest.approx(
+            sorted((scene.centers[others, 0] - data["origin"][0]).tolist()), abs=0.02
+        )
+        ahead = min(
+            scene.centers[row, 0] - scene.centers[ego, 0] - scene.roster.actors[row].length / 2
+            for row in others
+            if scene.centers[row, 0] > scene.centers[ego, 0]
+        )
+        assert rays[step][0] == pytest.approx(ahead, abs=0.02)  # the toy drives along the x axis
+
+
+def test_crash_without_observed_parts_has_no_layers_of_them(toy):
+    toy.crashhunt("run", "h", "1", "3", "99", "--scenario", "toy", "--arg", "speed=20", "--seed", "1")
+    data = player_data(list_bundles(toy.folder / "h")[0])
+    assert data["stopLines"] == []
+    assert not {"observed", "plan", "yields"} & data.keys()
+
+
+def test_present_values_of_a_history_are_its_last_ones():
+    part = ObservedPart("signals", (4, 3, 4), tuple(column.name for column in PARTS["signals"].columns))
+    channel = AgentChannel("ego", "<f8", (48,), "<f8", (2,), (), (), (part,))
+    assert _present(channel, "signals", np.arange(48.0)).tolist() == np.arange(36.0, 48).reshape(3, 4).tolist()
+
+
+def row(part: str, **values: float) -> np.ndarray:
+    return np.array([values.get(column.name, 0.0) for column in PARTS[part].columns])
+
+
+def words(**parts: np.ndarray) -> dict[str, str]:
+    return dict(
+        _in_words({name: _rows(values, [one.name for one in PARTS[name].columns]) for name, values in parts.items()})
+    )
+
+
+def test_signals_priority_and_the_lane_goal_are_said_in_words():
+    nobody = row("right_of_way")
+    assert words(signals=row("signals", present=1, state=2, distance=23.44, time_in_state=3.25)) == {
+        "signal": "red for 3.25 s, in 23.4 m"
+    }
+    assert words(signals=row("signals")) == {}  # no traffic light is ahead
+    assert words(right_of_way=nobody) == {"priority": "no actor to yield to"}
+    first = row("right_of_way", present=1, must_yield=1, other_arrival=1000)
+    other = row("right_of_way", present=1, other_arrival=0.5)
+    assert words(right_of_way=np.stack([first, other]))["priority"] == "must yield to 1 actor"  # which stands
+    route = row("route_state", lane_changes_needed=-2, distance_to_lane_change=80, distance_left=300)
+    assert words(route_state=route) == {
+        "lane goal": "2 lanes to the right within 80 m",
+        "goal": "in 300 m",
+    }
+    assert words(stop_line=row("stop_line", present=1, distance=-1, must_yield=1)) == {
+        "stop line": "inside the junction, must yield"
+    }
+
+
+def test_stop_lines_are_at_the_ends_of_the_lanes_that_have_to_yield():
+    scenario = load_scenario("intersection")
+    root = ET.parse(scenario.folder / "intersection.net.xml").getroot()
+    waits = {f"{one.get('from')}_{one.get('fromLane')}" for one in root.iter("connection") if one.get("state") == "m"}
+    waits = {lane for lane in waits if not lane.startswith(":")}
+    ends = {
+        lane.get("id"): [*map(float, lane.get("shape").split()[-1].split(","))]
+        for lane in root.iter("lane")
+        if lane.get("id") in waits
+    }
+    found = scenario.backend.stop_lines(scenario)
+    assert {line.lane for line in found} == waits
+    for line in found:
+        assert line.kind == "yield"
+        assert line.ends.mean(axis=0).tolist() == pytest.approx(ends[line.lane], abs=0.01)
