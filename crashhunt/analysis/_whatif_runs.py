@@ -29,6 +29,7 @@ import numpy as np
 from crashhunt.analysis._interventions import LeaveOut, Reseed, SetArguments
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import UsageError, WorkerError
+from crashhunt.base.text import format_percent
 from crashhunt.crashes import wilson
 from crashhunt.recording import first_divergence
 from crashhunt.replays import ReplayOptions, is_current_code, prepare, reruns_of, up_to
@@ -419,7 +420,7 @@ class Counts(Serializable):
         answer = f"{self.crash}: {self.crashed} of {self.runs} runs crashed"
         if self.interval is not None and self.share is not None:
             low, high = self.interval
-            answer += f" ({self.share:.1%}; 95 % interval: {low:.1%} to {high:.1%})"
+            answer += f" ({format_percent(self.share)}; 95 % interval: {format_percent(low)} to {format_percent(high)})"
         found = [answer, f"  recorded: {self.recorded_outcome} at step {self.recorded_steps}"]
         found += [f"  changed: {what}" for what in self.interventions]
         if self.outcomes:

@@ -30,6 +30,7 @@ _INVISIBLE_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 _JOINERS = "\u200c\u200d"
 _ASCII = re.compile(r"[ -~\n\t]*")
 _FOUR_DIGITS = 999.5  # from here on, three significant digits would be no whole number
+_MILLION = 999_999.5
 _LINE_BREAKS = re.compile(r"[^\S\n]*(?:\r\n|[\n\r\v\f\x1c-\x1e\x85\u2028\u2029])\s*")
 
 
@@ -66,32 +67,27 @@ def format_time(seconds: float, step_length_s: float) -> str:
     return f"{seconds:.{1 if abs(tenths - round(tenths)) < 1e-6 else 2}f} s"
 
 
-def format_number(value: float) -> str:
-    """Return a number for users with three significant digits; a whole number in full, with commas.
+def format_number(value: float, digits: int = 3) -> str:
+    """Return a number for users with three significant digits; a whole number below 1,000,000 in full, with commas.
 
-    >>> [format_number(value) for value in (0.012345, 12.0, 15.4509, 12345.6, 0.9996, 0.0000123)]
-    ['0.0123', '12', '15.5', '12,346', '1', '1.23e-5']
+    All texts and pages use this function for rates, shares, arguments and evidence, as ``formatNumber`` in the browser.
+    Measured times, distances and speeds have one decimal, so that the columns of tables agree with the texts.
+
+    >>> [format_number(value) for value in (0.012345, 12.0, 15.4509, 12345.6, 0.9996, 0.0000123, math.inf)]
+    ['0.0123', '12', '15.5', '12,346', '1', '1.23e-5', 'any number']
     """
     if not math.isfinite(value):
-        return "unlimited" if value == math.inf else str(value)
-    if value == round(value) or abs(value) >= _FOUR_DIGITS:
+        return "any number" if value == math.inf else str(value)
+    if abs(value) < _MILLION and (value == round(value) or abs(value) >= _FOUR_DIGITS):
         return f"{round(value):,}"
-    text = f"{value:.3g}"
-    if "e" not in text:
-        return text
-    digits, _, power = text.partition("e")
-    return f"{digits}e{int(power)}"
+    text = f"{value:.{digits}g}"
+    mantissa, _, power = text.partition("e")
+    return f"{mantissa}e{int(power)}" if power else text
 
 
 def format_percent(share: float) -> str:
     """Return a share from 0 to 1 as percent: ``12.3 %``."""
     return f"{format_number(100 * share)} %"
-
-
-def format_points(difference: float) -> str:
-    """Return a difference of two shares as percentage points with its sign: ``+1.2 points``."""
-    text = format_number(100 * difference)
-    return f"{text if text.startswith('-') or text == '0' else f'+{text}'} points"
 
 
 def count_of(number: int, noun: str) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.files import whole_file
+from crashhunt.base.text import format_number
 from crashhunt.cli._common import (
     add_build,
     add_ci_options,
@@ -247,5 +248,5 @@ def _watched(*, as_json: bool) -> Iterator[Callable[[GateProgress], None]]:
 def _progress(progress: GateProgress) -> str:
     return (
         f"{progress.name}: {progress.done:,} of {progress.most:,} pairs; only BASE crashes in {progress.only_base}, "
-        f"only HEAD in {progress.only_head}; evidence {progress.evidence:.3g}"
+        f"only HEAD in {progress.only_head}; evidence {format_number(progress.evidence)}"
     )

@@ -23,6 +23,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.forks import NoAnswer, NoProcessError
 from crashhunt.base.json_types import finite
 from crashhunt.base.resources import FREE, free_memory
+from crashhunt.base.text import format_percent
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates
 from crashhunt.episode._forks import ForkRunner
 from crashhunt.episode._observers import Observer
@@ -155,8 +156,8 @@ class Brancher(Observer):
                 self.fork_runner.skip()
             return
         if near and free_memory() < FREE:
-            self._tell(f"less than {FREE:.0%} of the memory is free: trials branch less than they might")
-            self.fork_runner.skip(f"less than {FREE:.0%} of the memory was free")
+            self._tell(f"less than {format_percent(FREE)} of the memory is free: trials branch less than they might")
+            self.fork_runner.skip(f"less than {format_percent(FREE)} of the memory was free")
         else:
             sleeper = self._suspend_fork(episode) if near else None
             if sleeper is not None and episode.steps >= self._strongest_at:

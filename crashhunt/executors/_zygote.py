@@ -31,6 +31,7 @@ from crashhunt.base.processes import adopt_orphans, children_of, die_with, end_d
 from crashhunt.base.programs import is_native
 from crashhunt.base.resources import FREE, free_memory, limit_behind
 from crashhunt.base.temporary import SharedMemoryWatch
+from crashhunt.base.text import format_percent
 from crashhunt.episode import Parts, generators, options_of, seed_everything, set_generators, stage_of
 from crashhunt.executors._rehearsal import rehearse_trial
 from crashhunt.executors._trial_process import TrialProcess
@@ -173,7 +174,8 @@ class WarmTraffics:
     def _make_room(self) -> bool:
         if free_memory() < FREE:
             self._notify(
-                f"less than {FREE:.0%} of the memory is free: fewer warmed-up copies are kept than there might be"
+                f"less than {format_percent(FREE)} of the memory is free: "
+                "fewer warmed-up copies are kept than there might be"
             )
             return False
         if len(self._suspended) < self._limit:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.codec import Serializable
+from crashhunt.base.text import format_number, format_percent
 from crashhunt.results import CrashTally
 from crashhunt.statistics import TRIALS_PER_ROOT
 
@@ -199,13 +200,11 @@ class RareReport:
         if found.estimate is None:
             certain = [] if found.roots else self._certain_lines  # bounds that rest on plain trials alone
             return [f"rare: no estimate: {found.why_not or 'no root has ended'}", *certain]
-        answer = f"rare: {found.estimate:.2g} per trial" if found.estimate else "rare: no crash yet"
+        answer = f"rare: {format_number(found.estimate)} per trial" if found.estimate else "rare: no crash yet"
         if found.estimated is not None:
             one = found.estimated
-            answer += (
-                f" ({one.low:.2g} to {one.high:.2g}, estimated from {found.roots} roots; "
-                f"effective sample size {one.effective:.0f})"
-            )
+            answer += f" ({_between(one.low, one.high)}, estimated from {found.roots} roots; "
+            answer += f"effective sample size {one.effective:.0f})"
         lines = [answer]
         if found.estimated is None:
             more = ""
@@ -213,17 +212,22 @@ class RareReport:
                 more = f"; about {found.more_roots * TRIALS_PER_ROOT} more trials are needed"
             lines.append(f"  no interval ({found.roots} roots with their copies): {found.why_not}{more}")
         shares = [
-            f"{cell} {part:.2g} ({part / found.disturbed:.0%})" for cell, part in found.parts.items() if found.disturbed
+            f"{cell} {format_number(part)} ({format_percent(part / found.disturbed)})"
+            for cell, part in found.parts.items()
+            if found.disturbed
         ]
         undisturbed = f"undisturbed {found.undisturbed_crashes} of {found.roots + found.plain} trials"
         lines.append("  " + "; ".join([undisturbed, *shares[:_MAX_SHOWN_CELLS]]))
         if len(shares) > _MAX_SHOWN_CELLS:
             lines.append(f"  {_MAX_SHOWN_CELLS} of {len(shares)} parts shown; run --json has all of them")
         if found.undisturbed_crashes and (part := found.estimated_disturbed) is not None:
-            lines.append(f"  with a disturbance: {found.disturbed:.2g} per trial ({part.low:.2g} to {part.high:.2g})")
+            between = _between(part.low, part.high)
+            lines.append(f"  with a disturbance: {format_number(found.disturbed)} per trial ({between})")
         if found.plain_equivalent_steps is not None:
             spent = f"{found.steps} steps, {found.plain_steps} of them in plain trials"
-            lines.append(f"  {spent}; plain trials alone need about {found.plain_equivalent_steps:.2g} steps")
+            lines.append(
+                f"  {spent}; plain trials alone need about {format_number(found.plain_equivalent_steps)} steps"
+            )
         if self.verified:
             lines.append(f"  of the {self.verified} weightiest crashes, {len(self.crashes)} came again from the start")
         lines += self._certain_lines
@@ -237,7 +241,12 @@ class RareReport:
             return []
         low, high = found.certain
         crashed = f"{found.plain_crashes} of {found.plain} plain trials crashed"
-        return [f"  certain: at least {low:.2g}, at most {high:.2g} ({found.confidence:.0%}; {crashed})"]
+        bounds = f"at least {format_number(low)}, at most {format_number(high)}"
+        return [f"  certain: {bounds} ({format_percent(found.confidence)}; {crashed})"]
+
+
+def _between(low: float, high: float) -> str:
+    return f"{format_number(low)} to {format_number(high)}"
 
 
 _MAX_SHOWN_CELLS = 5  # parts of the estimate of rare mode

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
         describe_rates as describe_rates,
         describe_running as describe_running,
         format_interval as format_interval,
-        format_rate as format_rate,
         rates_page as rates_page,
         write_rates_csv as write_rates_csv,
     )

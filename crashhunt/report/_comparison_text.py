@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import in_lines
-from crashhunt.report._rate_text import count_training_trials, format_rate
+from crashhunt.base.text import format_number, format_percent, in_lines
+from crashhunt.report._rate_text import count_training_trials
 from crashhunt.report._step_table import aligned, argument_units
 from crashhunt.results import FACTS, HuntResults, columns_of
 from crashhunt.statistics import PER_WORDS, held_out_by_seed
@@ -92,7 +92,7 @@ def describe_comparison(found: Comparison) -> str:
 
 def _number(hunt: HuntFigures, rate: float) -> str:
     """Return a crash rate as text: in percent if it is per trial."""
-    return f"{rate:.2%}" if hunt.per == "trial" else format_rate(rate)
+    return format_percent(rate) if hunt.per == "trial" else format_number(rate)
 
 
 def _unit(per: Per) -> str:
@@ -214,7 +214,7 @@ def _argument_plot(
         low = min(float(values.min()) for values, _ in of.values())
         high = max(float(values.max()) for values, _ in of.values())
         edges: NDArray[np.float64] = np.linspace(low, high, _MAX_BINS + 1)
-        labels = [f"{low:.4g}", f"{high:.4g}"]
+        labels = [format_number(low), format_number(high)]
     else:
         words = sorted({str(value) for values, _ in of.values() for value in values})
         labels = words
@@ -232,7 +232,7 @@ def _argument_plot(
     parts = ['<path class="axis" d="M40 8V148H268"/>',
              f'<text x="154" y="180" text-anchor="middle">{html.escape(label)}</text>',
              '<text transform="translate(11 78) rotate(-90)" text-anchor="middle">crash rate</text>',
-             f'<text x="36" y="16" text-anchor="end">{most:.0%}</text>',
+             f'<text x="36" y="16" text-anchor="end">{format_percent(most)}</text>',
              '<text x="36" y="150" text-anchor="end">0</text>']  # fmt: skip
     for place, end in enumerate(labels):
         x = 40 + 228 * (place / (len(labels) - 1) if numeric else (place + 0.5) / len(labels))
@@ -243,8 +243,8 @@ def _argument_plot(
         path = "L".join(f"{x:.1f} {y:.1f}" for x, y, _, _ in at)
         parts.append(f'<path d="M{path}" fill="none" stroke="{colors[hunt]}" stroke-width="2"/>')
         parts += [
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colors[hunt]}"><title>{rate:.1%} of {count} trials</title>'
-            "</circle>"
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colors[hunt]}">'
+            f"<title>{format_percent(rate)} of {count} trials</title></circle>"
             for x, y, count, rate in at
         ]
     return (

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.text import count_of, format_time, in_lines
+from crashhunt.base.text import count_of, format_number, format_time, in_lines
 from crashhunt.crashes import (
     Encounter,
     contact_record,
@@ -359,7 +359,8 @@ class Story:
             if is_opaque(channel.observation_shape):
                 facts = describe_value(seen)
             else:
-                facts = ", ".join(f"{name} {value:.3g}" for name, value in channel.values_by_name(seen).items())
+                values = channel.values_by_name(seen).items()
+                facts = ", ".join(f"{name} {format_number(value)}" for name, value in values)
             sentences.append(f"Its last observation, in step {last.step}: {facts}.")
         frames = [line.strip() for line in failure.traceback.splitlines() if line.strip()]
         if frames and failure.kind in ("signal", "timeout"):  # the most recent call comes first
@@ -397,7 +398,7 @@ class Story:
         if opaque := self._opaque_action(step):
             return [opaque]
         action = self._action(step)
-        return ["-"] * len(self._names()) if action is None else [f"{value:.4g}" for value in action]
+        return ["-"] * len(self._names()) if action is None else [format_number(value) for value in action]
 
 
 _GAP_M = 0.05  # shown as 0.1; a smaller one needs any deceleration, up to millions of m/s²
@@ -431,7 +432,7 @@ def _named(moment: Moment, nearest: Mapping[str, TableCell]) -> dict[str, object
 def _words(action: Sequence[float] | None, names: Sequence[str]) -> str:
     if action is None:
         return "not recorded"
-    return ", ".join(f"{name} {value:.4g}" for name, value in zip(names, action, strict=False))
+    return ", ".join(f"{name} {format_number(value)}" for name, value in zip(names, action, strict=False))
 
 
 def describe_programs(bundle: Bundle) -> list[str]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree as Xml
 
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import command_line, in_lines, visible
+from crashhunt.base.text import command_line, format_number, in_lines, visible
 from crashhunt.report._findings import escaped, row_of
 from crashhunt.report._rate_text import count_training_trials, format_interval
 
@@ -48,7 +48,7 @@ def _answer(found: GateReport) -> str:
     if found.verdict == "better":
         return f"better: {head} {_verb(found)} less often than {base}"
     if found.verdict == "no_difference":
-        return f"no difference above {found.margin:.3g} {_events(found)} per trial: {head}, {base}"
+        return f"no difference above {format_number(found.margin)} {_events(found)} per trial: {head}, {base}"
     return f"undecided: {head}, {base}"
 
 
@@ -74,10 +74,12 @@ def _evidence(found: GateReport) -> list[str]:
     confidence = f"{found.confidence:g} %, valid whenever you look"
     lines = [
         f"{found.pairs:,} pairs: {counts}",
-        f"evidence: {found.evidence:.3g}; {needed:.3g} decides ({confidence})",
+        f"evidence: {format_number(found.evidence)}; {format_number(needed)} decides ({confidence})",
     ]
     if found.difference is not None:
-        lines.append(f"difference: {found.difference.as_difference()} {_events(found)} per trial (HEAD minus BASE)")
+        lines.append(
+            f"difference: {found.difference.as_difference()} {_events(found)} per 100 trials (HEAD minus BASE)"
+        )
     return lines
 
 
@@ -180,10 +182,10 @@ def gate_summary(found: GateReport) -> str:
         lines += [row_of(("pairs of trials", f"{verb} only with BASE", "only with HEAD", "with both", "evidence"))]
         lines += [row_of(["---:"] * 5)]
         counts = (found.pairs, found.only_base, found.only_head, found.both)
-        lines += [row_of([*(f"{count:,}" for count in counts), f"{found.evidence:.3g}"]), ""]
+        lines += [row_of([*(f"{count:,}" for count in counts), format_number(found.evidence)]), ""]
     if found.difference is not None:
         confidence = f"{found.confidence:g} %, valid whenever you look"
-        difference = f"**{found.difference.as_difference()}** {_events(found)} per trial"
+        difference = f"**{found.difference.as_difference()}** {_events(found)} per 100 trials"
         lines += [f"Difference: {difference} (HEAD minus BASE, {confidence}).", ""]
     if other := [*found.cautions, *_invalid_pairs(found), *_new_types(found)]:
         lines += [*(f"- {escaped(line)}" for line in other), ""]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.base.text import count_of, format_number
+from crashhunt.base.text import count_of
 from crashhunt.crashes import stop_lines_of, yielding_actor
 from crashhunt.recording import is_opaque
 
@@ -189,8 +189,7 @@ def _in_words(rows: Mapping[str, Rows]) -> list[tuple[str, str]]:
     found = []
     for signal in rows.get("signals", [])[:1]:
         state = _STATES[int(signal["state"])]
-        since = format_number(signal["time_in_state"])
-        found.append(("signal", f"{state} for {since} s, in {_meters(signal['distance'])}"))
+        found.append(("signal", f"{state} for {signal['time_in_state']:.1f} s, in {_meters(signal['distance'])}"))
     for line in rows.get("stop_line", []):
         rules = [word for key, word in (("stop_sign", "stop sign"), ("must_yield", "must yield")) if line[key]]
         where = "inside the junction" if line["distance"] < 0 else f"in {_meters(line['distance'])}"
@@ -199,7 +198,7 @@ def _in_words(rows: Mapping[str, Rows]) -> list[tuple[str, str]]:
         first = [row for row in rows["right_of_way"] if row["must_yield"]]
         words = f"must yield to {count_of(len(first), 'actor')}" if first else "no actor to yield to"
         arrival = min((row["other_arrival"] for row in first), default=math.inf)
-        found.append(("priority", f"{words}, the next in {format_number(arrival)} s" if arrival < 1000 else words))
+        found.append(("priority", f"{words}, the next in {arrival:.1f} s" if arrival < 1000 else words))
     for route in rows.get("route_state", []):
         changes = int(route["lane_changes_needed"])
         side = "left" if changes > 0 else "right"
@@ -210,7 +209,7 @@ def _in_words(rows: Mapping[str, Rows]) -> list[tuple[str, str]]:
 
 
 def _meters(value: float) -> str:
-    return f"{format_number(round(value, 1))} m"
+    return f"{value:.1f} m"
 
 
 def _lights(recording: Recording, step: int, actors: Rows) -> list[tuple[str, int, int]]:

@@ -9,7 +9,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING, TextIO
 
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import in_lines
+from crashhunt.base.text import format_number, in_lines
 from crashhunt.statistics import PER_WORDS, Interval
 
 if TYPE_CHECKING:
@@ -36,25 +36,6 @@ th, td { text-align: left; padding: .4rem .7rem; border: 1px solid #ccc; }
 """
 
 
-def format_rate(rate: float, digits: int = 2) -> str:
-    """Return a rate as text with significant digits, two unless given: ``0.36``, ``1,200``, ``1.0e-3``.
-
-    >>> format_rate(0.0010014)
-    '1.0e-3'
-    """
-    if not math.isfinite(rate):
-        return "any number"
-    if rate == 0:
-        return "0"
-    exponent = math.floor(math.log10(rate))
-    rounded = round(rate, digits - 1 - exponent)
-    if 0.01 <= rounded < 1e6:
-        places = max(0, digits - 1 - math.floor(math.log10(rounded)))
-        return f"{rounded:,.{places}f}"
-    mantissa, _, power = f"{rate:.{digits - 1}e}".partition("e")
-    return f"{mantissa}e{int(power)}"
-
-
 def count_training_trials(count: int) -> str:
     """Return text on the trials that are not counted because an agent was trained on their traffic."""
     return f"{_count(count, 'trial', 'trials')} on training traffic {'is' if count == 1 else 'are'} excluded"
@@ -62,8 +43,8 @@ def count_training_trials(count: int) -> str:
 
 def format_interval(interval: Interval) -> str:
     """Return an interval as text, such as ``at least 0.19, at most 0.52``."""
-    least = f"at least {format_rate(interval.low)}, " if interval.low > 0 else ""
-    return f"{least}at most {format_rate(interval.high)}"
+    least = f"at least {format_number(interval.low)}, " if interval.low > 0 else ""
+    return f"{least}at most {format_number(interval.high)}"
 
 
 def describe_running(rate: RunningRate) -> str:
@@ -71,7 +52,7 @@ def describe_running(rate: RunningRate) -> str:
     if rate["method"] == "rare":
         return _describe_rare(rate)
     bar = (
-        f"; bar {format_rate(rate['bar'])} {PER_WORDS[rate['per']]}: {rate['verdict']}"
+        f"; bar {format_number(rate['bar'])} {PER_WORDS[rate['per']]}: {rate['verdict']}"
         if rate["bar"] is not None
         else ""
     )
@@ -91,9 +72,9 @@ def _describe_rare(rate: RunningRate) -> str:
         return f"crash rate: not known yet ({rate['why_not']}){certain}"
     if not rate["estimate"]:
         return f"crash rate: no crash yet in {roots} and their copies{certain}"
-    found = f"crash rate: {format_rate(rate['estimate'])} per trial"
+    found = f"crash rate: {format_number(rate['estimate'])} per trial"
     if (one := rate["estimated"]) is not None and one["high"] is not None:
-        found += f" ({format_rate(one['low'])} to {format_rate(one['high'])}, estimated from {roots})"
+        found += f" ({format_number(one['low'])} to {format_number(one['high'])}, estimated from {roots})"
     else:
         found += f" (no interval from {roots} yet)"
     return found + certain
@@ -120,7 +101,8 @@ def _of_hunt(rates: list[CrashRate]) -> list[str]:
     known = [rate for rate in rates if rate.certain is not None]
     lines: list[str]
     if known and not first.crashes:
-        each = [f"{format_rate(rate.certain.high)} {PER_WORDS[rate.per]}" for rate in known if rate.certain is not None]
+        highest = [(rate.certain.high, PER_WORDS[rate.per]) for rate in known if rate.certain is not None]
+        each = [f"{format_number(high)} {per}" for high, per in highest]
         lines = [f"{head}: at most {', '.join(each)} {confidence}"]
     elif known:
         lines = [f"{head} {confidence}", *(f"  {PER_WORDS[rate.per]}: {_answer(rate)}" for rate in known)]
@@ -142,7 +124,7 @@ def _of_hunt(rates: list[CrashRate]) -> list[str]:
 
 
 def _verdict(rate: CrashRate, bar: float) -> str:
-    exact = (format_rate(bar, digits) for digits in range(2, _MAX_DIGITS))
+    exact = (format_number(bar, digits) for digits in range(3, _MAX_DIGITS))
     text = next((text for text in exact if float(text.replace(",", "")) == bar), f"{bar:g}")
     shown = f"the bar of {text} {PER_WORDS[rate.per]}"
     if rate.verdict != "undecided":
@@ -161,22 +143,22 @@ def _verdict(rate: CrashRate, bar: float) -> str:
 def _format_distinct(rate: float, bar: float) -> str:
     """Return a rate with enough digits to show on which side of a bar it lies.
 
-    >>> _format_distinct(0.00996, 0.01)
-    '9.96e-3'
+    >>> _format_distinct(0.0099996, 0.01)
+    '0.0099996'
     >>> _format_distinct(0.012, 0.01)
     '0.012'
     """
-    for digits in range(2, _MAX_DIGITS):
-        text = format_rate(rate, digits)
+    for digits in range(3, _MAX_DIGITS):
+        text = format_number(rate, digits)
         if not math.isfinite(rate) or (float(text.replace(",", "")) - bar) * (rate - bar) > 0:
             return text
-    return format_rate(rate)
+    return format_number(rate)
 
 
 def _answer(rate: CrashRate | RatePart) -> str:
     if rate.certain is None:
         return "not known"
-    estimate = "" if rate.estimate is None else f"{format_rate(rate.estimate)}, "
+    estimate = "" if rate.estimate is None else f"{format_number(rate.estimate)}, "
     return f"{estimate}{format_interval(rate.certain)}"
 
 
@@ -253,7 +235,7 @@ def rates_page(rates: Sequence[CrashRate], path: Path) -> None:
 
 
 def _numbers(rate: CrashRate | RatePart) -> tuple[str, str, str]:
-    estimate = "" if rate.estimate is None else format_rate(rate.estimate)
+    estimate = "" if rate.estimate is None else format_number(rate.estimate)
     if rate.certain is None:
         return estimate, "", ""
-    return estimate, format_rate(rate.certain.low), format_rate(rate.certain.high)
+    return estimate, format_number(rate.certain.low), format_number(rate.certain.high)

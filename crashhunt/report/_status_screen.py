@@ -12,7 +12,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from crashhunt.base.text import one_line, out_of
+from crashhunt.base.text import format_number, format_percent, one_line, out_of
 from crashhunt.recording import Phase
 from crashhunt.report._rate_text import describe_running
 from crashhunt.trial import Outcome, without_folder
@@ -243,7 +243,7 @@ def format_inputs(result: TrialResult) -> str:
 
 def _short(value: Value) -> str:
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return format_number(value).replace(",", "")  # so that it can be copied
     return without_folder(value)
 
 
@@ -362,7 +362,7 @@ def _strategies(search: SearchStatus) -> str:
     for one in search.strategies:
         came = [] if one.danger is None else [f"mean criticality {one.danger:.2f}"]
         came += [f"{one.crashes} {'crash' if one.crashes == 1 else 'crashes'}"] if one.crashes else []
-        parts.append(f"{one.name} {one.share:.0%} of trials" + (f" ({', '.join(came)})" if came else ""))
+        parts.append(f"{one.name} {format_percent(one.share)} of trials" + (f" ({', '.join(came)})" if came else ""))
     return f"search: {', '.join(parts)}"
 
 

@@ -6,7 +6,7 @@ import math
 import statistics
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.base.text import command_line, count_of, one_line
+from crashhunt.base.text import command_line, count_of, format_number, format_percent, one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -556,7 +556,7 @@ def _outcome(factor: Factor) -> str:
     of = factor.clear
     if factor.kind in ("argument", "seed") and of > 1:
         low, high = factor.interval or (0.0, 1.0)
-        words = f"{factor.crashed} of {of} runs crash ({100 * low:.0f} to {100 * high:.0f} %)"
+        words = f"{factor.crashed} of {of} runs crash ({format_percent(low)} to {format_percent(high)})"
         if factor.crashed == factor.same:
             return words
         return f"{words}, {factor.same or 'none'} of them the same crash"
@@ -585,7 +585,7 @@ def _short(factor: Factor, runs: int, when: Callable[[int], str]) -> str:
 
 
 def _number(value: Value | None) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return format_number(value) if isinstance(value, float) else str(value)
 
 
 # The results of the robustness probes and branches of a hunt.

@@ -2,8 +2,8 @@
 function formatNumber(value) {
   if (typeof value !== "number" || !Number.isFinite(value)) return "-";
   const size = Math.abs(value);
-  if (Number.isInteger(value) || size >= 999.5) return Math.round(value).toLocaleString("en");
-  if (size >= 0.0001) return String(Number(value.toPrecision(3)));
+  if (size < 999999.5 && (Number.isInteger(value) || size >= 999.5)) return Math.round(value).toLocaleString("en");
+  if (size >= 0.0001 && size < 999.5) return String(Number(value.toPrecision(3)));
   const [digits, power] = value.toExponential(2).split("e");
   return `${Number(digits)}e${Number(power)}`;
 }

@@ -314,16 +314,16 @@ function showPicked() {
   const crash = view.crash, actor = crash.actors.findIndex(([id]) => id === view.picked), pose = actor < 0 ? null : state(view.step, actor);
   $("vehicle").hidden = actor < 0;
   if (actor < 0) return;
-  const [id, kind, length, breadth] = crash.actors[actor], rows = [["vehicle", id], ["kind", `${kind}, ${formatNumber(length)} m long, ${formatNumber(breadth)} m wide`]];
+  const [id, kind, length, breadth] = crash.actors[actor], rows = [["vehicle", id], ["kind", `${kind}, ${measured(length, "m")} long, ${measured(breadth, "m")} wide`]];
   if (pose) {
     const own = id === crash.agent ? null : state(view.step, view.agent), light = lightsAt(view.step, id), pull = accelerationOf(view.step, actor);
-    rows.push(["speed", `${formatNumber(pose[3])} m/s`], ["acceleration", Number.isFinite(pull) ? `${formatNumber(pull)} m/s²` : "-"]);
+    rows.push(["speed", measured(pose[3], "m/s")], ["acceleration", measured(pull, "m/s²")]);
     const [since, lane] = (crash.actorLanes ?? []).filter(([step, lanes]) => step <= view.step && lanes[id]).map(([step, lanes]) => [step, lanes[id]]).at(-1) ?? [];
     if (lane) rows.push(["lane", since === view.step ? lane : `${lane} (at step ${since})`]);
     if (light) rows.push(["lights", [light[1] ? "brake" : "", { 1: "left indicator", "-1": "right indicator", 2: "hazard lights" }[light[2]]].filter(Boolean).join(", ")]);
     if (own) {
       const [dx, dy] = [pose[0] - own[0], pose[1] - own[1]], ahead = dx * Math.cos(own[2]) + dy * Math.sin(own[2]), left = dy * Math.cos(own[2]) - dx * Math.sin(own[2]);
-      rows.push([`seen from ${crash.agent}`, `${formatNumber(Math.abs(ahead))} m ${ahead < 0 ? "behind" : "ahead"}, ${formatNumber(Math.abs(left))} m to the ${left < 0 ? "right" : "left"} (front bumpers)`]);
+      rows.push([`seen from ${crash.agent}`, `${measured(Math.abs(ahead), "m")} ${ahead < 0 ? "behind" : "ahead"}${Math.abs(left) < 0.05 ? "" : `, ${measured(Math.abs(left), "m")} to the ${left < 0 ? "right" : "left"}`} (front bumpers)`]);
     }
   } else rows.push(["at this step", "not in the scene"]);
   const roles = [id === crash.agent ? "agent" : crash.agents.includes(id) ? "another agent" : "", id === crash.other ? "collision partner" : "", crash.yields ? { [crash.yields]: "must yield by the map", [[crash.agent, crash.other].find((one) => one !== crash.yields)]: "has priority by the map" }[id] : ""].filter(Boolean);
@@ -669,6 +669,9 @@ function drawCursor(context, x, top, bottom) {
   context.stroke();
 }
 
+/* A measured value, with one decimal as in texts and tables. */
+const measured = (value, unit) => (Number.isFinite(value) ? `${value.toFixed(1)} ${unit}` : "-");
+
 /* The actors to which time to collision and gap of a step belong: the collision partner, or the closest ones. */
 function partners(crash, step) {
   if (crash.other) return [crash.other, crash.other];
@@ -677,11 +680,10 @@ function partners(crash, step) {
 
 /* What the rows of curves say at a step, and its actions: for the line below the scene and for the tip on the curves. */
 function valuesAt(crash, step) {
-  const number = (value, unit) => (Number.isFinite(value) ? `${formatNumber(value)} ${unit}` : "-");
-  const [ttcWith, gapTo] = partners(crash, step), other = crash.other ? [[`speed of ${crash.other}`, number(crash.otherSpeeds[step], "m/s")]] : [];
-  const parts = [["time", `${(crash.time0 + step * crash.dt).toFixed(Math.abs(10 * crash.dt - Math.round(10 * crash.dt)) < 1e-6 ? 1 : 2)} s`], ["speed", number(crash.speeds[step], "m/s")], ...other, ["acceleration", number(crash.pulls[step], "m/s²")]];
-  if (crash.other) parts.push([`acceleration of ${crash.other}`, number(crash.otherPulls[step], "m/s²")]);
-  parts.push([`TTC${ttcWith && ` with ${ttcWith}`}`, number(crash.ttcs[step], "s")], [`gap${gapTo && ` to ${gapTo}`}`, number(crash.gaps[step], "m")]);
+  const [ttcWith, gapTo] = partners(crash, step), other = crash.other ? [[`speed of ${crash.other}`, measured(crash.otherSpeeds[step], "m/s")]] : [];
+  const parts = [["time", `${(crash.time0 + step * crash.dt).toFixed(Math.abs(10 * crash.dt - Math.round(10 * crash.dt)) < 1e-6 ? 1 : 2)} s`], ["speed", measured(crash.speeds[step], "m/s")], ...other, ["acceleration", measured(crash.pulls[step], "m/s²")]];
+  if (crash.other) parts.push([`acceleration of ${crash.other}`, measured(crash.otherPulls[step], "m/s²")]);
+  parts.push([`TTC${ttcWith && ` with ${ttcWith}`}`, measured(crash.ttcs[step], "s")], [`gap${gapTo && ` to ${gapTo}`}`, measured(crash.gaps[step], "m")]);
   if (crash.dangers) parts.push(["criticality", formatNumber(crash.dangers[step])], ["rear criticality", formatNumber(crash.behinds[step])]);
   crash.actionNames.forEach((name, place) => {
     const value = crash.acts[step * crash.actionNames.length + place];

@@ -42,6 +42,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from crashhunt.base.text import format_number
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -75,22 +77,17 @@ class Interval(NamedTuple):
     low: float
     high: float
 
-    def as_difference(self, *, percent: bool = True) -> str:
-        """Return the interval of a difference as text; an end that is not 0 has a digit that is not 0.
+    def as_difference(self, *, per_hundred: bool = True) -> str:
+        """Return the interval of a difference as text; per 100 units unless ``per_hundred`` is False.
 
         >>> Interval(-0.0174, 0.1942).as_difference()
-        '-1.74% to +19.42%'
-        >>> Interval(0.0000042, 3.25).as_difference()
-        '+0.0004% to +325.00%'
+        '-1.74 to +19.4'
+        >>> Interval(0.0000042, 3.25).as_difference(per_hundred=False)
+        '+4.2e-6 to +3.25'
         """
-        return " to ".join(_signed(end, percent=percent) for end in self)
-
-
-def _signed(value: float, *, percent: bool) -> str:
-    if not percent or not math.isfinite(value):
-        return f"{value:+.3g}" if math.isfinite(value) else "any number"
-    text = f"{value:+.2%}"
-    return text if float(text.rstrip("%")) or not value else f"{100 * value:+.1g}%"
+        ends = [format_number(100 * end if per_hundred else end) for end in self]
+        signed = [f"+{text}" if 0 < end < math.inf else text for end, text in zip(self, ends, strict=True)]
+        return " to ".join(signed)
 
 
 def log_of_sum(logs: NDArray[np.float64]) -> float:

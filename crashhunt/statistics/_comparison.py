@@ -22,7 +22,7 @@ from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
 from crashhunt.base.codec import Serializable, null_is
 from crashhunt.base.errors import HuntDirectoryError, UsageError
-from crashhunt.base.text import count_of, one_of
+from crashhunt.base.text import count_of, format_number, one_of
 from crashhunt.ledger import Ledger
 from crashhunt.results import HuntResults
 from crashhunt.statistics._anytime_interval import Interval
@@ -191,9 +191,8 @@ class Pair(Serializable):
                 f"{self.only_second} only in {self.second}, {self.both} in both"
             )
         if self.evidence is not None:
-            what += (
-                f" (evidence {self.evidence:.3g}{f'; {1 / _ALPHA:g} decides' if self.answer == 'undecided' else ''})"
-            )
+            decides = f"; {format_number(1 / _ALPHA)} decides" if self.answer == "undecided" else ""
+            what += f" (evidence {format_number(self.evidence)}{decides})"
         return f"{self._answer}: {what}{self._difference}"
 
     @property
@@ -208,8 +207,10 @@ class Pair(Serializable):
     def _difference(self) -> str:
         if self.difference is None:
             return ""
-        found = self.difference.as_difference(percent=self.per == "trial")
-        return f"; difference: {found} crashes {PER_WORDS[self.per]} ({self.second} minus {self.first}, 95 %)"
+        is_trial = self.per == "trial"
+        found = self.difference.as_difference(per_hundred=is_trial)
+        per = "per 100 trials" if is_trial else PER_WORDS[self.per]
+        return f"; difference: {found} crashes {per} ({self.second} minus {self.first}, 95 %)"
 
     def _unpaired(self) -> str:
         reason = f"{self.first} and {self.second}{self.why_unpaired.removeprefix('they')}"

@@ -52,6 +52,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from crashhunt.base.codec import Serializable, plain
+from crashhunt.base.text import format_number, format_percent
 from crashhunt.disturbances import COPIES_PER_ROOT, SECONDS_PER_COPY
 from crashhunt.statistics._anytime_interval import Bets, RateTest
 from crashhunt.statistics._units import why_too_many_invalid
@@ -503,13 +504,14 @@ class RareCounter:
         why = why_too_many_invalid(counts["invalid"], counts["plain"], "plain trials are invalid")
         if self.excluded > MAX_EXCLUDED * (count + self.excluded):
             why = f"{self.excluded} of {count + self.excluded} roots have no complete result"
-            why += f" (allowed: {MAX_EXCLUDED:.0%})"
+            why += f" (allowed: {format_percent(MAX_EXCLUDED)})"
         certain = None if why else certain
         whole, why_not, more = self._interval()
         part, why_not_part, _ = self._disturbed.interval(count, self.confidence)
         if not why and whole is not None and certain is not None and certain[0] > whole.high:
             # Certain bounds rest on less. Where the two exclude each other, the copies have missed something.
-            why_not = f"plain trials crash more often than the copies explain ({whole.low:.2g} to {whole.high:.2g})"
+            within = f"{format_number(whole.low)} to {format_number(whole.high)}"
+            why_not = f"plain trials crash more often than the copies explain ({within})"
             whole = part = None
             why_not_part = why_not
         whole, part = _at_most_1(whole), _at_most_1(part)
@@ -620,7 +622,8 @@ class _Sums:
         reasons = [
             f"the effective sample size is {effective:.1f} (at least {MIN_EFFECTIVE:g})" * (effective < MIN_EFFECTIVE),
             f"roots with a crash: {self.positive} (at least {MIN_ROOTS_WITH_CRASH})" * few,
-            f"one root is {share:.0%} of the sum (at most {MAX_SHARE:.0%})" * (share > MAX_SHARE),
+            f"one root is {format_percent(share)} of the sum (at most {format_percent(MAX_SHARE)})"
+            * (share > MAX_SHARE),
         ]
         if why := ", ".join(filter(None, reasons)):
             return None, why, max(1, math.ceil(needed - count))

@@ -10,6 +10,7 @@ import math
 import time
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
+from crashhunt.base.text import format_percent
 from crashhunt.statistics._units import MAX_INVALID_SHARE, RateCounter, UnitSequence, facts_of, facts_of_plain
 
 if TYPE_CHECKING:
@@ -192,9 +193,8 @@ class BarWatch(RateWatch):
             self.decided_at = unit[-1].number
         elif self._is_at_bar(test):
             self.decided_at = unit[-1].number
-            self.why_undecided = (
-                f"the rate certainly is within {_EQUAL_TOLERANCE:.0%} of the bar, so more trials do not help"
-            )
+            within = format_percent(_EQUAL_TOLERANCE)
+            self.why_undecided = f"the rate certainly is within {within} of the bar, so more trials do not help"
         return found
 
     def _factors(self, found: tuple[float, float], test: RateTest) -> list[Any]:

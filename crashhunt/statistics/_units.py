@@ -20,6 +20,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
+from crashhunt.base.text import format_percent
 from crashhunt.plans import RATE_PERS, RatePer
 from crashhunt.statistics._anytime_interval import Bets, Interval, RateTest
 from crashhunt.trial import KILLED, Failure, Outcome
@@ -257,7 +258,7 @@ def why_too_many_invalid(invalid: int, valid: int, are_invalid: str) -> str:
     if not invalid or invalid / (invalid + valid) <= MAX_INVALID_SHARE:
         return ""
     many = f"{invalid} of {invalid + valid} {are_invalid}"
-    return f"{many}, more than {MAX_INVALID_SHARE:.0%}: the rest is other traffic than described"
+    return f"{many}, more than {format_percent(MAX_INVALID_SHARE)}: the rest is other traffic than described"
 
 
 def has_too_many_invalid(invalid: int, valid: int) -> bool:

@@ -56,7 +56,7 @@ def test_counts_leave_excluded_runs_out_of_the_share():
     assert (data["earliest_crash_step"], data["median_crash_step"]) == (8, 12)
     assert [each["number"] for each in data["each"]] == [0, 1, 2, 3, 4, 5]
     lines = found.lines()
-    assert lines[0].startswith("c: 3 of 4 runs crashed (75.0%; 95 % interval: ")
+    assert lines[0].startswith("c: 3 of 4 runs crashed (75 %; 95 % interval: ")
     assert "  excluded: 2 runs, why" in lines
 
 

@@ -1,17 +1,30 @@
 from __future__ import annotations
 
+import json
+import math
 import os
 import subprocess
 import sys
 import unicodedata
+from importlib import resources
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from browsers import needed
 from hypothesis import given, strategies as st
 
-from crashhunt.base.text import command_line, count_of, in_lines, one_line, out_of, visible
+from crashhunt.base.text import (
+    command_line,
+    count_of,
+    format_number,
+    format_percent,
+    in_lines,
+    one_line,
+    out_of,
+    visible,
+)
 
 SPOKEN = "\x1b[2J\x1b]0;title\x07 up\x1b[1A\r\x9b2K \u202eesrever\u2066 a\u0085b\u2028c [bold red]x[/] z"
 HOSTILE = f"{SPOKEN} \udc80"
@@ -137,3 +150,25 @@ def test_trials_are_a_share_of_the_planned_ones_only_where_they_are_fewer():
 
 def test_one_step_is_no_plural():
     assert [count_of(number, "step") for number in (0, 1, 2)] == ["0 steps", "1 step", "2 steps"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"), (0.0010014, "0.001"), (0.0123, "0.0123"), (0.36142, "0.361"), (0.09999, "0.1"), (1.2344, "1.23"),
+        (123.4, "123"), (1234.4, "1,234"), (999.6, "1,000"), (4.6123e7, "4.61e7"), (4.2e-6, "4.2e-6"),
+        (-0.25, "-0.25"), (1.2345e21, "1.23e21"), (123_456.0, "123,456"), (1e-12, "1e-12"),
+        (math.inf, "any number"), (12.0, "12"),
+    ],
+)  # fmt: skip
+def test_numbers_have_three_significant_digits(value, text):
+    assert format_number(value) == text
+
+
+def test_browser_writes_numbers_as_python_does():
+    values = [0.0, 0.00123456, 0.36142, 12, 12.345, 999.4, 999.6, 1234.4, -0.25, -1234.6, 1234567.8, 2e6, 4.2e-6, 1e-12]
+    script = resources.files("crashhunt.report").joinpath("numbers.js").read_text(encoding="utf-8")
+    script += f"; console.log(JSON.stringify({values}.map(formatNumber)))"
+    done = subprocess.run([needed("node"), "-e", script], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == [format_number(value) for value in values]
+    assert format_percent(0.12345) == "12.3 %"

@@ -172,8 +172,8 @@ def test_hunt_with_too_many_invalid_trials_ends_with_a_line(toy):
     words = ("--arg", "speed=2", "--set", "fail_reset=true|false", "--until-rate", "1e-4/trial", "--seed", "3")
     done = toy.crashhunt("run", "h", "2", "0", "20", "--scenario", "toy", *words, expect=3)
     why = "too many trials are invalid, so more of them do not help"
-    assert f"undecided about the bar of 1.0e-4 per trial: {why}" in done.out
-    assert "more than 5%: the rest is other traffic than described" in done.out
+    assert f"undecided about the bar of 0.0001 per trial: {why}" in done.out
+    assert "more than 5 %: the rest is other traffic than described" in done.out
 
 
 @pytest.mark.parametrize(

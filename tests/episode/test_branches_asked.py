@@ -182,7 +182,7 @@ def test_what_cannot_be_asked_is_counted_with_its_reason(branch, monkeypatch):
     monkeypatch.setattr(_branches, "free_memory", lambda: 0.24)
     made = branch(lambda number, job: answer(job))
     made.run(20)
-    assert (made.end().unanswered, made.end().why_unanswered) == (2, "less than 25% of the memory was free")
+    assert (made.end().unanswered, made.end().why_unanswered) == (2, "less than 25 % of the memory was free")
     assert (made.forks, made.jobs) == ([], [])
 
 

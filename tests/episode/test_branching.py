@@ -73,10 +73,10 @@ def test_branches_end_when_they_hang_or_die_and_copies_with_their_process(ask):
     assert (outcome, why_not, left) == ("survived", "", 0)  # the next trial is asked
     assert (branches["why_unanswered"], branches["may_be_asked_again"]) == ("a copy was killed by SIGKILL", True)
     outcome, branches, told = found["full"]
-    assert told == "less than 25% of the memory is free: trials branch less than they might"
+    assert told == "less than 25 % of the memory is free: trials branch less than they might"
     assert (branches["asked"], branches["unanswered"]) == (0, 3)
     assert (branches["why_unanswered"], branches["may_be_asked_again"]) == (
-        "less than 25% of the memory was free",
+        "less than 25 % of the memory was free",
         False,
     )
     assert len(found["left"]) == 3

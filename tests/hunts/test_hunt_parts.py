@@ -930,18 +930,18 @@ def lines_of(verified=0, crashes=(), **changes):
     return RareReport(replace(RARE, **changes), verified, 0, crashes).lines
 
 
-CERTAIN = "  certain: at least 0.001, at most 0.08 (95%; 4 of 239 plain trials crashed)"
+CERTAIN = "  certain: at least 0.001, at most 0.08 (95 %; 4 of 239 plain trials crashed)"
 OMITS = "  the estimate omits failures that no copy has met; the certain bounds include them"
 
 
 def test_estimate_of_rare_mode_is_explained_line_by_line():
-    cells = "; ".join(f"cell{number} 0.00{number} ({number}0%)" for number in range(1, 6))
+    cells = "; ".join(f"cell{number} 0.00{number} ({number}0 %)" for number in range(1, 6))
     assert lines_of(verified=3, crashes=("a", "b")) == [
-        "rare: 0.012 per trial (0.005 to 0.02, estimated from 60 roots; effective sample size 42)",
+        "rare: 0.0123 per trial (0.005 to 0.02, estimated from 60 roots; effective sample size 42)",
         f"  undisturbed 5 of 299 trials; {cells}",
         "  5 of 6 parts shown; run --json has all of them",
         "  with a disturbance: 0.01 per trial (0.004 to 0.019)",
-        "  9000 steps, 700 of them in plain trials; plain trials alone need about 1.2e+06 steps",
+        "  9000 steps, 700 of them in plain trials; plain trials alone need about 1.2e6 steps",
         "  of the 3 weightiest crashes, 2 came again from the start",
         CERTAIN, OMITS,
     ]  # fmt: skip
@@ -953,7 +953,7 @@ def test_estimate_of_rare_mode_is_explained_line_by_line():
 
 def test_estimate_of_rare_mode_without_an_interval_gives_the_reason():
     found = lines_of(estimated=None, why_not="few crashes", more_roots=20, plain_equivalent_steps=None)
-    assert found[0] == "rare: 0.012 per trial"
+    assert found[0] == "rare: 0.0123 per trial"
     more = f"about {20 * TRIALS_PER_ROOT} more trials are needed"
     assert found[1] == f"  no interval (60 roots with their copies): few crashes; {more}"
     assert not any("steps" in line for line in found)

@@ -218,7 +218,8 @@ def test_too_many_invalid_plain_trials_leave_no_estimate():
     rule = RareWatch(settings(), rows, SAMPLER)
     rule.read()
     found = rule.estimate()
-    assert found.why_not == "11 of 200 plain trials are invalid, more than 5%: the rest is other traffic than described"
+    why = "11 of 200 plain trials are invalid, more than 5 %: the rest is other traffic than described"
+    assert found.why_not == why
     assert (found.estimate, found.certain, found.estimated) == (None, None, None)
     rows[51] = plain(51)
     rule = RareWatch(settings(), rows, SAMPLER)

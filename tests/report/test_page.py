@@ -360,7 +360,7 @@ def test_click_on_vehicle_shows_its_facts_and_click_on_road_hides_them(hunt, bro
     words = text(browser, "vehicle-facts").split("\n")
     assert words[:2] == ["vehicle", "ego"]
     speed = browser.execute_script("return state(view.step, view.agent)[3]")
-    assert words[words.index("speed") + 1] == f"{speed:.3g} m/s"
+    assert words[words.index("speed") + 1] == f"{speed:.1f} m/s"
     browser.execute_script(click, 0, 150)
     assert not browser.find_element(By.ID, "vehicle").is_displayed()
     browser.find_element(By.ID, "scene").send_keys("v")

@@ -82,7 +82,7 @@ def words(**parts: np.ndarray) -> dict[str, str]:
 def test_signals_priority_and_the_lane_goal_are_said_in_words():
     nobody = row("right_of_way")
     assert words(signals=row("signals", present=1, state=2, distance=23.44, time_in_state=3.25)) == {
-        "signal": "red for 3.25 s, in 23.4 m"
+        "signal": "red for 3.2 s, in 23.4 m"
     }
     assert words(signals=row("signals")) == {}  # no traffic light is ahead
     assert words(right_of_way=nobody) == {"priority": "no actor to yield to"}
@@ -91,8 +91,8 @@ def test_signals_priority_and_the_lane_goal_are_said_in_words():
     assert words(right_of_way=np.stack([first, other]))["priority"] == "must yield to 1 actor"  # which stands
     route = row("route_state", lane_changes_needed=-2, distance_to_lane_change=80, distance_left=300)
     assert words(route_state=route) == {
-        "lane goal": "2 lanes to the right within 80 m",
-        "goal": "in 300 m",
+        "lane goal": "2 lanes to the right within 80.0 m",
+        "goal": "in 300.0 m",
     }
     assert words(stop_line=row("stop_line", present=1, distance=-1, must_yield=1)) == {
         "stop line": "inside the junction, must yield"

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 
 from crashhunt.crashes import Attempt, Factor, Judgement, LeftOut, Why
-from crashhunt.report._rate_text import format_rate
 from crashhunt.report._words import about_judgement, about_why
 
 
@@ -37,17 +34,6 @@ def test_factor_is_named_by_its_kind(factor, words):
     kind, name, what = factor
     one = Factor(kind, name, what, was=9.0, runs=(LeftOut(5.0, "none"),))
     assert about_why(Why((one,), 100), str)[1] == f"- {words}: no crash."
-
-
-@pytest.mark.parametrize(
-    ("rate", "text"),
-    [
-        (0.0, "0"), (0.0010014, "1.0e-3"), (0.0123, "0.012"), (0.3614, "0.36"), (0.0999, "0.10"), (1.234, "1.2"),
-        (123.4, "120"), (1234.0, "1,200"), (999_999.0, "1.0e6"), (math.inf, "any number"),
-    ],
-)  # fmt: skip
-def test_rates_have_two_significant_digits(rate, text):
-    assert format_rate(rate) == text
 
 
 def test_strongest_cause_comes_first():

@@ -104,7 +104,11 @@ def test_same_seeds_are_pairs_only_in_the_same_traffic(tmp_path):
 def test_difference_is_in_the_requested_unit_and_decides_although_the_intervals_overlap(tmp_path):
     few = hunt(tmp_path / "few", 4, trials=120, drive=lambda n: 4.0 if n < 4 else 9.0)
     many = hunt(tmp_path / "many", 17, trials=120, drive=lambda n: 4.0 if n < 17 else 9.0)
-    for per, low, unit in (("trial", 0.02, "per trial"), ("hour", 5.0, "per hour"), ("1000km", 100.0, "per 1,000 km")):
+    for per, low, unit in (
+        ("trial", 0.02, "per 100 trials"),
+        ("hour", 5.0, "per hour"),
+        ("1000km", 100.0, "per 1,000 km"),
+    ):
         found = crashhunt.compare(few, many, per=per)
         (pair,) = found.pairs
         one, other = found.hunts
@@ -196,7 +200,7 @@ def test_trials_that_are_invalid_for_both_agents_leave_both_sides(tmp_path):
         invalidate(folder, 30, 31, 32, 33, 34)
     (pair,) = crashhunt.compare(few, many).pairs
     assert (pair.trials, pair.evidence) == (0, None)
-    assert "6 of 100 pairs have an invalid trial, more than 5%" in pair.verdict
+    assert "6 of 100 pairs have an invalid trial, more than 5 %" in pair.verdict
 
 
 def test_trials_that_are_invalid_for_one_agent_only_count_against_it_or_have_no_result(tmp_path):

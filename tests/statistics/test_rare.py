@@ -173,7 +173,7 @@ def roots(*values):
     [
         (roots(*[0.0] * 50), "none of 50 roots has a crash"),
         (roots(*[0.0] * 50, *[1e-3] * 10), "roots with a crash: 10 "),
-        (roots(*[1e-3] * 30, 0.1), "of the sum (at most 20%)"),
+        (roots(*[1e-3] * 30, 0.1), "of the sum (at most 20 %)"),
         (roots(*[1e-3] * 30, 0.1), "effective sample size is 1.7"),
     ],
 )

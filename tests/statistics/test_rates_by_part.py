@@ -179,11 +179,11 @@ def test_hunt_whose_trials_are_not_independent_has_no_rate(tmp_path):
     (rate,) = measure_rates(path, per="trial", bar=0.1)
     assert (rate.certain, rate.estimate, rate.verdict) == (None, None, "undecided")
     assert "the sampler grid does not draw trials independently" in rate.why_not
-    assert "undecided about the bar of 0.10 per trial: there is no rate" in describe_rates([rate])
+    assert "undecided about the bar of 0.1 per trial: there is no rate" in describe_rates([rate])
 
 
 @pytest.mark.parametrize(
-    ("crashes", "bar", "verdict", "text"), [(0, 0.3, "below", "0.30"), (10, 0.001, "above", "1.0e-3")]
+    ("crashes", "bar", "verdict", "text"), [(0, 0.3, "below", "0.3"), (10, 0.001, "above", "0.001")]
 )
 def test_verdict_on_a_bar_is_a_line(tmp_path, crashes, bar, verdict, text):
     (rate,) = measure_rates(hunt(tmp_path / "h", crashes), per="trial", bar=bar)

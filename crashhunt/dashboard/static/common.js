@@ -82,20 +82,15 @@ export function seconds(value) {
   if (hours) return `${hours} h ${minutes} min`;
   return minutes ? `${minutes} min ${rest} s` : `${rest} s`;
 }
-export function rateOf(value) {
-  if (value === null || value === undefined) return "-";
-  if (value === 0) return "0";
-  return value >= 0.01 ? Number(value.toPrecision(2)).toString() : value.toExponential(1);
-}
 export function interval(rate) {
   if (!rate) return "";
   if (!rate.certain) return "";
   const { low, high } = rate.certain;
-  return `${low > 0 ? `at least ${rateOf(low)}, ` : ""}at most ${high === null ? "any number" : rateOf(high)}`;
+  return `${low > 0 ? `at least ${formatNumber(low)}, ` : ""}at most ${high === null ? "any number" : formatNumber(high)}`;
 }
 export function between(rate) {
   const { low, high } = rate.certain;
-  return low > 0 && high !== null ? `${rateOf(low)} to ${rateOf(high)}` : interval(rate);
+  return low > 0 && high !== null ? `${formatNumber(low)} to ${formatNumber(high)}` : interval(rate);
 }
 /* One unit is enough for how long ago something was. */
 export function ago(value) {
@@ -106,7 +101,7 @@ export function ago(value) {
 /* The state in words: a hunt of the state `crashed` has finished, and its crashes are counted. */
 export const stateOf = (row) => (row.exported ? "exported" : row.state === "crashed" ? `finished, ${plural(row.crashes, "crash", "crashes")}` : row.state);
 export const plural = (number, one, many) => `${count(number)} ${number === 1 ? one : many}`;
-export const short = (value) => (typeof value === "number" ? String(Number(value.toPrecision(4))) : String(value));
+export const short = (value) => (typeof value === "number" ? formatNumber(value) : String(value));
 export const quoted = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 
 export function setText(node, text) {

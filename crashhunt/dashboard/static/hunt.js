@@ -1,5 +1,5 @@
 /* The page of one hunt. */
-import { $, PALETTE, Refused, between, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, make, mayControl, now, onScheme, plural, poll, post, quoted, rateOf, seconds, setText, short, stateOf, sinceNewestKind, spelled, table, tell } from "/static/common.js";
+import { $, PALETTE, Refused, between, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, make, mayControl, now, onScheme, plural, poll, post, quoted, seconds, setText, short, stateOf, sinceNewestKind, spelled, table, tell } from "/static/common.js";
 
 const ID = location.pathname.split("/")[2], API = `/api/hunts/${ID}`;
 const NOT_DECIDED = "nobody can tell"; // the verdict of the API
@@ -58,10 +58,10 @@ function showHunt() {
     ["crashes", count(hunt.crashed_trials)],
     ...(hunt.kinds_count === null ? [] : [["crash types", count(hunt.kinds_count)]]),
     ...(newest === null ? [] : [["since the last new type", seconds(newest)]]),
-    ["trials/s", hunt.rate_per_s ? hunt.rate_per_s.toFixed(1) : "-"],
+    ["trials/s", hunt.rate_per_s ? formatNumber(hunt.rate_per_s) : "-"],
     ...(hunt.seconds_left === null ? [] : [["time left", seconds(hunt.seconds_left)]]),
     ...(rate?.certain ? [["crash rate per trial, 95 % interval", between(rate)]] : []),
-    ...(rate && rate.estimate !== null && rate.estimate !== undefined ? [["crash rate per trial, estimate", rateOf(rate.estimate)]] : []),
+    ...(rate && rate.estimate !== null && rate.estimate !== undefined ? [["crash rate per trial, estimate", formatNumber(rate.estimate)]] : []),
     ...(hunt.until_rate ? [[`bar ${hunt.until_rate.bar}`, hunt.until_rate.verdict]] : []),
   ];
   renew("tiles", tiles, () => $("tiles").replaceChildren(...tiles.map(([name, value]) => {
@@ -74,7 +74,7 @@ function showHunt() {
   renew("command", hunt.command, () => $("command").replaceChildren(...(hunt.command ? [make("span", "command"), make("code", hunt.command), copyButton(hunt.command, "repeat this hunt")] : [make("span", "No command is known.")])));
   $("workers-card").hidden = hunt.state !== "running" && !(hunt.nodes ?? []).length;
   renew("workers", hunt.workers, () => $("workers").replaceChildren(...(hunt.workers.length ? [table([["Trial", "number"], ["Step", "number"], ["Doing"], ["Since", "number"]], hunt.workers.map((one) => [count(one.trial), count(one.step), one.doing, seconds(one.since_s)]), "Running trials")] : [make("p", hunt.state === "running" ? "Between two trials." : "No trial is running.", "faint")])));
-  renew("nodes", hunt.nodes, () => $("nodes").replaceChildren(...(hunt.nodes?.length ? [table([["Node"], ["Trials at a time", "number"], ["Trials", "number"], ["Trials/s", "number"]], hunt.nodes.map((one) => [one.name, one.parallel, count(one.trials), (one.rate_per_s ?? 0).toFixed(1)]), "Nodes")] : [])));
+  renew("nodes", hunt.nodes, () => $("nodes").replaceChildren(...(hunt.nodes?.length ? [table([["Node"], ["Trials at a time", "number"], ["Trials", "number"], ["Trials/s", "number"]], hunt.nodes.map((one) => [one.name, one.parallel, count(one.trials), formatNumber(one.rate_per_s ?? 0)]), "Nodes")] : [])));
   const copies = [["probes", hunt.probes], ["branches", hunt.branches]].flatMap(([name, sums]) => (sums ? Object.entries(sums).map(([key, value]) => [`${name}: ${key.replaceAll("_", " ")}`, value]) : []));
   $("copies-card").hidden = !copies.length;
   renew("copies", copies, () => $("copies").replaceChildren(...copies.flatMap(([name, value]) => [make("dt", name), make("dd", value ?? "-", "mono")])));
@@ -177,7 +177,7 @@ function chooseDots() {
   drawn = points.filter((one) => one.crash || isDrawn(one));
 }
 
-const about = (one) => spelled([`trial ${one.number}: ${one.outcome}`, one.danger === null ? "" : `criticality ${one.danger.toFixed(2)}`, one.disturbances ? plural(one.disturbances, "disturbance", "disturbances") : "", one.origin && `from ${one.origin}`, ...Object.entries(one.values).map(([name, value]) => `${name} ${short(value)}${units[name] ? ` ${units[name]}` : ""}`)].filter((part) => part).join("\n")).replaceAll("\n", "<br>");
+const about = (one) => spelled([`trial ${one.number}: ${one.outcome}`, one.danger === null ? "" : `criticality ${formatNumber(one.danger)}`, one.disturbances ? plural(one.disturbances, "disturbance", "disturbances") : "", one.origin && `from ${one.origin}`, ...Object.entries(one.values).map(([name, value]) => `${name} ${short(value)}${units[name] ? ` ${units[name]}` : ""}`)].filter((part) => part).join("\n")).replaceAll("\n", "<br>");
 function drawTrials() {
   chooseDots();
   const measured = drawn.filter((one) => one.danger !== null || one.crash), origins = [...new Set(points.map((one) => one.origin))].sort();
@@ -354,7 +354,7 @@ function pick(number) {
   const command = run.map(quoted).join(" "), box = make("div", undefined, "command");
   box.append(make("span", "run its arguments again, with other seeds"), make("code", command), copyButton(command, `the arguments of trial ${number}`));
   const facts = make("dl");
-  facts.append(...[["outcome", one.outcome], ["steps", one.steps], ["criticality", one.danger ?? "-"], ["disturbances", one.disturbances], ["least time to collision with any actor", one.ttc === null ? "-" : `${one.ttc.toFixed(2)} s`], ["came from", [one.origin, one.parent === null ? "" : `trial ${one.parent}`].filter((part) => part).join(", ") || "-"], ...Object.entries(one.values).map(([name, value]) => [name, `${short(value)}${units[name] ? ` ${units[name]}` : ""}`])].flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
+  facts.append(...[["outcome", one.outcome], ["steps", one.steps], ["criticality", formatNumber(one.danger)], ["disturbances", one.disturbances], ["least time to collision with any actor", one.ttc === null ? "-" : `${one.ttc.toFixed(1)} s`], ["came from", [one.origin, one.parent === null ? "" : `trial ${one.parent}`].filter((part) => part).join(", ") || "-"], ...Object.entries(one.values).map(([name, value]) => [name, `${short(value)}${units[name] ? ` ${units[name]}` : ""}`])].flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
   panel.replaceChildren(make("h3", `Trial ${number}`), facts, box);
   panel.scrollIntoView({ block: "nearest" });
 }

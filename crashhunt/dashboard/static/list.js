@@ -102,7 +102,7 @@ function fill(row) {
   setText(node.why, row.damaged || row.state === "error" || row.state === "killed" ? row.detail : "");
   setText(cells.scenario, row.scenario);
   setText(cells.trials, row.trials_planned >= row.trials_run && row.trials_planned ? `${count(row.trials_run)} of ${count(row.trials_planned)}` : count(row.trials_run));
-  setText(cells.speed, row.rate_per_s ? row.rate_per_s.toFixed(row.rate_per_s < 10 ? 1 : 0) : "-");
+  setText(cells.speed, row.rate_per_s ? formatNumber(row.rate_per_s) : "-");
   setText(cells.left, seconds(row.seconds_left));
   setText(cells.crashes, count(row.crashed_trials));
   setText(cells.types, row.kinds_count === null ? "-" : count(row.kinds_count));
@@ -162,7 +162,7 @@ function arrange() {
 function fillTotals() {
   const all = [...rows.values()], sum = (name) => all.reduce((total, row) => total + (row[name] || 0), 0);
   const running = all.filter((row) => row.state === "running");
-  const tiles = [["running", count(running.length)], ["hunts", count(all.length)], ["trials", count(sum("trials_run"))], ["trials/s", running.reduce((total, row) => total + row.rate_per_s, 0).toFixed(1)], ["crashes", count(sum("crashed_trials"))], ["crash types", count(sum("kinds_count"))]];
+  const tiles = [["running", count(running.length)], ["hunts", count(all.length)], ["trials", count(sum("trials_run"))], ["trials/s", formatNumber(running.reduce((total, row) => total + row.rate_per_s, 0))], ["crashes", count(sum("crashed_trials"))], ["crash types", count(sum("kinds_count"))]];
   const there = $("tiles").children;
   tiles.forEach(([name, value], place) => {
     if (!there[place]) {
