@@ -12,13 +12,13 @@ from crashhunt.crashes import list_bundles
 
 def hunted(shell):
     shell.crashhunt(
-        "run", "out", "1", "2", "300", "--scenario", "loop", "--arg", "speed=25", "--seed", "1", "--keep-going"
+        "run", "out", "1", "2", "99", "--scenario", "toy", "--arg", "speed=14", "--seed", "1", "--keep-going"
     )
 
 
 @pytest.fixture
-def hunt(shell, made_once):
-    return made_once(hunted, shell)
+def hunt(toy, made_once):
+    return made_once(hunted, toy)
 
 
 def test_notes_are_added_found_shown_and_removed(hunt):
@@ -53,7 +53,7 @@ def test_salvaged_hunt_keeps_its_notes_and_a_new_hunt_has_none(hunt):
     hunt.crashhunt("note", "out", "mine")
     hunt.crashhunt("check", "out", "--salvage", "saved")
     assert [one["text"] for one in hunt.crashhunt("note", "saved", "--json").json["notes"]] == ["mine"]
-    hunt.crashhunt("run", "saved", "1", "1", "20", "--overwrite")
+    hunt.crashhunt("run", "saved", "1", "1", "20", "--scenario", "toy", "--overwrite")
     assert hunt.crashhunt("note", "saved", "--json").json["notes"] == []
 
 

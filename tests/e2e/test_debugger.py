@@ -9,13 +9,13 @@ from conftest import CRASHHUNT, Done
 
 
 def hunted(shell):
-    words = ("--agent", "faulty:Raises", "--arg", "at=30", "--arg", "speed=8", "--set", "vehicles=10", "--seed", "1")
+    words = ("--agent", "faulty:Raises", "--arg", "at=30", "--arg", "speed=8", "--scenario", "toy", "--set", "gap_m=60")
     shell.crashhunt("run", "h", "1", "1", "60", *words)
 
 
 @pytest.fixture
-def crash(shell, made_once):
-    return made_once(hunted, shell)
+def crash(toy, made_once):
+    return made_once(hunted, toy)
 
 
 def typed(shell, text: str, *words: str, fork: bool = False, expect: int | None = None) -> str:

@@ -63,7 +63,7 @@ def specs(folder):
 def test_worse_agent_fails_the_gate_and_the_hunts_stay_for_compare(drivers):
     report = ("--markdown", "m.md", "--junit", "j.xml", "--summary", "s.md", "--annotate")
     # Trials of BASE end without a crash, many times as fast as those of HEAD: more of them than pairs are no use.
-    most = ("--most", "24")
+    most = ("--most", "12")
     done = drivers.crashhunt("gate", CALM, WILD, *TOY, *SEED, *most, "--keep", "kept", "--json", *report, expect=1)
     found = done.json
     assert (found["verdict"], found["pairs"], found["only_base"], found["only_head"]) == ("worse", 8, 0, 8)

@@ -14,7 +14,7 @@ import pytest
 from conftest import mostly_nightly
 
 FINE = ("--scenario", "toy", "--agent", "faulty:Fine", "--seed", "5", "--set", "step_wall_s=0.0005")
-LONG = ("30", *FINE[:-1], "step_wall_s=0.005")  # 0.15 s a trial, most of it asleep
+LONG = ("30", *FINE[:-1], "step_wall_s=0.01")  # 0.3 s a trial, most of it asleep
 ON_SUMO = ("300", "--agent", "faulty:Fine", "--set", "vehicles=10", "--seed", "5")
 
 
@@ -105,7 +105,7 @@ def test_a_crash_stops_everything_at_once_even_hung_workers(toy):
 
 @pytest.mark.parametrize(
     ("number", "hunted", "trials"),
-    [(signal.SIGINT, LONG, 30), pytest.param(signal.SIGTERM, ON_SUMO, 24, marks=pytest.mark.nightly)],
+    [(signal.SIGINT, LONG, 14), pytest.param(signal.SIGTERM, ON_SUMO, 24, marks=pytest.mark.nightly)],
 )
 def test_an_interrupt_keeps_what_has_finished_and_the_same_command_continues(toy, number, hunted, trials):
     words = ("run", "h", "2", str(trials), *hunted, "--json")
@@ -144,14 +144,14 @@ def test_an_interrupt_while_it_starts_is_not_lost(toy, libraries):
 
 
 def test_a_killed_hunt_leaves_no_process_and_continues(toy):
-    words = ("run", "h", "2", "30", *LONG, "--json")
+    words = ("run", "h", "2", "14", *LONG, "--json")
     process = toy.begin(*words, start_new_session=True)
     wait_for(lambda: count(toy.folder / "h") >= 4)
     process.kill()
     process.communicate()
     wait_for(lambda: session_is_gone(process.pid))
     before = ledger(toy.folder / "h")
-    assert toy.crashhunt(*words).json["trials_run"] == 30
+    assert toy.crashhunt(*words).json["trials_run"] == 14
     after = ledger(toy.folder / "h")
     assert {key: after[key] for key in before} == before
 

@@ -115,81 +115,81 @@ def test_hunt_without_results_may_change_its_code(agent, tmp_path):
 @pytest.mark.long
 def test_versions_are_kept_apart_in_every_figure(agent, tmp_path, capsys):
     hunt = tmp_path / "h"
-    first = run(20, keep=1)
+    first = run(8, keep=1)
     failed = first.outcomes["agent_error"]
     agent(0, 1, 2, 3)
     with pytest.raises(
-        HuntDirectoryError, match="TRIALS is 20, but the first 20 trials belong to earlier code"
+        HuntDirectoryError, match="TRIALS is 8, but the first 8 trials belong to earlier code"
     ) as caught:
-        run(20, continue_with_new_code=True)
-    assert caught.value.fix.startswith("give more than 20 TRIALS")
-    report = run(30, keep=1, continue_with_new_code=True)
+        run(8, continue_with_new_code=True)
+    assert caught.value.fix.startswith("give more than 8 TRIALS")
+    report = run(14, keep=1, continue_with_new_code=True)
     newest, earlier = sorted(report.code_versions, key=lambda one: not one.is_newest)
-    assert (newest.version, newest.first, newest.trials, newest.crashes) == (2, 20, 10, 10)
-    assert (earlier.version, earlier.first, earlier.trials, earlier.crashes) == (1, None, 20, failed)
-    assert report.tally.found == sum(group.count for group in report.kinds) == 10
-    assert "newest version 2: 10 of 10 trials crashed; version 1:" in describe_hunt(report)
-    assert report.to_json()["code_versions"][1]["crashes"] == 10
+    assert (newest.version, newest.first, newest.trials, newest.crashes) == (2, 8, 6, 6)
+    assert (earlier.version, earlier.first, earlier.trials, earlier.crashes) == (1, None, 8, failed)
+    assert report.tally.found == sum(group.count for group in report.kinds) == 6
+    assert "newest version 2: 6 of 6 trials crashed; version 1:" in describe_hunt(report)
+    assert report.to_json()["code_versions"][1]["crashes"] == 6
 
     (rate,) = measure_rates(hunt, per="trial")
-    assert (rate.trials, rate.crashes, rate.estimate, rate.excluded) == (10, 10, 1.0, {"other_code": 20})
-    assert "not counted: 20 of earlier code" in describe_rates([rate])
+    assert (rate.trials, rate.crashes, rate.estimate, rate.excluded) == (6, 6, 1.0, {"other_code": 8})
+    assert "not counted: 8 of earlier code" in describe_rates([rate])
     state = hunt_state(hunt)
-    assert (state.rate["trials"], state.rate["crashes"], state.rate["certain"]["low"]) == (10, 10, rate.certain.low)
-    assert (state.crashes, [one["crashes"] for one in state.code_versions]) == (failed + 10, [failed, 10])
-    assert state.kinds[0]["count"] == 10
+    assert (state.rate["trials"], state.rate["crashes"], state.rate["certain"]["low"]) == (6, 6, rate.certain.low)
+    assert (state.crashes, [one["crashes"] for one in state.code_versions]) == (failed + 6, [failed, 6])
+    assert state.kinds[0]["count"] == 6
     results = HuntResults(hunt)
-    assert [row["code_version"] for row in results.rows()] == [1] * 20 + [2] * 10
-    assert results.trials()["code_version"].tolist() == [1] * 20 + [2] * 10
-    run(30, "other", keep=1)
+    assert [row["code_version"] for row in results.rows()] == [1] * 8 + [2] * 6
+    assert results.trials()["code_version"].tolist() == [1] * 8 + [2] * 6
+    run(14, "other", keep=1)
     comparison = compare(hunt, "other")
     figures = comparison.hunts[0]
-    assert (figures.trials, figures.crashes, figures.crash_rate, figures.outcomes) == (10, 10, 1.0, {"agent_error": 10})
+    assert (figures.trials, figures.crashes, figures.crash_rate, figures.outcomes) == (6, 6, 1.0, {"agent_error": 6})
     (pair,) = comparison.pairs
-    assert (pair.trials, pair.both) == (10, 10)
+    assert (pair.trials, pair.both) == (6, 6)
     groups = group_crashes(list_bundles(hunt), faults=False).groups
-    assert [*crashes_by_version([hunt], groups)[str(hunt)].values()] == [{1: failed, 2: 10}]
+    assert [*crashes_by_version([hunt], groups)[str(hunt)].values()] == [{1: failed, 2: 6}]
     found = find_crashes(hunt, 9)
-    assert (list(found.types.values()), found.untyped, found.tally.found) == ([10], 0, failed + 10)
+    assert (list(found.types.values()), found.untyped, found.tally.found) == ([6], 0, failed + 6)
     assert check(hunt)[0].fine
     for command in ("status", "crashes", "rate"):
         with pytest.raises(SystemExit) as ended:
             main([command, str(hunt)])
         assert ended.value.code == 0
-        assert "version 1" in (text := capsys.readouterr().out) or "20 of earlier code" in text
+        assert "version 1" in (text := capsys.readouterr().out) or "8 of earlier code" in text
 
     # A raise after results of the newest version forbids its estimate; the next version begins without it.
     assert measure_rates(hunt, per="trial")[0].estimate == 1.0
-    run(32, keep=1)
+    run(16, keep=1)
     assert measure_rates(hunt, per="trial")[0].why_not.startswith("TRIALS was changed")
     agent(0)  # the first version again
-    with pytest.raises(HuntDirectoryError, match=f"{REFUSED} 12 trials"):
-        run(36)
-    report = run(36, keep=1, continue_with_new_code=True)
+    with pytest.raises(HuntDirectoryError, match=f"{REFUSED} 8 trials"):
+        run(20)
+    report = run(20, keep=1, continue_with_new_code=True)
     newest = next(one for one in report.code_versions if one.is_newest)
-    assert (newest.version, newest.first, newest.trials, len(report.code_versions)) == (1, 32, 24, 2)
+    assert (newest.version, newest.first, newest.trials, len(report.code_versions)) == (1, 16, 12, 2)
     (rate,) = measure_rates(hunt, per="trial")
-    assert (rate.trials, rate.excluded, rate.estimate) == (4, {"other_code": 32}, rate.crashes / 4)
+    assert (rate.trials, rate.excluded, rate.estimate) == (4, {"other_code": 16}, rate.crashes / 4)
     assert HuntResults(hunt)._snapshot().digest in CodeVersions.of(HuntResults(hunt).facts).newest
 
 
 @pytest.mark.long
 def test_crash_of_earlier_code_does_not_end_the_hunt_for_one_of_the_new_code(agent, tmp_path):
     options = {"keep_going": False}
-    report = run(40, **options)
+    report = run(16, **options)
     assert report.stopped_because == "crash"
     (crash,) = report.crashes
     agent()  # fixed
     with pytest.raises(HuntDirectoryError, match=REFUSED):
-        run(40, **options)
-    fixed = run(40, continue_with_new_code=True, **options)
+        run(16, **options)
+    fixed = run(16, continue_with_new_code=True, **options)
     assert (fixed.stopped_because, fixed.crashes, fixed.tally.found) == ("all_trials", (), 0)
     (rate,) = measure_rates(tmp_path / "h", per="trial")
     assert rate.crashes == 0
     # Trials that were under way when the crash ended the hunt are a choice by their results.
-    assert crash.result.spec.number < 40 - rate.trials
+    assert crash.result.spec.number < 16 - rate.trials
     assert [one.id for one in list_bundles(tmp_path / "h")] == [crash.id]
-    again = run(40, **options)  # which states the result again
+    again = run(16, **options)  # which states the result again
     assert (again.stopped_because, again.crashes) == ("all_trials", ())
 
 
@@ -239,27 +239,27 @@ def test_hunt_of_a_gate_names_no_option_that_its_command_lacks(agent, tmp_path, 
 
 def test_learning_sampler_receives_no_results_of_earlier_code(agent, tmp_path, monkeypatch):
     told = []
-    run(6, sampler="mutation")
+    run(4, sampler="mutation")
     agent(0, 1, 2, 3)
     tell = NamedSampler.tell
     monkeypatch.setattr(NamedSampler, "tell", lambda sampler, result: told.append(result) or tell(sampler, result))
-    run(14, sampler="mutation", continue_with_new_code=True)
+    run(8, sampler="mutation", continue_with_new_code=True)
     assert {str(one.outcome) for one in told} == {"agent_error"}
-    assert min(one.spec.number for one in told) >= 6
+    assert min(one.spec.number for one in told) >= 4
 
 
 def test_versions_of_a_hunt_that_recorded_none_are_those_of_its_snapshots(agent, tmp_path):
     """A hunt of an earlier crashhunt, which resumed with any code."""
     hunt = tmp_path / "h"
-    run(6)
+    run(4)
     agent(0, 1, 2, 3)
-    run(12, continue_with_new_code=True, keep=1)
+    run(7, continue_with_new_code=True, keep=1)
     with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
         ledger.note(code_versions=None)
-    report = run(16, keep=1)
-    assert [(one.trials, one.is_newest) for one in report.code_versions] == [(6, False), (10, True)]
+    report = run(9, keep=1)
+    assert [(one.trials, one.is_newest) for one in report.code_versions] == [(4, False), (5, True)]
     (rate,) = measure_rates(hunt, per="trial")
-    assert (rate.crashes, rate.trials + rate.excluded["other_code"]) == (rate.trials, 16)
+    assert (rate.crashes, rate.trials + rate.excluded["other_code"]) == (rate.trials, 9)
     assert rate.trials > 0
     with closing(Ledger(hunt / "ledger.sqlite")) as ledger:
         assert len(count_versions(ledger, ledger.facts(), ("agent_error",))) == 2

@@ -56,7 +56,7 @@ WORDS = ("--scenario", "toy", "--agent", "driver:Driver", "--arg", "bug=0:5", "-
 def hunted(shell):
     (shell.folder / "driver.py").write_text(AGENT)
     for name, more in (("all", ()), ("kept", ("--keep", "1"))):
-        done = shell.crashhunt("run", name, "2", "18", "40", *WORDS, *more)
+        done = shell.crashhunt("run", name, "2", "13", "40", *WORDS, *more)
         (shell.folder / f"{name}.json").write_text(json.dumps(done.json))
         (shell.folder / f"{name}.txt").write_text(done.err)
 
@@ -85,7 +85,7 @@ def test_every_count_of_crashes_is_that_of_the_ledger(hunts, name):
     count = sum(truth.values())
     saved = len(list_bundles(hunts.folder / name))
     assert len(truth) == 5
-    assert count > 10
+    assert count > 7
     assert (saved < count) is (name == "kept")
     run = json.loads((hunts.folder / f"{name}.json").read_text())
     assert (run["crashes_found"], len(run["crashes"])) == (count, saved)
