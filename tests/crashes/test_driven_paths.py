@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from conftest import mostly_nightly
 from test_contact_record import record
 from test_fault import Map, rotated
 
@@ -52,6 +53,7 @@ PATHS = {
     **{f"right turn of {radius} m": turn(radius, -1) for radius in (3, 5)},
     "loop ramp of 9 m": loop_ramp(9),
 }
+NARROWEST = ("ring of 3.5 m", "hairpin of 1.6 m", "S-bend of 4 m", "left turn of 4 m", "right turn of 3 m")
 
 
 class Way:
@@ -101,9 +103,10 @@ def in_every_view(case):
     return said[0]
 
 
-@pytest.mark.parametrize("path", PATHS.values(), ids=PATHS)
+@pytest.mark.parametrize("name", mostly_nightly(PATHS, NARROWEST))
 @pytest.mark.parametrize("step_s", [0.1, 0.5])
-def test_contact_in_one_lane_of_a_bend_is_a_rear_end(path, step_s):
+def test_contact_in_one_lane_of_a_bend_is_a_rear_end(name, step_s):
+    path = PATHS[name]
     way = Way(path)
     lanes = Map([borders(path)], (0.0, 0.0))
     for place in bends(path):
@@ -114,8 +117,9 @@ def test_contact_in_one_lane_of_a_bend_is_a_rear_end(path, step_s):
         assert in_every_view(case) == ("rear end", "other", "the other"), place
 
 
-@pytest.mark.parametrize("path", PATHS.values(), ids=PATHS)
-def test_vehicle_that_stands_in_a_bend_is_hit_from_behind(path):
+@pytest.mark.parametrize("name", mostly_nightly(PATHS, NARROWEST))
+def test_vehicle_that_stands_in_a_bend_is_hit_from_behind(name):
+    path = PATHS[name]
     way = Way(path)
     lanes = Map([borders(path)], (0.0, 0.0))
     for place in bends(path):

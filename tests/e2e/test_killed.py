@@ -208,7 +208,7 @@ def test_rerun_to_that_was_killed_before_it_ran_continues(damaged, monkeypatch):
     monkeypatch.setattr(_rerun, "run_all", lambda folders, *_, **__: ran.extend(folders))
 
     def again(**options):
-        return _rerun.rerun([hunt], to=to, trusted=True, **{"changes": {"seed": "5"}, **options})
+        return _rerun.rerun([hunt], to=to, trusted=True, **{"changes": {"seed": "7"}, **options})
 
     killed(again, NEVER)
     request = json.loads((to / "request.json").read_text())
@@ -466,7 +466,7 @@ def test_what_no_link_leads_to_goes_where_it_lies(toy, made_once, monkeypatch):
     said = {finding.where for finding in found.findings}
     assert {str(path) for path in before[:4]} <= said
     assert str(stay[0]) not in said  # shrink may be writing it
-    toy.crashhunt("run", "h", "2", "25", "99", "--scenario", "toy", "--seed", "4", "--keep-going")
+    toy.crashhunt("run", "h", "2", "12", "99", "--scenario", "toy", "--seed", "5", "--keep-going")
     toy.crashhunt("corpus", "add", str(min((hunt / "crashes").glob("[!.]*"))), "--to", "kept")
     assert [path for path in before if path.exists()] == []
     assert [path for path in stay if not path.exists()] == []

@@ -34,7 +34,7 @@ def crash_of(folder: Path) -> dict[str, Any]:
     return {**found, "path": path.parent}
 
 
-ON_SUMO = ("Raises", "Segfaults")
+ON_SUMO = ("Segfaults",)
 # By day, an exception and a signal. Tests of executors have other ends of processes and hangs, also of what holds the
 # interpreter; tests of episodes have what is no action.
 AT_NIGHT = (

@@ -36,7 +36,7 @@ class Driver:
         pass
 
     def act(self, observation):
-        time.sleep(0.02)
+        time.sleep(0.01)
         return (self.speed, 0)
 """
 
@@ -170,7 +170,7 @@ def test_confirmation_is_seen_while_it_runs_and_resumed_after_an_interrupt(toy):
         assert process.poll() is None, process.communicate()
         if (toy.folder / "h" / "ledger.sqlite").exists():
             states.append(hunt_state(toy.folder / "h"))
-        time.sleep(0.4)
+        time.sleep(0.2)
     state = states[-1]
     assert (state.state, state.trials_run, state.phase["name"], state.phase["total"]) == ("running", 5, "confirming", 5)
     assert "confirming" in toy.crashhunt("status", "h").out
@@ -205,9 +205,9 @@ def test_a_comparison_knows_whether_trials_are_left_or_only_confirmations(toy, m
         return found.hunts[1], found.pairs[0]
 
     phase = {"name": "confirming", "done": 3, "total": 9, "seconds_left": 4.0}
-    whole, pair = compared(planned=25)
+    whole, pair = compared(planned=12)
     assert (whole.state, whole.interval is not None, pair.test) == ("running", True, "pairs")
-    figures, pair = compared(planned=30)
+    figures, pair = compared(planned=15)
     assert (figures.interval, pair.test) == (whole.interval, "pairs")  # both hold at any time
     began = time.time()
     figures, pair = compared(planned=0, phase=phase)  # its time was up
