@@ -13,14 +13,14 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import UnusableValueError
 from crashhunt.base.scalars import number_of
 from crashhunt.base.text import did_you_mean, listed
-from crashhunt.simulators import HasMap, NamesObservations, ReportsEvents, ReportsSurroundings
+from crashhunt.simulators import HasMap, NamesObservations, ReportsEvents, ReportsNearestAhead, ReportsSurroundings
 from crashhunt.world import EVENT_WORDS, approaches
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from crashhunt.simulators import Info, Observations, Simulator
-    from crashhunt.world import Lane, Scene
+    from crashhunt.world import Lane, Neighbor, Scene
 
 Read = Callable[[], float | None]
 
@@ -101,6 +101,7 @@ class TrialSignals:
 
     def __init__(self, episode: SignalledEpisode) -> None:
         self._episode = episode
+        self._readers: dict[str, _SceneReader] = {}
         self.step_length_s = episode.simulator.step_length_s
 
     def reader(self, names: Sequence[str], agent: str) -> Callable[[], Sequence[float] | None]:
@@ -183,7 +184,9 @@ class TrialSignals:
         if whose:
             agent, name = whose, name[len(whose) + 1 :]
         if name in self._of_scene(agent):
-            return _SceneReader(self._episode, agent).read(name)
+            if agent not in self._readers:
+                self._readers[agent] = _SceneReader(self._episode, agent)
+            return self._readers[agent].read(name)
         if name in self._events():
             return lambda: any(event.kind == name and event.agent == agent for event in self._scene().events)
         if name == _REWARD:
@@ -254,6 +257,7 @@ class _SceneReader:
         self._episode, self._agent = episode, agent
         self._step_s = episode.simulator.step_length_s
         self._lanes: Sequence[Lane] | None = None
+        self._ahead_at, self._last_ahead = -1, (math.inf, math.inf)
 
     def read(self, name: str) -> Read:
         """Return the function that reads a signal."""
@@ -290,13 +294,20 @@ class _SceneReader:
     def _speed(self) -> float:
         return self._scene.speeds[self._row]
 
+    def _nearest(self, kind: str) -> Neighbor | None:
+        simulator = self._episode.simulator
+        if supports(simulator, ReportsNearestAhead):
+            return simulator.nearest_ahead(self._agent, kind)
+        assert supports(simulator, ReportsSurroundings)
+        ahead = (one for one in simulator.surroundings(self._agent).ahead if one.kind == kind)
+        return min(ahead, key=lambda one: one.gap_m, default=None)
+
     def _ahead(self) -> tuple[float, float]:
         """Return the gap to the nearest vehicle ahead, in m, and its speed, in m/s; both infinite without one."""
-        simulator = self._episode.simulator
-        assert supports(simulator, ReportsSurroundings)
-        ahead = [one for one in simulator.surroundings(self._agent).ahead if one.kind == "vehicle"]
-        nearest = min(ahead, key=lambda one: one.gap_m, default=None)
-        return (math.inf, math.inf) if nearest is None else (nearest.gap_m, nearest.speed_mps)
+        if self._ahead_at != self._episode.steps:  # several signals need it in each step
+            self._ahead_at, nearest = self._episode.steps, self._nearest("vehicle")
+            self._last_ahead = (math.inf, math.inf) if nearest is None else (nearest.gap_m, nearest.speed_mps)
+        return self._last_ahead
 
     def _headway(self) -> float:
         speed = self._speed()
@@ -308,10 +319,8 @@ class _SceneReader:
         return max(0.0, gap_m) / closing if closing > 0 else math.inf
 
     def _red_light(self) -> float:
-        simulator = self._episode.simulator
-        assert supports(simulator, ReportsSurroundings)
-        ahead = simulator.surroundings(self._agent).ahead
-        return min((one.gap_m for one in ahead if one.kind == "red light"), default=math.inf)
+        nearest = self._nearest("red light")
+        return math.inf if nearest is None else nearest.gap_m
 
     def _clearance(self) -> float:
         return float(approaches([self._scene.frame], self._agent)[1][0])

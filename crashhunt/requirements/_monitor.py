@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections import deque
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -163,6 +164,8 @@ class _Check:
         )
         self._end = math.inf if end is None else end
         self._unfavourable_at = -math.inf
+        self._is_settled = self._surely(self._inner, holds=True)
+        self._open: deque[int] = deque()  # samples that later samples may make false
 
     def add(self, row: Sequence[float], count: int) -> bool:
         """Add a sample, and return whether the conjunct is certainly violated."""
@@ -172,11 +175,15 @@ class _Check:
             part.truths.append(math.inf if holds else -math.inf)
             if holds is not part.favourable:
                 self._unfavourable_at = last
+        low, high = max(self._begin, last - self._ahead), min(self._end, last)
+        if not self._is_settled():
+            self._open.append(last)
+        while self._open and self._open[0] < low:
+            self._open.popleft()
+        if not self._open or self._open[0] > high:
+            return False
         # A favourable sample changes nothing, unless operators of the past see an older one or an empty window.
         if last - self._unfavourable_at > self._back and last > self._back:
-            return False
-        low, high = max(self._begin, last - self._ahead), min(self._end, last)
-        if low > high or (self._ahead == 0 and self._is_surely(self._inner, holds=True)):
             return False
         reach = self._ahead + self._back
         if math.isinf(reach) and count > MAX_PREFIX:
@@ -186,19 +193,28 @@ class _Check:
     def _bounds(self, window: Window) -> tuple[int, int | None]:
         return steps_of(window, self._step_length_s, self._text)
 
-    def _is_surely(self, formula: Formula, *, holds: bool) -> bool:
-        """Return whether the parts without temporal operators alone decide that the last sample has a truth value."""
+    def _surely(self, formula: Formula, *, holds: bool) -> Callable[[], bool]:
+        """Return a function that returns whether the last sample decides that a formula has a truth value.
+
+        Later samples cannot change this value.
+        """
         part = self._parts.get(id(formula))
         if part is not None:
-            return (part.truths[-1] > 0) is holds
+            truths = part.truths
+            return (lambda: truths[-1] > 0) if holds else (lambda: truths[-1] < 0)
         match formula:
             case Not(formula=inner):
-                return self._is_surely(inner, holds=not holds)
+                return self._surely(inner, holds=not holds)
             case Join(operator=operator, parts=parts):
-                decide = any if (operator == "or") is holds else all
-                return decide(self._is_surely(one, holds=holds) for one in parts)
+                whether = [self._surely(one, holds=holds) for one in parts]
+                if (operator == "or") is holds:
+                    return lambda: True in [one() for one in whether]
+                return lambda: False not in [one() for one in whether]
+            case Temporal(operator=operator, window=window, formula=inner) if window.begin_s == 0:
+                is_enough = (operator in ("eventually", "once")) is holds
+                return self._surely(inner, holds=holds) if is_enough else lambda: False
             case _:
-                return False
+                return lambda: False
 
     def _is_violated(self, low: int, high: int, start: int) -> bool:
         """Return whether the formula inside is false at a sample from `low` to `high`; reads samples from `start`."""

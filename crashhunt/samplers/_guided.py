@@ -207,6 +207,7 @@ class Peaks:
 
 
 _WORTHWHILE = 1.5  # mean payoff: below that, the even search proposes, because criticality cannot mislead it
+_FEW = 5  # trials that may have equal scores by chance
 _PRIOR = 2.0  # payoff of one imagined trial of the model, so that it is tried
 
 
@@ -260,7 +261,14 @@ class Portfolio:
         if draft is not None:
             return replace(draft, origin=_MODEL)
         point = self._even.point(place)
-        return Draft(point if self._shapes is None else self._shapes.with_shapes(point, rng), origin=_EVEN)
+        if self._shapes is not None and self._differ:
+            point = self._shapes.with_shapes(point, rng)
+        return Draft(point, origin=_EVEN)
+
+    @property
+    def _differ(self) -> bool:
+        """Whether scores differ: where none does, such as for gears, shapes have no advantage over even points."""
+        return len(self._unguided) < _FEW or self._unguided[0] < self._unguided[-1]
 
     def _is_worthwhile(self, rng: np.random.Generator) -> bool:
         """Draw whether the model finds more than the even search."""

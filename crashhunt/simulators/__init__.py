@@ -68,6 +68,7 @@ if TYPE_CHECKING:
         ReportsCrashCell as ReportsCrashCell,
         ReportsDanger as ReportsDanger,
         ReportsEvents as ReportsEvents,
+        ReportsNearestAhead as ReportsNearestAhead,
         ReportsNotices as ReportsNotices,
         ReportsSurroundings as ReportsSurroundings,
         ReportsTruncation as ReportsTruncation,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.native import UsualSteps, Vehicles
     from crashhunt.simulators._observation_parts import ObservationLayout
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Lane, Motion, Paths, RoadMap, Roster, Scene, Surroundings, VehicleData
+    from crashhunt.world import Lane, Motion, Neighbor, Paths, RoadMap, Roster, Scene, Surroundings, VehicleData
 
 
 class Options(TypedDict, total=False):
@@ -103,10 +103,11 @@ class Simulator(Protocol):
     changes an array that it has returned.
 
     Each optional capability is its own protocol: `ReportsNotices`, `FlattensObservations`, `RestoresObservations`,
-    `ObservesParts`, `NamesObservations`, `ReportsEvents`, `MasksActions`, `HasMap`, `HasWindow`, `SupportsFullBraking`,
-    `ReportsSurroundings`, `SupportsDisturbances`, `SupportsHolds`, `SupportsExclusion`, `SupportsScripts`,
-    `SupportsReseeding`, `CountsSetUp`, `RunsForeignCode`, `RestoresState` and `PreparesProcess`. A simulator supports a
-    protocol if it has the methods and attributes of the protocol. Registration is not needed.
+    `ObservesParts`, `NamesObservations`, `ReportsEvents`, `MasksActions`, `HasMap`, `HasWindow`,
+    `SupportsFullBraking`, `ReportsSurroundings`, `ReportsNearestAhead`, `SupportsDisturbances`, `SupportsHolds`,
+    `SupportsExclusion`, `SupportsScripts`, `SupportsReseeding`, `CountsSetUp`, `RunsForeignCode`, `RestoresState`
+    and `PreparesProcess`. A simulator supports a protocol if it has the methods and attributes of the protocol.
+    Registration is not needed.
     """
 
     @property
@@ -324,6 +325,21 @@ class ReportsSurroundings(Protocol):
 
         Args:
             agent: The identifier of an agent's vehicle that has not left the simulation.
+        """
+
+
+class ReportsNearestAhead(Protocol):
+    """A simulator that reports the nearest object ahead in less time than all of `ReportsSurroundings.surroundings`.
+
+    The signals of requirements read it in every step. Contract: `nearest_ahead` changes nothing in the simulation.
+    """
+
+    def nearest_ahead(self, agent: str, kind: str) -> Neighbor | None:
+        """Return the nearest object of a kind among ``surroundings(agent).ahead``; None without one.
+
+        Args:
+            agent: as in `ReportsSurroundings.surroundings`.
+            kind: ``vehicle`` or ``red light``.
         """
 
 
@@ -548,6 +564,7 @@ FACULTIES: tuple[type, ...] = (
     HasWindow,
     SupportsFullBraking,
     ReportsSurroundings,
+    ReportsNearestAhead,
     SupportsDisturbances,
     SupportsHolds,
     SupportsExclusion,

@@ -47,7 +47,7 @@ from crashhunt.sumo._options import SumoSetup
 from crashhunt.sumo._range_of_sight import Sight
 from crashhunt.sumo._reader_protocol import Moment
 from crashhunt.sumo._scripted import ScriptedSight, place_agents
-from crashhunt.sumo._surroundings import surroundings_of, unregulated_junctions
+from crashhunt.sumo._surroundings import nearest_ahead_of, surroundings_of, unregulated_junctions
 from crashhunt.sumo._traffic_events import SumoEvents
 from crashhunt.world import PERSON, Lane, is_person
 
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.simulators import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Motion, Paths, RoadMap, Scene, Surroundings, VehicleData
+    from crashhunt.world import Motion, Neighbor, Paths, RoadMap, Scene, Surroundings, VehicleData
 
 guard_against_agents()
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
@@ -358,6 +358,11 @@ class SumoSimulator:
         if self._unregulated is None:  # the network is read at the first use; libsumo has no getter
             self._unregulated = unregulated_junctions(self._scenario.folder / self._scenario.table(SumoSetup).net)
         return surroundings_of(agent, self._driving.neighboring_lane, self._unregulated)
+
+    def nearest_ahead(self, agent: str, kind: str) -> Neighbor | None:
+        """Return the vehicle ahead, or the next red light; None without one."""
+        self.scene()  # brings SUMO to the current step
+        return nearest_ahead_of(agent, kind)
 
     def resolve_target(self, disturbance: Disturbance) -> str:
         """Return the actor that a disturbance names by a place, such as ``ahead``; empty if there is none."""

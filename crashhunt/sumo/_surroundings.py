@@ -44,7 +44,7 @@ def surroundings_of(
         unregulated: identifiers of the junctions without rules of right of way.
     """
     speed = max(0.0, float(sumo.vehicle_getSpeed(agent)))
-    look_m = max(_MIN_LOOK_M, _LOOK_S * speed)
+    look_m = _look_m(speed)
     return Surroundings(
         speed_mps=speed,
         acceleration_mps2=float(sumo.vehicle_getAccel(agent)),
@@ -53,6 +53,17 @@ def surroundings_of(
         crossing=tuple(_crossing(agent, _regulated_m(agent, look_m, unregulated))),
         sides={change: side for change in (1, -1) if (side := _side(agent, change, neighboring_lane)) is not None},
     )
+
+
+def nearest_ahead_of(agent: str, kind: str) -> Neighbor | None:
+    """Return the nearest object of a kind that `surroundings_of` returns ahead; None without one."""
+    look_m = _look_m(max(0.0, float(sumo.vehicle_getSpeed(agent))))
+    found = _leaders(agent, look_m) if kind == "vehicle" else _red_lights(agent, look_m)
+    return min(found, key=lambda one: one.gap_m, default=None)
+
+
+def _look_m(speed: float) -> float:
+    return max(_MIN_LOOK_M, _LOOK_S * speed)
 
 
 def _braking(vehicle: str) -> float:
@@ -72,7 +83,7 @@ def _neighbor(vehicle: str, gap_m: float) -> Neighbor:
 def _leaders(agent: str, look_m: float) -> list[Neighbor]:
     found = sumo.vehicle_getLeader(agent, look_m)
     # SUMO subtracts the agent's minGap from the distance. A person on a crossing is no vehicle.
-    if not found or not found[0] or found[0] not in sumo.vehicle_getIDList():
+    if not found or not found[0] or found[0] in sumo.person_getIDList():
         return []
     return [_neighbor(found[0], found[1] + float(sumo.vehicle_getMinGap(agent)))]
 

@@ -240,6 +240,80 @@ def bench_observation() -> Iterator[Figure]:
         yield Figure(name=name, value=found["ratio"], unit="x", better="lower", target=target, note=note)
 
 
+TEN_NODES = "always (speed > 8 -> eventually[0:2] (headway_s >= 0.8))"
+
+
+def child_requirement(scenario: str) -> dict[str, float]:
+    """A step of the formula of ten nodes, with its signals and without, and a whole step without a requirement."""
+    from crashhunt.agents import KeepLaneWithSpeed
+    from crashhunt.episode import Episode, FastEpisode, Nearness, Recorder, TrialSignals
+    from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, RequirementOracle
+    from crashhunt.recording import BlackBox
+    from crashhunt.requirements import Monitor, parse
+    from crashhunt.scenario import argument_values, load_scenario
+    from crashhunt.sumo import SumoSimulator
+    from crashhunt.trial import TrialSpec
+
+    steps, clock, chosen = 1000, time.process_time, load_scenario(scenario)
+    with folder() as stage:
+        simulator, box = SumoSimulator(chosen, stage), BlackBox(stage / "blackbox.bin")
+        arguments = argument_values(chosen)
+        spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments=arguments, max_steps=steps)
+
+        def whole(*requirements: RequirementOracle) -> float:
+            box.begin(pid=os.getpid(), trial=0, started=time.monotonic())
+            with FastEpisode(
+                spec,
+                simulator=simulator,
+                make_agent=lambda *_: KeepLaneWithSpeed(10.0),
+                oracles=[ReportedCollision(), Overlap(), OffRoad(), *requirements],
+                crash_on=(),
+                observers=[Recorder(box, simulator), Nearness(box.take_frames)],
+            ) as episode:
+                result = episode.start()
+                began = clock()
+                while result is None:
+                    result = episode.step()
+                return (clock() - began) / max(1, result.steps)
+
+        rounds = [(whole(), whole(RequirementOracle("calm", TEN_NODES))) for _ in range(5)]
+        requirement = parse(TEN_NODES)
+        with Episode(spec, simulator=simulator, make_agent=lambda *_: KeepLaneWithSpeed(10.0)) as episode:
+            episode.start()
+            episode.step()
+            agent = episode.names[0]
+            read = TrialSignals(episode).reader(requirement.signals, agent)
+
+            def monitored() -> float:
+                monitor = Monitor(requirement, simulator.step_length_s)
+                began = clock()
+                for _ in range(steps):
+                    monitor.add((10.0, 2.0))
+                return (clock() - began) / steps
+
+            began = clock()
+            for _ in range(steps):
+                read()
+            signals = (clock() - began) / steps
+            formula = min(monitored() for _ in range(9))
+    plain = min(without for without, _ in rounds)
+    return {
+        "formula": 1e6 * formula, "signals": 1e6 * signals, "whole": 1e6 * plain, "share": 100 * formula / plain,
+        "ratio": statistics.median(with_one / without for without, with_one in rounds),
+    }  # fmt: skip
+
+
+def bench_requirement() -> Iterator[Figure]:
+    """A requirement with a formula of ten nodes, as a share of a step."""
+    for scenario in ("loop", "intersection"):
+        found = in_child("child_requirement", scenario)
+        note = f"formula {found['formula']:.1f} µs, step without a requirement {found['whole']:.0f} µs"
+        name = f"requirement_{scenario}"
+        yield Figure(name=f"{name}_share", value=found["share"], unit="%", better="lower", target=3.0, note=note)
+        note = "with the Python part of each step, which the compiled core omits without a requirement"
+        yield Figure(name=f"{name}_ratio", value=found["ratio"], unit="x", better="lower", target=None, note=note)
+
+
 def bench_step() -> Iterator[Figure]:
     """A whole step against a bare loop."""
     for scenario in ("loop", "merge", "intersection"):
@@ -1611,6 +1685,7 @@ def bench_training() -> Iterator[Figure]:
 BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "observation": bench_observation,
     "step": bench_step,
+    "requirement": bench_requirement,
     "actions": bench_actions,
     "core": bench_core,
     "isolation": bench_isolation,

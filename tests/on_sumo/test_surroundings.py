@@ -38,6 +38,9 @@ def test_gaps_and_speeds_are_those_of_the_scene(merge):
         if step % 8:
             continue
         around, scene = merge.surroundings("ego"), merge.scene()
+        for kind in ("vehicle", "red light"):
+            of_kind = [one for one in around.ahead if one.kind == kind]
+            assert merge.nearest_ahead("ego", kind) == min(of_kind, key=lambda one: one.gap_m, default=None)
         if any(math.hypot(c, s) < 0.999 for c, s in [(1, 0)]) or around.speed_mps == 0:
             continue
         assert around.speed_mps == pytest.approx(scene.speeds[scene.roster.index["ego"]])
