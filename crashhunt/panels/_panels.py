@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from crashhunt.base.text import format_number
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
@@ -284,7 +286,7 @@ def span_of(low: float, high: float) -> float:
 
 def number(value: float) -> str:
     """Return a number as text for a label."""
-    return f"{value:.3g}" if math.isfinite(value) else "-"
+    return format_number(value) if math.isfinite(value) else "-"
 
 
 @lru_cache(maxsize=256)
@@ -539,6 +541,15 @@ def _paint_picture(panel: Picture, canvas: Canvas) -> None:
     canvas.image.paste(drawn, ((canvas.width - size[0]) // 2, _TOP + (canvas.height - _TOP - 6 - size[1]) // 2))
 
 
+_CUT_PIXELS, _CUT_DOT_PIXELS = 1.0, 3.0  # beyond an axis, a value is cut: a dotted line at the axis
+
+
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int, bool]]:
+    """Return the begin, the end and the value of each run of equal flags."""
+    ends = [*(np.flatnonzero(flags[1:] != flags[:-1]) + 1).tolist(), len(flags)]
+    return [(begin, end, bool(flags[begin])) for begin, end in zip([0, *ends], ends, strict=False)]
+
+
 class _Axes:
     """Axes with labels, and the conversion of values to pixel positions."""
 
@@ -562,10 +573,20 @@ class _Axes:
     def line(self, points: NDArray[np.float64], color: tuple[int, int, int]) -> None:
         placed = np.empty_like(points)
         placed[:, 0] = _LEFT + (points[:, 0] - self._left) * self._scale_x
-        placed[:, 1] = np.clip(self._bottom - (points[:, 1] - self._low) * self._scale_y, _TOP, self._bottom)
+        heights = self._bottom - (points[:, 1] - self._low) * self._scale_y
+        placed[:, 1] = np.clip(heights, _TOP, self._bottom)
         if len(placed) == 1:
-            placed = np.repeat(placed, 2, axis=0)
-        self._draw.line(placed.ravel().tolist(), color, 2)
+            placed, heights = np.repeat(placed, 2, axis=0), np.repeat(heights, 2)
+        is_cut = np.abs(heights - placed[:, 1]) > _CUT_PIXELS
+        is_cut = is_cut[1:] & is_cut[:-1]
+        for begin, end, cut in _runs(is_cut):
+            if not cut:
+                self._draw.line(placed[begin : end + 1].ravel().tolist(), color, 2)
+                continue
+            level = placed[begin, 1]
+            for left in np.arange(placed[begin, 0], placed[end, 0], 2 * _CUT_DOT_PIXELS):
+                right = min(left + _CUT_DOT_PIXELS, placed[end, 0])
+                self._draw.line((left, level, right, level), color, 2)
 
 
 def _bars(canvas: Canvas, names: Sequence[str], values: NDArray[np.float64], low: float, high: float) -> None:

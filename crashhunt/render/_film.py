@@ -108,7 +108,7 @@ class Layout:
         next_to = width + math.ceil(count / rows) * panel[0], max(height, min(rows, count) * panel[1])
         below = max(width, min(columns, count) * panel[0]), height + math.ceil(count / columns) * panel[1]
         self.places: dict[str, tuple[int, int]] = {}
-        if next_to[0] * next_to[1] <= below[0] * below[1]:
+        if next_to[0] * next_to[1] < below[0] * below[1]:  # of two equal sizes, the narrow one is legible on a page
             self.size = next_to
             for number, label in enumerate(labels):
                 self.places[label] = width + number // rows * panel[0], number % rows * panel[1]

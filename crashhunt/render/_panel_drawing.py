@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.crashes import Encounter
+from crashhunt.crashes import Encounter, danger_course
 from crashhunt.panels import (
     Action as Action,
     ActionDistribution as ActionDistribution,
@@ -36,13 +36,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.recording import Recording
+    from crashhunt.world import Scene
 
 
 # The panels that every film has.
 
 _SHOWN_S = 10.0  # of the built-in curves
-_WITH_OTHER = ("time to collision (s)", "gap (m)", "speed (m/s)", "action")
-_WITH_NEAREST = ("least time to collision (s)", "nearest gap (m)", "speed (m/s)", "action")  # a crash without a partner
+_TTC_CUT_S, _GAP_CUT_M, _ACCELERATION_CUT_MPS2 = 10.0, 100.0, 12.0  # as in the player of the report
+_MOTION = ("speed (m/s)", "acceleration (m/s^2)", "criticality", "action")  # the font has no ²
+_WITH_OTHER = ("time to collision (s)", "gap (m)", *_MOTION)
+_WITH_NEAREST = ("least time to collision (s)", "nearest gap (m)", *_MOTION)  # a crash without a partner
 _PANELS_WITHOUT_SCENE = ("reward", "action")
 
 
@@ -55,13 +58,16 @@ def builtin_labels(recording: Recording, other: str) -> tuple[str, ...]:
     """
     if not recording.actors:
         return _PANELS_WITHOUT_SCENE
-    return _WITH_OTHER if other else _WITH_NEAREST
+    labels = _WITH_OTHER if other else _WITH_NEAREST
+    # A compact recording lacks actors that criticality depends on.
+    return labels if recording.compact is None else tuple(label for label in labels if label != "criticality")
 
 
 class BuiltinPanels:
-    """The panels that every film has: curves of time to collision, gap and speed of the agent, and its action.
+    """The panels that every film has: time to collision, gap, speeds, accelerations, criticality, and the action.
 
-    A recording without a scene has a curve of the reward instead of the three curves.
+    A recording without a scene has a curve of the reward instead of the other curves. A dotted line is a value that is
+    cut at the axis.
 
     Args:
         recording: recording of the trial.
@@ -82,10 +88,12 @@ class BuiltinPanels:
                 np.array([getattr(moments[n], name) if n in moments else np.nan for n in range(len(scenes))])
                 for name in ("gap_m", "time_to_collision_s")
             )
-        rows = [scene.roster.index.get(agent) for scene in scenes]
-        self._speeds = np.array(
-            [np.nan if row is None else scene.speeds[row] for scene, row in zip(scenes, rows, strict=True)]
-        )
+        self._speeds = {name: _speeds_of(scenes, name) for name in (agent, other) if name}
+        self._accelerations = {
+            name: np.append(np.nan, np.diff(speeds)) / self._dt for name, speeds in self._speeds.items()
+        }
+        course = danger_course(recording, agent) if recording.compact is None else None
+        self._danger = course.own if course is not None else np.full(len(scenes), np.nan)
         self._rewards = np.array([step.rewards.get(agent, 0.0) for step in recording.all_steps if step.whole])
         self._seconds = np.array([scene.time_s for scene in scenes])
         channel = next((found for found in recording.prologue.agents if found.id == agent), None)
@@ -106,11 +114,16 @@ class BuiltinPanels:
         first = max(0, step - round(_SHOWN_S / self._dt))
         part = slice(first, step + 1)
         x = self._seconds[part]
-        times = np.where(np.isfinite(self._times[part]), np.minimum(self._times[part], 10.0), np.nan)
+        gaps, is_whole = self._gaps[part], self._recording.compact is None
+        pulls = {name: values[part] for name, values in self._accelerations.items()}
+        strongest = max(float(np.abs(values[np.isfinite(values)]).max(initial=1.0)) for values in pulls.values())
+        bound = min(_ACCELERATION_CUT_MPS2, strongest)
         curves = [
-            Curve(times, x, low=0.0, high=10.0),
-            Curve(np.minimum(self._gaps[part], 100.0), x, low=0.0),
-            Curve(self._speeds[part], x, low=0.0),
+            Curve(self._times[part], x, low=0.0, high=_TTC_CUT_S),
+            Curve(gaps, x, low=0.0, high=min(_GAP_CUT_M, float(gaps[np.isfinite(gaps)].max(initial=1.0)))),
+            Curve({name: values[part] for name, values in self._speeds.items()}, x, low=0.0),
+            Curve(pulls, x, low=-bound, high=bound),
+            *([Curve(self._danger[part], x, low=0.0, high=1.0)] if is_whole else []),
         ]
         if not self._recording.actors:
             curves = [Curve(self._rewards[part], x)]
@@ -124,6 +137,12 @@ class BuiltinPanels:
                 drawn = Action(value=value, low=self._low, high=self._high, names=self._names)
             found.append((self._labels[-1], drawn))
         return found
+
+
+def _speeds_of(scenes: Sequence[Scene], actor: str) -> NDArray[np.float64]:
+    """Return the speed of an actor in each scene; NaN where the actor is not in the scene."""
+    rows = [scene.roster.index.get(actor) for scene in scenes]
+    return np.array([np.nan if row is None else scene.speeds[row] for scene, row in zip(scenes, rows, strict=True)])
 
 
 # Drawn panels on their way from the process of the agent to the one that makes the film.

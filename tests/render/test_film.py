@@ -32,7 +32,7 @@ def shot(steps: int = 20, *, crash: bool = True, other: str = "other", panels=No
         )
         for n in range(steps + 1)
     ]
-    recording = SimpleNamespace(
+    recording = SimpleNamespace(compact=None,
         all_steps=records, prologue=Prologue((), 0.1), steps=steps, agents=["ego"], actors=list(ROSTER.actors),
         disturbances=(), scenes=lambda: [record.scene for record in records], scene=lambda n: records[n].scene,
     )  # fmt: skip

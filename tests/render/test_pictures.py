@@ -131,7 +131,7 @@ def street(turn: int, other: str = "truck", nearest: int = -1) -> Shot:
 
 
 def recording(steps, actors, step_length_s, agents=("ego",), disturbances=()):
-    return SimpleNamespace(
+    return SimpleNamespace(compact=None,
         all_steps=steps, prologue=Prologue((), step_length_s), steps=len(steps) - 1, agents=list(agents),
         actors=list(actors), disturbances=disturbances, scenes=lambda: [step.scene for step in steps],
         scene=lambda n: steps[n].scene,

@@ -34,7 +34,7 @@ def recording(*steps, actors, dt=0.1, agents=("ego",), actions=None, disturbance
         scene = Scene(number * dt, roster, [(x, y) for x, y, *_ in found], [float(one[2]) for one in found],
                       [float(one[3]) for one in found])  # fmt: skip
         records.append(StepRecord(number, scene, actions=(actions or {}).get(number, {})))
-    return SimpleNamespace(
+    return SimpleNamespace(compact=None,
         all_steps=records, prologue=Prologue((), dt), steps=len(steps) - 1, agents=[*agents], actors=[*actors],
         disturbances=disturbances, scenes=lambda: [record.scene for record in records],
         scene=lambda n: records[n].scene,
@@ -185,22 +185,25 @@ def test_panels_show_time_to_collision_gap_and_speed_of_the_last_seconds(other):
     shot = following(other=other, steps=120)
     for step in (60, 75):
         panels = dict(builtin_panels(shot).panels(step))
-        times, gaps, speeds = [panel for panel in panels.values() if isinstance(panel, Curve)]
+        times, gaps, speeds, pulls, danger = [panel for panel in panels.values() if isinstance(panel, Curve)]
         shown = len(times.x)
         assert times.x[-1] == pytest.approx(step / 10)
         assert np.diff(times.x) == pytest.approx(0.1)
-        assert shown == len(times.series) == len(gaps.series) == len(speeds.series)
+        assert shown == len(times.series) == len(gaps.series) == len(speeds.series["ego"]) == len(danger.series)
         assert shown <= step + 1
         assert gaps.series[-1] == pytest.approx(90.0 - step)
         assert times.series[-1] == pytest.approx((90.0 - step) / 10)
-        assert speeds.series[-1] == pytest.approx(10.0)
+        actors = {"ego": 10.0, "other": 0.0} if other else {"ego": 10.0}
+        assert {name: speed[-1] for name, speed in speeds.series.items()} == pytest.approx(actors)
+        assert {name: pull[-1] for name, pull in pulls.series.items()} == pytest.approx(dict.fromkeys(actors, 0.0))
+        assert (danger.low, danger.high) == (0.0, 1.0)
         (action,) = [panel for panel in panels.values() if isinstance(panel, Action)]
         assert action.value == pytest.approx([3.0 - step, 0.5])
         assert action.low == pytest.approx([-117.0, 0.0])
         assert action.high == pytest.approx([117.0, 1.0])  # with two directions, 0 is in the middle
-    assert len(dict(builtin_panels(shot).panels(0))) == 3  # nothing has been decided yet
+    assert len(dict(builtin_panels(shot).panels(0))) == 5  # nothing has been decided yet
     beginning = dict(builtin_panels(following(other=other, steps=5)).panels(2))
-    assert max(next(iter(beginning.values())).series) <= 10.0
+    assert next(iter(beginning.values())).high == 10.0
 
 
 def test_lane_change_of_0_is_in_the_middle_of_its_axis():
@@ -258,7 +261,15 @@ def test_far_gaps_are_cut_so_that_near_ones_can_be_read():
     places = [{"ego": (float(n), 0.0, 0.0, 10.0), "other": (400.0, 0.0, 0.0, 10.0)} for n in range(4)]
     shot = Shot(recording(*places, actors=[CAR, TRUCK]), [], "ego", "other", -1, {})
     curves = [panel for _, panel in builtin_panels(shot).panels(3) if isinstance(panel, Curve)]
-    assert curves[1].series.tolist() == [100.0] * 4
+    assert (curves[1].low, curves[1].high) == (0.0, 100.0)
+
+
+def test_cut_values_are_a_dotted_line_at_the_axis():
+    inside, cut = (Curve(np.full(50, value), low=0.0, high=10.0).draw() for value in (9.0, 12.0))
+    blue = [(picture == (0, 114, 178)).all(axis=2) for picture in (inside, cut)]
+    assert blue[0].sum(axis=1).max() > 180  # a line over the whole width
+    assert 80 < blue[1].sum(axis=1).max() < 140  # gaps between its dots
+    assert np.flatnonzero(blue[1].any(axis=1)).max() < np.flatnonzero(blue[0].any(axis=1)).min()
 
 
 def test_a_film_shows_the_last_seconds_or_those_around_a_near_miss():
