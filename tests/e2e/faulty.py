@@ -98,16 +98,6 @@ class DiesAtStart:
         os._exit(7)
 
 
-class SlowsDown(Fine):
-    """Another speed every time, so that no two runs are the same."""
-
-    def act(self, observation):
-        self.step += 1
-        if self.step > 40:
-            raise ValueError("enough")
-        return 5.0 + int.from_bytes(os.urandom(4), "big") / 2**32, 0
-
-
 class HangsUnlessFirst(Fine):
     """In trial 0 it raises at step 150; in every other trial it hangs at once, holding the interpreter."""
 

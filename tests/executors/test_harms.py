@@ -191,12 +191,6 @@ def test_there_are_more_than_300_kinds():
     assert len(TABLE) + len(ATTACKS) > 300
 
 
-@pytest.mark.nightly  # by day, test_harm.py
-def test_harm_costs_its_own_trial_and_is_named(run):
-    trials = [*sample(3), ("raises_long_message", "fifth act"), ("stops_itself", "fifth act"), ("sleeps", "close")]
-    check(trials, run(trials, timeout_s=2.0))
-
-
 @pytest.mark.nightly
 @pytest.mark.parametrize("part", range(8))
 def test_every_harm_at_every_moment_costs_its_own_trial_and_is_named(run, part):

@@ -8,7 +8,7 @@ import pytest
 
 from crashhunt.base.errors import NoValidTrialError, ScenarioError
 from crashhunt.scenario import load_scenario, shipped_folder
-from crashhunt.sumo._ego import _departure_of, _departures, refine, restore
+from crashhunt.sumo._ego import _departure_of, _departures, refine
 
 TRIPS = "".join(f'<trip id="t{at}" depart="{at}" from="south" to="east"/>' for at in range(0, 1000, 50))
 
@@ -160,16 +160,6 @@ def test_the_only_vehicle_of_the_files_stays_the_controlled_one_if_it_enters(tow
     scenario = town('<trip id="t" depart="5" from="south" to="east"/>')
     assert refine(scenario, [run([("t", 6.0), ("other", 7.0)])]).agents == scenario.agents
     assert list(refine(scenario, [run([("x", 6.0), ("y", 7.0)])]).agents) == ["ego"]
-
-
-def test_an_earlier_hunt_keeps_its_candidates(town):
-    hunted = refine(town(), [run([("t200", 201.0), ("t250", 251.0), ("t300", 301.0)])])
-    restored = restore(town(), hunted)
-    assert restored.arguments == hunted.arguments
-    assert restored.agents == hunted.agents
-    assert "3 candidates of this hunt" in restored.notes[0]
-    assert restore(town(), town(ego="t50")) is None
-    assert restore(town(), town('<route id="way" edges="south east"/>')) is None
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ class Needs(Agent):
         pass
 
 class Open(Agent):
-    def __init__(self, **options):
+    def __init__(self, speed: float = 7.0, *, observation_space, **options):
         pass
 """
 
@@ -322,25 +322,10 @@ def test_no_trials_are_fine_with_a_time_and_drivers_have_to_be_importable(folder
         request_of(HuntOptions(agent=drives.Agent()), trials=1, max_steps=1)
 
 
-def test_whose_an_argument_is():
+def test_an_argument_that_is_nobodys_is_named_with_those_that_exist():
     owners = Owners(
         {"a": Takes(("speed", "gap")), "a.b": Takes(("speed",)), "c": Takes((), open=True)}, ("gap", "rain")
     )
-
-    def of(word):
-        return owners.of(word, option="--set")
-
-    assert of("a.speed") == ("a", "speed")
-    assert of("a.b.speed") == ("a.b", "speed")
-    assert of("a.rain") is None
-    assert of("c.rain") == ("c", "rain")
-    assert of("rain") == of("scenario.rain") == ("", "rain")
-    assert of("scenario.speed") is None
-    assert of("mood") == ("c", "mood")
-    with pytest.raises(ArgumentError, match=r"a and scenario have it; write --set a\.gap=… or --set scenario\.gap=…"):
-        of("gap")
-    with pytest.raises(ArgumentError, match=r"several agents take it; write --set a\.speed=… or --set a\.b\.speed=…"):
-        of("speed")
     assert Owners({"a": Takes(("speed",))}).of("mood", option="--arg") is None
     assert (agent_of("a.b.speed", owners.agents), agent_of("a.x", owners.agents), agent_of("x", owners.agents)) == (
         "a.b", "a", "",
@@ -367,13 +352,14 @@ def test_of_a_record_the_code_is_asked_only_where_it_does_not_know():
     assert owners.of_record("b.weights", ask, option="--set") == ("b", "weights")
     assert calls == ["a", "b", "b"]
     assert owners.of_record("a.weights", ask, option="--set") is None
+    assert owners.of_record("a.weights", lambda _: Takes((), open=True), option="--set") == ("a", "weights")
 
 
 def test_code_states_what_an_agent_takes(folder):
     assert takes_of("drives:Agent") == Takes(
         ("speed", "mode", "needed", "gap"), defaults={"speed": 7.0, "mode": "a|b", "gap": "wide"}
     )
-    assert takes_of("drives:Open") == Takes((), open=True)
+    assert takes_of("drives:Open") == Takes(("speed",), open=True, defaults={"speed": 7.0})
     assert takes_of("drives:Nothing") == Takes(open=True)  # whoever runs it says why
     other = folder / "other"
     other.mkdir()
