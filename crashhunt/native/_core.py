@@ -113,8 +113,8 @@ class UsualSteps(Protocol):
         """Set the functions for observations that consist of parts.
 
         Args:
-            make: function that receives the columns of a scene, its time (s), the row and the lane of the agent, and
-                the number of the step, and returns the recorded array.
+            make: function that returns the recorded array. It receives the columns of a scene, its time (s), the row
+                and the lane of the agent, and the number of the step.
             restore: function that returns what the agent receives, from the recorded array.
         """
 
@@ -219,8 +219,8 @@ class Draft(Protocol):
             who: The value of ``kind`` and the id of each actor of the scene.
             limits: The radius (m), the number of rows, and the step length (s).
             last_speeds: The speeds after the last step, by id.
-            path: The lanes on the path of the vehicle; the known answers of the function by lane; a function that
-                returns whether a lane leads into the lane of the vehicle.
+            path: The lanes on the path of the vehicle; known results by lane; a function that returns whether a lane
+                leads into the lane of the vehicle.
         """
 
     def lanes(

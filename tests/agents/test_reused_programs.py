@@ -94,7 +94,7 @@ def test_a_program_that_does_not_answer_a_second_hello_is_refused_with_the_fix(t
         ("garbage", "ego: its answer to observe of step 3 is not JSON: thinking"),
     ],
 )
-def test_a_program_that_fails_is_started_anew_for_the_next_trial(tmp_path, reused, harm, message):
+def test_a_program_that_fails_is_started_again_for_the_next_trial(tmp_path, reused, harm, message):
     locator = f"exec:{write_program(tmp_path)} {harm} observe"
     program = reused(locator)
     before = trial(program, locator, tmp_path, kind="none")

@@ -211,7 +211,7 @@ def test_states_of_a_suite_end_it_with_1_after_an_error(capsys):
 
 
 def test_change_of_a_state_has_a_line(capsys):
-    watch, finish = _suite._watcher(as_json=False)
+    watch, finish = _suite.states_watcher(as_json=False)
     for first, second in (("queued", "running"), ("running", "running"), ("crashed", "running"), ("crashed", "error")):
         watch([HuntState(dir="a", state=first, crashes=2), HuntState(dir="b", state=second)])
     finish()
@@ -231,18 +231,18 @@ def test_each_hunt_of_a_suite_is_asked_for_once(monkeypatch):
     monkeypatch.setattr("crashhunt.suites.trust_hunt", lambda hunt, place: trusted.append(str(place)))
     monkeypatch.setattr(_suite, "ask_to_trust", lambda refusal, as_json: answers[refusal.where])
     options = Namespace(trust=False, json=False)
-    assert _suite._run_with_trust(suite, options) == "done"
+    assert _suite.run_with_trust(suite, options) == "done"
     assert trusted == ["a", "b"]
     trusted.clear()
     answers["b"] = False
     with pytest.raises(UntrustedError):
-        _suite._run_with_trust(suite, options)
+        _suite.run_with_trust(suite, options)
     assert trusted == ["a"]
-    assert _suite._run_with_trust(suite, Namespace(trust=True, json=False)) == "done"
+    assert _suite.run_with_trust(suite, Namespace(trust=True, json=False)) == "done"
     monkeypatch.setattr("crashhunt.suites.trust_hunt", lambda hunt, place: None)  # which changes nothing
     answers["b"] = True
     with pytest.raises(UntrustedError):
-        _suite._run_with_trust(suite, options)
+        _suite.run_with_trust(suite, options)
 
 
 @pytest.mark.parametrize(
