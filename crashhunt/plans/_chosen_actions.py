@@ -8,21 +8,25 @@ from crashhunt.base.errors import UsageError
 from crashhunt.scenario import action_settings, canonical_action, check_action
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Signature
 
 
-def chosen_actions(asked: str, scenario: Scenario, signatures: Mapping[str, Signature]) -> dict[str, str]:
+def chosen_actions(
+    asked: str, scenario: Scenario, signatures: Mapping[str, Signature], brought: Collection[str] = ()
+) -> dict[str, str]:
     """Return the form of actions of each agent for which the command line or the agent's class chooses one.
 
-    The command line takes precedence over the scenario, and the scenario over the class.
+    The command line takes precedence over the scenario, and the scenario over the class of its own agent. A class that
+    ``--agent`` names takes precedence over the scenario, because the scenario's form is that of the scenario's agent.
 
     Args:
         asked: value of ``--action``; may be empty.
         scenario: scenario with its agents.
         signatures: signature of each agent.
+        brought: the vehicles for which ``--agent`` names the agent.
 
     Raises:
         UsageError: an agent cannot return actions of the chosen form, or names a form that does not exist.
@@ -36,7 +40,7 @@ def chosen_actions(asked: str, scenario: Scenario, signatures: Mapping[str, Sign
         action_settings(asked, where="--action")
         if asked:
             found[agent] = asked
-        elif signature.action and setup.action is None:
+        elif signature.action and (setup.action is None or agent in brought):
             found[agent] = signature.action
         check_action(found.get(agent, setup.action), signature.actions, setup.agent)
     return found

@@ -309,9 +309,8 @@ def plan_with_code(request: Request, *, survey: Surveyor | None = None) -> tuple
 
 def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tuple[Scenario, HuntSettings, CodeFacts]:
     """Resolve a request in a loaded scenario, with the facts about its code if they are known."""
-    scenario = _agents_in(
-        scenario.with_agents(_locators(request, scenario)), dict.fromkeys(scenario.agents, request.action)
-    )
+    brought = _locators(request, scenario)
+    scenario = _agents_in(scenario.with_agents(brought), dict.fromkeys(scenario.agents, request.action))
     with _name_scenario_in_errors(request, scenario):
         disturb = _disturb(request, scenario)
     if code is None or any(setup.agent not in code.signatures for setup in scenario.agents.values()):
@@ -322,16 +321,16 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
         )  # fmt: skip
     hunted = not varies_only_asked(request.sampler)
     signatures = {agent: code.signatures[setup.agent] for agent, setup in scenario.agents.items()}
-    acting = chosen_actions(request.action, scenario, signatures)
+    acting = chosen_actions(request.action, scenario, signatures, brought)
     scenario = _agents_in(scenario, acting)
     requirements = chosen_requirements(request, scenario)
     oracles = chosen_oracles([*request.oracles, *requirements], code.oracles)
     scenario = without_refuted_notes(scenario, requirements)
-    brought = outcomes_brought(oracles, code.oracles)
-    crash_on, limits = parse_crash_on(request.crash_on, brought)
+    new_outcomes = outcomes_brought(oracles, code.oracles)
+    crash_on, limits = parse_crash_on(request.crash_on, new_outcomes)
     if crash_on == CRASHES:  # the default
-        crash_on += tuple(outcome for outcome in brought if outcome not in crash_on)
-    observations = chosen_observations(request.observe, scenario, signatures)
+        crash_on += tuple(outcome for outcome in new_outcomes if outcome not in crash_on)
+    observations = chosen_observations(request.observe, scenario, signatures, brought)
     options = {name: getattr(request, name) for name in fields_of(TrialOptions)}
     options |= {
         "seed": request.seed if request.seed is not None else secrets.randbits(32),

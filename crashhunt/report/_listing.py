@@ -10,7 +10,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import work_apart
 from crashhunt.base.plugins import is_foreign, locate, registered
 from crashhunt.scenario import ACTIONS, installed_backends, load_scenario, shipped_scenarios
-from crashhunt.simulators import HISTORY, PARTS, parse_parts
+from crashhunt.simulators import MODIFIERS, PARTS, parse_parts
 from crashhunt.trial import signature_of, without_folder
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.json_types import Plain
     from crashhunt.base.plugins import Group
+    from crashhunt.simulators import Setting
     from crashhunt.trial import Argument, Kind, Value
 
 _IMPORT_S = 60.0
@@ -136,29 +137,19 @@ def list_actions() -> list[ListingEntry]:
 def list_observations() -> list[ListingEntry]:
     """Return the parts that agents may observe, with the titles of the simulators that have each part."""
     found: list[ListingEntry] = []
-    for name, part in {**PARTS, HISTORY.name: HISTORY}.items():
+    for name, part in {**PARTS, **MODIFIERS}.items():
         having = [backend for _, backend in installed_backends() if backend.observations]
-        simulators = [backend.title for backend in having if part is HISTORY or name in backend.observations]
+        simulators = [backend.title for backend in having if name in MODIFIERS or name in backend.observations]
         if not simulators:
             continue
-        shape = [length for one in parse_parts([name], where="") for length in one.shape] if part is not HISTORY else []
+        shape = [length for one in parse_parts([name], where="") for length in one.shape] if name in PARTS else []
         columns = part.values_of_last_axis
         found.append(
             {
                 "name": name,
                 "locator": ", ".join(simulators),
                 "title": part.meaning[0].upper() + part.meaning[1:] + ".",
-                "arguments": [
-                    {
-                        "name": setting.name,
-                        "kind": "int" if setting.is_whole else "float",
-                        "default": int(setting.default) if setting.is_whole else setting.default,
-                        "range": f"{setting.low:g}:{setting.high:g}",
-                        "unit": setting.unit,
-                        "help": setting.meaning,
-                    }
-                    for setting in part.settings
-                ],
+                "arguments": [_setting_entry(setting) for setting in part.settings],
                 "shape": shape,
                 "columns": [column.name for column in part.columns],
                 "units": [column.unit for column in columns],
@@ -176,6 +167,24 @@ def list_observations() -> list[ListingEntry]:
             }
         )
     return found
+
+
+def _setting_entry(setting: Setting) -> ArgumentEntry:
+    whole, default = setting.is_whole, setting.default
+    if setting.choices:
+        words = setting.choices
+        return {
+            "name": setting.name, "kind": "str", "default": words[int(default)], "range": ",".join(words),
+            "unit": "", "help": setting.meaning,
+        }  # fmt: skip
+    return {
+        "name": setting.name,
+        "kind": "int" if whole else "float",
+        "default": int(default) if whole else default,
+        "range": f"{setting.low:g}:{setting.high:g}",
+        "unit": setting.unit,
+        "help": setting.meaning,
+    }
 
 
 def describe(entries: Sequence[ListingEntry]) -> str:

@@ -29,18 +29,22 @@ if TYPE_CHECKING:
         time_limit_of as time_limit_of,
     )
     from ._bicycle_model import (
+        MAX_JERK_MPS3 as MAX_JERK_MPS3,
         MAX_STEERING_RAD as MAX_STEERING_RAD,
+        MAX_STEERING_RATE_RADPS as MAX_STEERING_RATE_RADPS,
         WHEELBASE_SHARE as WHEELBASE_SHARE,
         BicycleModel as BicycleModel,
         MotionState as MotionState,
     )
     from ._kinematics_observation import Kinematics as Kinematics, Unseen as Unseen, kind_number as kind_number
     from ._observation_parts import (
-        HISTORY as HISTORY,
+        MODIFIERS as MODIFIERS,
         PARTS as PARTS,
+        REACH_M as REACH_M,
         History as History,
         ObservationLayout as ObservationLayout,
         RequestedPart as RequestedPart,
+        Setting as Setting,
         layouts_of as layouts_of,
         parse_parts as parse_parts,
     )
@@ -93,11 +97,15 @@ if TYPE_CHECKING:
         bicycle_steering as bicycle_steering,
     )
     from ._scene_parts import (
+        ActorNumbers as ActorNumbers,
         NearActor as NearActor,
         RayCaster as RayCaster,
         center_of as center_of,
+        covariances_of as covariances_of,
         nearest_actors as nearest_actors,
+        occluded as occluded,
         predictions_of as predictions_of,
+        with_reference_point as with_reference_point,
         wrapped as wrapped,
     )
     from ._standstill import Standstill as Standstill

@@ -5,7 +5,8 @@ class (``observation``) names parts. The Gymnasium space, the agent's parameter 
 observations`` and the reference page follow from this table.
 
 All parts use one frame: x to the east, y to the north, headings counter-clockwise from the x axis in rad. The reference
-point of ego and of actors is the centre of their rectangle. Rows without content are 0, including ``present``.
+point of ego and of actors is the centre of their rectangle, unless the word `REFERENCE_POINT` names another point. Rows
+without content are 0, including ``present``.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_of
+from crashhunt.simulators._bicycle_model import WHEELBASE_SHARE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -62,6 +65,7 @@ class Setting(NamedTuple):
         high: The largest value.
         unit: Unit of the value; empty for whole numbers.
         meaning: Description of the setting.
+        choices: The words that the setting takes instead of numbers; its value is then the index of the word.
     """
 
     name: str
@@ -70,11 +74,20 @@ class Setting(NamedTuple):
     high: float
     unit: str
     meaning: str
+    choices: tuple[str, ...] = ()
 
     @property
     def is_whole(self) -> bool:
         """Whether only whole numbers are allowed."""
         return not self.unit
+
+    @property
+    def allowed(self) -> str:
+        """The allowed values as text."""
+        if self.choices:
+            return f"one of {', '.join(self.choices)}"
+        kind = "a whole number" if self.is_whole else f"a number in {self.unit}"
+        return f"{kind} within {self.low:g} and {self.high:g}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,6 +179,32 @@ HISTORY = Part(
     settings=(Setting("steps", 4, 1, 100, "", "number of observations"),),
 )
 """A word that names no array of its own."""
+
+CENTER, REAR_AXLE, FRONT_BUMPER = "center", "rear_axle", "front_bumper"
+_REFERENCE_SHARES = {CENTER: 0.0, REAR_AXLE: -WHEELBASE_SHARE / 2, FRONT_BUMPER: 0.5}
+"""How far each reference point is ahead of the centre, as a share of the length."""
+
+REFERENCE_POINT = Part(
+    name="reference_point",
+    meaning="the point of vehicles whose ``x`` and ``y`` the parts ``ego``, ``actors`` and ``predictions`` contain; "
+    "all other values are those of the centre",
+    settings=(
+        Setting(
+            "at", 1, 0, 2, "", "the centre of the rectangle, the middle of the rear axle or of the front bumper",
+            (CENTER, REAR_AXLE, FRONT_BUMPER),
+        ),
+    ),
+)  # fmt: skip
+
+OCCLUSION = Part(
+    name="occlusion",
+    meaning="hides actors behind others in all parts: an actor is seen if one of the rays from the centre of the "
+    "controlled vehicle hits its outline first",
+    settings=(Setting("rays", 3600, 360, 36_000, "", "number of rays, evenly distributed over the full circle"),),
+)
+
+MODIFIERS: Mapping[str, Part] = {one.name: one for one in (HISTORY, OCCLUSION, REFERENCE_POINT)}
+"""The words that name no array of their own and change the arrays of all parts, by name."""
 
 PARTS: Mapping[str, Part] = {
     part.name: part
@@ -352,6 +391,54 @@ PARTS: Mapping[str, Part] = {
             measured=("x", "y", "speed"),
         ),
         Part(
+            name="prediction_covariance",
+            meaning="covariance of the positions in ``predictions``, if the acceleration of an actor is unknown and "
+            "constant: the standard deviation along and across the heading is that of the acceleration times t² / 2",
+            axes=("rows", "steps"),
+            columns=(
+                Column("var_x", "m²", 0.0, _DISTANCE_M**2, "variance of x"),
+                Column("var_y", "m²", 0.0, _DISTANCE_M**2, "variance of y"),
+                Column("cov_xy", "m²", -(_DISTANCE_M**2), _DISTANCE_M**2, "covariance of x and y"),
+            ),
+            settings=(
+                Setting("rows", 32, 1, 1000, "", "number of rows"),
+                Setting("steps", 30, 1, 1000, "", "number of times, the first one interval from now"),
+                Setting("radius", 100.0, 1.0, REACH_M, "m", "largest distance of the centres"),
+                Setting("interval", 0.1, 0.01, 10.0, "s", "time between two positions"),
+                Setting("along", 1.5, 0.0, 20.0, "m/s²", "standard deviation of the acceleration along the heading"),
+                Setting("across", 0.5, 0.0, 20.0, "m/s²", "standard deviation of the acceleration across the heading"),
+            ),
+        ),
+        Part(
+            name="actor_ids",
+            meaning="numbers of the actors in the rows of ``actors``, which an actor keeps during the episode; 0 in "
+            "rows without an actor",
+            axes=("rows",),
+            values=Column("id", "", 0.0, 1e9, "number of the actor, from 1 in the order in which the agent saw them"),
+            settings=(
+                Setting("rows", 32, 1, 1000, "", "number of rows"),
+                Setting("radius", 100.0, 1.0, REACH_M, "m", "largest distance of the centres"),
+            ),
+            dtype="<i8",
+        ),
+        Part(
+            name="crossings",
+            meaning="pedestrian crossings on the route within the next junction, the next first",
+            axes=("rows",),
+            columns=(
+                _PRESENT,
+                _distance("distance", "distance of the front bumper to the crossing, negative if it is behind"),
+                _flag("must_yield", "1 if the controlled vehicle must yield to persons on the crossing"),
+                Column("persons", "", 0.0, 1e6, "number of persons within ``near`` of the crossing's centre line"),
+                _distance("nearest", "distance of the nearest person to where the paths cross; 1000 without a person"),
+            ),
+            settings=(
+                Setting("rows", 4, 1, 50, "", "number of rows"),
+                Setting("near", 5.0, 0.1, 50.0, "m", "largest distance of a person that counts"),
+            ),
+            measured=("nearest",),
+        ),
+        Part(
             name="lidar2d",
             meaning="distances from the centre of the controlled vehicle to the nearest outline, for directions "
             "counter-clockwise from its heading; ``range`` if no outline is nearer",
@@ -431,7 +518,7 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
 
     Args:
         words: One word per part: its name, and its settings as ``:NAME=VALUE``, such as ``actors:rows=8:radius=50``;
-            or only `KINEMATICS`. The word `HISTORY` is checked, but not returned.
+            or only `KINEMATICS`. The words of `MODIFIERS` are checked, but not returned.
         available: Names of the parts that the simulator has.
         where: The option or key that contains the words, for messages.
 
@@ -439,6 +526,7 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
         UsageError: A part or a setting does not exist, or a value is out of range.
     """
     known, found, given_words = tuple(available), dict[str, RequestedPart](), [str(word) for word in words]
+    modifiers = tuple(MODIFIERS) if known else ()
     if KINEMATICS in given_words and known:
         if len(given_words) > 1:
             fix = f"name {KINEMATICS} alone, or only parts"
@@ -446,9 +534,9 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
         return ()
     for word in given_words:
         name, *given = word.split(":")
-        if name not in known and not (name == HISTORY.name and known):
+        if name not in known and name not in modifiers:
             fix = (
-                one_of(name, (*known, HISTORY.name, KINEMATICS))
+                one_of(name, (*known, *modifiers, KINEMATICS))
                 if known
                 else "omit it, because agents observe what it returns"
             )
@@ -458,24 +546,27 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
             raise UsageError(message, fix=fix)
         if name in found:
             raise UsageError(f"{where} names the part {name!r} twice", fix="name each part once")
-        part = PARTS.get(name, HISTORY)
+        part = PARTS[name] if name in PARTS else MODIFIERS[name]
         settings = {setting.name: setting.default for setting in part.settings}
         for text in given:
             setting, value = _parse_setting(part, text, where)
             settings[setting] = value
         found[name] = RequestedPart(part, settings)
-    if HISTORY.name in found and len(found) == 1:
-        raise UsageError(f"{where} names {HISTORY.name} and no part", fix="name the parts to stack as well")
-    return tuple(one for one in found.values() if one.part is not HISTORY)
+    parts = tuple(one for one in found.values() if one.part.name not in MODIFIERS)
+    if found and not parts:
+        raise UsageError(f"{where} names {next(iter(found))} and no part", fix="name at least one part as well")
+    return parts
 
 
-def history_of(words: Iterable[str]) -> int:
-    """Return the number of observations that checked words stack; 0 for observations without a history."""
+def modifiers_of(words: Iterable[str]) -> dict[str, float]:
+    """Return the value of each word of `MODIFIERS` that checked words contain, by name."""
+    found = {}
     for word in words:
         name, *given = word.split(":")
-        if name == HISTORY.name:
-            return int(_parse_setting(HISTORY, given[-1], "")[1] if given else HISTORY.settings[0].default)
-    return 0
+        if name in MODIFIERS:
+            part = MODIFIERS[name]
+            found[name] = _parse_setting(part, given[-1], "")[1] if given else part.settings[0].default
+    return found
 
 
 def _parse_setting(part: Part, text: str, where: str) -> tuple[str, float]:
@@ -491,13 +582,14 @@ def _parse_setting(part: Part, text: str, where: str) -> tuple[str, float]:
         raise UsageError(f"{where}: {part.name} has no setting {name!r}", fix=fix)
     setting = known[name]
     try:
-        value = float(int(digits) if setting.is_whole else float(digits))
+        if setting.choices:
+            value = float(setting.choices.index(digits))
+        else:
+            value = float(int(digits) if setting.is_whole else float(digits))
     except ValueError:
         value = math.nan
     if not setting.low <= value <= setting.high:
-        kind = "a whole number" if setting.is_whole else f"a number in {setting.unit}"
-        fix = f"give {kind} within {setting.low:g} and {setting.high:g}"
-        raise UsageError(f"{where}: {part.name}:{name} is {digits!r}", fix=fix)
+        raise UsageError(f"{where}: {part.name}:{name} is {digits!r}", fix=f"give {setting.allowed}")
     return name, value
 
 
@@ -508,10 +600,12 @@ class ObservationLayout:
 
     Args:
         parts: The parts that the agent observes.
-        history: Number of observations that are stacked; 0 to stack none.
+        modifiers: The values of words of `MODIFIERS`, by name.
 
     Attributes:
         history: Number of observations that are stacked; 0 if none are.
+        occlusion_rays: Number of rays that decide which actors are seen; 0 if no actor hides others.
+        reference_share: How far the reference point is ahead of the centre, as a share of a vehicle's length.
         parts: The parts by name, in the order of the recorded array.
         reach_m: Largest distance at which a part shows actors.
         columns: The index of every column, by part and name of the column.
@@ -520,9 +614,14 @@ class ObservationLayout:
         flat_space: The space of the recorded array.
     """
 
-    def __init__(self, parts: Sequence[RequestedPart], history: int = 0) -> None:
+    def __init__(self, parts: Sequence[RequestedPart], modifiers: Mapping[str, float] = MappingProxyType({})) -> None:
         import numpy as np
         from gymnasium import spaces
+
+        history = int(modifiers.get(HISTORY.name, 0))
+        self.occlusion_rays = int(modifiers.get(OCCLUSION.name, 0))
+        point = REFERENCE_POINT.settings[0].choices[int(modifiers.get(REFERENCE_POINT.name, 0))]
+        self.reference_share = _REFERENCE_SHARES[point]
 
         self.reach_m = max((one.settings.get(name, 0.0) for one in parts for name in ("radius", "range")), default=0.0)
         self.parts = {one.part.name: one for one in sorted(parts, key=lambda one: one.part.name)}
@@ -663,7 +762,7 @@ def layouts_of(setups: Mapping[str, AgentSetup], available: Iterable[str]) -> di
         for agent, setup in setups.items()
     }
     return {
-        agent: ObservationLayout(found, history_of(setups[agent].observation or ()))
+        agent: ObservationLayout(found, modifiers_of(setups[agent].observation or ()))
         for agent, found in parts.items()
         if found
     }

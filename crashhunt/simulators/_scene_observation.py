@@ -5,14 +5,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from math import cos, sin
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from crashhunt.simulators._bicycle_model import WHEELBASE_SHARE
 from crashhunt.simulators._kinematics_observation import kind_number
-from crashhunt.simulators._observation_parts import History, layouts_of
-from crashhunt.simulators._scene_parts import RayCaster, center_of, nearest_actors, predictions_of, wrapped
+from crashhunt.simulators._observation_parts import REACH_M, History, layouts_of
+from crashhunt.simulators._scene_parts import (
+    ActorNumbers,
+    RayCaster,
+    center_of,
+    covariances_of,
+    nearest_actors,
+    occluded,
+    predictions_of,
+    with_reference_point,
+    wrapped,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -20,13 +30,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import AgentSetup
-    from crashhunt.simulators._observation_parts import RequestedPart
     from crashhunt.simulators._scene_parts import NearActor
     from crashhunt.world import Scene
 
 _MAX_BEND = 2.0  # of the wheelbase times the curvature, with the front wheels across
 
-SCENE_PARTS = ("ego", "actors", "predictions", "lidar2d")
+SCENE_PARTS = ("ego", "actors", "actor_ids", "predictions", "prediction_covariance", "lidar2d")
 """The parts that follow from scenes and from `LanePlace`."""
 
 
@@ -61,14 +70,15 @@ class SceneObserver:
         self.hidden: set[tuple[str, str]] = set()
         self._step_length_s = self._start_s = 0.0
         self._histories: dict[str, History] = {}
-        self._casters: dict[str, RayCaster] = {}
+        self._casters: dict[tuple[int, float], RayCaster] = {}
+        self._numbers: dict[str, ActorNumbers] = {}
         self._before: dict[str, dict[str, tuple[float, float]]] = {}
 
     def begin(self, time_s: float, step_length_s: float) -> None:
         """Begin an episode at a simulation time, with a step length, both in s."""
         self._start_s, self._step_length_s = time_s, step_length_s
         self._histories = {agent: History(layout) for agent, layout in self.layouts.items()}
-        self._before = {}
+        self._before, self._numbers = {}, {}
         self.hidden.clear()
 
     def blank(self, agent: str) -> NDArray[np.generic]:
@@ -96,21 +106,34 @@ class SceneObserver:
         layout, row = self.layouts[agent], scene.roster.index[agent]
         motion = _Motion(scene, self._before.get(agent, {}), self._step_length_s)
         self._before[agent] = motion.now
-        arrays = {}
+        hidden = frozenset(other for who, other in self.hidden if who == agent)
+        if layout.occlusion_rays:
+            hidden |= occluded(scene, row, self._caster(layout.occlusion_rays, REACH_M))
+        arrays: dict[str, NDArray[Any]] = {}
         for name, one in layout.parts.items():
             if name == "ego":
                 arrays[name] = self._ego(scene, row, motion, place(row), distance=distance, steering=steering)
                 continue
             reach = one.settings["range"] + max(scene.roster.lengths) if name == "lidar2d" else one.settings["radius"]
             limit = None if name == "lidar2d" else int(one.settings["rows"])
-            hidden = frozenset(other for who, other in self.hidden if who == agent)
             near = nearest_actors(scene, row, hidden=hidden, radius=reach, limit=limit)
             if name == "lidar2d":
-                arrays[name] = self._caster(agent, one).cast(scene, row, [found.row for found in near])
+                caster = self._caster(int(one.settings["rays"]), one.settings["range"])
+                arrays[name] = caster.cast(scene, row, [found.row for found in near])
             elif name == "predictions":
-                arrays[name] = predictions_of(scene, near, shape=one.shape, interval=one.settings["interval"])
+                arrays[name] = predictions_of(
+                    scene, near, shape=one.shape, interval=one.settings["interval"],
+                    reference_share=layout.reference_share,
+                )  # fmt: skip
+            elif name == "prediction_covariance":
+                arrays[name] = covariances_of(scene, near, one.settings, shape=one.shape)
+            elif name == "actor_ids":
+                numbers = self._numbers.setdefault(agent, ActorNumbers())
+                arrays[name] = numbers.of(scene, near, int(one.settings["rows"]))
             else:
                 arrays[name] = _actors(scene, row, near, motion, place, one.shape)
+        if layout.reference_share:
+            with_reference_point(arrays, layout.columns, layout.reference_share)
         return layout.flat(self._histories[agent].add(arrays))
 
     def _ego(
@@ -128,10 +151,10 @@ class SceneObserver:
             )
         )  # fmt: skip
 
-    def _caster(self, agent: str, one: RequestedPart) -> RayCaster:
-        found = self._casters.get(agent)
+    def _caster(self, rays: int, reach_m: float) -> RayCaster:
+        found = self._casters.get((rays, reach_m))
         if found is None:
-            found = self._casters[agent] = RayCaster(int(one.settings["rays"]), one.settings["range"])
+            found = self._casters[rays, reach_m] = RayCaster(rays, reach_m)
         return found
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from crashhunt.world import on_one_level, outlines
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -81,7 +81,7 @@ def nearest_actors(
 
 
 def predictions_of(
-    scene: Scene, near: Sequence[NearActor], *, shape: tuple[int, ...], interval: float
+    scene: Scene, near: Sequence[NearActor], *, shape: tuple[int, ...], interval: float, reference_share: float = 0.0
 ) -> NDArray[np.float64]:
     """Return the positions of actors at constant velocity: the columns of the part ``predictions``.
 
@@ -90,15 +90,91 @@ def predictions_of(
         near: The actors, one per row.
         shape: Numbers of rows, times and columns.
         interval: Time between two positions, in s; the first position is one interval from now.
+        reference_share: How far the reference point is ahead of the centre, as a share of the length.
     """
     found = np.zeros(shape)
     times = interval * np.arange(1, shape[1] + 1)
     for place, one in enumerate(near):
         heading, speed = scene.headings[one.row], scene.speeds[one.row]
-        found[place, :, 0] = one.x + speed * cos(heading) * times
-        found[place, :, 1] = one.y + speed * sin(heading) * times
+        ahead = reference_share * scene.roster.actors[one.row].length
+        found[place, :, 0] = one.x + ahead * cos(heading) + speed * cos(heading) * times
+        found[place, :, 1] = one.y + ahead * sin(heading) + speed * sin(heading) * times
         found[place, :, 2:] = wrapped(heading), speed
     return found
+
+
+def covariances_of(
+    scene: Scene, near: Sequence[NearActor], settings: Mapping[str, float], *, shape: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Return the covariances of the positions in `predictions_of`: the columns of ``prediction_covariance``.
+
+    Let d be the standard deviation of an acceleration that is unknown, but constant. After the time t, the standard
+    deviation of the position is d t² / 2, along and across the heading.
+
+    Args:
+        scene: The scene after the last step.
+        near: The actors, one per row.
+        settings: The values of ``interval``, ``along`` and ``across``.
+        shape: Numbers of rows, times and columns.
+    """
+    found = np.zeros(shape)
+    times = settings["interval"] * np.arange(1, shape[1] + 1)
+    spread = times * times / 2.0
+    along, across = ((settings[name] * spread) ** 2 for name in ("along", "across"))
+    for place, one in enumerate(near):
+        c, s = cos(scene.headings[one.row]), sin(scene.headings[one.row])
+        found[place, :, 0] = c * c * along + s * s * across
+        found[place, :, 1] = s * s * along + c * c * across
+        found[place, :, 2] = c * s * (along - across)
+    return found
+
+
+class ActorNumbers:
+    """The numbers of the actors that an agent has seen in an episode, from 1 in the order in which it saw them."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[str, int] = {}
+
+    def of(self, scene: Scene, near: Sequence[NearActor], limit: int) -> NDArray[np.int64]:
+        """Return the number of each actor in its row, shape (limit,): the part ``actor_ids``."""
+        found = np.zeros(limit, np.int64)
+        for row, one in enumerate(near):
+            name = scene.roster.actors[one.row].id
+            found[row] = self._numbers.setdefault(name, len(self._numbers) + 1)
+        return found
+
+
+def with_reference_point(
+    arrays: Mapping[str, NDArray[np.generic]], columns: Mapping[str, Mapping[str, int]], share: float
+) -> None:
+    """Move ``x`` and ``y`` of the parts ``ego`` and ``actors`` from the centre to another point.
+
+    Args:
+        arrays: The parts by name.
+        columns: The index of every column, by part and name of the column.
+        share: How far the point is ahead of the centre, as a share of the length.
+    """
+    for name in ("ego", "actors"):
+        if name in arrays:
+            index, rows = columns[name], arrays[name].reshape(-1, len(columns[name]))
+            for row in rows:
+                heading, ahead = float(row[index["heading"]]), share * float(row[index["length"]])
+                row[index["x"]] += ahead * cos(heading)
+                row[index["y"]] += ahead * sin(heading)
+
+
+def occluded(scene: Scene, row: int, caster: RayCaster) -> frozenset[str]:
+    """Return the identifiers of the actors that other actors hide from a vehicle.
+
+    Args:
+        scene: The scene after the last step.
+        row: Row of the vehicle in the scene.
+        caster: Casts the rays that decide which actors are seen.
+    """
+    reach = caster.reach_m + max(scene.roster.lengths)
+    near = [one.row for one in nearest_actors(scene, row, hidden=frozenset(), radius=reach)]
+    seen = caster.seen(scene, row, near)
+    return frozenset(scene.roster.actors[other].id for other in near if other not in seen)
 
 
 class RayCaster:
@@ -107,10 +183,13 @@ class RayCaster:
     Args:
         rays: Number of rays, evenly distributed over the full circle; the first one points along the heading.
         reach_m: Largest distance, in m.
+
+    Attributes:
+        reach_m: Largest distance, in m.
     """
 
     def __init__(self, rays: int, reach_m: float) -> None:
-        self._rays, self._reach_m = rays, reach_m
+        self._rays, self.reach_m = rays, reach_m
         angles = [math.tau * number / rays for number in range(rays)]
         self._cos, self._sin = np.array([*map(cos, angles)]), np.array([*map(sin, angles)])
 
@@ -122,10 +201,29 @@ class RayCaster:
             row: Row of the vehicle in the scene.
             others: Rows of the actors whose outlines the rays hit.
         """
-        found = np.full(self._rays, self._reach_m)
-        rectangles = [one for other in others for one in outlines(scene, other)]
+        found = np.full(self._rays, self.reach_m)
+        _, ray, enters = self._hits(scene, row, others)
+        np.minimum.at(found, ray, enters)
+        return found
+
+    def seen(self, scene: Scene, row: int, others: Sequence[int]) -> frozenset[int]:
+        """Return the rows of the actors that a ray hits first, of the given rows."""
+        nearest = np.full(self._rays, self.reach_m)
+        owner, ray, enters = self._hits(scene, row, others)
+        np.minimum.at(nearest, ray, enters)
+        return frozenset(np.asarray(others)[owner[enters == nearest[ray]]].tolist() if len(owner) else ())
+
+    def _hits(
+        self, scene: Scene, row: int, others: Sequence[int]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+        """Return the hits of rays: the index of the actor, the ray, and the distance in m."""
+        rectangles, owners = [], []
+        for index, other in enumerate(others):
+            outline = outlines(scene, other)
+            rectangles += outline
+            owners += [index] * len(outline)
         if not rectangles:
-            return found
+            return np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0)
         (own_x, own_y), heading = center_of(scene, row), scene.headings[row]
         own_cos, own_sin = cos(heading), sin(heading)
         facts = []
@@ -144,7 +242,7 @@ class RayCaster:
         along, across, first_cos, first_sin, half_length, half_width = table[which].T
         ray_cos, ray_sin = self._cos[ray], self._sin[ray]
         towards = first_cos * ray_cos - first_sin * ray_sin, first_sin * ray_cos + first_cos * ray_sin
-        enters, leaves = np.zeros(len(ray)), np.full(len(ray), self._reach_m)
+        enters, leaves = np.zeros(len(ray)), np.full(len(ray), self.reach_m)
         with np.errstate(divide="ignore", invalid="ignore"):
             for offset, step, half in ((along, towards[0], half_length), (across, towards[1], half_width)):
                 one, two = (-half - offset) / step, (half - offset) / step
@@ -152,8 +250,7 @@ class RayCaster:
                 enters = np.fmax(enters, np.minimum(one, two))
                 leaves = np.fmin(leaves, np.maximum(one, two))
         hit = enters <= leaves
-        np.minimum.at(found, ray[hit], enters[hit])
-        return found
+        return np.array(owners)[which[hit]], ray[hit], enters[hit]
 
     def _candidates(self, table: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return pairs of a rectangle and a ray: at least all pairs in which the ray hits the rectangle."""
@@ -166,7 +263,7 @@ class RayCaster:
         step = math.tau / self._rays
         first = np.floor((direction - half) / step).astype(np.intp)  # one ray more on each side than is hit
         last = np.ceil((direction + half) / step).astype(np.intp)
-        counts = np.where(distance - radius > self._reach_m, 0, np.minimum(last - first + 1, self._rays))
+        counts = np.where(distance - radius > self.reach_m, 0, np.minimum(last - first + 1, self._rays))
         which = np.repeat(np.arange(len(table)), counts)
         offset = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
         return which, (first[which] + offset) % self._rays

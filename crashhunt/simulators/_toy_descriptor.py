@@ -23,7 +23,7 @@ BACKEND: Backend = Backend(
     check=_check,
     reported_events=(),
     disturbances=("brake", "stop", "unseen"),
-    observations=("ego", "actors", "predictions", "lidar2d"),
+    observations=("ego", "actors", "actor_ids", "predictions", "prediction_covariance", "lidar2d"),
     side_effect=lambda *_: "",
     forkable=True,
 )

@@ -185,6 +185,7 @@ BACKEND: Backend = Backend(
     observations=(
         "ego",
         "actors",
+        "actor_ids",
         "lanes",
         "route",
         "route_state",
@@ -192,7 +193,9 @@ BACKEND: Backend = Backend(
         "right_of_way",
         "stop_line",
         "speed_limit",
+        "crossings",
         "predictions",
+        "prediction_covariance",
         "lidar2d",
         "grid",
         "image",

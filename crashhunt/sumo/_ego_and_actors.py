@@ -10,7 +10,17 @@ import libsumo
 import numpy as np
 from libsumo import _libsumo as sumo
 
-from crashhunt.simulators import WHEELBASE_SHARE, bicycle_steering, center_of, kind_number, nearest_actors, wrapped
+from crashhunt.simulators import (
+    MAX_JERK_MPS3,
+    MAX_STEERING_RAD,
+    MAX_STEERING_RATE_RADPS,
+    WHEELBASE_SHARE,
+    bicycle_steering,
+    center_of,
+    kind_number,
+    nearest_actors,
+    wrapped,
+)
 from crashhunt.sumo._reader_protocol import Reader
 from crashhunt.world import PERSON, VehicleData, is_person
 
@@ -43,6 +53,9 @@ def vehicle_data_of(vehicle: str) -> VehicleData:
         max_deceleration=float(sumo.vehicle_getDecel(vehicle)),
         emergency_deceleration=float(sumo.vehicle_getEmergencyDecel(vehicle)),
         kind=str(sumo.vehicle_getVehicleClass(vehicle)),
+        max_steering=MAX_STEERING_RAD,
+        max_steering_rate=MAX_STEERING_RATE_RADPS,
+        max_jerk=MAX_JERK_MPS3,
     )
 
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.simulators import History, layouts_of
+from crashhunt.simulators import REACH_M, History, RayCaster, layouts_of, occluded, with_reference_point
 from crashhunt.sumo._conflicts import Conflicts
 from crashhunt.sumo._ego_and_actors import ActorsReader, EgoReader
 from crashhunt.sumo._lane_graph import lane_graph
 from crashhunt.sumo._reader_protocol import Places, ReaderSetup
 from crashhunt.sumo._road_readers import (
+    CrossingsReader,
     LanesReader,
     RightOfWayReader,
     RouteReader,
@@ -22,7 +24,14 @@ from crashhunt.sumo._road_readers import (
     SpeedLimitReader,
     StopLineReader,
 )
-from crashhunt.sumo._scene_readers import GridReader, ImageReader, PredictionsReader, RangesReader
+from crashhunt.sumo._scene_readers import (
+    ActorIdsReader,
+    CovarianceReader,
+    GridReader,
+    ImageReader,
+    PredictionsReader,
+    RangesReader,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -34,15 +43,16 @@ if TYPE_CHECKING:
     from crashhunt.sumo._lane_graph import LaneGraph
     from crashhunt.sumo._reader_protocol import Moment, Reader
 
-_DRAFTED = "<f8"  # the type of the values that the compiled core writes
-
 READERS: Mapping[str, type[Reader]] = {
+    "actor_ids": ActorIdsReader,
     "actors": ActorsReader,
+    "crossings": CrossingsReader,
     "ego": EgoReader,
     "grid": GridReader,
     "image": ImageReader,
     "lanes": LanesReader,
     "lidar2d": RangesReader,
+    "prediction_covariance": CovarianceReader,
     "predictions": PredictionsReader,
     "right_of_way": RightOfWayReader,
     "route": RouteReader,
@@ -78,6 +88,7 @@ class ObservedParts:
             self.graph  # noqa: B018 - the zygote makes the simulator, so the processes of all trials share the graph
         self._readers: dict[str, dict[str, Reader]] = {}
         self._histories: dict[str, History] = {}
+        self._casters: dict[str, RayCaster] = {}
         self._drafts: dict[str, tuple[Draft, list[tuple[int, Reader]]]] = {}
 
     @cached_property
@@ -124,6 +135,7 @@ class ObservedParts:
                         start_s=time_s,
                         steering=known.get(agent),
                         core=self.core,
+                        reference_share=layout.reference_share,
                     )
                 )
                 for name, request in layout.parts.items()
@@ -134,14 +146,19 @@ class ObservedParts:
         self._drafts = {}
         for agent, readers in self._readers.items():
             layout = self.layouts[agent]
-            if self.core is None or layout.history:
+            if self.core is None or layout.history or layout.reference_share or layout.flat_space.dtype != np.float64:
                 continue
-            if all(one.part.dtype == _DRAFTED for one in layout.parts.values()):
-                places = [(layout.begins[name], reader) for name, reader in readers.items()]
-                self._drafts[agent] = self.core.Draft(math.prod(layout.flat_space.shape)), places
+            places = [(layout.begins[name], reader) for name, reader in readers.items()]
+            self._drafts[agent] = self.core.Draft(math.prod(layout.flat_space.shape)), places
 
     def observe(self, agent: str, moment: Moment) -> NDArray[np.generic]:
         """Return the recorded array of an agent's observation."""
+        layout = self.layouts[agent]
+        if layout.occlusion_rays:
+            caster = self._casters.get(agent)
+            if caster is None:
+                caster = self._casters[agent] = RayCaster(layout.occlusion_rays, REACH_M)
+            moment = replace(moment, hidden=moment.hidden | occluded(moment.scene, moment.row, caster))
         drafted = self._drafts.get(agent)
         if drafted is not None:
             draft, places = drafted
@@ -149,7 +166,9 @@ class ObservedParts:
                 reader.write(draft, place, moment)
             return np.frombuffer(draft.take())
         arrays = {name: reader.observe(moment) for name, reader in self._readers[agent].items()}
-        return self.layouts[agent].flat(self._histories[agent].add(arrays))
+        if layout.reference_share:
+            with_reference_point(arrays, layout.columns, layout.reference_share)
+        return layout.flat(self._histories[agent].add(arrays))
 
     def identifiers(self, agent: str) -> tuple[str, ...] | None:
         """Return the identifiers of the actors in the rows of ``actors``; None if the agent does not observe them."""

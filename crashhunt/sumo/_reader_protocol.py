@@ -37,6 +37,7 @@ class ReaderSetup:
         steering: Function that returns the steering angle of the vehicle, in rad, positive to the left. None if the
             vehicle's actions contain no steering angle. The angle then follows from the yaw rate.
         core: The compiled core; None if it is not used.
+        reference_share: How far the reference point is ahead of the centre, as a share of a vehicle's length.
     """
 
     agent: str
@@ -49,6 +50,7 @@ class ReaderSetup:
     start_s: float
     steering: Callable[[], float] | None = None
     core: Core | None = None
+    reference_share: float = 0.0
 
     @property
     def settings(self) -> Mapping[str, float]:
@@ -187,4 +189,4 @@ class Reader:
 
     def write(self, draft: Draft, place: int, moment: Moment) -> None:
         """Write the same values into a draft of the compiled core, which replaces a call of `observe`."""
-        draft.put_array(place, self.observe(moment))
+        draft.put_array(place, self.observe(moment).astype(np.float64, copy=False))

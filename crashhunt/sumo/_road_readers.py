@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 _NEAR_M = 50.0  # lanes are shown within this distance
 _SQUARE_M = 16.0  # within squares of this size, the same lanes are candidates
 _WINDOW_M = 24.0  # within a square, the nearest point of a lane moves less along the lane
+_NO_PERSON_M = 1000.0  # the distance of the nearest person where there is none
 _STANDING_MPS, NEVER_S = 0.1, 1000.0  # an actor that stands arrives after this time
 _STATES = {"G": 0.0, "g": 0.0, "y": 1.0, "Y": 1.0, "r": 2.0, "R": 2.0, "u": 2.0, "s": 2.0, "o": 3.0, "O": 3.0}
 _OFF = 3.0
@@ -505,6 +506,53 @@ def path_across(place: Place) -> tuple[LaneLink, float] | None:
     if entry is None:
         return None
     return entry, -(entry.length_m - link.length_m - lane.data.length_m) - place.position_m
+
+
+class CrossingsReader(Reader):
+    """Reads the pedestrian crossings within the next junction, and the persons near them."""
+
+    def observe(self, moment: Moment) -> Array:
+        """Return the columns of ``crossings``."""
+        found = np.zeros(self._setup.shape)
+        place = self._setup.places.find(moment)
+        path = path_across(place) if place is not None else None
+        if path is None:
+            return found
+        link, line = path
+        graph, scene = self._setup.graph, moment.scene
+        persons = [
+            (*point, cos(heading), sin(heading), actor.length)
+            for actor, point, heading in zip(scene.roster.actors, scene.points, scene.headings, strict=True)
+            if is_person(actor.id) and actor.id not in moment.hidden
+        ]
+        middles = [(x - length / 2 * c, y - length / 2 * s) for x, y, c, s, length in persons]
+        rows = []
+        for lane, approaches in self._setup.conflicts.around(link).items():
+            for conflict in (one.conflict for one in approaches if one.conflict.link is None):
+                center = graph.lines(graph.lanes[lane]).center
+                share = (conflict.other_begin_m + conflict.other_end_m) / 2 / max(graph.length(lane), 1e-9)
+                area = _point_at(center, share)
+                near = [one for one in middles if _distance_to(center, *one) <= self._setup.settings["near"]]
+                nearest = min((math.dist(area, one) for one in middles), default=_NO_PERSON_M)
+                rows.append((line + conflict.begin_m, conflict.must_yield, len(near), min(nearest, _NO_PERSON_M)))
+        rows.sort()
+        for number, values in enumerate(rows[: self._setup.limit]):
+            found[number] = 1.0, *values
+        return found
+
+
+def _point_at(line: Array, share: float) -> tuple[float, float]:
+    """Return the point at a share of the length of a line."""
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
+    x, y = (float(np.interp(share * along[-1], along, line[:, axis])) for axis in (0, 1))
+    return x, y
+
+
+def _distance_to(line: Array, x: float, y: float) -> float:
+    """Return the distance of a point from a line, in m."""
+    start, step = line[:-1], np.diff(line, axis=0)
+    share = np.clip((((x, y) - start) * step).sum(axis=1) / np.maximum((step * step).sum(axis=1), 1e-12), 0.0, 1.0)
+    return float(np.hypot(*(start + share[:, None] * step - (x, y)).T).min())
 
 
 class StopLineReader(Reader):

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from libsumo import _libsumo as sumo
 
-from crashhunt.simulators import Raster, RayCaster, center_of, nearest_actors, picture, predictions_of
+from crashhunt.simulators import (
+    ActorNumbers,
+    Raster,
+    RayCaster,
+    center_of,
+    covariances_of,
+    nearest_actors,
+    picture,
+    predictions_of,
+)
 from crashhunt.sumo._reader_protocol import Reader
 
 if TYPE_CHECKING:
@@ -31,7 +40,38 @@ class PredictionsReader(Reader):
         near = nearest_actors(
             moment.scene, moment.row, hidden=moment.hidden, radius=settings["radius"], limit=self._setup.limit
         )
-        return predictions_of(moment.scene, near, shape=self._setup.shape, interval=settings["interval"])
+        share, interval = self._setup.reference_share, settings["interval"]
+        return predictions_of(moment.scene, near, shape=self._setup.shape, interval=interval, reference_share=share)
+
+
+class CovarianceReader(Reader):
+    """Reads the part ``prediction_covariance``."""
+
+    def observe(self, moment: Moment) -> NDArray[np.float64]:
+        """Return the columns of ``prediction_covariance``."""
+        settings = self._setup.settings
+        near = nearest_actors(
+            moment.scene, moment.row, hidden=moment.hidden, radius=settings["radius"], limit=self._setup.limit
+        )
+        return covariances_of(moment.scene, near, settings, shape=self._setup.shape)
+
+
+class ActorIdsReader(Reader):
+    """Numbers the actors.
+
+    Args:
+        setup: The part.
+    """
+
+    def __init__(self, setup: ReaderSetup) -> None:
+        super().__init__(setup)
+        self._numbers = ActorNumbers()
+
+    def observe(self, moment: Moment) -> NDArray[np.int64]:
+        """Return the values of ``actor_ids``."""
+        radius, limit = self._setup.settings["radius"], self._setup.limit
+        near = nearest_actors(moment.scene, moment.row, hidden=moment.hidden, radius=radius, limit=limit)
+        return self._numbers.of(moment.scene, near, limit)
 
 
 class RangesReader(Reader):

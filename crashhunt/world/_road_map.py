@@ -122,6 +122,9 @@ class VehicleData:
         max_deceleration: largest deceleration in normal driving, in m/s².
         emergency_deceleration: largest deceleration of which the vehicle is capable, in m/s².
         kind: class of the vehicle in the simulator, such as ``passenger``.
+        max_steering: largest steering angle in rad, to both sides.
+        max_steering_rate: largest change of the steering angle, in rad/s.
+        max_jerk: largest change of the acceleration, in m/s³.
     """
 
     length: float
@@ -133,6 +136,9 @@ class VehicleData:
     max_deceleration: float
     emergency_deceleration: float
     kind: str
+    max_steering: float
+    max_steering_rate: float
+    max_jerk: float
 
 
 class LaneLines(NamedTuple):

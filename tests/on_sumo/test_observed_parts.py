@@ -6,10 +6,13 @@ import itertools
 import math
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
 
 import libsumo
 import numpy as np
 import pytest
+import sumolib
 
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.simulators import PARTS, BicycleModel, MotionState
@@ -18,6 +21,7 @@ from crashhunt.sumo._observing import READERS
 from crashhunt.trial import Disturbance
 
 STEPS = 90
+NETS = Path(__file__).parent / "nets"
 
 
 def simulator_of(name, stage, *parts, **changes):
@@ -252,3 +256,137 @@ def test_ego_that_moves_freely_is_where_its_bicycle_model_is(form, tmp_path):
             assert own[[columns[name] for name in expected]] == pytest.approx([*expected.values()], abs=2e-3), step
             assert own[columns["distance"]] == pytest.approx(driven, rel=1e-4)
             before = state
+
+
+def test_every_part_stacks_with_a_history_and_is_within_its_space(tmp_path):
+    parts = tuple(f"{name}:rows=8:columns=8" if name in ("grid", "image") else name for name in READERS)
+    with (
+        closing(simulator_of("intersection", tmp_path / "a", *parts)) as plain,
+        closing(simulator_of("intersection", tmp_path / "b", *parts, "history:steps=3")) as stacking,
+    ):
+        single = list(episode(plain, 4, 5))
+        stacked = list(episode(stacking, 4, 5))
+        assert stacking.observation_layouts["ego"].space.contains(stacked[-1])
+    assert set(single[0]) == set(READERS)
+    for step, shown in enumerate(stacked):
+        for name in READERS:
+            expected = [single[max(0, step - back)][name] for back in (2, 1, 0)]
+            assert shown[name].dtype == single[0][name].dtype
+            assert shown[name].tobytes() == np.stack(expected).tobytes(), (step, name)
+
+
+@pytest.mark.parametrize(("point", "share"), [("center", 0.0), ("rear_axle", -0.3), ("front_bumper", 0.5)])
+def test_positions_are_those_of_the_reference_point(point, share, tmp_path):
+    with closing(
+        simulator_of("loop", tmp_path / "stage", "ego", "actors", "predictions", f"reference_point:at={point}")
+    ) as simulator:
+        columns = simulator.observation_layouts["ego"].columns
+        for shown in episode(simulator, 3, 8):
+            for who, row in zip(("ego", *simulator.identifiers("ego")), (shown["ego"], *shown["actors"]), strict=False):
+                index = columns["ego" if who == "ego" else "actors"]
+                heading = math.radians(90.0 - libsumo.vehicle.getAngle(who))
+                ahead = share * libsumo.vehicle.getLength(who) * np.array((math.cos(heading), math.sin(heading)))
+                assert row[[index["x"], index["y"]]] == pytest.approx(center(who) + ahead, abs=1e-9)
+            assert shown["predictions"][0, 0, :2] == pytest.approx(
+                shown["actors"][0, 1:3] + 0.1 * shown["actors"][0, 4:6]
+            )
+        if point == "front_bumper":
+            assert shown["ego"][:2] == pytest.approx(libsumo.vehicle.getPosition("ego"), abs=1e-9)
+
+
+def test_occlusion_hides_the_same_actors_in_every_part(tmp_path):
+    parts = ("actors:radius=120:rows=99", "actor_ids:radius=120:rows=99", "predictions:radius=120:rows=99", "lidar2d")
+    with (
+        closing(simulator_of("motorway", tmp_path / "a", *parts)) as plain,
+        closing(simulator_of("motorway", tmp_path / "b", *parts, "occlusion")) as hiding,
+    ):
+        before = [(shown, plain.identifiers("ego")) for shown in episode(plain, 2, 12, speed=25.0)]
+        after = [(shown, hiding.identifiers("ego")) for shown in episode(hiding, 2, 12, speed=25.0)]
+    fewer, names = 0, {}
+    for (all_, everybody), (some, seen) in zip(before, after, strict=True):
+        assert set(seen) <= set(everybody)
+        fewer += len(everybody) - len(seen)
+        assert [all_["actors"][everybody.index(one)].tolist() for one in seen] == some["actors"][: len(seen)].tolist()
+        assert np.count_nonzero(some["predictions"].any(axis=(1, 2))) == len(seen)
+        # The rays of lidar2d are among those that decide who is seen.
+        assert some["lidar2d"].tobytes() == all_["lidar2d"].tobytes()
+        for one, number in zip(seen, some["actor_ids"].tolist(), strict=False):
+            assert names.setdefault(one, number) == number > 0
+    assert fewer > 5
+
+
+CROSSING_TOWN = """schema = 1
+simulator = "sumo"
+step_length_s = 0.1
+[sumo]
+net = "walks.net.xml"
+routes = ["r.rou.xml"]
+[agents.ego]
+route = "ego"
+observation = ["crossings", "right_of_way", "ego"]
+"""
+
+
+def must_yield(net, lane, target, crossing):
+    """Whether the network file makes a path across junction c yield to a crossing."""
+    junction = ElementTree.parse(NETS / "walks.net.xml").find("junction[@id='c']")
+    inside = junction.get("intLanes").split()
+    vias = [one.getViaLaneID() for one in net.getLane(lane).getOutgoing() if one.getTo().getID() == target]
+    index = next(inside.index(one) for one in vias if one in inside)
+    return int(junction.find(f"request[@index='{index}']").get("response")[-1 - inside.index(crossing)])
+
+
+@pytest.mark.parametrize(("target", "second"), [("cd", ":c_c1_0"), ("cs", ":c_c2_0")])
+def test_crossings_show_the_persons_near_them(target, second, tmp_path):
+    """Persons, distances and their order by SUMO's own shapes and positions."""
+    walks = "".join(
+        f'<person id="p{number}" depart="{at}" departPos="-8"><walk from="{a}" to="{b}"/></person>'
+        for number, (at, a, b) in enumerate([(0, "wc", "cw"), (1, "wc", "cs"), (1, "wc", "cw"), (3, "sc", "cd")])
+    )
+    (tmp_path / "r.rou.xml").write_text(f'<routes><route id="ego" edges="wc {target}"/>{walks}</routes>')
+    (tmp_path / "walks.net.xml").write_bytes((NETS / "walks.net.xml").read_bytes())
+    (tmp_path / "scenario.toml").write_text(CROSSING_TOWN)
+    net = sumolib.net.readNet(str(NETS / "walks.net.xml"), withInternal=True, withPedestrianConnections=True)
+    crossings = (":c_c3_0", second)
+    lines = [[point[:2] for point in net.getLane(name).getShape()] for name in crossings]
+    (tmp_path / "stage").mkdir()
+    with closing(SumoSimulator(load_scenario(str(tmp_path)), tmp_path / "stage")) as simulator:
+        people, yields = 0, False
+        for shown in episode(simulator, 1, 260, speed=1.2):
+            lane = libsumo.vehicle.getLaneID("ego")
+            if not lane.startswith("wc"):
+                continue
+            rows = shown["crossings"]
+            assert rows[:, 0].tolist() == [1.0, 1.0, 0.0, 0.0]
+            assert rows[0, 1] < rows[1, 1]
+            middles = []
+            for person in libsumo.person.getIDList():
+                x, y = libsumo.person.getPosition(person)
+                angle = math.radians(90.0 - libsumo.person.getAngle(person))
+                half = libsumo.person.getLength(person) / 2
+                middles.append((x - half * math.cos(angle), y - half * math.sin(angle)))
+            front = libsumo.vehicle.getPosition("ego")
+            for row, line, crossing in zip(rows, lines, crossings, strict=False):
+                away = [sumolib.geomhelper.distancePointToPolygon(one, line) for one in middles]
+                assert row[3] == sum(one <= 5.0 for one in away)
+                assert min([1000.0, *away]) <= row[4] + 1e-6
+                people += int(row[3])
+                yields |= bool(row[2])
+                assert row[2] == must_yield(net, lane, target, crossing)
+                if abs(row[1]) < 0.3:  # 0.8 of the mean width of lane and crossing
+                    gap = sumolib.geomhelper.distancePointToPolygon(front, line)
+                    assert 1.5 < gap < 0.8 * (3.2 + 4.0) / 2 + 0.6
+        assert people > 20
+        assert yields == (target == "cs")  # who turns gives way
+
+
+def test_vehicle_data_contain_the_limits_of_the_bicycle_model(tmp_path):
+    with closing(simulator_of("loop", tmp_path / "stage", "ego")) as simulator:
+        simulator.reset(seed=1, options={"arguments": argument_values(simulator._scenario)})
+        data = simulator.vehicle_data("ego")
+    model = BicycleModel(wheelbase=data.wheelbase, max_acceleration=9.0, max_deceleration=9.0, max_speed=99.0)
+    state = MotionState(x=0.0, y=0.0, heading=0.0, speed=5.0)
+    after = model.step(state, 9.0, 9.0, 0.01)
+    assert after.steering == pytest.approx(data.max_steering_rate * 0.01)
+    assert after.acceleration == pytest.approx(data.max_jerk * 0.01)
+    assert model.step(state, 0.0, 9.0, 10.0).steering == data.max_steering

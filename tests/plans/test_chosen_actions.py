@@ -1,10 +1,14 @@
 """Tests of the choice of a form of actions: command line, then scenario, then the agent's class."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from crashhunt.base.errors import UsageError
 from crashhunt.plans import Request, plan, with_settings
-from crashhunt.scenario import load_scenario
+from crashhunt.plans._chosen_actions import chosen_actions, notes_on_actions
+from crashhunt.plans._chosen_observations import chosen_observations
+from crashhunt.scenario import load_scenario, with_observations
 
 AGENTS = """
 class Accelerates:
@@ -44,12 +48,16 @@ def test_class_chooses_the_form_that_nothing_else_chooses():
     assert not any("precedence" in note for note in scenario.notes)
 
 
-def test_scenario_takes_precedence_over_the_class_with_a_note():
+def test_class_named_by_the_user_takes_precedence_over_the_scenario_and_the_scenario_over_its_own_agent():
     scenario, settings = plan(asked("Accelerates", "motorway"))
-    assert (scenario.agents["ego"].action_form, settings.agents["ego"].action) == ("meta", None)
-    assert any(
-        "meta, which takes precedence over acceleration of acting_agents:Accel" in note for note in scenario.notes
-    )
+    assert scenario.agents["ego"].action_form == settings.agents["ego"].action == "acceleration"
+    signatures = {"ego": SimpleNamespace(action="acceleration", observation=("ego",), actions=None)}
+    scenario = with_observations(load_scenario("motorway"), {"ego": ("actors",)})
+    assert chosen_actions("", scenario, signatures) == {}
+    assert chosen_observations((), scenario, signatures) == {"ego": ("actors",)}
+    assert chosen_observations((), scenario, signatures, ("ego",)) == {"ego": ("ego",)}
+    (note,) = notes_on_actions(scenario, signatures)
+    assert "meta, which takes precedence over acceleration of crashhunt.agents:NumpyPolicy" in note
 
 
 def test_command_line_takes_precedence_over_scenario_and_class():
@@ -66,7 +74,6 @@ def test_agent_without_a_declaration_leaves_the_settings_as_they_are():
     ("agent", "options", "message"),
     [
         ("Strict", {"action": "meta"}, "Strict returns actions of the form acceleration or sumo, not meta"),
-        ("Strict", {"scenario": "motorway"}, "acceleration or sumo, not meta"),
         ("Other", {}, "action of acting_agents:Other: 'teleport' is not a form of actions"),
         ("crashhunt.agents:CarFollowing", {"action": "acceleration"}, "speed_and_lane or meta, not acceleration"),
         (

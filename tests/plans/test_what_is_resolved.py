@@ -202,16 +202,17 @@ def test_what_cannot_be_resolved_is_refused(folder, options, says):
     assert says in str(refused.value)
 
 
-def test_parts_are_those_of_the_command_line_then_of_the_scenario_then_of_the_class(folder):
-    (folder / "drives.py").write_text(AGENT.replace("class Agent:", "class Agent:\n    observation = 'ego, actors'", 1))
+def test_parts_are_those_of_the_command_line_then_of_the_named_class_then_of_the_scenario(folder):
+    named = AGENT.replace("class Agent:", "class Agent:\n    observation = 'ego, actors'", 1)
+    (folder / "drives.py").write_text(named + AGENT.replace("class Agent:", "class Plain:", 1))
     copy_shipped_scenario("loop", folder / "town")
     text = (folder / "town" / "scenario.toml").read_text()
 
-    def parts(observe=(), scenario=()):
+    def parts(observe=(), scenario=(), agent="drives:Agent"):
         words = f"observation = {list(scenario)}" if scenario else ""
         (folder / "town" / "scenario.toml").write_text(text.replace("[agents.ego]", f"[agents.ego]\n{words}"))
         request = Request(
-            trials=3, max_steps=9, scenario="town", seed=1, agents={"ego": "drives:Agent"}, observe=observe,
+            trials=3, max_steps=9, scenario="town", seed=1, agents={"ego": agent}, observe=observe,
             scenario_arguments={}, arguments={"speed": "3"},
         )  # fmt: skip
         made, settings = plan(request)
@@ -219,10 +220,14 @@ def test_parts_are_those_of_the_command_line_then_of_the_scenario_then_of_the_cl
         return settings.agents["ego"].observation
 
     assert parts() == ("ego", "actors")
-    assert parts(scenario=["ego"]) == ("ego",)
+    assert parts(scenario=["ego"]) == ("ego", "actors")
+    assert parts(scenario=["ego"], agent="drives:Plain") == ("ego",)
     assert parts(observe=["actors:rows=3"], scenario=["ego"]) == ("actors:rows=3",)
     assert parts(observe=["kinematics"]) == ("kinematics",)
-    for words, where in (({"observe": ["eg"]}, "--observe"), ({"scenario": ["eg"]}, "agents.ego.observation")):
+    for words, where in (
+        ({"observe": ["eg"]}, "--observe"),
+        ({"scenario": ["eg"], "agent": "drives:Plain"}, "agents.ego.observation"),
+    ):
         with pytest.raises(UsageError) as refused:
             parts(**words)
         assert str(refused.value).startswith(f"{where}: 'eg' is not a part of observations; did you mean 'ego'?")

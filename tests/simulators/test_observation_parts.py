@@ -9,7 +9,7 @@ from hypothesis import given, strategies as st
 
 from crashhunt.base.errors import UsageError
 from crashhunt.simulators import PARTS, History, ObservationForm, ObservationLayout, parse_parts
-from crashhunt.simulators._observation_parts import history_of
+from crashhunt.simulators._observation_parts import modifiers_of
 
 
 def layout_of(*words):
@@ -46,11 +46,13 @@ def test_columns_are_those_of_the_documented_table():
         "stop_line": "present distance must_yield stop_sign signal",
         "speed_limit": "speed_limit",
         "predictions": "x y yaw speed",
+        "prediction_covariance": "var_x var_y cov_xy",
+        "crossings": "present distance must_yield persons nearest",
     }  # fmt: skip
     assert {name: [column.name for column in PARTS[name].columns] for name in words} == {
         name: text.split() for name, text in words.items()
     }
-    assert set(PARTS) - set(words) == {"lidar2d", "grid", "image"}
+    assert set(PARTS) - set(words) == {"lidar2d", "grid", "image", "actor_ids"}
 
 
 @given(
@@ -110,7 +112,7 @@ def test_wrong_words_are_refused_in_one_line(words, message, fix):
 def test_part_that_a_simulator_lacks_is_refused():
     with pytest.raises(UsageError, match="has no part 'lanes'") as refused:
         parse_parts(["lanes"], ["ego"], where="--observe")
-    assert refused.value.fix == "give one of ego, history, kinematics"
+    assert refused.value.fix == "give one of ego, history, occlusion, reference_point, kinematics"
     with pytest.raises(UsageError, match="has no part 'ego'") as refused:
         parse_parts(["ego"], [], where="--observe")
     assert "omit it" in refused.value.fix
@@ -138,7 +140,7 @@ def test_errors_change_what_is_measured_and_nothing_else():
 
 def test_history_stacks_the_last_observations_with_the_present_one_last():
     words = ["ego", "history:steps=3", "lidar2d:rays=2"]
-    layout = ObservationLayout(parse_parts(words, where=""), history_of(words))
+    layout = ObservationLayout(parse_parts(words, where=""), modifiers_of(words))
     assert {name: box.shape for name, box in layout.space.spaces.items()} == {"ego": (3, 13), "lidar2d": (3, 2)}
     assert layout.describe()["ego"]["shape"] == [3, 13]
     history, seen = History(layout), []
@@ -148,11 +150,16 @@ def test_history_stacks_the_last_observations_with_the_present_one_last():
     assert seen == [[0, 0, 0], [0, 0, 1], [0, 1, 2], [1, 2, 3]]
     assert shown["lidar2d"].tolist() == [[11, 11], [12, 12], [13, 13]]
     assert layout.columns["ego"]["y"] == 1  # of the last axis, as without a history
-    assert history_of(["ego"]) == 0
-    assert history_of(["ego", "history"]) == 4
+    assert modifiers_of(["ego"]) == {}
+    assert modifiers_of(["ego", "history"]) == {"history": 4}
     for wrong, message in (
         (["history"], "names history and no part"),
         (["ego", "history:steps=0"], "history:steps is '0'"),
+        (
+            ["ego", "reference_point:at=nose"],
+            "reference_point:at is 'nose'; give one of center, rear_axle, front_bumper",
+        ),
+        (["occlusion"], "names occlusion and no part"),
     ):
         with pytest.raises(UsageError, match=message):
             parse_parts(wrong, where="--observe")

@@ -7,9 +7,20 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 
-from crashhunt.simulators import Raster, RayCaster, center_of, nearest_actors, picture, predictions_of, wrapped
+from crashhunt.simulators import (
+    ActorNumbers,
+    Raster,
+    RayCaster,
+    center_of,
+    covariances_of,
+    nearest_actors,
+    occluded,
+    picture,
+    predictions_of,
+    wrapped,
+)
 from crashhunt.world import Actor, Roster, Scene, corners
 
 number = st.floats(-40.0, 40.0).map(lambda value: round(value, 3))
@@ -169,3 +180,67 @@ def test_raster_without_lanes_is_empty_and_pictures_have_the_colours_of_films():
     assert drawn[5, 5].tolist() == [125, 139, 156]  # 10 m ahead
     assert drawn[0, 5].tolist() == [228, 232, 237]  # the road
     assert drawn[15, 0].tolist() == [246, 247, 249]
+
+
+@settings(max_examples=15)
+@given(st.lists(poses, min_size=2, max_size=6))
+def test_actor_is_hidden_if_and_only_if_every_slow_ray_hits_another_actor_first(actors):
+    scene, rays = scene_of(*actors), 60
+    hidden = occluded(scene, 0, RayCaster(rays, 120.0))
+    x, y = center_of(scene, 0)
+    surely, nearly = set(), set()
+    for ray in range(rays):
+        winners = []
+        for turn in (0.0, -1e-7, 1e-7):  # a ray along an edge or through a corner may hit or miss it by rounding
+            angle = scene.headings[0] + math.tau * ray / rays + turn
+            away = [slow_range(corners(scene, other), x, y, angle) for other in range(1, len(actors))]
+            winners.append({other for other, one in enumerate(away, 1) if one <= min([*away, 120.0]) + 1e-3})
+        nearly |= set().union(*winners)
+        surely |= winners[0] if winners[0] == winners[1] == winners[2] and len(winners[0]) == 1 else set()
+    assert surely <= {other for other in range(1, len(actors)) if scene.roster.actors[other].id not in hidden} <= nearly
+
+
+def test_actor_behind_a_lorry_is_hidden_until_it_looks_out():
+    lorry = (30.0, 0.0, 0.0, 12.0, 2.5, 0.0)
+    for y, is_hidden in ((0.0, True), (1.0, True), (3.5, False)):
+        scene = scene_of((0.0, 0.0, 0.0, 4.0, 1.8, 0.0), lorry, (60.0, y, 0.0, 4.0, 1.8, 0.0))
+        assert (occluded(scene, 0, RayCaster(3600, 120.0)) == {"a2"}) == is_hidden, y
+
+
+def test_covariances_are_those_of_actors_with_random_accelerations():
+    scene = scene_of((0.0, 0.0, 0.0, 4.0, 1.8, 0.0), (20.0, 0.0, 0.7, 4.0, 1.8, 6.0), (9.0, 9.0, 0.0, 4.0, 1.8, 6.0))
+    near = nearest_actors(scene, 0, hidden=frozenset(), radius=50.0)
+    asked = {"interval": 0.5, "along": 2.0, "across": 0.4}
+    found = covariances_of(scene, near, asked, shape=(3, 4, 3))
+    assert not found[2].any()
+    draw = np.random.default_rng(1)
+    accelerations = draw.normal(0.0, (2.0, 0.4), (60_000, 2))
+    for row, heading in ((0, 0.0), (1, 0.7)):  # the nearest first
+        turn = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
+        for step in range(4):
+            places = accelerations @ turn.T * (0.5 * (step + 1)) ** 2 / 2
+            (var_x, cov_xy), (_, var_y) = np.cov(places.T)
+            assert found[row, step] == pytest.approx([var_x, var_y, cov_xy], rel=0.03, abs=0.03)
+
+
+def test_actor_keeps_its_number_when_others_come_and_go():
+    numbers, seen = ActorNumbers(), {}
+    for places in ((5.0, 9.0, 60.0), (70.0, 3.0, 4.0), (5.0, 90.0, 6.0)):
+        actors = [(x, 0.0, 0.0, 4.0, 1.8, 0.0) for x in (0.0, *places)]
+        scene = scene_of(*actors)
+        near = nearest_actors(scene, 0, hidden=frozenset(), radius=50.0)
+        found = numbers.of(scene, near, 4)
+        assert not found[len(near) :].any()
+        for one, number_ in zip(near, found.tolist(), strict=False):
+            assert seen.setdefault(one.row, number_) == number_ > 0
+    assert len(set(seen.values())) == len(seen) == 3
+
+
+def test_predictions_of_another_reference_point_are_shifted_along_the_heading():
+    scene = scene_of((0.0, 0.0, 0.0, 4.0, 1.8, 0.0), (20.0, 0.0, 0.7, 4.0, 1.8, 6.0))
+    near = nearest_actors(scene, 0, hidden=frozenset(), radius=50.0)
+    plain, front = (
+        predictions_of(scene, near, shape=(1, 3, 4), interval=0.1, reference_share=share) for share in (0.0, 0.5)
+    )
+    assert (front - plain)[0, :, :2] == pytest.approx(np.full((3, 2), [2.0 * math.cos(0.7), 2.0 * math.sin(0.7)]))
+    assert (front[..., 2:] == plain[..., 2:]).all()
