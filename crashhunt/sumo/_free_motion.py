@@ -75,8 +75,10 @@ class FreeMotion:
             max_speed=sumo.vehicle_getMaxSpeed(vehicle),
         )
         self._kind = sumo.vehicle_getVehicleClass(vehicle)
-        self._route, self._goal = sumo.vehicle_getRouteID(vehicle), sumo.vehicle_getRoute(vehicle)[-1]
-        self._last = len(sumo.vehicle_getRoute(vehicle)) - 1
+        route = sumo.vehicle_getRoute(vehicle)
+        self._route, self._goal, self._last = sumo.vehicle_getRouteID(vehicle), route[-1], len(route) - 1
+        self.edges = frozenset(route)
+        """The edges of the route; SUMO gives a vehicle that leaves its route another one."""
         sumo.vehicle_setSpeedMode(vehicle, 0)  # SUMO would otherwise report a speed within its own limits
 
     def apply(self, action: NDArray[np.generic]) -> bool:

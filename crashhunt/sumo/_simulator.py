@@ -229,7 +229,8 @@ class SumoSimulator:
             self._notices.append(_CORE_DISABLED_NOTICE)
             self._read_scene()
             observations, usual = self._observe_all(), None
-        self._events.begin(self._scene, self.agents, self._moved)
+        routes = {agent: motion.edges for agent, motion in self._driving.moving.items()}
+        self._events.begin(self._scene, self.agents, self._moved, routes)
         self._shown, self.at_once = observations, usual
         if usual is not None:
             usual.begin()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from operator import sub
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,7 @@ from crashhunt.simulators import Standstill
 from crashhunt.world import Event, is_person, outlines, rectangle_gap
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from crashhunt.world import Actor, Scene
 
@@ -176,15 +177,23 @@ class SumoEvents:
         self._braking = HardBraking(step_length_s, limits.get("hard_braking"))
         self._standstill = Standstill(step_length_s, limits)
 
-    def begin(self, scene: Scene, agents: Sequence[str], controlled: Mapping[str, object]) -> None:
+    def begin(
+        self,
+        scene: Scene,
+        agents: Sequence[str],
+        controlled: Mapping[str, object],
+        routes: Mapping[str, Collection[str]] = MappingProxyType({}),
+    ) -> None:
         """Reset the state of the last episode.
 
         Args:
             scene: The scene before the first step.
             agents: Identifiers of the agents that act.
             controlled: All controlled vehicles, by identifier.
+            routes: The edges of the route of each vehicle that can leave it, because it moves freely.
         """
-        self._controlled = controlled
+        self._controlled, self._routes = controlled, routes
+        self._astray: set[str] = set()
         self._last = scene
         self._lanes = dict(scene.agent_lanes)
         self._steps = 0
@@ -296,9 +305,18 @@ class SumoEvents:
         along = ((x - was_x) * math.sin(angle) + (y - was_y) * math.cos(angle)) / driven
         if along >= _WRONG_WAY_COSINE:
             self._wrong.discard(agent)
+            self._ask_route(agent, lane, scene, found)
         elif agent not in self._wrong:
             self._wrong.add(agent)
             found.append(self._of(scene, agent, "wrong_way", f"{agent} drove the wrong way on lane {lane}"))
+
+    def _ask_route(self, agent: str, lane: str, scene: Scene, found: list[Event]) -> None:
+        """Add an event if the agent drives along a lane of a road that its route does not contain."""
+        if lane.rpartition("_")[0] in self._routes.get(agent, (lane.rpartition("_")[0],)):
+            self._astray.discard(agent)
+        elif agent not in self._astray:
+            self._astray.add(agent)
+            found.append(self._of(scene, agent, "off_route", f"{agent} left its route: it drives on lane {lane}"))
 
     def _at_dead_ends(self, scene: Scene, agents: Sequence[str], found: list[Event]) -> None:
         """Add an event for agents that SUMO stops at the end of a lane.

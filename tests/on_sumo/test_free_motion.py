@@ -331,3 +331,71 @@ def test_pursued_trajectory_that_is_elsewhere_is_refused(start):
     with pytest.raises(ActionError, match=r"the trajectory is 6\.0 m away from the vehicle") as caught:
         simulator.actions["ego"].encode([[0.1, 6.0, 0.0, 0.0, 5.0]])
     assert caught.value.fix == "return a point within 5 m"
+
+
+def drive_to(motion, *pose):
+    """Place the vehicle of a motion at a pose of its centre."""
+    x, y, heading, speed = pose
+    motion.state = MotionState(x=x, y=y, heading=heading, speed=speed)
+
+
+def test_vehicle_far_from_all_lanes_stays_where_it_is_and_is_not_teleported(start):
+    simulator, step = start("acceleration_steering", **EMPTY)
+    motion = simulator._driving.moving["ego"]
+    drive_to(motion, -60.0, 70.0, 1.0, 10.0)
+    assert step((0.0, 0.0)) == {"ego": True}
+    assert centre()[:2] == pytest.approx((-60.0 + math.cos(1.0), 70.0 + math.sin(1.0)), abs=1e-6)
+    assert not libsumo.simulation.getStartingTeleportIDList()
+    drive_to(motion, 5000.0, 5000.0, 1.0, 10.0)  # SUMO finds no lane there, and keeps the last place
+    assert not motion.apply(np.array((0.0, 0.0)))
+    libsumo.simulationStep()
+    assert "ego" in libsumo.vehicle.getIDList()
+    assert not libsumo.simulation.getStartingTeleportIDList()
+
+
+def test_vehicle_across_two_lanes_is_seen_in_the_lane_below_its_front_and_hit_in_the_other(start):
+    simulator, step = start("acceleration_steering", "motorway", demand=2000)
+    cars = [car for car in libsumo.vehicle.getIDList() if car != "ego"]
+    for car in cars[2:]:
+        libsumo.vehicle.remove(car)
+    road, y = libsumo.vehicle.getRoadID("ego"), libsumo.lane.getShape(f"{libsumo.vehicle.getRoadID('ego')}_0")[0][1]
+    for lane, car in enumerate(cars[:2]):
+        libsumo.vehicle.setLaneChangeMode(car, 0)
+        libsumo.vehicle.moveTo(car, f"{road}_{lane}", 300.0)
+        libsumo.vehicle.setSpeed(car, -1)
+    motion = simulator._driving.moving["ego"]
+    drive_to(
+        motion, libsumo.simulation.convert2D(road, 400.0, 0)[0], y + 2.0, 0.6, 0.0
+    )  # on the line between the lanes, its front to the left
+    found = []
+    for _ in range(100):
+        step((0.0, 0.0))
+        found += Overlap().check(simulator.scene(), ("ego",))
+        if found:
+            break
+    assert libsumo.vehicle.getLaneID("ego") == f"{road}_1"
+    assert libsumo.vehicle.getLeader(cars[1], 200.0)[0] == "ego"
+    assert (libsumo.vehicle.getLeader(cars[0], 200.0) or ("",))[0] != "ego"
+    assert {found[0].collision.collider, found[0].collision.victim} == {"ego", cars[0]}
+
+
+def test_road_that_the_route_does_not_contain_is_reported_once(start):
+    simulator, step = start("acceleration_steering", **EMPTY)
+    motion, lane = simulator._driving.moving["ego"], libsumo.lane.getShape("to-south_0")
+    (x, y), (to_x, to_y) = lane[0][:2], lane[-1][:2]
+    drive_to(motion, x, y, math.atan2(to_y - y, to_x - x), 8.0)
+    kinds = []
+    for _ in range(30):
+        step((0.0, 0.0))
+        kinds += [(event.kind, event.what) for event in simulator.scene().events]
+    assert kinds == [("off_route", "ego left its route: it drives on lane to-south_0")]
+    assert simulator.agents == ["ego"]
+
+
+def test_vehicle_does_not_drive_backwards(start):
+    simulator, _ = start("target_pose", **EMPTY)
+    motion = simulator._driving.moving["ego"]
+    x, y, heading = centre()
+    drive_to(motion, x, y, heading, 2.0)
+    with pytest.raises(ActionError, match="the target pose moves the vehicle backwards"):
+        simulator.actions["ego"].encode((x - 0.21, y, heading, 0.1))
