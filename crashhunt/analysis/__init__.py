@@ -7,6 +7,7 @@ from crashhunt.base.doors import offer_lazily
 if TYPE_CHECKING:
     from ._avoidability import judge as judge
     from ._delta_debugging import Tried as Tried, fewest as fewest, plainest as plainest
+    from ._driver_runs import judge_preventability as judge_preventability
     from ._interventions import (
         Disturb as Disturb,
         HandOver as HandOver,

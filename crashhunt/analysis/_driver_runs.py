@@ -30,7 +30,7 @@ from crashhunt.crashes import (
     overruled_trial,
     visible_from,
 )
-from crashhunt.replays import reruns_of
+from crashhunt.replays import ReplayOptions, prepare, reruns_of
 from crashhunt.reruns import StoppedError
 from crashhunt.trial import Outcome, Overruled
 from crashhunt.world import is_person
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from crashhunt.base.codec import JsonObject
+    from crashhunt.crashes import Bundle
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
     from crashhunt.reruns import EndedRun
@@ -98,6 +99,29 @@ def find_preventability(
         except CrashhuntError as error:
             return Preventability(since_step=since, runs=_in_order(runs), why_not=error.message)
     return Preventability(since_step=since, runs=_in_order(runs))
+
+
+def judge_preventability(
+    bundle: Bundle, *, parallel: int = 1, stopped: Callable[[], bool] = lambda: False
+) -> bool | None:
+    """Return whether any model of a competent driver would have prevented a crash, by running its trial again.
+
+    Args:
+        bundle: the crash. The code of its snapshot runs, and must be trusted.
+        parallel: number of runs at a time.
+        stopped: function that returns whether to stop.
+
+    Returns:
+        None if no model applies, or the runs do not decide it.
+
+    Raises:
+        CrashhuntError: the trial could not be run.
+    """
+    hit = bundle.result.collision
+    if bundle.result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
+        return None
+    rerun = prepare(bundle, ReplayOptions(force=True, trusted=True))
+    return find_preventability(rerun, parallel=parallel, stopped=stopped, tell=lambda _: None).by_any
 
 
 def _in_order(runs: dict[str, DriverRun]) -> tuple[DriverRun, ...]:

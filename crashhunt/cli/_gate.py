@@ -89,6 +89,12 @@ def add_gate(commands: Commands) -> None:
         f"0: never report the verdict no difference; default: {_MARGIN}",
     )  # fmt: skip
     how.add_argument(
+        "--only-preventable", action="store_true",
+        help="count a collision only if a model of a competent driver would have prevented it (crashhunt judge). If "
+        "all answers are null, the collision does not count, and the report has the number of these. Crashes that are "
+        "no collisions, such as agent_error, count as before",
+    )  # fmt: skip
+    how.add_argument(
         "--confidence",
         metavar="PERCENT",
         type=number,
@@ -138,6 +144,7 @@ def _gate(options: argparse.Namespace, words: list[str]) -> int:
         is_suite=options.suite is not None,
         trusted=options.trust,
         machine={"executor": options.executor} if options.suite is None or "--executor" in _flags(words) else None,
+        only_preventable=options.only_preventable,
         build=options.build,
         build_limit_s=build_limit_s(options),
     )

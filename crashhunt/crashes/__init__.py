@@ -76,6 +76,7 @@ if TYPE_CHECKING:
         LeftOut as LeftOut,
         Why as Why,
         judgement_of as judgement_of,
+        preventable_by as preventable_by,
         wilson as wilson,
         with_judgement as with_judgement,
     )

@@ -300,6 +300,12 @@ def judgement_of(bundle: Bundle) -> Judgement | None:
         return None
 
 
+def preventable_by(bundle: Bundle) -> dict[str, bool | None] | None:
+    """Return whether each model of a competent driver would have prevented a crash; None if that was not asked."""
+    judgement = judgement_of(bundle)
+    return None if judgement is None or judgement.drivers is None else judgement.preventable_by
+
+
 def with_judgement(bundle: Bundle, judgement: Judgement) -> Bundle:
     """Return a copy of a bundle that contains a judgement, to be written."""
     return replace(bundle, added={**bundle.added, _CRASH_JSON_KEY: judgement.to_json()})

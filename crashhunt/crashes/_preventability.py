@@ -59,6 +59,12 @@ class Preventability(Serializable):
         return {model: found.get(model) for model in COMPETENT_DRIVERS}
 
     @property
+    def by_any(self) -> bool | None:
+        """Whether any model would have prevented the collision; None if no model has an answer."""
+        found = [answer for answer in self.answers.values() if answer is not None]
+        return any(found) if found else None
+
+    @property
     def perceived(self) -> DriverRun | None:
         """The run of the model that perceived the risk first; None if no model did."""
         seen = [run for run in self.runs if run.perceived_step is not None]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError
-from crashhunt.crashes import Bundle, judgement_of
+from crashhunt.crashes import Bundle, judgement_of, preventable_by
 from crashhunt.crashes._contact_record import contact_record
 from crashhunt.crashes._fault import Verdict, fault_of
 from crashhunt.crashes._signature import Signature, signature_of
@@ -35,7 +35,7 @@ class Group(Serializable):
 
     json_keys = (
         "words", "signature", "count", "saved", "outcome=signature.outcome", "manner=signature.manner", "fault",
-        "avoidable", "first=first.path", "shortest=shortest.path", "members",
+        "avoidable", "first=first.path", "shortest=shortest.path", "members", "preventable_by?",
     )  # fmt: skip
 
     @property
@@ -66,6 +66,11 @@ class Group(Serializable):
     def shortest(self) -> Bundle:
         """The crash with the fewest steps; if several crashes have as few, the first of them."""
         return min(self.bundles, key=lambda bundle: bundle.result.steps)
+
+    @property
+    def preventable_by(self) -> dict[str, bool | None] | None:
+        """Whether each model of a competent driver would have prevented the shortest crash; None if not judged."""
+        return preventable_by(self.shortest)
 
     @property
     def words(self) -> str:

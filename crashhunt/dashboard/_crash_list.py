@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.text import command_line
-from crashhunt.crashes import crash_folders, fault_of, most_dangerous, read_bundle, signature_of
+from crashhunt.crashes import crash_folders, fault_of, most_dangerous, preventable_by, read_bundle, signature_of
 from crashhunt.dashboard._catalog import is_inside, unreadable, unreadable_below
 from crashhunt.dashboard._hunt_page import read_tail
 from crashhunt.ledger import Ledger, has_begun
@@ -284,6 +284,7 @@ def _summary(bundle: Bundle) -> JsonObject:
         "confirmed": bundle.confirmed,
         "why_unconfirmed": bundle.why_unconfirmed,
         "disturbed": result.disturbed,
+        **({"preventable_by": answers} if (answers := preventable_by(bundle)) is not None else {}),
         "x": round(x, 2) if known else None,
         "y": round(y, 2) if known else None,
     }

@@ -149,6 +149,7 @@ _GATE = {
     "interrupted": bool,
     "dir": str | None,
     "trained_on": int,
+    "preventable?": dict[str, int],
 }
 _CASES = {
     "cases": [

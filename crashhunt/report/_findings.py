@@ -18,6 +18,7 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.text import command_line, one_line
 from crashhunt.base.version import __version__
 from crashhunt.crashes import own_frames
+from crashhunt.report._words import list_preventing
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
@@ -66,7 +67,8 @@ def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None =
         count = "1 crash" if group.count == 1 else f"{group.count} crashes"
         fault = f" At fault: {group.fault}." if group.fault not in ("", "nobody can tell") else ""
         show = command_line("crashhunt", "show", example.path)
-        message = f"{example.result.summary}.{fault} {count}. To look at it: {show}"
+        prevented = f" Preventable ({words})." if (words := list_preventing(group.preventable_by)) else ""
+        message = f"{example.result.summary}.{fault}{prevented} {count}. To look at it: {show}"
         found.append(
             CrashFinding(
                 rule=group.signature.outcome,
@@ -317,7 +319,12 @@ def _result(finding: CrashFinding, rule: int) -> dict[str, object]:
             "crashhuntKind/v1": finding.fingerprint,
             "primaryLocationLineHash": f"{finding.fingerprint}:1",
         },
-        "properties": {"crashes": finding.group.count, "fault": finding.group.fault, "known": finding.known},
+        "properties": {
+            "crashes": finding.group.count,
+            "fault": finding.group.fault,
+            "known": finding.known,
+            **({"preventable_by": answers} if (answers := finding.group.preventable_by) is not None else {}),
+        },
     }
 
 

@@ -11,6 +11,7 @@ from crashhunt.report._findings import escaped, row_of
 from crashhunt.report._rate_text import count_training_trials, format_interval
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from crashhunt.statistics import CrashRate, GateReport, SideCounts
@@ -27,6 +28,8 @@ def describe_gate(found: GateReport) -> str:
     lines += [f"  {line}" for line in (*_evidence(found), *_invalid_pairs(found), *_new_types(found))]
     if found.trained_on:
         lines.append(f"  {_training_pairs(found)}")
+    if found.preventable is not None:
+        lines.append(f"  {_preventable(found.preventable)}")
     if found.rates is not None:
         lines += [f"  {line}" for line in _rates(found)]
     if len(found.scenarios) > 1:
@@ -37,6 +40,16 @@ def describe_gate(found: GateReport) -> str:
     if found.dir:
         lines.append(f"see {command_line('crashhunt', 'compare', found.dir)}")
     return in_lines(lines)
+
+
+def _preventable(numbers: Mapping[str, int]) -> str:
+    """Return which crashes of both versions count, if only preventable ones do."""
+    other = f"; crashes without a collision: {numbers['no_collision']}, all count" if numbers["no_collision"] else ""
+    total = numbers["yes"] + numbers["no"] + numbers["unknown"]
+    return (
+        f"only preventable collisions count: {numbers['yes']} of {total}; "
+        f"no model prevents {numbers['no']}, and no model has an answer for {numbers['unknown']}{other}"
+    )
 
 
 def _answer(found: GateReport) -> str:

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.text import command_line, count_of, in_lines, out_of
-from crashhunt.crashes import count_causes, join_causes, judgement_of
+from crashhunt.crashes import count_causes, join_causes
 from crashhunt.report._rate_text import describe_rates
 from crashhunt.report._status_screen import describe_types, format_arguments, format_inputs, format_seconds
 from crashhunt.report._words import (
     by_likelihood,
     describe_branches,
     describe_disturbances,
-    describe_drivers,
     describe_probes,
     describe_versions,
     fault_words,
     list_disturbances,
+    list_preventing,
 )
 from crashhunt.world import event_counts
 
@@ -77,8 +77,7 @@ def describe_groups(
 
 def _describe_prevented(group: Group) -> str:
     """Return which models of a competent driver would have prevented the shortest crash; empty if it is not judged."""
-    judgement = judgement_of(group.shortest)
-    return "" if judgement is None or judgement.drivers is None else describe_drivers(judgement.drivers)
+    return list_preventing(group.preventable_by)
 
 
 def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGroup]]) -> str:

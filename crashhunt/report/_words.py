@@ -367,10 +367,14 @@ def about_drivers(drivers: Preventability, ago: Callable[[int], str], agent: str
     return sentences
 
 
-def describe_drivers(drivers: Preventability) -> str:
-    """Return the answers of the models in one line; empty if no model has answered."""
-    known = [run for run in drivers.runs if run.prevented is not None]
-    return ", ".join(f"{DRIVER_NAMES[run.model]}: {_ANSWER_WORDS[run.prevented]}" for run in known)
+def list_preventing(answers: Mapping[str, bool | None] | None) -> str:
+    """Return the answers of the models that have one, as text; empty if there are none.
+
+    Args:
+        answers: the answer of each model; None if the models were not asked.
+    """
+    known = ((name, answer) for name, answer in (answers or {}).items() if answer is not None)
+    return ", ".join(f"{DRIVER_NAMES[name]}: {_ANSWER_WORDS[answer]}" for name, answer in known)
 
 
 def _driver_answer(run: DriverRun) -> str:

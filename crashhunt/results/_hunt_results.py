@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import warnings
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
@@ -16,12 +16,21 @@ import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
-from crashhunt.base.errors import HuntDirectoryError, UntrustedError, UsageError
+from crashhunt.base.errors import BundleError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.extras import install_command
 from crashhunt.base.files import whole_file
 from crashhunt.base.temporary import temporary_beside, temporary_folder, temporary_name
 from crashhunt.base.text import one_of, out_of
-from crashhunt.crashes import Bundle, describe_code, is_hunt_trusted, list_bundles
+from crashhunt.crashes import (
+    COMPETENT_DRIVERS,
+    Bundle,
+    crash_folders,
+    describe_code,
+    is_hunt_trusted,
+    list_bundles,
+    preventable_by,
+    read_bundle,
+)
 from crashhunt.episode import Parts, WorkerSettings
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import HuntSettings, read_settings, with_settings
@@ -63,6 +72,11 @@ upper bound of the margin if that was not all of them."""
 
 BRANCHES = ("branches", "branch_crashes", "branches_asked")
 """Further ones, of hunts with branches: number of branches, how many crashed, and how many of all have an answer."""
+
+PREVENTABLE = tuple(f"preventable_by.{model}" for model in COMPETENT_DRIVERS)
+"""Further columns of hunts with judged crashes: whether each model of a competent driver prevents the crash."""
+
+_JUDGED = b'"drivers"'
 
 CODE_VERSION = "code_version"
 """A further column of hunts whose code has changed: the number of the version with which a trial ran."""
@@ -263,7 +277,19 @@ class HuntResults:
         disturbances = DISTURBANCES if self.settings.disturb else ()
         branches = BRANCHES if self.settings.branch else ()
         versions = (CODE_VERSION,) if self.code_versions.are_several else ()
-        return (*columns_of(self.settings), *disturbances, *stress, *branches, *origins, *versions)
+        preventable = PREVENTABLE if self._preventable else ()
+        return (*columns_of(self.settings), *disturbances, *stress, *branches, *origins, *preventable, *versions)
+
+    @cached_property
+    def _preventable(self) -> dict[int, dict[str, bool | None]]:
+        """The answers of the models of a competent driver, by the number of the trial."""
+        found = {}
+        for folder in crash_folders(self.directory):
+            with suppress(OSError, BundleError):  # damaged bundles are reported by other commands
+                if _JUDGED in (folder / layout.CRASH).read_bytes():  # without parsing all others
+                    bundle = read_bundle(folder)
+                    found[bundle.result.spec.number] = preventable_by(bundle)
+        return {number: answers for number, answers in found.items() if answers is not None}
 
     @cached_property
     def code_versions(self) -> CodeVersions:
@@ -293,6 +319,8 @@ class HuntResults:
             for data in ledger.plain_results(outcomes=tuple(outcomes)):
                 row = TrialRow(data)
                 cells = row.cells(names)
+                for model, answer in self._preventable.get(row.number, {}).items():
+                    cells[f"preventable_by.{model}"] = answer
                 if ran:
                     cells[CODE_VERSION] = next((version for numbers, version in ran if row.number in numbers), None)
                 yield cells

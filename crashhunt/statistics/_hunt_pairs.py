@@ -27,7 +27,7 @@ from crashhunt.training import HeldOutTraffics, held_out_traffics
 from crashhunt.trial import KILLED
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
@@ -131,6 +131,8 @@ class GateReport:
         dir: directory of the hunts; empty if they are not kept.
         trained_on: number of pairs that do not count, because an agent was trained on their traffic.
         cautions: facts because of which the verdict may not be about the two versions.
+        preventable: numbers of crashes of both versions, if only preventable crashes count: ``yes``, ``no`` and
+            ``unknown`` for collisions, and ``no_collision``; None if all crashes count.
     """
 
     verdict: PairVerdict
@@ -153,6 +155,7 @@ class GateReport:
     dir: str = ""
     trained_on: int = 0
     cautions: tuple[str, ...] = ()
+    preventable: Mapping[str, int] | None = None
 
     @property
     def sides(self) -> tuple[SideCounts, SideCounts]:
@@ -220,6 +223,7 @@ class GateReport:
             "dir": self.dir or None,
             "trained_on": self.trained_on,
             "cautions": list(self.cautions),
+            **({"preventable": dict(self.preventable)} if self.preventable is not None else {}),
         }
 
 
@@ -231,12 +235,17 @@ class PairedHunts:
         base: directory of BASE's hunt.
         head: directory of HEAD's hunt.
         pairs: maximum number of trials of each hunt.
+        counts: function that returns whether a crash counts, from the directory of its hunt and the number of its
+            trial; by default, every crash counts.
 
     Attributes:
         trained_on: number of pairs that do not count, because an agent was trained on their traffic.
     """
 
-    def __init__(self, name: str, base: Path, head: Path, pairs: int) -> None:
+    def __init__(
+        self, name: str, base: Path, head: Path, pairs: int, *, counts: Callable[[Path, int], bool] | None = None
+    ) -> None:
+        self._counts = counts
         self.name, self.folders, self.most = name, (base, head), pairs
         self.trained_on = 0
         self._held_out: HeldOutTraffics | None = None
@@ -276,6 +285,9 @@ class PairedHunts:
             if not all(self._held_out.has(int(one.tags[0])) for one, _ in pair):
                 self.trained_on += 1
                 continue
+            if self._counts is not None:
+                base, head = self.folders
+                pair = tuple((self._counted(base, one), self._counted(head, two)) for one, two in pair)
             self._test.add(pair)
             watch.test.add(pair)
             for both in pair:
@@ -284,6 +296,11 @@ class PairedHunts:
                         crashed.append(one.number)
             if not self.why_not:
                 watch.decide(may_end=may_end)
+
+    def _counted(self, folder: Path, trial: TrialFacts) -> TrialFacts:
+        if self._counts is None or not trial.crashed or self._counts(folder, trial.number):
+            return trial
+        return trial._replace(crashed=False)
 
     @property
     def counts(self) -> ScenarioCounts:

@@ -39,6 +39,7 @@ from crashhunt.plans import read_settings
 from crashhunt.results import HuntDirectory, hunt_state, is_hunt
 from crashhunt.scenario import load_scenario
 from crashhunt.statistics import GateCase, GateReport, PairedHunts, PairWatch, check_confidence, measure_rates
+from crashhunt.suites._preventable_crashes import PreventableCrashes
 from crashhunt.suites._processes import (
     REQUEST,
     RunRequest,
@@ -149,6 +150,8 @@ class Gate:
             last hunt.
         trusted: whether existing hunts and the corpus may run even if they are not trusted.
         machine: execution options, such as ``executor``, that apply to all hunts.
+        only_preventable: whether a collision counts only if a model of a competent driver would have prevented it.
+            Crashes without a collision partner always count.
         build: command line that builds each commit in its work tree; empty for no build.
         build_limit_s: maximum wall time of a build, in s.
     """
@@ -166,6 +169,7 @@ class Gate:
     is_suite: bool = False
     trusted: bool = False
     machine: Given | None = None
+    only_preventable: bool = False
     build: str = ""
     build_limit_s: float = math.inf
 
@@ -275,6 +279,7 @@ class _Run:
         self._cautions: tuple[str, ...] | None = None
         self._until = time.monotonic() + gate.duration_s
         self._pairs = PairWatch(gate.margin, 1 - gate.confidence / 100)
+        self._preventable = PreventableCrashes(place, slots_of(gate.parallel)) if gate.only_preventable else None
         self._seed = self._begin()
         self._wait_for_hunts()
         self._trees: dict[str, Path] = {}
@@ -347,7 +352,8 @@ class _Run:
         for number, (name, run) in enumerate(gate.hunts.items()):
             most = gate.most // len(gate.hunts) + (number < gate.most % len(gate.hunts))
             folder = self._folder(name)
-            paired = PairedHunts(name, folder / BASE, folder / HEAD, most)
+            counts = self._preventable.counts if self._preventable is not None else None
+            paired = PairedHunts(name, folder / BASE, folder / HEAD, most, counts=counts)
             for side, place in zip((BASE, HEAD), paired.folders, strict=True):
                 self._plan(place, self._request(run, side, most, number))
             yield paired
@@ -371,7 +377,8 @@ class _Run:
     def _request(self, run: RunRequest, side: str, most: int, number: int) -> RunRequest:
         """Return the request of the hunt of one version; ``number`` is its position among the hunts."""
         asked = run.request
-        settings = replace(asked.run, keep_going=True, keep=_BUNDLES_PER_TYPE, parallel=1)
+        kept = 0 if self._gate.only_preventable else _BUNDLES_PER_TYPE  # 0 keeps all: each crash is judged
+        settings = replace(asked.run, keep_going=True, keep=kept, parallel=1)
         seed = asked.seed
         if seed is None and not self._gate.is_suite:
             seed = self._seed
@@ -649,14 +656,23 @@ class _Run:
             dir=str(self._place) if self._is_kept else "",
             trained_on=sum(one.trained_on for one in self._hunts),
             cautions=self._cautions or (),
+            preventable=None if self._preventable is None else self._preventable.numbers,
         )
         self._write(report)
         return report
 
     def _rates(self) -> tuple[CrashRate, CrashRate] | None:
-        """Return the rates of the only two hunts; None if there are several pairs, or if a hunt has not begun."""
+        """Return the rates of the only two hunts; None if there are several pairs, or if a hunt has not begun.
+
+        If only preventable crashes count, there are no rates, because the rate of a hunt counts all its crashes.
+        """
         (paired, *others) = self._hunts
-        if others or not all((folder / layout.HUNT).exists() for folder in paired.folders) or not paired.counts.pairs:
+        if (
+            self._preventable is not None
+            or others
+            or not all((folder / layout.HUNT).exists() for folder in paired.folders)
+            or not paired.counts.pairs
+        ):
             return None
         held_out = held_out_traffics(read_settings(paired.folders[0] / layout.HUNT), paired.folders)
         base, head = (

@@ -12,7 +12,9 @@ from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings, Request, RunSettings, write_settings
+from crashhunt.report import describe_gate
 from crashhunt.suites import Gate, GateVersion, RunRequest, _gate_runs as _gate
+from crashhunt.suites._preventable_crashes import PreventableCrashes
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
 SEED = 4
@@ -170,3 +172,38 @@ def test_hunts_continue_until_the_pairs_are_enough(tmp_path, ran, monkeypatch):
     monkeypatch.setattr(_gate, "run_all", watched)
     gate(tmp_path, ["loop"], most=5).run(tmp_path / "g")
     assert said == [False, True]
+
+
+def test_only_collisions_that_a_competent_driver_prevents_count(tmp_path, ran, monkeypatch):
+    _, crashes = ran
+    crashes[0] |= {0, 1}
+    crashes[1] |= {0, 2, 3, 4}
+    answers = {("base", 0): "yes", ("head", 0): "no", ("head", 2): "no_collision", ("head", 3): "yes"}
+    asked = []
+
+    def judge(_, hunt, number):
+        asked.append((hunt.name, number))
+        return answers.get((hunt.name, number), "unknown")
+
+    monkeypatch.setattr(PreventableCrashes, "_judge", judge)
+    report = gate(tmp_path, ("a",), only_preventable=True).run(tmp_path / "kept")
+    assert (report.only_base, report.only_head, report.both) == (1, 2, 0)
+    assert report.preventable == {"yes": 2, "no": 1, "unknown": 2, "no_collision": 1}
+    assert report.to_json()["preventable"] == report.preventable
+    assert (
+        "2 of 5; no model prevents 1, and no model has an answer for 2; crashes without a collision: 1"
+        in describe_gate(report)
+    )
+    assert report.rates is None
+    first = len(asked)
+    again = gate(tmp_path, ("a",), only_preventable=True).run(tmp_path / "kept")
+    assert (again.only_base, again.only_head) == (1, 2)
+    assert len(asked) == first == 6  # each crash once
+
+
+def test_gate_without_the_option_counts_all_crashes_and_reports_no_answers(tmp_path, ran):
+    _, crashes = ran
+    crashes[1] |= {2}
+    report = gate(tmp_path, ("a",)).run()
+    assert report.only_head == 1
+    assert "preventable" not in report.to_json()

@@ -105,6 +105,8 @@ function showKinds() {
 function withNotes(one) {
   const cell = make("span", one.damaged || one.summary);
   cell.append(...notesOn(one.id).map((note) => make("span", note, "sub note")));
+  const answers = Object.entries(one.preventable_by ?? {}).filter(([, answer]) => answer !== null);
+  if (answers.length) cell.append(make("span", `preventable: ${answers.map(([model, answer]) => `${model} ${answer ? "yes" : "no"}`).join(", ")}`, "sub"));
   return cell;
 }
 
