@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -27,6 +29,13 @@ def install_command(extra: str) -> str:
     if (root / "pyproject.toml").is_file():
         return command_line(*pip, "install", "-e", f"{_near(root)}[{extra}]")
     return command_line(*pip, "install", f"crashhunt[{extra}]")
+
+
+def installation_in(fix: str) -> list[str]:
+    """Return the words of the command for an extra if the fix of an error contains this command; otherwise no words."""
+    named = re.search(r"\[([a-z0-9-]+)\]", fix)
+    command = install_command(named[1]) if named is not None else ""
+    return shlex.split(command) if command and command in fix else []
 
 
 def _near(path: Path) -> Path:

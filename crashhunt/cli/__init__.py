@@ -17,6 +17,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import DISK, CrashhuntError, InternalError, UsageError, remedy
+from crashhunt.base.extras import installation_in
 from crashhunt.base.removed import refuse_removed_words
 from crashhunt.base.resources import error_of_next_thread, is_no_thread, limit_behind
 from crashhunt.base.signals import ended_by_signals, is_interrupt
@@ -145,10 +146,27 @@ def _run(words: Sequence[str]) -> int:
         with ended_by_signals():
             code: int = options.command(options, words)
     except CrashhuntError as error:
-        return _report(error, as_json="--json" in words)
+        code = _report(error, as_json="--json" in words)
+        _offer_extra(error, words)
+        return code
     except SystemExit as leaving:  # of --help and --version
         return leaving.code if isinstance(leaving.code, int) else 0
     return code
+
+
+def _offer_extra(error: CrashhuntError, words: Sequence[str]) -> None:
+    """Offer to install a missing extra and run the command again; only to a user at a terminal, and not in CI."""
+    command = installation_in(error.fix)
+    is_asked = sys.stdin.isatty() and sys.stderr.isatty() and "--json" not in words and not os.environ.get("CI")
+    if not command or not is_asked:
+        return
+    print("Install it now, and run the command again? [y/N] ", end="", file=sys.stderr, flush=True)
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        return
+    import subprocess
+
+    if subprocess.run(command, check=False).returncode == 0:
+        os.execv(sys.executable, [sys.executable, "-m", "crashhunt", *words])
 
 
 def _check_folder() -> None:

@@ -55,3 +55,11 @@ def test_environment_whose_pip_is_not_the_one_of_the_shell_names_its_own(place, 
 def test_environment_without_pip_names_its_python(place, monkeypatch):
     monkeypatch.chdir(place(clone=False, on_path=False, pip=False))
     assert extras.install_command("video") == ".venv/bin/python -m pip install 'crashhunt[video]'"
+
+
+def test_only_a_fix_with_the_whole_command_names_an_installation(place, monkeypatch):
+    monkeypatch.chdir(place(clone=True, on_path=False))
+    command = extras.install_command("video")
+    assert extras.installation_in(f"{command}, or give --gif") == shlex.split(command)
+    assert extras.installation_in("give speed=[a] or pip install x[video]") == []
+    assert extras.installation_in("") == []
