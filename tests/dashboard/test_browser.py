@@ -115,6 +115,9 @@ def test_texts_of_strangers_are_text_on_every_page(hunts, page):
             assert page.run("return document.documentElement.scrollWidth") <= 360, url
             if url == dashboard.url:
                 assert page.serious() == []  # which takes seconds a page
+            assert not page.run("return document.querySelector('.loading').checkVisibility()")
+            page.run("delete document.body.dataset.polls; delete document.body.dataset.complete")  # as before an answer
+            assert page.run("return document.querySelector('.loading').checkVisibility()")
     assert [fault for fault in page.faults() if "404" not in fault] == []
 
 

@@ -215,6 +215,7 @@ export function draw(node, traces, more, name, onClick) {
   drawWhenNear(node, () => {
     const isFirst = !node.on;
     Plotly.react(node, traces, layout({ uirevision: "keep", ...more }), CONFIG);
+    document.getElementById("js-plotly-tester")?.setAttribute("aria-hidden", "true");
     if (isFirst && onClick) node.on("plotly_click", (event) => onClick(event.points));
   });
 }
