@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from conftest import examples
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.crashes._lanes import LaneMap, _Lane
@@ -39,7 +40,7 @@ TWO = [[(0, 0), (200, 0)], [(0, 3.2), (200, 3.2)]]
 
 
 @given(st.floats(-3.1, 3.1), st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.booleans(), st.booleans())
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 def test_who_changes_to_the_lane_next_to_is_seen_wherever_the_road_lies(angle, x, y, at_once, changes):
     lanes = LaneMap([lane(*turned(points, angle, x, y)) for points in TWO], turned([(100, 0)], angle, x, y)[0])
     side = [0.0] * 5 + ([0.0, 3.2] if at_once else list(np.linspace(0, 3.2, 20))) + [3.2] * 5

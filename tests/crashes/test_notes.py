@@ -8,6 +8,7 @@ import zipfile
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from conftest import examples
 from hypothesis import given, settings, strategies as st
 from test_archive import crash as crash
 
@@ -35,7 +36,7 @@ def test_notes_of_two_writers_at_once_are_all_there(tmp_path):
     assert {note.text for note in read_notes(tmp_path)} == {f"text {number}" for number in range(40)}
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(st.text(min_size=1, max_size=80).filter(str.strip))
 def test_any_text_comes_back_as_it_was_written(tmp_path_factory, text):
     hunt = tmp_path_factory.mktemp("hunt")

@@ -24,13 +24,12 @@ from crashhunt.crashes import (
     list_trusted,
     open_archive,
     refuse_untrusted,
-    remove_trusted,
     snapshot_of,
     trust_repositories,
     trust_repository,
     trust_snapshot,
 )
-from crashhunt.errors import UntrustedError, UsageError
+from crashhunt.errors import UntrustedError
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.scenario import digest_of_described
 from crashhunt.snapshots import latest_snapshot
@@ -317,21 +316,6 @@ def test_archive_is_signed_only_where_the_crash_was_made_here(place):
     trust_snapshot(latest_snapshot(place / "theirs"), place / "theirs")
     with open_archive(place / "theirs.zip") as archive:
         assert is_bundle_trusted(find_bundle(archive.directory))
-
-
-def test_origins_are_removed_by_fingerprint_or_path(place):
-    first = add_trusted("ab" * 32, path=str(place / "one"), runs="x")
-    add_trusted("abab" * 15 + "cdcd", path=str(place / "two"), runs="y")
-    for name in ("abab", "ffffffff", str(place / "three"), ""):
-        with pytest.raises(UsageError, match="no trusted origin"):
-            remove_trusted([first.fingerprint, name])
-    with pytest.raises(UsageError, match="matches 2 origins"):
-        remove_trusted(["ababab"])
-    assert len(list_trusted()) == 2
-    assert [origin.runs for origin in remove_trusted([str(place / "two")])] == ["y"]
-    assert list_trusted() == [first]
-    remove_trusted([first.fingerprint])
-    assert list_trusted() == []
 
 
 def test_damaged_entries_are_not_listed(place):

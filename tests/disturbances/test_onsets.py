@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import pytest
+from conftest import examples
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.disturbances import DisturbanceSampler, Drawn, FirstOnsets, brake, cut_in, first_forcing, late_action
@@ -32,7 +33,7 @@ ratios = st.dictionaries(st.sampled_from(["brake=2.0", "brake=6.0", "cut_in=0.0"
                          st.floats(0.1, 9))  # fmt: skip
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(chances, ratios, st.integers(0, 2**31), st.floats(0.1, 1.0))
 def test_one_onset_lies_in_each_interval_of_the_proposed_probability(some, given_ratios, seed, part):
     start = first_forcing(sampler(**some), LAST)

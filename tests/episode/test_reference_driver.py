@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import examples
 from gymnasium import spaces
 from hypothesis import given, settings, strategies as st
 
@@ -57,7 +58,7 @@ def driver(road, faculty, action=(35.0, 0), after=0):
     return made
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     st.floats(0.0, 30.0), st.floats(0.0, 30.0), st.lists(st.floats(-BRAKING, 2.0), min_size=5, max_size=12), st.data()
 )

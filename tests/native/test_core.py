@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import examples
 from hypothesis import given, settings, strategies as some
 
 from crashhunt.agents import KeepLaneWithSpeed
@@ -66,7 +67,7 @@ def both_ways(scene, call):
     return with_it, call()
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(two_scenes(), some.integers(1, 10), some.floats(-1e4, 1e4))
 def test_an_observation_is_the_same_bit_by_bit(scenes, rows, place):
     kinematics = Kinematics(ObservationSetup(vehicles=rows))
@@ -77,7 +78,7 @@ def test_an_observation_is_the_same_bit_by_bit(scenes, rows, place):
         assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(two_scenes())
 def test_the_same_are_within_reach(scenes):
     previous, scene = scenes
@@ -87,7 +88,7 @@ def test_the_same_are_within_reach(scenes):
         assert ours == theirs
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(two_scenes(), some.randoms(use_true_random=False), some.integers(0, 3))
 def test_the_same_are_within_reach_where_actors_come_and_go(scenes, rng, missing):
     first, scene = scenes
@@ -140,7 +141,7 @@ def test_an_actor_is_within_reach():
     assert _within_reach(now, was, 0) == [1]
 
 
-@settings(deadline=None, max_examples=80)
+@settings(deadline=None, max_examples=examples(80))
 @given(some.lists(two_scenes(), min_size=1, max_size=3))
 def test_the_closest_approach_is_the_same_bit_by_bit(episodes):
     for scene in itertools.chain(*episodes):  # as if many were one: rosters differ
@@ -208,7 +209,7 @@ def test_a_part_that_is_not_whole_is_left_to_python():
         assert core.tracks([tuple(whole)], every, 20.0, 0.0, 0.0, 0.0) is None
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(some.lists(two_scenes(), min_size=1, max_size=4), some.sampled_from([0.1, 0.3, 0.9]))
 def test_the_ways_that_were_driven_are_the_same(episodes, step_length_s):
     frames = [joined_frame(one.roster, np.concatenate([one.frame.columns, two.frame.columns]), [None] * 2)
@@ -294,7 +295,7 @@ def repr_of(seen):
 
 
 @pytest.mark.nightly
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(some.lists(two_scenes(), min_size=2, max_size=4))
 def test_the_closest_until_then_leaves_out_nothing(episodes):
     ours, theirs = ApproachMeter("0"), ApproachMeter("0")
@@ -344,7 +345,7 @@ def said(ask):
         return repr(error)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(two_scenes(), some.lists(some.floats(), max_size=3), some.integers(0, 2**40))
 def test_the_record_of_a_step_is_the_same(tmp_path_factory, scenes, rewards, step):
     rewards, scene = tuple(rewards), scenes[0]

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import examples
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.crashes import Encounter, closest_actors, danger_course
@@ -114,7 +115,7 @@ def test_steps_that_are_decoded_at_each_use_are_those_that_are_kept(records, req
     assert [scene.time_s for scene in reversed(long.scenes()[10:70:7])] == times
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     presences=st.lists(st.lists(st.integers(0, 7), unique=True, max_size=4), min_size=1, max_size=40),
     size=st.integers(2, 9),

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from conftest import examples
 from episodes import Episode, episodes, record
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -26,7 +27,9 @@ from crashhunt.recording._foxglove import messages_of
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Lane
 
-shared_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=30)
+shared_folder = settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=examples(30)
+)
 LANES = [Lane("x_0", 3.2, ((0.0, 0.0), (50.0, 0.0), (80.0, 20.0))), Lane("far_0", 3.2, ((9e5, 9e5), (9e5 + 1, 9e5)))]
 CRASH = TrialResult(
     TrialSpec(7, 1, {}, {}, max_steps=100),

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import examples
 from episodes import Episode, episodes, record, write
 from hypothesis import HealthCheck, given, settings, strategies as st
 
@@ -13,7 +14,9 @@ from crashhunt.errors import BundleError
 from crashhunt.recording import Recording, Tag, digest_of, first_divergence, read_black_box, read_header
 from crashhunt.world import Contact
 
-shared_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=60)
+shared_folder = settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=examples(60)
+)
 
 
 @given(episodes)

@@ -6,6 +6,7 @@ import asyncio
 
 import numpy as np
 import pytest
+from conftest import examples
 from hypothesis import example, given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 from PIL import Image
@@ -40,7 +41,7 @@ def colors(picture: np.ndarray) -> dict[tuple[int, ...], int]:
     return {tuple(map(int, color)): int(count) for color, count in zip(found, counts, strict=True)}
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(panels, st.sampled_from([(240, 160), (64, 64), (500, 90)]))
 @example(Curve([5e-324, 0.0]), (240, 160))  # as near as floats get
 def test_whatever_an_agent_shows_becomes_a_picture_or_one_clear_error(panel, size):

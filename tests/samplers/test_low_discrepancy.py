@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from conftest import examples
 from hypothesis import HealthCheck, example, given, settings, strategies as st
 from spaces import are_inside, ask, distributions, spaces, spec_of
 
@@ -14,7 +15,7 @@ from crashhunt.samplers import Cube, HaltonSampler, HuntFacts, NamedSampler, Pro
 from crashhunt.space import Choice, Constant, Range
 
 KINDS = (HaltonSampler, SobolSampler)
-quickly = settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.too_slow])
+quickly = settings(deadline=None, max_examples=examples(30), suppress_health_check=[HealthCheck.too_slow])
 
 
 @quickly

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import pytest
+from conftest import examples
 from hypothesis import assume, given, settings, strategies as st
 
 from crashhunt.world import Actor, Roster, Scene, contact_at, first_contact, lane_jump
@@ -91,7 +92,7 @@ def described(view, one, two, step_s, phase):
     return touch, back
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(
     view=VIEWS, step_s=STEPS, phase=PHASES, lengths=st.tuples(LENGTHS, LENGTHS), widths=st.tuples(WIDTHS, WIDTHS),
     slower=st.floats(0.0, 20.0), faster=st.floats(0.5, 15.0), aside=st.floats(-0.9, 0.9), turn=st.floats(-0.3, 0.3),
@@ -113,7 +114,7 @@ def test_rear_end_has_a_faster_collider_behind(view, step_s, phase, lengths, wid
         assert (found.drives_into, found.turn) == (True, pytest.approx(view.flip * turn, abs=1e-9))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(
     view=VIEWS, step_s=STEPS, phase=PHASES, speed=st.floats(0.5, 20.0), its=st.floats(0.0, 25.0),
     along=st.floats(-0.9, 0.9), side=st.sampled_from((1, -1)), rounding=st.sampled_from((0.0, 1e-14, -1e-14, 0.3)),
@@ -139,7 +140,7 @@ def test_actor_that_jumps_into_a_lane_drives_into_the_actor_there(
     assert lane_jump(before, after, "b") == 0.0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(view=VIEWS, step_s=STEPS, phase=PHASES, speed=st.floats(0.5, 20.0), along=st.floats(-0.9, 0.9))
 def test_two_that_jump_into_one_lane_drive_into_each_other(view, step_s, phase, speed, along):
     end = (1 - phase) * step_s
@@ -149,7 +150,7 @@ def test_two_that_jump_into_one_lane_drive_into_each_other(view, step_s, phase, 
     assert (touch.jumps, touch.other_jumps, touch.drives_into, back.drives_into) == (True, True, True, True)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(view=VIEWS, step_s=STEPS, speed=st.floats(0.5, 20.0), slow=st.floats(0.0, 1.0), share=st.floats(0.1, 0.9))
 def test_lane_change_after_the_contact_has_no_part_in_it(view, step_s, speed, slow, share):
     """The vehicle drives into the one ahead first, and SUMO changes its lane at the end of the step."""
@@ -162,7 +163,7 @@ def test_lane_change_after_the_contact_has_no_part_in_it(view, step_s, speed, sl
     assert not touch.is_sideways
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(
     view=VIEWS, step_s=STEPS, phase=PHASES, angle=st.floats(1.1, 2.0), side=st.sampled_from((1, -1)),
     speed=st.floats(3.0, 20.0), its=st.floats(0.0, 1.0), where=st.floats(-0.25, 0.25),
@@ -181,7 +182,7 @@ def test_crossing_is_by_the_front_into_the_side(view, step_s, phase, angle, side
     assert touch.turn == pytest.approx(view.flip * heading, abs=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(view=VIEWS, step_s=STEPS, phase=PHASES, speed=st.floats(2.0, 20.0), side=st.sampled_from((1, -1)))
 def test_actor_that_stands_drives_into_nothing(view, step_s, phase, speed, side):
     stands = Mover(0, 0, 0, 0.0)
@@ -197,7 +198,7 @@ def test_actor_that_stands_drives_into_nothing(view, step_s, phase, speed, side)
     assert [(one.face, one.other_face) for one in both] == [("front", "front")] * 2
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     view=VIEWS, step_s=STEPS, was=st.floats(0.0, 20.0), change=st.floats(-6.0, 6.0), phase=PHASES,
     kind=st.sampled_from((-0.3, 0.0, 0.4, 1.0, 1.3)),

@@ -6,6 +6,7 @@ import math
 from itertools import pairwise
 
 import pytest
+from conftest import examples
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.oracles import Overlap, ReportedCollision, merge_findings
@@ -64,7 +65,7 @@ cars = st.tuples(
 
 
 @given(cars, cars)
-@settings(max_examples=80)
+@settings(max_examples=examples(80))
 def test_the_first_contact_agrees_with_a_thousand_samples_of_the_step(one, two):
     motions = [bend(name, *car[:5], car[5], 1.0) for name, car in (("ego", one), ("other", two))]
     before, after = (scene(float(time), *(motion[time] for motion in motions)) for time in (0, 1))

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from conftest import examples
 from hypothesis import example, given, settings, strategies as st
 
 from crashhunt.world import Actor, DangerMeter, Frame, Roster, dangers, followers_danger, outlines_overlap
@@ -293,7 +294,7 @@ places = st.floats(-40, 40)
 others = st.tuples(places, places, st.floats(-3.1, 3.1), st.floats(2, 20), st.floats(-0.3, 0.3))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @example(bend=0.0, speed=5.0, ways=[(-3.0, 14.0, -1.6875, 11.0, 0.28125)])  # crosses where the way begins
 @given(bend=st.floats(-0.03, 0.03), speed=st.floats(4, 14), ways=st.lists(others, min_size=1, max_size=2))
 def test_it_is_what_a_search_over_time_shifts_finds(bend, speed, ways):
