@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
 import sys
-import time
-from pathlib import Path
 
 import pytest
-
-from crashhunt.executors import worker_environment
+from single_threaded import answer_of, wait_for_the_end_of
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
@@ -19,16 +13,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linu
 @pytest.fixture
 def ask(tmp_path):
     """Asks a process of one thread."""
-
-    def ask_it(what):
-        done = subprocess.run(
-            [sys.executable, Path(__file__).with_name("branching.py"), what, tmp_path],
-            env={**os.environ, **worker_environment()}, capture_output=True, text=True, check=False, timeout=500,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        return json.loads(done.stdout.splitlines()[-1])
-
-    return ask_it
+    return lambda what: answer_of("branching.py", what, tmp_path)
 
 
 @pytest.mark.parametrize("scenario", ["toy", pytest.param("loop", marks=pytest.mark.nightly)])
@@ -80,16 +65,5 @@ def test_branches_end_when_they_hang_or_die_and_copies_with_their_process(ask):
         False,
     )
     assert len(found["left"]) == 3
-    deadline = time.monotonic() + 60.0
     for pid in found["left"]:
-        while goes_on(pid):
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-
-
-def goes_on(pid):
-    """Whether a process has not ended; it may not have been reaped."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+        wait_for_the_end_of(pid)

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-
-from crashhunt.executors import worker_environment
+from single_threaded import answer_of
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
@@ -19,16 +14,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linu
 @pytest.fixture
 def ask(tmp_path):
     """Asks a process of one thread."""
-
-    def ask_it(what):
-        done = subprocess.run(
-            [sys.executable, Path(__file__).with_name("forcing.py"), what, tmp_path],
-            env={**os.environ, **worker_environment()}, capture_output=True, text=True, check=False, timeout=500,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        return json.loads(done.stdout.splitlines()[-1])
-
-    return ask_it
+    return lambda what: answer_of("forcing.py", what, tmp_path)
 
 
 NIGHTLY = [pytest.param(name, marks=pytest.mark.nightly) for name in ("loop", "merge")]

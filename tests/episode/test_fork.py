@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
 import sys
-import time
-from pathlib import Path
 
 import pytest
-
-from crashhunt.executors import worker_environment
+from single_threaded import answer_of, wait_for_the_end_of
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
@@ -26,28 +20,10 @@ class Words(str):
         return other.startswith(str(self))
 
 
-def goes_on(pid):
-    """Whether a process has not ended; it may not have been reaped."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 @pytest.fixture
 def ask(tmp_path):
     """Asks a process of one thread."""
-
-    def ask_it(what):
-        done = subprocess.run(
-            [sys.executable, Path(__file__).with_name("forking.py"), what, tmp_path],
-            env={**os.environ, **worker_environment()}, capture_output=True, text=True, check=False, timeout=1000,
-        )  # fmt: skip
-        assert done.stderr == ""
-        (line,) = done.stdout.splitlines()
-        return json.loads(line)
-
-    return ask_it
+    return lambda what: answer_of("forking.py", what, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -87,10 +63,7 @@ def test_copies_end_with_their_process_and_before_it_when_they_hang(ask):
         "sleeper": ["was killed by SIGKILL", True, False],
     }
     assert found["raised"] == "ZeroDivisionError: division by zero"
-    deadline = time.monotonic() + 60.0
-    while goes_on(found["left"]):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for_the_end_of(found["left"])
 
 
 def test_probes_find_the_mildest_that_crashes_and_change_nothing(ask):

@@ -16,7 +16,6 @@ from crashhunt.scenario import (
     AgentSetup,
     Scenario,
     load_scenario,
-    scenario_digest,
     scenario_from_dict,
     shipped_folder,
     shipped_scenarios,
@@ -376,12 +375,3 @@ def test_arguments_have_their_names_and_a_mistake_in_them_is_found_by_file_and_t
         load_scenario(loop)
     assert str(loop) in str(caught.value)
     assert name in str(caught.value)
-
-
-def test_the_digest_of_a_scenario_is_that_of_its_values_and_files(loop):
-    scenario = load_scenario(loop)
-    before = scenario_digest(scenario)
-    assert scenario_digest(load_scenario(loop)) == before
-    assert scenario_digest(replace(scenario, warmup_s=scenario.warmup_s + 1)) != before
-    (loop / "loop.net.xml").write_bytes((loop / "loop.net.xml").read_bytes() + b"\n")
-    assert scenario_digest(load_scenario(loop)) != before
