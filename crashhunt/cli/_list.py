@@ -29,6 +29,7 @@ _KINDS: dict[str, Callable[[], list[ListingEntry]]] = {
     "disturbances": lambda: report.list_registered("disturbances"),
     "observations": lambda: report.list_observations(),
     "oracles": lambda: report.list_registered("oracles"),
+    "requirements": lambda: report.list_requirements(),
     "scenarios": lambda: report.list_scenarios(),
 }
 """Kinds of things that can be listed, each with a function that returns its entries."""

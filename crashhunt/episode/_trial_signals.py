@@ -13,7 +13,14 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import UnusableValueError
 from crashhunt.base.scalars import number_of
 from crashhunt.base.text import did_you_mean, listed
-from crashhunt.simulators import HasMap, NamesObservations, ReportsEvents, ReportsNearestAhead, ReportsSurroundings
+from crashhunt.simulators import (
+    HasMap,
+    NamesObservations,
+    ReportsEvents,
+    ReportsNearestAhead,
+    ReportsSpeedLimit,
+    ReportsSurroundings,
+)
 from crashhunt.world import EVENT_WORDS, approaches
 
 if TYPE_CHECKING:
@@ -37,6 +44,11 @@ UNITS: Mapping[str, str] = {
     "headway_s": "s",
     "ttc_s": "s",
     "leader_speed": "m/s",
+    "leader_acceleration": "m/s²",
+    "leader_changed": "",
+    "priority_m": "m",
+    "priority_arrival_s": "s",
+    "speed_limit": "m/s",
     "red_light_m": "m",
     "clearance_m": "m",
     "lane": "",
@@ -57,6 +69,13 @@ MEANINGS: Mapping[str, str] = {
     "headway_s": "gap_m at the own speed; infinite without a vehicle ahead, or at a standstill",
     "ttc_s": "time to collision with the vehicle ahead; infinite if the gap grows",
     "leader_speed": "speed of the nearest vehicle ahead; infinite without one",
+    "leader_acceleration": "change of leader_speed since the last step; 0 if the vehicle ahead has just changed",
+    "leader_changed": "whether another vehicle is ahead than before the step; false without one",
+    "priority_m": "to the nearest conflict area in a junction that an actor with the right of way approaches; "
+    "0 inside, infinite without one",
+    "priority_arrival_s": "until an actor with the right of way reaches the conflict area in which the vehicle is; "
+    "infinite outside",
+    "speed_limit": "speed limit of the lane",
     "red_light_m": "to the stop line of the next red light; infinite without one",
     "clearance_m": "between the outlines, to the nearest actor in any direction; infinite beyond 50 m",
     "lane": "number at the end of the lane's name",
@@ -175,6 +194,7 @@ class TrialSignals:
             return {"time_s": UNITS["time_s"]}
         simulator = self._episode.simulator
         lacks = set() if supports(simulator, ReportsSurroundings) else set(_SURROUNDINGS)
+        lacks |= set() if supports(simulator, ReportsSpeedLimit) else {"speed_limit"}
         lacks |= set() if supports(simulator, HasMap) else {"lane", "lane_offset_m"}
         return {name: unit for name, unit in UNITS.items() if name not in lacks}
 
@@ -225,7 +245,10 @@ class TrialSignals:
 
 _MAX_ELEMENTS = 1000
 _NAME = re.compile(r"[A-Za-z_]\w*")
-_SURROUNDINGS = ("gap_m", "headway_s", "ttc_s", "leader_speed", "red_light_m")
+_SURROUNDINGS = (
+    "gap_m", "headway_s", "ttc_s", "leader_speed", "leader_acceleration", "leader_changed", "red_light_m", "priority_m",
+    "priority_arrival_s",
+)  # fmt: skip
 
 
 def _known(value: float | None, name: str) -> float:
@@ -257,7 +280,9 @@ class _SceneReader:
         self._episode, self._agent = episode, agent
         self._step_s = episode.simulator.step_length_s
         self._lanes: Sequence[Lane] | None = None
-        self._ahead_at, self._last_ahead = -1, (math.inf, math.inf)
+        self._ahead_at, self._last_ahead, self._leader = -1, (math.inf, math.inf), ""
+        self._change_at, self._change, self._before = -1, (0.0, False), ("", math.inf)
+        self._priority_at, self._last_priority = -1, (math.inf, math.inf)
 
     def read(self, name: str) -> Read:
         """Return the function that reads a signal."""
@@ -274,6 +299,11 @@ class _SceneReader:
             "headway_s": self._headway,
             "ttc_s": self._time_to_collision,
             "leader_speed": lambda: self._ahead()[1],
+            "leader_acceleration": lambda: self._leader_change()[0],
+            "leader_changed": lambda: self._leader_change()[1],
+            "priority_m": lambda: self._priority()[0],
+            "priority_arrival_s": lambda: self._priority()[1],
+            "speed_limit": self._speed_limit,
             "red_light_m": self._red_light,
             "clearance_m": self._clearance,
             "lane": self._lane_number,
@@ -307,7 +337,35 @@ class _SceneReader:
         if self._ahead_at != self._episode.steps:  # several signals need it in each step
             self._ahead_at, nearest = self._episode.steps, self._nearest("vehicle")
             self._last_ahead = (math.inf, math.inf) if nearest is None else (nearest.gap_m, nearest.speed_mps)
+            self._leader = "" if nearest is None else nearest.actor
         return self._last_ahead
+
+    def _leader_change(self) -> tuple[float, bool]:
+        """Return the acceleration of the vehicle ahead, in m/s², and whether it is another one than before."""
+        if self._change_at != self._episode.steps:
+            (_, speed), (leader, before) = self._ahead(), self._before
+            is_first, is_same = self._change_at < 0, leader == self._leader
+            change = (speed - before) / self._step_s if is_same and self._leader else 0.0
+            self._change = change, not is_same and not is_first and bool(self._leader)
+            self._change_at, self._before = self._episode.steps, (self._leader, speed)
+        return self._change
+
+    def _priority(self) -> tuple[float, float]:
+        """Return the distance to the next conflict area, in m, and the time of arrival of the other actor, in s."""
+        if self._priority_at != self._episode.steps:
+            simulator = self._episode.simulator
+            assert supports(simulator, ReportsSurroundings)
+            crossing = [one for one in simulator.surroundings(self._agent).crossing if one.has_right_of_way]
+            distance_m = min((max(0.0, one.distance_m) for one in crossing), default=math.inf)
+            inside = [one for one in crossing if one.distance_m <= 0 < one.exit_m and one.actor_exit_m > 0]
+            arrival_s = min((_arrival_s(one.actor_distance_m, one.speed_mps) for one in inside), default=math.inf)
+            self._priority_at, self._last_priority = self._episode.steps, (distance_m, arrival_s)
+        return self._last_priority
+
+    def _speed_limit(self) -> float:
+        simulator = self._episode.simulator
+        assert supports(simulator, ReportsSpeedLimit)
+        return simulator.speed_limit(self._agent)
 
     def _headway(self) -> float:
         speed = self._speed()
@@ -352,6 +410,10 @@ class _SceneReader:
         nearest = int(np.argmin(np.hypot(x - x0 - share * along_x, y - y0 - share * along_y)))
         offset = (along_x[nearest] * (y - y0[nearest]) - along_y[nearest] * (x - x0[nearest])) / length[nearest]
         return self._lanes[int(self._pieces[nearest, 0])].id, float(offset)
+
+
+def _arrival_s(distance_m: float, speed_mps: float) -> float:
+    return 0.0 if distance_m <= 0 else distance_m / speed_mps if speed_mps > 0 else math.inf
 
 
 class _Rate:

@@ -275,6 +275,7 @@ SCHEMAS: dict[str, object] = {
         "disturbances?": list[ListingEntry],
         "observations?": list[ListingEntry],
         "oracles?": list[ListingEntry],
+        "requirements?": list[ListingEntry],
         "scenarios?": list[ListingEntry],
     },
     "signals": SignalList,

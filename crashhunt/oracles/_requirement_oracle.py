@@ -9,9 +9,9 @@ from functools import cache
 from typing import TYPE_CHECKING, Annotated
 
 from crashhunt.base.errors import CrashhuntError, FormulaError, UnusableValueError, UsageError
-from crashhunt.base.text import format_time
+from crashhunt.base.text import did_you_mean, format_time
 from crashhunt.oracles._protocol import REQUIREMENT, Finding
-from crashhunt.requirements import Monitor, parse
+from crashhunt.requirements import TRAFFIC_RULES, Monitor, parse
 from crashhunt.trial import MAX_ROBUSTNESS, Argument, Outcome
 from crashhunt.world import Event
 
@@ -162,7 +162,8 @@ def requirement_oracles(texts: Iterable[str], option: str = "--require") -> list
     """Return requirements in the form of oracles, ``requirement:TITLE=FORMULA``.
 
     Args:
-        texts: requirements as ``TITLE=FORMULA``; without a title, a requirement is called ``requirement``.
+        texts: requirements as ``TITLE=FORMULA``, a formula alone, or the name of a traffic rule. A formula alone is called
+            ``requirement``.
         option: the option or key of the texts, for errors.
 
     Raises:
@@ -173,7 +174,10 @@ def requirement_oracles(texts: Iterable[str], option: str = "--require") -> list
     for text in texts:
         match = _TITLE.fullmatch(str(text))
         title, formula = (match[1], match[2]) if match else (REQUIREMENT, str(text))
-        if match is None and title in found:
+        rule = TRAFFIC_RULES.get(formula.strip())
+        if rule is not None:
+            title, formula = title if match else rule.name.replace("-", "_"), rule.formula
+        if match is None and rule is None and title in found:
             title = f"{REQUIREMENT}_{len(found) + 1}"
         if title in found:
             raise UsageError(f"{option}: {title!r} is given twice", fix="give each requirement another name")
@@ -181,6 +185,8 @@ def requirement_oracles(texts: Iterable[str], option: str = "--require") -> list
             parse(formula)
         except FormulaError as error:
             error.where = f"{option} {title}" if match else option
+            if similar := did_you_mean(formula.strip(), TRAFFIC_RULES):
+                error.fix = f"{error.fix}; of the rules of crashhunt list requirements, {similar}"
             raise
         found[title] = " ".join(formula.split())
     return [f"{REQUIREMENT}:{title}={formula}" for title, formula in found.items()]

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         list_actions as list_actions,
         list_observations as list_observations,
         list_registered as list_registered,
+        list_requirements as list_requirements,
         list_scenarios as list_scenarios,
     )
     from ._page import (

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import work_apart
 from crashhunt.base.plugins import is_foreign, locate, registered
+from crashhunt.requirements import TRAFFIC_RULES
 from crashhunt.scenario import ACTIONS, installed_backends, load_scenario, shipped_scenarios
 from crashhunt.simulators import MODIFIERS, PARTS, parse_parts
 from crashhunt.trial import signature_of, without_folder
@@ -132,6 +133,14 @@ def list_actions() -> list[ListingEntry]:
         }
         for name, form in ACTIONS.items()
     ]  # fmt: skip
+
+
+def list_requirements() -> list[ListingEntry]:
+    """Return the traffic rules that ``--require`` accepts by name."""
+    return [
+        {"name": rule.name, "locator": rule.formula, "title": f"{rule.title} Source: {rule.source}", "arguments": []}
+        for rule in TRAFFIC_RULES.values()
+    ]
 
 
 def list_observations() -> list[ListingEntry]:

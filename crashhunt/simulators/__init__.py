@@ -74,6 +74,7 @@ if TYPE_CHECKING:
         ReportsEvents as ReportsEvents,
         ReportsNearestAhead as ReportsNearestAhead,
         ReportsNotices as ReportsNotices,
+        ReportsSpeedLimit as ReportsSpeedLimit,
         ReportsSurroundings as ReportsSurroundings,
         ReportsTruncation as ReportsTruncation,
         RestoresObservations as RestoresObservations,

@@ -104,10 +104,10 @@ class Simulator(Protocol):
 
     Each optional capability is its own protocol: `ReportsNotices`, `FlattensObservations`, `RestoresObservations`,
     `ObservesParts`, `NamesObservations`, `ReportsEvents`, `MasksActions`, `HasMap`, `HasWindow`,
-    `SupportsFullBraking`, `ReportsSurroundings`, `ReportsNearestAhead`, `SupportsDisturbances`, `SupportsHolds`,
-    `SupportsExclusion`, `SupportsScripts`, `SupportsReseeding`, `CountsSetUp`, `RunsForeignCode`, `RestoresState`
-    and `PreparesProcess`. A simulator supports a protocol if it has the methods and attributes of the protocol.
-    Registration is not needed.
+    `SupportsFullBraking`, `ReportsSurroundings`, `ReportsNearestAhead`, `ReportsSpeedLimit`, `SupportsDisturbances`,
+    `SupportsHolds`, `SupportsExclusion`, `SupportsScripts`, `SupportsReseeding`, `CountsSetUp`, `RunsForeignCode`,
+    `RestoresState` and `PreparesProcess`. A simulator supports a protocol if it has the methods and attributes of the
+    protocol. Registration is not needed.
     """
 
     @property
@@ -343,6 +343,17 @@ class ReportsNearestAhead(Protocol):
         """
 
 
+class ReportsSpeedLimit(Protocol):
+    """A simulator that reports the speed limit of the lane of an agent's vehicle."""
+
+    def speed_limit(self, agent: str) -> float:
+        """Return the speed limit after the last step, in m/s.
+
+        Args:
+            agent: as in `ReportsSurroundings.surroundings`.
+        """
+
+
 class TranslatesMotion(Protocol):
     """A simulator that translates actions of acceleration and steering into speeds and lane changes.
 
@@ -565,6 +576,7 @@ FACULTIES: tuple[type, ...] = (
     SupportsFullBraking,
     ReportsSurroundings,
     ReportsNearestAhead,
+    ReportsSpeedLimit,
     SupportsDisturbances,
     SupportsHolds,
     SupportsExclusion,

@@ -365,6 +365,11 @@ class SumoSimulator:
         self.scene()  # brings SUMO to the current step
         return nearest_ahead_of(agent, kind)
 
+    def speed_limit(self, agent: str) -> float:
+        """Return the speed limit of the vehicle's lane, which can differ from that of the network file."""
+        self.scene()
+        return float(libsumo.lane.getMaxSpeed(libsumo.vehicle.getLaneID(agent)))
+
     def resolve_target(self, disturbance: Disturbance) -> str:
         """Return the actor that a disturbance names by a place, such as ``ahead``; empty if there is none."""
         return self._disturbances.resolve_target(disturbance, self.scene())

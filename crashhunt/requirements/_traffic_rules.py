@@ -1,0 +1,79 @@
+"""Traffic rules as ready requirements, each with its source.
+
+Sources: S. Maierhofer, A.-K. Rettinger, E. C. Mayer and M. Althoff, "Formalization of Interstate Traffic Rules in
+Temporal Logic", IV 2020 (rules R_G1 to R_G3 and R_I1); S. Maierhofer, P. Moosbrugger and M. Althoff, "Formalization of
+Intersection Traffic Rules in Temporal Logic", IV 2022 (traffic lights and priority). The formulas follow the structure
+of these rules with the signals of crashhunt. Where a rule was changed, its entry says how.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+_INTERSTATE, _INTERSECTION = "Maierhofer et al. 2020", "Maierhofer et al. 2022"
+
+# The gap in which both vehicles brake with 10 m/s², the rear one after 0.3 s.
+_SAFE = "gap_m >= (speed * speed - leader_speed * leader_speed) / 20 + 0.3 * speed"
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficRule:
+    """A requirement that ``--require`` accepts by name.
+
+    Args:
+        name: name for ``--require``.
+        title: what the rule requires, in a sentence.
+        source: publication and rule, and how the formula differs from it.
+        formula: formula of the requirement.
+    """
+
+    name: str
+    title: str
+    source: str
+    formula: str
+
+
+TRAFFIC_RULES = {
+    rule.name: rule
+    for rule in (
+        TrafficRule(
+            "safe-distance",
+            "Keep the distance in which both vehicles can stop, except for 3 s after the vehicle ahead has changed.",
+            f"{_INTERSTATE}, R_G1: deceleration 10 m/s², reaction time 0.3 s. A lane change of ego counts as a cut-in.",
+            f"always (once[0:3] leader_changed or {_SAFE})",
+        ),
+        TrafficRule(
+            "unnecessary-braking",
+            "Do not brake harder than 2 m/s² without a reason.",
+            f"{_INTERSTATE}, R_G2: a vehicle ahead that is too near or brakes, too. Added: a red light, and priority.",
+            f"always (acceleration < -2 -> not ({_SAFE}) or acceleration - leader_acceleration >= -2 "
+            "or red_light_m < 100 or priority_m < 100)",
+        ),
+        TrafficRule(
+            "maximum-speed",
+            "Do not drive faster than the speed limit of the lane.",
+            f"{_INTERSTATE}, R_G3: the limit of the lane only. A tolerance of 0.01 m/s is added.",
+            "always (speed <= speed_limit + 0.01)",
+        ),
+        TrafficRule(
+            "no-stopping",
+            "Do not stop without a reason.",
+            f"{_INTERSTATE}, R_I1: a slow vehicle ahead. Added: a red light, priority of others, a start at rest.",
+            "always (once (speed > 1) and speed < 0.1 -> (gap_m < 20 and leader_speed < 5) or red_light_m < 20 "
+            "or priority_m < 20)",
+        ),
+        TrafficRule(
+            "right-of-way",
+            "Do not be in the path of an actor with the right of way that arrives within 1 s.",
+            f"{_INTERSECTION}, priority: the arrival within a time replaces the braking of the other actor.",
+            "always (priority_arrival_s > 1)",
+        ),
+        TrafficRule(
+            "red-light",
+            "Do not pass the stop line while the light is red.",
+            f"{_INTERSECTION}, traffic lights: the event red_light of crashhunt.",
+            "always (not red_light)",
+        ),
+    )
+}
+"""The rules by name."""
