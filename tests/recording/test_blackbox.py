@@ -225,7 +225,9 @@ def test_a_copy_of_the_process_writes_to_nowhere(box, tmp_path):
 def test_what_is_too_short_or_of_others_has_no_header(tmp_path):
     path = tmp_path / "box"
     assert read_header(path) is None
-    for content in (b"", b"CRASHBB1", b"CRASHBB1" + bytes(30), b"CRASHBB2" + bytes(80)):
+    with pytest.raises(BundleError):
+        list(read_black_box(path))
+    for content in (b"", b"CRASHBB1", b"CRASHBB1" + bytes(30), b"CRASHBB2" + bytes(80), b"x" * 200):
         path.write_bytes(content)
         assert read_header(path) is None
         with pytest.raises(BundleError, match="left no recording"):

@@ -111,12 +111,7 @@ def test_a_speed_that_no_one_knows_is_no_difference(tmp_path):
     assert (found.step, found.field) == (5, "scene.contacts")
 
 
-def test_what_is_no_black_box_is_refused(tmp_path):
-    with pytest.raises(BundleError):
-        list(read_black_box(tmp_path / "missing"))
-    (tmp_path / "other").write_bytes(b"x" * 200)
-    with pytest.raises(BundleError):
-        list(read_black_box(tmp_path / "other"))
+def test_recording_without_records_is_refused():
     with pytest.raises(BundleError, match="no beginning"):
         Recording(())
 

@@ -16,7 +16,6 @@ from crashhunt.sumo.maps._picture import (
     _draw_scale,
     _midpoint,
     draw_map,
-    drawable,
 )
 from crashhunt.sumo.maps._road_network import Edge, NetworkLane, RoadNetwork
 from crashhunt.sumo.maps._traffic_flow import PlainRun
@@ -285,11 +284,3 @@ def test_labels_stay_apart_in_every_direction(place, labels):
     calls = []
     _draw_labels(Drawing(calls), RoadNetwork(edges=roads), [("a", 9.0), ("b", 9.0)], lambda point: point, (900, 900))
     assert len([call for call in calls if call[0] == "text"]) == labels
-
-
-def test_text_without_half_of_its_letters_is_empty():
-    pytest.importorskip("PIL")
-    assert drawable("Øst") == "Ost"
-    assert drawable("東京 a") == " a"
-    assert drawable("東京都 a") == ""
-    assert drawable("") == ""
