@@ -166,7 +166,7 @@ def _offer_extra(error: CrashhuntError, words: Sequence[str]) -> None:
     import subprocess
 
     if subprocess.run(command, check=False).returncode == 0:
-        os.execv(sys.executable, [sys.executable, "-m", "crashhunt", *words])
+        os.execv(sys.executable, [sys.executable, "-P", "-m", "crashhunt", *words])
 
 
 def _check_folder() -> None:

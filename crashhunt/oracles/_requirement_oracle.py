@@ -162,8 +162,8 @@ def requirement_oracles(texts: Iterable[str], option: str = "--require") -> list
     """Return requirements in the form of oracles, ``requirement:TITLE=FORMULA``.
 
     Args:
-        texts: requirements as ``TITLE=FORMULA``, a formula alone, or the name of a traffic rule. A formula alone is called
-            ``requirement``.
+        texts: requirements as ``TITLE=FORMULA``, a formula alone (which is called ``requirement``), or the name of a
+            traffic rule.
         option: the option or key of the texts, for errors.
 
     Raises:

@@ -37,42 +37,56 @@ TRAFFIC_RULES = {
     rule.name: rule
     for rule in (
         TrafficRule(
-            "safe-distance",
-            "Keep the distance in which both vehicles can stop, except for 3 s after the vehicle ahead has changed.",
-            f"{_INTERSTATE}, R_G1: deceleration 10 m/s², reaction time 0.3 s. A lane change of ego counts as a cut-in.",
-            f"always (once[0:3] leader_changed or {_SAFE})",
+            name="safe-distance",
+            title=(
+                "Keep the distance in which both vehicles can stop, except for 3 s after the vehicle ahead has changed."
+            ),
+            source=(
+                f"{_INTERSTATE}, R_G1: deceleration 10 m/s², reaction time 0.3 s. A lane change of ego "
+                "counts as a cut-in."
+            ),
+            formula=f"always (once[0:3] leader_changed or {_SAFE})",
         ),
         TrafficRule(
-            "unnecessary-braking",
-            "Do not brake harder than 2 m/s² without a reason.",
-            f"{_INTERSTATE}, R_G2: a vehicle ahead that is too near or brakes, too. Added: a red light, and priority.",
-            f"always (acceleration < -2 -> not ({_SAFE}) or acceleration - leader_acceleration >= -2 "
-            "or red_light_m < 100 or priority_m < 100)",
+            name="unnecessary-braking",
+            title="Do not brake harder than 2 m/s² without a reason.",
+            source=(
+                f"{_INTERSTATE}, R_G2: a vehicle ahead that is too near or brakes, too. Added: a red light, "
+                "and priority."
+            ),
+            formula=(
+                f"always (acceleration < -2 -> not ({_SAFE}) or acceleration - leader_acceleration >= -2 "
+                "or red_light_m < 100 or priority_m < 100)"
+            ),
         ),
         TrafficRule(
-            "maximum-speed",
-            "Do not drive faster than the speed limit of the lane.",
-            f"{_INTERSTATE}, R_G3: the limit of the lane only. A tolerance of 0.01 m/s is added.",
-            "always (speed <= speed_limit + 0.01)",
+            name="maximum-speed",
+            title="Do not drive faster than the speed limit of the lane.",
+            source=f"{_INTERSTATE}, R_G3: the limit of the lane only. A tolerance of 0.01 m/s is added.",
+            formula="always (speed <= speed_limit + 0.01)",
         ),
         TrafficRule(
-            "no-stopping",
-            "Do not stop without a reason.",
-            f"{_INTERSTATE}, R_I1: a slow vehicle ahead. Added: a red light, priority of others, a start at rest.",
-            "always (once (speed > 1) and speed < 0.1 -> (gap_m < 20 and leader_speed < 5) or red_light_m < 20 "
-            "or priority_m < 20)",
+            name="no-stopping",
+            title="Do not stop without a reason.",
+            source=(
+                f"{_INTERSTATE}, R_I1: a slow vehicle ahead. Added: a red light, priority of others, a start at rest."
+            ),
+            formula=(
+                "always (once (speed > 1) and speed < 0.1 -> (gap_m < 20 and leader_speed < 5) or red_light_m < 20 "
+                "or priority_m < 20)"
+            ),
         ),
         TrafficRule(
-            "right-of-way",
-            "Do not be in the path of an actor with the right of way that arrives within 1 s.",
-            f"{_INTERSECTION}, priority: the arrival within a time replaces the braking of the other actor.",
-            "always (priority_arrival_s > 1)",
+            name="right-of-way",
+            title="Do not be in the path of an actor with the right of way that arrives within 1 s.",
+            source=f"{_INTERSECTION}, priority: the arrival within a time replaces the braking of the other actor.",
+            formula="always (priority_arrival_s > 1)",
         ),
         TrafficRule(
-            "red-light",
-            "Do not pass the stop line while the light is red.",
-            f"{_INTERSECTION}, traffic lights: the event red_light of crashhunt.",
-            "always (not red_light)",
+            name="red-light",
+            title="Do not pass the stop line while the light is red.",
+            source=f"{_INTERSECTION}, traffic lights: the event red_light of crashhunt.",
+            formula="always (not red_light)",
         ),
     )
 }

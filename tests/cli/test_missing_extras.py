@@ -42,7 +42,7 @@ def answered(monkeypatch):
 def test_extra_is_installed_on_request_and_the_command_runs_again(answered):
     install = shlex.split(install_command("video"))
     assert answered("y\n", "replay", "h", "--gif", "a.gif") == [
-        install, ["-m", "crashhunt", "replay", "h", "--gif", "a.gif"]
+        install, ["-P", "-m", "crashhunt", "replay", "h", "--gif", "a.gif"]
     ]  # fmt: skip
     assert answered("\n", "replay", "h") == []
     assert answered("", "replay", "h") == []  # the end of the input

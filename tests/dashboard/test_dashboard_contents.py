@@ -223,7 +223,7 @@ def bundle(name="000003-collision", outcome=Outcome.COLLISION, *, x=1.234, y=-5.
     )  # fmt: skip
     return SimpleNamespace(
         id=name, result=result, is_near_miss=outcome.category == "no crash", confirmed=True, why_unconfirmed="",
-        path=Path("/hunts/one/crashes") / name, **more,
+        path=Path("/hunts/one/crashes") / name, added={}, **more,
     )  # fmt: skip
 
 

@@ -57,7 +57,7 @@ def test_copy_of_a_scenario_is_refused_with_the_fix(shell):
 
 def test_list_without_a_kind_names_the_entries_of_every_kind(shell):
     found = shell.crashhunt("list", "--json").json
-    assert [*found] == ["actions", "agents", "disturbances", "observations", "oracles", "scenarios"]
+    assert [*found] == ["actions", "agents", "disturbances", "observations", "oracles", "requirements", "scenarios"]
     *lines, more = shell.crashhunt("list").out.splitlines()
     assert lines == [f"{kind}: {', '.join(entry['name'] for entry in entries)}" for kind, entries in found.items()]
     assert "crashhunt list agents" in more

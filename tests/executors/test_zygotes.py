@@ -212,7 +212,9 @@ def test_traffic_that_cannot_be_forked_is_reported_once(warm, copies):
 def zygote(monkeypatch, tmp_path):
     """A zygote whose trials are forks that have ended; `supervisor` is the other end of its connection."""
     ours, theirs = socket.socketpair()
-    settings = SimpleNamespace(warm_copies=0, scratch=tmp_path, scenario=SimpleNamespace(agents={}), reuses=())
+    settings = SimpleNamespace(
+        warm_copies=0, scratch=tmp_path, scenario=SimpleNamespace(agents={}), reuses=(), argument_files=()
+    )
     trial = SimpleNamespace(
         make_simulator=lambda: "simulator", record_shared_state=lambda control: "", run=lambda job: leave("trial")
     )

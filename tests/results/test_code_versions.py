@@ -221,8 +221,10 @@ def test_other_time_limit_is_refused_where_earlier_trials_would_end_otherwise(ag
     run(4, timeout_s=4)  # which changes nothing
     with closing(Ledger(tmp_path / "h" / "ledger.sqlite", writable=True)) as ledger:
         snapshot = ledger.snapshot_of(0)
-        for number, outcome in ((0, Outcome.HANG), (1, Outcome.SURVIVED)):
-            ledger.record(replace(ledger.result(number), outcome=outcome, wall_s=3.0), snapshot=snapshot)
+        for number, outcome, wall_s in (
+            (0, Outcome.HANG, 3.0), (1, Outcome.SURVIVED, 3.0), (2, Outcome.SURVIVED, 0.1), (3, Outcome.SURVIVED, 0.1),
+        ):  # fmt: skip
+            ledger.record(replace(ledger.result(number), outcome=outcome, wall_s=wall_s), snapshot=snapshot)
     with pytest.raises(HuntDirectoryError, match=f"--timeout was 4 and is now {timeout_s}, but {says}") as caught:
         run(5, timeout_s=timeout_s)
     assert caught.value.fix == "give --timeout 4, or a new directory"
