@@ -35,6 +35,10 @@ def add_init(commands: Commands) -> None:
     maps = init.add_argument_group("the map (exactly one)").add_mutually_exclusive_group(required=True)
     maps.add_argument("--osm", metavar="FILE", type=Path, help="a map of OpenStreetMap: .osm, .osm.gz or .pbf")
     maps.add_argument("--opendrive", metavar="FILE", type=Path, help="an OpenDRIVE map: .xodr")
+    maps.add_argument(
+        "--xosc", metavar="FILE", type=Path,
+        help="instead of a map: the parameters of an OpenSCENARIO file of a test case of UN R157 (.xosc)",
+    )  # fmt: skip
     maps.add_argument("--net", metavar="FILE", type=Path, help="a network of SUMO: .net.xml or .net.xml.gz")
     maps.add_argument("--grid", metavar="NxM", default="", help="a generated grid of N by M junctions, such as 4x4")
     maps.add_argument("--spider", metavar="NxM", default="", help="a generated web of N arms and M rings, such as 5x3")
@@ -64,6 +68,8 @@ def add_init(commands: Commands) -> None:
 
 
 def _init(options: argparse.Namespace, _words: list[str]) -> int:
+    if options.xosc is not None:
+        return _init_from_parameters(options)
     from crashhunt.sumo.maps import MapOptions, describe_place, make_scenario, parse_bbox
 
     asked = MapOptions(
@@ -93,6 +99,31 @@ def _init(options: argparse.Namespace, _words: list[str]) -> int:
         tell("")
     lines = [f"made {command_line(options.directory)}", "", *describe_place(made), "", "Next:"]
     say("\n".join([*lines, *(f"  {command}" for command in made.commands)]), as_json=options.json)
+    if options.json:
+        print(json.dumps(made.to_json()))
+    return DONE
+
+
+def _init_from_parameters(options: argparse.Namespace) -> int:
+    """Make a scenario from an OpenSCENARIO file."""
+    from crashhunt.formats import scenario_from_openscenario
+
+    given = {"--bbox": options.bbox, "--agent": options.agent, "--workflow": options.workflow or None}
+    for flag, value in given.items():
+        if value is not None:
+            raise UsageError(f"{flag} cannot be used with --xosc", fix=f"omit {flag}")
+    made = scenario_from_openscenario(options.xosc, options.directory)
+    read = [f"  {name}: {words}" for name, words in made.read.items()]
+    left = [f"  {words}" for words in made.not_read]
+    run = command_line("crashhunt", "run", "hunt", "2", "100", "400", "--scenario", options.directory)
+    lines = [
+        f"made {command_line(options.directory)}, a variant of {made.scenario}", "",
+        "Read:", *read, *(["Not read:", *left] if left else []), "",
+        "The storyboard of the file is not run: the other road users move as in the scenario of crashhunt.",
+        "All other arguments of the scenario keep their values.", "",
+        "Next:", f"  {run}",
+    ]  # fmt: skip
+    say("\n".join(lines), as_json=options.json)
     if options.json:
         print(json.dumps(made.to_json()))
     return DONE

@@ -232,7 +232,7 @@ _REPLAY = {"**": ReplayReport, "divergence": (_DIVERGENCE, None), "table?": list
 
 SCHEMAS: dict[str, object] = {
     "run": _RUN,
-    "init": _INIT,
+    "init": (_INIT, {"dir": str, "scenario": str, "read": dict[str, str], "not_read": list[str]}),
     "replay": ({**_REPLAY, "written?": dict[str, int]}, {"crashes": [_REPLAY], "written": dict[str, int]}),
     "show": _SHOW,
     "report": {"file": str, "bytes": int, **_LISTED_CRASHES},

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from libsumo import _libsumo as sumo
 
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.sumo._options import MANOEUVRE_ARGUMENTS
+from crashhunt.sumo._options import arguments_of
 from crashhunt.world import START_M, ActorState, Path, Paths, actor_of_manoeuvre, manoeuvre_motions
 
 if TYPE_CHECKING:
@@ -31,15 +31,21 @@ def manoeuvre_paths(manoeuvre: str, agent: str, arguments: Mapping[str, Value], 
     """Return the paths of all vehicles of a manoeuvre, with the controlled vehicle at its start.
 
     Args:
-        manoeuvre: a key of `MANOEUVRE_ARGUMENTS`.
+        manoeuvre: as in the table of the scenario.
         agent: identifier of the controlled vehicle.
-        arguments: the arguments of the scenario, as in `MANOEUVRE_ARGUMENTS`.
+        arguments: the arguments of the scenario, as in `arguments_of`.
         step_s: step length, in s.
 
     Raises:
         InvalidEpisodeError: an argument is out of its range.
     """
-    values = {name: _number(name, arguments[name]) for name in MANOEUVRE_ARGUMENTS[manoeuvre]}
+    names = arguments_of(manoeuvre, arguments)
+    values = {name: _number(name, arguments[name]) for name in names}
+    if values.get("slower_kmh", 0.0) > values["ego_kmh"]:
+        raise InvalidEpisodeError(
+            f"slower_kmh is {values['slower_kmh']:g} (allowed: 0 to ego_kmh, {values['ego_kmh']:g})",
+            fix="give a smaller value",
+        )
     lanes = sorted(str(lane) for lane in sumo.lane_getIDList() if not str(lane).startswith(":"))
     if len(lanes) != 2:
         raise InvalidEpisodeError(f"the network has {len(lanes)} lanes, and a manoeuvre needs 2")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Container, Iterator, Mapping
 
 
 DEFAULT_OPTIONS = {"time-to-teleport": "-1"}  # otherwise a jam removes vehicles; a scenario may want just that
@@ -263,7 +263,7 @@ class SumoSetup:
     manoeuvre: Manoeuvre | None = None
 
 
-MANOEUVRE_ARGUMENTS: Mapping[str, tuple[str, ...]] = {
+_MANOEUVRE_ARGUMENTS: Mapping[str, tuple[str, ...]] = {
     "cut_in": ("ego_kmh", "other_kmh", "gap_m", "lateral_mps", "side"),
     "cut_out": ("ego_kmh", "front_m", "lateral_mps", "headway_s", "side"),
     "deceleration": ("ego_kmh", "decel_mps2", "headway_s"),
@@ -274,4 +274,16 @@ MANOEUVRE_ARGUMENTS: Mapping[str, tuple[str, ...]] = {
     "pedestrian": ("ego_kmh", "distance_m", "walk_kmh", "impact_m", "from_side"),
     "detection_range": ("ego_kmh", "seen_m", "distance_m", "offset_m"),
 }
-"""The arguments that a scenario with a manoeuvre must have."""
+
+
+def arguments_of(manoeuvre: str, given: Container[str]) -> tuple[str, ...]:
+    """Return the arguments that a scenario with a manoeuvre must have.
+
+    Args:
+        manoeuvre: name of the manoeuvre.
+        given: the arguments that the scenario has. A cut-in may have ``slower_kmh`` instead of ``other_kmh``.
+    """
+    names = _MANOEUVRE_ARGUMENTS[manoeuvre]
+    if "slower_kmh" in given:
+        names = tuple("slower_kmh" if name == "other_kmh" else name for name in names)
+    return names

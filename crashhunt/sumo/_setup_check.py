@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.scenario import refuse
 from crashhunt.sumo._files import read_xml
-from crashhunt.sumo._options import MANOEUVRE_ARGUMENTS, RESERVED, SumoSetup, canonical, is_true
+from crashhunt.sumo._options import RESERVED, SumoSetup, arguments_of, canonical, is_true
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,7 +35,7 @@ def check(scenario: Scenario, where: str) -> None:
             if name not in scenario.arguments:
                 message = f"has no {name!r}, which {file} asks for"
                 refuse(where, "arguments", sorted(scenario.arguments), message, "declare it")
-    for name in MANOEUVRE_ARGUMENTS[sumo.manoeuvre] if sumo.manoeuvre else ():
+    for name in arguments_of(sumo.manoeuvre, scenario.arguments) if sumo.manoeuvre else ():
         if name not in scenario.arguments:
             message = f"has no {name!r}, which the manoeuvre {sumo.manoeuvre!r} needs"
             refuse(where, "arguments", sorted(scenario.arguments), message, "declare it")

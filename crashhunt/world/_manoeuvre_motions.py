@@ -76,8 +76,12 @@ def manoeuvre_motions(
 def _cut_in(
     values: Mapping[str, float], speed: float, own_y: float, next_y: float, step_s: float
 ) -> Iterator[dict[str, ActorState]]:
-    """Yield states of a vehicle that cuts in; `gap_m` is the gap when its lateral speed is full."""
-    full, other_speed = values["lateral_mps"], values["other_kmh"] / _KMH
+    """Yield states of a vehicle that cuts in; `gap_m` is the gap when its lateral speed is full.
+
+    The vehicle has an absolute speed, or is slower by a difference.
+    """
+    full = values["lateral_mps"]
+    other_speed = values["other_kmh"] / _KMH if "other_kmh" in values else speed - values["slower_kmh"] / _KMH
     run_up = math.ceil(full / _LATERAL_RATE_MPS2 / step_s - _ROUNDING)
     ramp = [min(full, _LATERAL_RATE_MPS2 * step_s * (number + 1)) for number in range(run_up)]
     towards = math.copysign(1.0, own_y - next_y)
