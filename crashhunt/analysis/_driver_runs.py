@@ -140,7 +140,7 @@ def _applies(rerun: Rerun) -> tuple[str, bool]:
     if not contact.same_way:
         return "the two vehicles did not drive in the same direction", False
     if contact.follower == hit.other:
-        return f"{hit.other} drove into {hit.agent} from behind", False
+        return f"{hit.other} drove into the back of {hit.agent}", False
     changers = contact.lane_changers(_CHANGE_S)
     if hit.agent in changers:
         return f"{hit.agent} changed lanes, and the models do not decide about lanes", False

@@ -128,7 +128,7 @@ def find_escape(
     if braking is None:
         return Escape(why_not=f"the simulator does not say how {hit.agent} brakes")
     if _is_from_behind(recording, hit):
-        return Escape(why_not=f"{hit.other} drove into {hit.agent} from behind")
+        return Escape(why_not=f"{hit.other} drove into the back of {hit.agent}")
     search = _Search(result=result, recording=recording, braking=braking, run=run)
     found = search.last()
     if found is None:

@@ -194,7 +194,7 @@ def _why_no_estimate(settings: HuntSettings, facts: Facts, sequence: UnitSequenc
     if not run.keep_going:
         return "the hunt stops at its first crash, so crashes by trials would be too high; run with --keep-going"
     if run.distinct:
-        return f"the hunt stops at {run.distinct} kinds of crashes, so crashes by trials would be too high"
+        return f"the hunt stops at {run.distinct} crash types, so crashes by trials would be too high"
     if not settings.trials:
         return "the number of trials was not fixed ahead"
     if facts.get("replanned"):

@@ -251,7 +251,7 @@ def test_vehicle_hit_from_the_side_has_an_answer_and_one_hit_from_behind_the_rea
         scene.speeds.reverse()
     world.runs.clear()
     found = find_escape(dataclasses.replace(result, collision=victim), recording, FullBraking(None, "", 8.0), world.run)
-    assert found == Escape(why_not="other drove into ego from behind")
+    assert found == Escape(why_not="other drove into the back of ego")
     assert world.runs == []
 
 

@@ -271,7 +271,7 @@ def test_a_hunt_without_a_last_trial_that_was_to_stop_at_kinds_has_no_crash_rate
     path = stopped / "hunt.toml"
     path.write_text(path.read_text().replace("trials = 40", "trials = 0"))
     figures = crashhunt.compare(stopped, hunt(tmp_path / "plain", 12)).hunts[0]
-    assert "the hunt stops at 2 kinds of crashes" in figures.why_not
+    assert "the hunt stops at 2 crash types" in figures.why_not
     assert math.isnan(figures.crash_rate)
     assert figures.interval is not None
 

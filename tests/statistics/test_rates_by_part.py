@@ -132,7 +132,7 @@ def test_every_unit_of_a_rate_is_measured_by_default(tmp_path):
     ("given", "why"),
     [
         ({"keep_going": False}, "the hunt stops at its first crash"),
-        ({"distinct": 3}, "the hunt stops at 3 kinds of crashes"),
+        ({"distinct": 3}, "the hunt stops at 3 crash types"),
         ({"seeds": 8}, ""),
     ],
     ids=str,
