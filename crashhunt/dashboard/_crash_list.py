@@ -311,8 +311,10 @@ def _commands(hunt: Path, crash: str, bundle: Bundle) -> list[list[str]]:
     words = {
         "show": ["show", str(hunt), "--crash", crash],
         "replay": ["replay", str(hunt), "--crash", crash],
+        "replay with your present code": ["replay", str(hunt), "--crash", crash, "--code", "current"],
         **({} if near else {"judge": ["judge", str(hunt), "--crash", crash]}),
         **({} if not may_shrink else {"minimize": ["shrink", str(hunt), "--crash", crash]}),
+        "note": ["note", str(hunt), "--crash", crash, "TEXT"],
         "export": ["export", str(hunt), f"{crash}.zip", "--crash", crash],
         **({} if near else {"add to corpus": ["corpus", "add", str(bundle.path), "--to", "corpus"]}),
     }

@@ -264,6 +264,8 @@ def test_commands_of_a_crash_are_those_that_suit_it():
     assert usual == {
         "show": "crashhunt show '/my hunts/one' --crash c", "replay": "crashhunt replay '/my hunts/one' --crash c",
         "judge": "crashhunt judge '/my hunts/one' --crash c", "minimize": "crashhunt shrink '/my hunts/one' --crash c",
+        "replay with your present code": "crashhunt replay '/my hunts/one' --crash c --code current",
+        "note": "crashhunt note '/my hunts/one' --crash c TEXT",
         "export": "crashhunt export '/my hunts/one' c.zip --crash c",
         "add to corpus": "crashhunt corpus add /hunts/one/crashes/000003-collision --to corpus",
     }  # fmt: skip

@@ -402,7 +402,16 @@ def test_page_of_a_crash_has_the_data_of_its_bundle(tmp_path, monkeypatch):
     monkeypatch.setattr(_crashes, "player_data", lambda found, told: {"player": (found, told)})
     found = made.detail(folder.name)
     commands = found.pop("commands")
-    assert [name for name, _ in commands] == ["show", "replay", "judge", "minimize", "export", "add to corpus"]
+    assert [name for name, _ in commands] == [
+        "show",
+        "replay",
+        "replay with your present code",
+        "judge",
+        "minimize",
+        "note",
+        "export",
+        "add to corpus",
+    ]
     assert found == {
         "player": (bundle, story), "near_miss": False, "minimized": "", "minimized_from": "",
         "parameters": {"ego": {"speed": 2}}, "scenario_parameters": {"cars": 3}, "judged": None,
