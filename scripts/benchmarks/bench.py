@@ -238,6 +238,33 @@ def bench_observation() -> Iterator[Figure]:
         note = f"{parts}; whole {found['whole']:.0f} µs, bare {found['bare']:.0f} µs"
         name = f"observation_ratio_{parts.count(',') + 1}_parts"
         yield Figure(name=name, value=found["ratio"], unit="x", better="lower", target=target, note=note)
+    found = in_child("child_lidar")
+    yield Figure(
+        name="observation_lidar2d", value=found["whole"], unit="ms", better="lower", target=0.15,
+        note="360 rays, 35 actors within 100 m, without the compiled core",
+    )  # fmt: skip
+
+
+def child_lidar() -> dict[str, float]:
+    """The part lidar2d: the actors near ego, and the rays to their outlines."""
+    import numpy as np
+
+    from crashhunt.simulators import RayCaster, nearest_actors
+    from crashhunt.world import Actor, Roster, Scene
+
+    draw = np.random.default_rng(1)
+    roster = Roster(tuple(Actor(str(number), "passenger", 4.5, 1.8) for number in range(36)))
+    points = [(0.0, 0.0), *map(tuple, draw.uniform(-65.0, 65.0, (35, 2)).tolist())]
+    scene = Scene(0.0, roster, points, draw.uniform(-3.0, 3.0, 36).tolist(), [5.0] * 36)
+    caster = RayCaster(360, 100.0)
+    spent = []
+    for _ in range(20):
+        began = time.process_time()
+        for _ in range(50):
+            near = nearest_actors(scene, 0, hidden=frozenset(), radius=104.5)
+            caster.cast(scene, 0, [one.row for one in near])
+        spent.append((time.process_time() - began) / 50)
+    return {"whole": 1e3 * min(spent)}
 
 
 TEN_NODES = "always (speed > 8 -> eventually[0:2] (headway_s >= 0.8))"
