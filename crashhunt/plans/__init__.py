@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
+    from ._argument_owners import Owners as Owners, Takes as Takes, agent_of as agent_of, takes_of as takes_of
     from ._code import (
         CodeFacts as CodeFacts,
         describe_code as describe_code,
@@ -12,12 +13,17 @@ if TYPE_CHECKING:
         reused_agents as reused_agents,
     )
     from ._declaration import Given as Given, HuntOption as HuntOption
-    from ._durations import check_duration as check_duration, seconds_of as seconds_of
+    from ._durations_and_rates import (
+        RATE_PERS as RATE_PERS,
+        RatePer as RatePer,
+        check_duration as check_duration,
+        check_rate as check_rate,
+        rate_of as rate_of,
+        seconds_of as seconds_of,
+        share_of as share_of,
+    )
     from ._plan import (
         FIXED as FIXED,
-        Owners as Owners,
-        Takes as Takes,
-        agent_of as agent_of,
         core_of as core_of,
         disturber as disturber,
         disturber_apart as disturber_apart,
@@ -27,7 +33,6 @@ if TYPE_CHECKING:
         plan as plan,
         plan_with_code as plan_with_code,
         sampler_of as sampler_of,
-        takes_of as takes_of,
         with_recorded_load_order as with_recorded_load_order,
         with_settings as with_settings,
     )
@@ -53,13 +58,6 @@ if TYPE_CHECKING:
         request_of as request_of,
         spec_words as spec_words,
         write_settings as write_settings,
-    )
-    from ._shares_and_rates import (
-        RATE_PERS as RATE_PERS,
-        RatePer as RatePer,
-        check_rate as check_rate,
-        rate_of as rate_of,
-        share_of as share_of,
     )
 
 offer_lazily(__name__)

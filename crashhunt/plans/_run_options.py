@@ -26,8 +26,7 @@ from crashhunt.plans._declaration import (
     option,
     within,
 )
-from crashhunt.plans._durations import check_duration, check_probe
-from crashhunt.plans._shares_and_rates import check_rate, check_share
+from crashhunt.plans._durations_and_rates import check_duration, check_probe, check_rate, check_share
 from crashhunt.trial import CRASHES
 
 Spec = str | int | float | bool

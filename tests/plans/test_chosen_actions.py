@@ -6,8 +6,7 @@ import pytest
 
 from crashhunt.base.errors import UsageError
 from crashhunt.plans import Request, plan, with_settings
-from crashhunt.plans._chosen_actions import chosen_actions, notes_on_actions
-from crashhunt.plans._chosen_observations import chosen_observations
+from crashhunt.plans._choices import chosen_actions, chosen_observations, notes_on_actions
 from crashhunt.scenario import load_scenario, with_observations
 
 AGENTS = """

@@ -14,15 +14,18 @@ from crashhunt.errors import ArgumentError, HuntDirectoryError, ScenarioError, U
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.plans import (
     HuntOptions,
+    Owners,
     Request,
+    Takes,
+    agent_of,
     disturber_apart,
     hunt_options,
     plan,
     read_settings,
     request_of,
+    takes_of,
     write_settings,
 )  # fmt: skip
-from crashhunt.plans._plan import Owners, Takes, agent_of, takes_of
 from crashhunt.plans._settings import executor_of, parallel_here, sizes_itself
 from crashhunt.scenario import copy_shipped_scenario
 
