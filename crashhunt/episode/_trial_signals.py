@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -31,56 +31,49 @@ if TYPE_CHECKING:
 
 Read = Callable[[], float | None]
 
-UNITS: Mapping[str, str] = {
-    "time_s": "s",
-    "x": "m",
-    "y": "m",
-    "heading": "rad",
-    "speed": "m/s",
-    "acceleration": "m/s²",
-    "jerk": "m/s³",
-    "yaw_rate": "rad/s",
-    "gap_m": "m",
-    "headway_s": "s",
-    "ttc_s": "s",
-    "leader_speed": "m/s",
-    "leader_acceleration": "m/s²",
-    "leader_changed": "",
-    "priority_m": "m",
-    "priority_arrival_s": "s",
-    "speed_limit": "m/s",
-    "red_light_m": "m",
-    "clearance_m": "m",
-    "lane": "",
-    "lane_offset_m": "m",
-}
-"""The signals of scenes with actors, and their units."""
 
-MEANINGS: Mapping[str, str] = {
-    "time_s": "time since the first step",
-    "x": "centre of the front bumper, in the frame of the map",
-    "y": "centre of the front bumper, in the frame of the map",
-    "heading": "counter-clockwise from the x axis",
-    "speed": "speed along the heading",
-    "acceleration": "change of the speed since the last step",
-    "jerk": "change of the acceleration since the last step",
-    "yaw_rate": "change of the heading since the last step",
-    "gap_m": "between the bumpers, to the nearest vehicle ahead on the path; infinite without one",
-    "headway_s": "gap_m at the own speed; infinite without a vehicle ahead, or at a standstill",
-    "ttc_s": "time to collision with the vehicle ahead; infinite if the gap grows",
-    "leader_speed": "speed of the nearest vehicle ahead; infinite without one",
-    "leader_acceleration": "change of leader_speed since the last step; 0 if the vehicle ahead has just changed",
-    "leader_changed": "whether another vehicle is ahead than before the step; false without one",
-    "priority_m": "to the nearest conflict area in a junction that an actor with the right of way approaches; "
-    "0 inside, infinite without one",
-    "priority_arrival_s": "until an actor with the right of way reaches the conflict area in which the vehicle is; "
-    "infinite outside",
-    "speed_limit": "speed limit of the lane",
-    "red_light_m": "to the stop line of the next red light; infinite without one",
-    "clearance_m": "between the outlines, to the nearest actor in any direction; infinite beyond 50 m",
-    "lane": "number at the end of the lane's name",
-    "lane_offset_m": "of the centre from the centre line of the nearest lane; positive to the left",
+class KnownSignal(NamedTuple):
+    """The unit of a signal, and its meaning as a clause."""
+
+    unit: str
+    meaning: str
+
+
+SIGNALS: Mapping[str, KnownSignal] = {
+    "time_s": KnownSignal("s", "time since the first step"),
+    "x": KnownSignal("m", "centre of the front bumper, in the frame of the map"),
+    "y": KnownSignal("m", "centre of the front bumper, in the frame of the map"),
+    "heading": KnownSignal("rad", "counter-clockwise from the x axis"),
+    "speed": KnownSignal("m/s", "speed along the heading"),
+    "acceleration": KnownSignal("m/s²", "change of the speed since the last step"),
+    "jerk": KnownSignal("m/s³", "change of the acceleration since the last step"),
+    "yaw_rate": KnownSignal("rad/s", "change of the heading since the last step"),
+    "gap_m": KnownSignal("m", "between the bumpers, to the nearest vehicle ahead on the path; infinite without one"),
+    "headway_s": KnownSignal("s", "gap_m at the own speed; infinite without a vehicle ahead, or at a standstill"),
+    "ttc_s": KnownSignal("s", "time to collision with the vehicle ahead; infinite if the gap grows"),
+    "leader_speed": KnownSignal("m/s", "speed of the nearest vehicle ahead; infinite without one"),
+    "leader_acceleration": KnownSignal(
+        "m/s²", "change of leader_speed since the last step; 0 if the vehicle ahead has just changed"
+    ),
+    "leader_changed": KnownSignal("", "whether another vehicle is ahead than before the step; false without one"),
+    "priority_m": KnownSignal(
+        "m",
+        "to the nearest conflict area in a junction that an actor with the right of way approaches; "
+        "0 inside, infinite without one",
+    ),
+    "priority_arrival_s": KnownSignal(
+        "s",
+        "until an actor with the right of way reaches the conflict area in which the vehicle is; infinite outside",
+    ),
+    "speed_limit": KnownSignal("m/s", "speed limit of the lane"),
+    "red_light_m": KnownSignal("m", "to the stop line of the next red light; infinite without one"),
+    "clearance_m": KnownSignal(
+        "m", "between the outlines, to the nearest actor in any direction; infinite beyond 50 m"
+    ),
+    "lane": KnownSignal("", "number at the end of the lane's name"),
+    "lane_offset_m": KnownSignal("m", "of the centre from the centre line of the nearest lane; positive to the left"),
 }
+"""The signals of scenes with actors."""
 
 _OBSERVATION = re.compile(r"observation\[(\d+)\]")
 _TRAILING_NUMBER = re.compile(r"\d+$")
@@ -160,8 +153,8 @@ class TrialSignals:
     def meaning(self, name: str) -> str:
         """Return the meaning of a signal of `known`."""
         element = _OBSERVATION.fullmatch(name)
-        if name in MEANINGS:
-            return MEANINGS[name]
+        if name in SIGNALS:
+            return SIGNALS[name].meaning
         if element is not None:
             return self._column(int(element[1]))
         if name in self._events():
@@ -191,12 +184,12 @@ class TrialSignals:
 
     def _of_scene(self, agent: str) -> dict[str, str]:
         if agent not in self._scene().roster.index:
-            return {"time_s": UNITS["time_s"]}
+            return {"time_s": SIGNALS["time_s"].unit}
         simulator = self._episode.simulator
         lacks = set() if supports(simulator, ReportsSurroundings) else set(_SURROUNDINGS)
         lacks |= set() if supports(simulator, ReportsSpeedLimit) else {"speed_limit"}
         lacks |= set() if supports(simulator, HasMap) else {"lane", "lane_offset_m"}
-        return {name: unit for name, unit in UNITS.items() if name not in lacks}
+        return {name: known.unit for name, known in SIGNALS.items() if name not in lacks}
 
     def _one(self, name: str, agent: str) -> Read:
         """Return the function that reads one signal."""

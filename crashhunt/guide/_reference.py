@@ -440,10 +440,10 @@ _SUBJECTS = {
 
 def describe_signals() -> str:
     """Return the signals of scenes with actors, as a table in Markdown."""
-    from crashhunt.episode import MEANINGS, UNITS  # they import NumPy, which the help does not need
+    from crashhunt.episode import SIGNALS  # it imports NumPy, which the help does not need
     from crashhunt.world import EVENT_WORDS
 
-    rows = [f"| `{name}` | {unit} | {MEANINGS[name]} |" for name, unit in UNITS.items()]
+    rows = [f"| `{name}` | {known.unit} | {known.meaning} |" for name, known in SIGNALS.items()]
     rows += [f"| `{kind}` | | true in the steps with this event: {words[0]} |" for kind, words in EVENT_WORDS.items()]
     return "\n".join(["| signal | unit | meaning |", "| --- | --- | --- |", *rows]) + "\n"
 

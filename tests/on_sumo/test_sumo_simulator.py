@@ -287,7 +287,7 @@ def test_core_runs_steps_of_one_usual_agent(running, monkeypatch, change, fast):
             change.get("_lateral", False),
         )
         assert named["takes_speed"] is True
-        assert named["instead_of"].keys() == {"actions", "reset", "step", "scene"}
+        assert named["instead_of"].keys() == {"actions", "reset", "step", "scene", "restore_observation"}
         assert named["apply"]("a", "off") is False
         assert running._off_road == ["a"]
         assert named["apply"]("a", 1) is True
