@@ -69,12 +69,19 @@ if TYPE_CHECKING:
         yielding_actor as yielding_actor,
     )
     from ._judgement import (
+        COMPETENT_DRIVERS as COMPETENT_DRIVERS,
         INTERRUPTED as INTERRUPTED,
         Attempt as Attempt,
+        DriverRun as DriverRun,
         Factor as Factor,
         Judgement as Judgement,
         LeftOut as LeftOut,
+        Omission as Omission,
+        Preventability as Preventability,
+        Reference as Reference,
+        ReferenceRun as ReferenceRun,
         Why as Why,
+        Without as Without,
         judgement_of as judgement_of,
         preventable_by as preventable_by,
         wilson as wilson,
@@ -101,24 +108,16 @@ if TYPE_CHECKING:
         tags_of as tags_of,
         unreadable_notes as unreadable_notes,
     )
-    from ._omission import (
-        Omission as Omission,
-        Reference as Reference,
-        ReferenceRun as ReferenceRun,
-        Without as Without,
-    )
-    from ._preventability import (
-        COMPETENT_DRIVERS as COMPETENT_DRIVERS,
-        DriverRun as DriverRun,
-        Preventability as Preventability,
-    )
-    from ._signature import (
+    from ._types import (
         SIGNATURE_VERSION as SIGNATURE_VERSION,
+        Group as Group,
+        Groups as Groups,
         Signature as Signature,
+        group_crashes as group_crashes,
+        groups_of as groups_of,
         own_frames as own_frames,
         signature_of as signature_of,
         signature_of_fault as signature_of_fault,
     )
-    from ._types import Group as Group, Groups as Groups, group_crashes as group_crashes, groups_of as groups_of
 
 offer_lazily(__name__)

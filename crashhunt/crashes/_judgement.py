@@ -10,12 +10,163 @@ from typing import TYPE_CHECKING, Any, Literal
 from crashhunt.base.codec import Serializable, typed_where_there
 from crashhunt.base.integrity import typed
 from crashhunt.crashes._last_avoidable_step import Ending, last_avoiding
-from crashhunt.crashes._omission import Reference, Without as Without
-from crashhunt.crashes._preventability import Preventability
 from crashhunt.trial import Value
 
 if TYPE_CHECKING:
     from crashhunt.crashes._bundle import Bundle
+
+
+# Results of runs with a reference driver: what the agent failed to do, since when, and for which actor.
+
+
+Without = Literal["same", "other", "none", "unclear"]
+"""What became of the collision: the same two again, another crash, none, or something that does not say it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferenceRun(Serializable):
+    """One run in which a reference driver controls a part of the agent's driving.
+
+    Args:
+        faculty: the controlled part: ``longitudinal``, ``lateral`` or ``both``.
+        step: the step after which the reference driver takes control.
+        ending: what happened to the crash: ``none``, ``same``, ``other`` or ``unclear``.
+        changed: further differences from the recorded crash, such as ``ego does not change lanes``.
+    """
+
+    faculty: str
+    step: int
+    ending: Without
+    changed: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Omission(Serializable):
+    """An omission: something that the agent failed to do. In every run without the omission, there is no crash.
+
+    Args:
+        faculty: the part of the driving with which a reference driver avoids the crash: ``longitudinal``, ``lateral``
+            or ``both``.
+        kind: what the agent disregarded. On its path: ``vehicle``, ``red light`` or ``crossing`` (an actor with a
+            crossing path). In a lane change: ``ahead``, ``behind``, ``alongside`` or ``no lane``, followed by the side.
+        actor: identifier of the disregarded actor; empty for a red light and for a missing lane.
+        step: the step after which the omission began.
+        instead: what the agent did instead: ``sped up``, ``kept its speed``, ``braked too little`` or ``changed
+            lanes``. Whether it sped up is decided over the last 2 s before the crash.
+        speed_mps: speed of the agent after that step, in m/s.
+        actor_speed_mps: speed of the disregarded actor, in m/s; None if there is no such actor.
+        gap_m: gap between the agent and the actor or stop line, in m; negative if the vehicles are side by side. The
+            gap is None if there is neither an actor nor a stop line.
+        safe: the safe speed for that gap, in m/s; for a lane change, the safe gap in m; None for a missing lane.
+        visible_step: the step after which an observation first contained the actor; None if the step is unknown.
+        last_speed_mps: speed of the agent just before the crash, in m/s; None for a lane change, or if it is unknown.
+        kept_s: time until the crash over which the agent's speed stayed within 0.5 m/s of the last speed, in s. It does
+            not exceed the time since the omission began. None for a lane change, or if it is unknown.
+    """
+
+    faculty: str
+    kind: str
+    actor: str
+    step: int
+    instead: str
+    speed_mps: float
+    actor_speed_mps: float | None = None
+    gap_m: float | None = None
+    safe: float | None = None
+    visible_step: int | None = None
+    last_speed_mps: float | None = None
+    kept_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reference(Serializable):
+    """The results of the runs with a reference driver.
+
+    Args:
+        omission: the omission that caused the crash; None if the runs show none.
+        runs: all runs in which a reference driver acted.
+        why_not: why the result is missing or incomplete; empty if it is complete.
+    """
+
+    omission: Omission | None = None
+    runs: tuple[ReferenceRun, ...] = ()
+    why_not: str = ""
+
+    @property
+    def deciding(self) -> tuple[ReferenceRun, ...]:
+        """The runs on which the omission rests: of the same part of the driving, from its step or up to 1 s earlier."""
+        omission = self.omission
+        if omission is None:
+            return ()
+        return tuple(run for run in self.runs if run.faculty == omission.faculty and run.step <= omission.step)
+
+
+# Whether models of a competent driver would have prevented a collision, according to runs in which they drive.
+
+
+COMPETENT_DRIVERS = ("cc_human", "fsm", "rss", "reg157")
+"""The models of a competent driver, in the order of their answers."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriverRun(Serializable):
+    """The answer of one model of a competent driver.
+
+    Args:
+        model: name of the model.
+        prevented: whether the run with this model ends without the collision; None if the model does not apply or the
+            run does not decide it.
+        why_not: why there is no answer; empty if there is one.
+        perceived_step: the step after which the model perceived the risk; None if it never did, or did not run.
+        gap_m: gap between the vehicles when the model perceived the risk, in m.
+        speed_mps: speed of the agent then, in m/s.
+        other_speed_mps: speed of the other vehicle then, in m/s.
+        margin_m: the smallest gap to the other vehicle in the own path after that, in m; None if there is no answer,
+            or the collision was not prevented.
+    """
+
+    model: str
+    prevented: bool | None = None
+    why_not: str = ""
+    perceived_step: int | None = None
+    gap_m: float | None = None
+    speed_mps: float | None = None
+    other_speed_mps: float | None = None
+    margin_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Preventability(Serializable):
+    """The answers of all models of a competent driver for one collision.
+
+    Args:
+        since_step: the step after which the models watch the other vehicle: the first step at which the agent could
+            see it.
+        runs: the answer of each model.
+        why_not: why no model applies; empty if at least one does.
+    """
+
+    since_step: int = 0
+    runs: tuple[DriverRun, ...] = ()
+    why_not: str = ""
+
+    @property
+    def answers(self) -> dict[str, bool | None]:
+        """Whether each model would have prevented the collision; None if that is unknown or it does not apply."""
+        found = {run.model: run.prevented for run in self.runs}
+        return {model: found.get(model) for model in COMPETENT_DRIVERS}
+
+    @property
+    def by_any(self) -> bool | None:
+        """Whether any model would have prevented the collision; None if no model has an answer."""
+        found = [answer for answer in self.answers.values() if answer is not None]
+        return any(found) if found else None
+
+    @property
+    def perceived(self) -> DriverRun | None:
+        """The run of the model that perceived the risk first; None if no model did."""
+        seen = [run for run in self.runs if run.perceived_step is not None]
+        return min(seen, key=lambda run: run.perceived_step or 0, default=None)
 
 
 # The causes of a collision, found by runs that each omit one candidate cause.

@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given, strategies as st
 
-from crashhunt.analysis import _scripting, _shrink_stages as _stages, fewest, plainest
-from crashhunt.analysis._scripting import Part
-from crashhunt.analysis._shrink_stages import Minimizer
+from crashhunt.analysis import _shrink_stages as _stages, fewest, plainest
+from crashhunt.analysis._shrink_stages import Minimizer, Part
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.reruns import OutOfTimeError, StoppedError
 from crashhunt.trial import ALL_AGENTS, Disturbance, Escape, TrialSpec
@@ -249,7 +248,7 @@ def test_it_begins_while_the_agent_can_still_avoid_it(steps, escape, begins):
             agents=("ego",), steps=steps, prologue=SimpleNamespace(step_length_s=0.1), scenes=lambda: scenes
         ),
     )
-    assert _scripting.Scripting(rerun).begins(("ego",)) == begins
+    assert _stages.Scripting(rerun).begins(("ego",)) == begins
 
 
 BRAKE, STOP = Disturbance(20, "ahead", "brake", 4.0, 2.0, "ego"), Disturbance(30, "ahead", "stop", 1.0, 2.0, "ego")
@@ -636,7 +635,7 @@ def test_a_script_may_take_a_second_longer_than_what_was_recorded():
         recorded=Recorded(scenes),
     )
     rerun.recorded.steps = 49
-    scripting = _scripting.Scripting(rerun)
+    scripting = _stages.Scripting(rerun)
     spec = scripting.spec(Part(("ego",), ()))
     assert (scripting.steps, spec.max_steps, spec.only) == (49, 59, None)
     assert spec.disturbances == (LATE,)
@@ -645,7 +644,7 @@ def test_a_script_may_take_a_second_longer_than_what_was_recorded():
     assert later.disturbances == (replace(LATE, step=10),)
     assert scripting.spec(Part(("ego",), (), begin=40)).disturbances == ()
     rerun.recorded.prologue = SimpleNamespace(step_length_s=2.5)
-    assert _scripting.Scripting(rerun).spec(Part(("ego",), ())).max_steps == 50  # a step at least
+    assert _stages.Scripting(rerun).spec(Part(("ego",), ())).max_steps == 50  # a step at least
 
 
 def test_after_a_part_was_excluded_the_parts_stay_as_small():
