@@ -17,12 +17,13 @@ if TYPE_CHECKING:
         parse_rates as parse_rates,
         word_of as word_of,
     )
-    from ._foreign_models import ModelApart as ModelApart, described_model as described_model
     from ._models import (
         Choices as Choices,
+        ModelApart as ModelApart,
         brake as brake,
         cut_in as cut_in,
         dawdle as dawdle,
+        described_model as described_model,
         ignore_priority as ignore_priority,
         late_action as late_action,
         late_merge as late_merge,
