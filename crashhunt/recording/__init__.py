@@ -43,15 +43,13 @@ if TYPE_CHECKING:
         is_opaque as is_opaque,
     )
     from .records import RECORD_TYPES as RECORD_TYPES, Tag as Tag
-    from .records._event_record import (
-        encode_disturbance as encode_disturbance,
-        encode_events as encode_events,
-        encode_notes as encode_notes,
-    )
     from .records._scene_record import (
         encode_actors as encode_actors,
+        encode_disturbance as encode_disturbance,
+        encode_events as encode_events,
         encode_heights as encode_heights,
         encode_lanes as encode_lanes,
+        encode_notes as encode_notes,
         encode_roster as encode_roster,
         encode_spines as encode_spines,
     )

@@ -29,8 +29,7 @@ import numpy as np
 from crashhunt.base.errors import DISK, BundleError, RecorderError
 from crashhunt.base.forks import MEMORY
 from crashhunt.recording.records._agent_records import ACTION, OBSERVATION, PROLOGUE
-from crashhunt.recording.records._event_record import NOTES
-from crashhunt.recording.records._scene_record import LANES, STEP
+from crashhunt.recording.records._scene_record import LANES, NOTES, STEP
 from crashhunt.world import joined_frame
 
 if TYPE_CHECKING:

@@ -25,8 +25,7 @@ from crashhunt.recording._reading import Prologue
 from crashhunt.recording._recording import Compact, Recording
 from crashhunt.recording.records import RECORD_TYPES
 from crashhunt.recording.records._agent_records import ACTION, OBSERVATION
-from crashhunt.recording.records._event_record import DISTURBANCES
-from crashhunt.recording.records._scene_record import STEP, time_of
+from crashhunt.recording.records._scene_record import DISTURBANCES, STEP, time_of
 from crashhunt.recording.records._type import BytesForm, TextForm
 
 if TYPE_CHECKING:

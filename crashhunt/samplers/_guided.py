@@ -35,7 +35,7 @@ import numpy as np
 from crashhunt.samplers._model import TRIALS, Model
 from crashhunt.samplers._signal_shapes import SignalShapes
 from crashhunt.samplers._space_filling import HaltonSampler
-from crashhunt.samplers._strategy import CRASHED, NEAREST, Draft, Elites
+from crashhunt.samplers._strategies import CRASHED, NEAREST, Draft, Elites
 from crashhunt.trial import MAX_ROBUSTNESS
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from crashhunt.samplers._protocol import HuntFacts, Space
     from crashhunt.samplers._space_filling import Cube
-    from crashhunt.samplers._strategy import ScoredTrial
+    from crashhunt.samplers._strategies import ScoredTrial
 
     Floats = NDArray[np.float64]
     Seeds = NDArray[np.int64]

@@ -5,8 +5,12 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._changes import CodeChanges as CodeChanges, code_changes as code_changes
-    from ._differences import code_differences as code_differences, program_warnings as program_warnings
+    from ._differences import (
+        CodeChanges as CodeChanges,
+        code_changes as code_changes,
+        code_differences as code_differences,
+        program_warnings as program_warnings,
+    )
     from ._environment import (
         Environment as Environment,
         environment as environment,

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._data import check_disturbances as check_disturbances, check_parts as check_parts
     from ._disturbance import (
         CELLS as CELLS,
         HOLD_KINDS as HOLD_KINDS,
@@ -46,6 +45,8 @@ if TYPE_CHECKING:
         ForcedCopy as ForcedCopy,
         Stress as Stress,
         TrialResult as TrialResult,
+        check_disturbances as check_disturbances,
+        check_parts as check_parts,
         in_effect as in_effect,
     )
     from ._space import (

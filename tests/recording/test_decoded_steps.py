@@ -19,7 +19,7 @@ from crashhunt.recording import (
     Record,
     Recording,
     Tag,
-    _decoded_steps,
+    _recording,
     encode_actors,
     encode_disturbance,
     encode_roster,
@@ -69,15 +69,15 @@ def records(tmp_path, arrival):
 def decoded(monkeypatch):
     """The number of times that each part of a recording was decoded, while only four parts may be kept."""
     found = Counter()
-    decode = _decoded_steps.DecodedSteps._decode
+    decode = _recording.DecodedSteps._decode
 
     def counted(self, number):
         found[number] += 1
         return decode(self, number)
 
-    monkeypatch.setattr(_decoded_steps.DecodedSteps, "_decode", counted)
-    monkeypatch.setattr(_decoded_steps, "_CHUNK_STEPS", 8)
-    monkeypatch.setattr(_decoded_steps, "_MAX_DECODED_BYTES", 0)
+    monkeypatch.setattr(_recording.DecodedSteps, "_decode", counted)
+    monkeypatch.setattr(_recording, "_CHUNK_STEPS", 8)
+    monkeypatch.setattr(_recording, "_MAX_DECODED_BYTES", 0)
     return found
 
 
@@ -134,8 +134,8 @@ def test_parts_of_any_size_name_the_actors_that_come_and_go(presences, size):
         written.append(Record(Tag.STEP, 0, struct.pack(f"<qd{len(values)}d", step, 0.1 * step, *values)))
         expected.append([(f"v{one}", (one, step)) for one in present])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_decoded_steps, "_CHUNK_STEPS", size)
-        patch.setattr(_decoded_steps, "_MAX_DECODED_BYTES", 0)
+        patch.setattr(_recording, "_CHUNK_STEPS", size)
+        patch.setattr(_recording, "_MAX_DECODED_BYTES", 0)
         recording = Recording(written)
         for scenes in (recording.scenes(), [*reversed(recording.scenes())][::-1]):
             named = [[(a.id, tuple(p)) for a, p in zip(one.roster.actors, one.points, strict=True)] for one in scenes]
@@ -144,7 +144,7 @@ def test_parts_of_any_size_name_the_actors_that_come_and_go(presences, size):
 
 
 def test_a_short_recording_is_decoded_once(records, decoded, monkeypatch):
-    monkeypatch.setattr(_decoded_steps, "_MAX_DECODED_BYTES", 64 << 20)
+    monkeypatch.setattr(_recording, "_MAX_DECODED_BYTES", 64 << 20)
     recording = Recording(records)
     assert recording.scenes()[3] is recording.scenes()[3]
     measured(recording)

@@ -7,7 +7,7 @@ import pytest
 
 from crashhunt.samplers import Cube
 from crashhunt.samplers._model import TRIALS, Model, Process, _Parameters, _ranks
-from crashhunt.samplers._strategy import ScoredTrial
+from crashhunt.samplers._strategies import ScoredTrial
 from crashhunt.space import Choice, Range
 
 PLANE = Cube({("ego", "x"): Range(0.0, 1.0), ("ego", "y"): Range(0.0, 1.0)})

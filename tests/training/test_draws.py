@@ -12,7 +12,7 @@ import pytest
 
 from crashhunt.errors import HuntDirectoryError, SimulatorError, UsageError
 from crashhunt.training import CrashEnv, TrainedOn, _crash_env, is_test_traffic, read_trained_on
-from crashhunt.training._prioritized_replay import CrashReplay
+from crashhunt.training._crash_env import CrashReplay
 from crashhunt.training._training_episodes import _seeded
 
 

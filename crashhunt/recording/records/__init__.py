@@ -10,8 +10,17 @@ from enum import IntEnum
 from typing import TYPE_CHECKING
 
 from crashhunt.recording.records._agent_records import ACTION, OBSERVATION, PROLOGUE
-from crashhunt.recording.records._event_record import DISTURBANCES, EVENTS, NOTES
-from crashhunt.recording.records._scene_record import ACTORS, HEIGHTS, LANES, ROSTER, SPINES, STEP
+from crashhunt.recording.records._scene_record import (
+    ACTORS,
+    DISTURBANCES,
+    EVENTS,
+    HEIGHTS,
+    LANES,
+    NOTES,
+    ROSTER,
+    SPINES,
+    STEP,
+)
 
 if TYPE_CHECKING:
     from crashhunt.recording.records._type import RecordType
