@@ -18,7 +18,7 @@ from crashhunt.base.errors import ActionError, InvalidEpisodeError, UnusableValu
 from crashhunt.base.scalars import number_of
 from crashhunt.gym import GymSimulator, _simulator as gym
 from crashhunt.gym._descriptor import CrashRule, GymSetup
-from crashhunt.gym._end_state import crash_cell
+from crashhunt.gym._simulator import crash_cell
 from crashhunt.recording import encode_value
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.simulators import _any_space as _gymnasium

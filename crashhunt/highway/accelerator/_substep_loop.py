@@ -7,12 +7,16 @@ time, so the state is read again after foreign code has run.
 from __future__ import annotations
 
 import inspect
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic
 
 import highway_env
+import numpy as np
 from gymnasium import Env
+from highway_env import utils
 from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.envs.common.action import ActionType, DiscreteMetaAction
 from highway_env.envs.common.observation import (
     ExitObservation,
     KinematicObservation,
@@ -22,18 +26,160 @@ from highway_env.envs.common.observation import (
 from highway_env.envs.parking_env import ParkingEnv
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
+from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 
-from crashhunt.highway.accelerator._agent_steps import choose
 from crashhunt.highway.accelerator._roads import cached, is_known, look, methods_of, prepared, watches
-from crashhunt.highway.accelerator._rules import finish
 from crashhunt.highway.accelerator._supported import Own, is_genuine, kinds_of, originals
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from highway_env.envs.common.observation import ObservationType
+    from highway_env.envs.highway_env import HighwayEnv
 
+    from crashhunt.highway.accelerator._kernel import Traffic
     from crashhunt.highway.accelerator._roads import Prepared
+
+
+# The parts of a sub-step that stay in Python: checks of pairs by highway-env, and right of way at intersections.
+
+
+def finish(road: Road, dt: float) -> None:
+    """Finish a sub-step with highway-env's code, because the kernel has found a number that is not finite."""
+    for vehicle in road.vehicles:
+        vehicle.on_state_update()
+    collide_one_by_one(road, dt)
+
+
+def collide_one_by_one(road: Road, dt: float) -> None:
+    """Check all pairs of objects for collisions, with highway-env's own code."""
+    for number, vehicle in enumerate(road.vehicles):
+        for other in road.vehicles[number + 1 :]:
+            vehicle.handle_collisions(other, dt)
+        for other in road.objects:
+            vehicle.handle_collisions(other, dt)
+
+
+def enforce(road: RegulatedRoad, traffic: Traffic) -> bool:
+    """Compute the result of `RegulatedRoad.enforce_road_rules`, with one prediction per vehicle.
+
+    Args:
+        road: The road.
+        traffic: The road's vehicles in the kernel, with their current state.
+
+    Returns:
+        Whether the rules were applied; False, with nothing changed, if highway-env must predict a path.
+    """
+    vehicles = road.vehicles
+    conflicts = traffic.conflicts()
+    if conflicts is None:
+        return False
+    for vehicle in vehicles:
+        if getattr(vehicle, "is_yielding", False):
+            if vehicle.yield_timer >= road.YIELD_DURATION * road.REGULATION_FREQUENCY:
+                vehicle.target_speed = vehicle.lane.speed_limit
+                delattr(vehicle, "color")
+                vehicle.is_yielding = False
+            else:
+                vehicle.yield_timer += 1
+    for row, other, is_certain in conflicts:
+        one, two = vehicles[row], vehicles[other]
+        if not is_certain and not road.is_conflict_possible(one, two):
+            continue
+        yielding = road.respect_priorities(one, two)
+        if yielding is not None and isinstance(yielding, ControlledVehicle) and not isinstance(yielding, MDPVehicle):
+            yielding.color = road.YIELDING_COLOR
+            yielding.target_speed = 0
+            yielding.is_yielding = True
+            yielding.yield_timer = 0
+    return True
+
+
+# What a step computes for each agent: the effect of its meta-action, and the rewards of `HighwayEnv`.
+
+
+_CLIP = np.clip
+_ONE = np.float64(1)
+_SPEED_CHANGES = {"SLOWER": -1, "IDLE": 0, "FASTER": 1}
+_DTYPES = (np.dtype(np.float64), np.dtype(np.int64))
+_MEMBERS = [(owner, name) for owner in (ActionType, DiscreteMetaAction) for name in ("act", "controlled_vehicle")]
+_ORIGINALS = [vars(owner).get(name) for owner, name in _MEMBERS]
+
+
+def choose(env: AbstractEnv, action: object) -> bool:
+    """Apply that part of `DiscreteMetaAction.act` whose effect remains after the next `Road.act`.
+
+    `MDPVehicle.act` chooses a target speed or lane, and then computes steering and acceleration. `Road.act` computes
+    both again from the same state before any code reads them.
+
+    Args:
+        env: The environment, whose road has just been checked: no vehicle on it has own methods.
+        action: The action of the environment's agent.
+
+    Returns:
+        Whether the action was applied; False, with nothing changed, if highway-env must apply it.
+    """
+    deciding = env.action_type
+    if type(deciding) is not DiscreteMetaAction or type(action) not in (int, np.int64) or "act" in vars(deciding):
+        return False
+    if [vars(owner).get(name) for owner, name in _MEMBERS] != _ORIGINALS or type(deciding.actions) is not dict:
+        return False
+    meaning = deciding.actions.get(action)
+    change = _SPEED_CHANGES.get(meaning) if type(meaning) is str else None
+    vehicle = deciding.controlled_vehicle
+    if change is None or type(vehicle) is not MDPVehicle:
+        return False
+    road = env.road
+    if vehicle.road is not road or not any(other is vehicle for other in road.vehicles):
+        return False
+    try:
+        at_end = road.network.get_lane(vehicle.target_lane_index).after_end(vehicle.position)
+    except Exception:
+        return False  # highway-env raises the same error
+    return not at_end and (not change or _change_speed(vehicle, change))
+
+
+def _change_speed(vehicle: MDPVehicle, change: int) -> bool:
+    """Compute the result of `MDPVehicle.act` for the target speed; return False if the speeds are unusual."""
+    speed, speeds = vehicle.speed, vehicle.target_speeds
+    if type(speed) not in (float, np.float64) or type(speeds) is not np.ndarray:
+        return False
+    if speeds.ndim != 1 or speeds.size < 2 or speeds.dtype not in _DTYPES:
+        return False
+    first, last = float(speeds[0]), float(speeds[-1])
+    if first == last:
+        return False
+    nearest = (float(speed) - first) / (last - first) * (speeds.size - 1)
+    if not math.isfinite(nearest):
+        return False
+    index = min(max(round(nearest), 0), speeds.size - 1) + change
+    vehicle.speed_index = min(max(index, 0), speeds.size - 1)
+    vehicle.target_speed = speeds[vehicle.speed_index]
+    return True
+
+
+def rewards(env: HighwayEnv) -> dict[str, float]:
+    """Return the result of `HighwayEnv._rewards`, in which the speed is limited by faster code."""
+    vehicle = env.vehicle
+    neighbours = env.road.network.all_side_lanes(vehicle.lane_index)
+    lane = vehicle.target_lane_index[2] if isinstance(vehicle, ControlledVehicle) else vehicle.lane_index[2]
+    forward_speed = vehicle.speed * np.cos(vehicle.heading)
+    scaled_speed = utils.lmap(forward_speed, env.config["reward_speed_range"], [0, 1])
+    return {
+        "collision_reward": float(vehicle.crashed),
+        "right_lane_reward": lane / max(len(neighbours) - 1, 1),
+        "high_speed_reward": _clip_to_unit(scaled_speed),
+        "on_road_reward": float(vehicle.on_road),
+    }
+
+
+def _clip_to_unit(value: float) -> float:
+    """Return the result of ``np.clip(value, 0, 1)``."""
+    if type(value) is not np.float64 or np.clip is not _CLIP or not value > 0:
+        clipped: float = np.clip(value, 0, 1)  # decides about the sign of zero, and about NaN
+        return clipped
+    return value if value < 1 else _ONE
+
 
 # A wrapper of a road's `step` that declares whether it changes the road.
 

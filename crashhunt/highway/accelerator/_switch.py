@@ -20,7 +20,6 @@ from highway_env.envs.highway_env import HighwayEnv
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from crashhunt.highway.accelerator._agent_steps import rewards
 from crashhunt.highway.accelerator._observe import (
     close_objects,
     fill_lanes,
@@ -42,8 +41,15 @@ from crashhunt.highway.accelerator._roads import (
     take_for_observation,
     watches,
 )
-from crashhunt.highway.accelerator._rules import collide_one_by_one, enforce, finish
-from crashhunt.highway.accelerator._substep_loop import can_run_alone, run_step, simulate
+from crashhunt.highway.accelerator._substep_loop import (
+    can_run_alone,
+    collide_one_by_one,
+    enforce,
+    finish,
+    rewards,
+    run_step,
+    simulate,
+)
 from crashhunt.highway.accelerator._supported import (
     Watch,
     is_genuine,

@@ -21,7 +21,7 @@ from highway_env.vehicle.controller import MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 from crashhunt.highway import HighwaySimulator, restore_classes
-from crashhunt.highway.accelerator import Onlooker, _agent_steps, _substep_loop, switch_off, switch_on
+from crashhunt.highway.accelerator import Onlooker, _substep_loop, switch_off, switch_on
 
 assert highway_env
 assert HighwaySimulator
@@ -304,7 +304,7 @@ def test_meta_action_at_the_end_of_a_lane_is_applied_by_highway_env():
     env.step(1)
     at_the_end_of_its_lane(env)
     before = exact(vars(env.vehicle))
-    assert not _agent_steps.choose(env, 3)
+    assert not _substep_loop.choose(env, 3)
     assert exact(vars(env.vehicle)) == before
 
 
@@ -495,7 +495,7 @@ def test_meta_action_leaves_controls_to_the_road():
     env = made()
     env.step(1)
     env.vehicle.action = action = {"steering": 0.5, "acceleration": 0.5}
-    assert _agent_steps.choose(env, 4)
+    assert _substep_loop.choose(env, 4)
     assert env.vehicle.action is action
     assert env.vehicle.target_speed == env.vehicle.target_speeds[env.vehicle.speed_index]
 

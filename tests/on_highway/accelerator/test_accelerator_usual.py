@@ -34,7 +34,6 @@ from small_roads import small_road
 
 from crashhunt.highway.accelerator import (
     Onlooker,
-    _agent_steps,
     _frames,
     _kernel_objects,
     _lane_network as _network,
@@ -356,7 +355,7 @@ def test_usual_change_of_the_target_speed_needs_no_code_of_highway_env():
     before = {name: vars(vehicle)[name] for name in ("target_speed", "speed_index", "target_lane_index")}
     for action, table, speed in product((1, 3, 4, np.int64(3)), tables, (22.0, np.float64(-3), 99.0, 25, 15.0)):
         found, usual = [], type(speed) is not int or action == 1
-        for apply in (lambda action: _agent_steps.choose(env, action), env.action_type.act):
+        for apply in (lambda action: _substep_loop.choose(env, action), env.action_type.act):
             vars(vehicle).update(before, speed=speed, target_speeds=table)
             applied = apply(action)
             found.append({name: vars(vehicle)[name] for name in before})
