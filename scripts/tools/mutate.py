@@ -125,7 +125,6 @@ _TESTS_ELSEWHERE = {
         "crashes/test_encounter.py",
         "crashes/test_visible.py",
     ),
-    "dashboard/_control.py": ("dashboard/test_dashboard_parts.py", "dashboard/test_control.py"),
     "envs": ("envs/test_*.py",),
     "episode/_action_override.py": (
         "episode/test_overruled_agents.py",
@@ -158,7 +157,6 @@ _TESTS_ELSEWHERE = {
         "executors/test_pool_of_trials.py",
         "executors/test_what_is_left.py",
     ),
-    "executors/_rehearsal.py": ("executors/test_zygotes.py",),
     "executors/_supervisor.py": (
         "executors/test_escapes_of_trials.py",
         "executors/test_killed_trials.py",
@@ -310,10 +308,9 @@ _TESTS_ELSEWHERE = {
     "testing/_disturbance_contract.py": ("testing/test_broken_contracts.py", "disturbances/test_rates.py"),
     "testing/_last_avoidable_step_check.py": ("testing/test_broken_contracts.py", "e2e/test_escapes.py"),
     "testing/_survives.py": ("testing/test_assert_survives.py", "e2e/test_survives.py"),
-    "training/_crash_env.py": ("training/test_draws.py", "training/test_training_env.py"),
     "training/_training_episodes.py": ("training/test_draws.py", "training/test_training_env.py"),
     "training/_trained_on.py": ("training/test_draws.py", "training/test_held_out_traffics.py"),
-    "training/_prioritized_replay.py": ("training/test_draws.py", "training/test_training_env.py"),
+    "training/_crash_env.py": ("training/test_draws.py", "training/test_training_env.py"),
     "training/_traffic_split.py": ("training/test_draws.py", "training/test_held_out_traffics.py"),
     "analysis/_avoidability.py": ("analysis/test_avoiding.py", "e2e/test_judging.py"),
     "analysis/_causes.py": ("analysis/test_maneuvers.py", "e2e/test_judging.py"),
