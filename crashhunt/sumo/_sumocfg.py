@@ -17,9 +17,9 @@ from crashhunt.sumo._files import nested_files, read_xml, written_by
 from crashhunt.sumo._options import (
     FIXED_OPTIONS,
     INPUTS,
-    MANOEUVRE_ARGUMENTS,
     RESERVED,
     SumoSetup,
+    arguments_of,
     canonical,
     is_output,
     is_shown,
