@@ -17,7 +17,7 @@ MODULES = (_surroundings, _traffic_events)
 
 @pytest.fixture
 def sumo(monkeypatch):
-    made = FakeSumo()
+    made = FakeSumo(person_getIDList=())
     for module in MODULES:
         monkeypatch.setattr(module, "sumo", made)
     return made
