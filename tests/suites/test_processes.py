@@ -38,13 +38,22 @@ def folders(tmp_path):
 
 @pytest.fixture
 def started(monkeypatch):
-    """Which hunts were started with which options; each takes as long as `sleeps` has for its name, or an instant."""
+    """Which hunts were started with which options.
+
+    Each takes as long as `sleeps` has for its name: so many seconds, until another one starts, or an instant.
+    """
     calls, sleeps = [], {}
 
     def start(folder, run, environment):
         if isinstance(error := sleeps.get(folder.name, 0), Exception):
             raise error
-        process = subprocess.Popen(["sleep", str(error)])
+        if isinstance(error, str):
+            process = subprocess.Popen(["cat"], stdin=subprocess.PIPE)
+        else:
+            process = subprocess.Popen(["sleep", str(error)])
+        for name, *_, other in calls:
+            if sleeps.get(name) == folder.name:
+                other.stdin.close()
         calls.append((folder.name, run, environment, process))
         return process
 
@@ -64,13 +73,14 @@ def test_a_request_is_read_as_it_was_written(tmp_path):
 
 def test_the_last_hunts_share_the_slots_and_have_the_options_of_the_machine(folders, started):
     calls, sleeps = started
-    sleeps.update(a=0.05)
+    sleeps.update(a="c")
     run_all(folders, 2, machine={"executor": "fresh"}, environments={folders[1]: {"WHO": "b"}})
     assert [(name, run["parallel"]) for name, run, *_ in calls] == [("a", 1), ("b", 1), ("c", 1)]
     assert all(run["executor"] == "fresh" for _, run, *_ in calls)
     assert [environment for *_, environment, _ in calls] == [None, {"WHO": "b"}, None]
     assert [run.get("partner") for _, run, *_ in calls] == [None] * 3
     calls.clear()
+    sleeps.clear()
     run_all(folders[:2], 2, partners={folders[0]: folders[1]})
     assert [run.get("partner") for _, run, *_ in calls] == [str(folders[1]), None]
     calls.clear()
