@@ -17,7 +17,7 @@ MODULES = (_surroundings, _traffic_events)
 
 @pytest.fixture
 def sumo(monkeypatch):
-    made = FakeSumo(person_getIDList=())
+    made = FakeSumo()
     for module in MODULES:
         monkeypatch.setattr(module, "sumo", made)
     return made
@@ -342,7 +342,7 @@ def around(sumo):
         "vehicle_getSpeed": lambda name: {"ego": 20.0, "back": -1.0}.get(name, 7.0),
         "vehicle_getDecel": lambda name: {"ego": 4.5, "weak": 0.0}.get(name, 3.0),
         "vehicle_getAccel": lambda name: 2.5 if name == "ego" else 1.5,
-        "vehicle_getMinGap": lambda name: 2.5 if name == "ego" else 1.0, "vehicle_getIDList": ("ego", "lead", "weak"),
+        "vehicle_getMinGap": lambda name: 2.5 if name == "ego" else 1.0, "person_getIDList": ("person",),
         "vehicle_getLeader": ("lead", 10.0), "vehicle_getNextTLS": (), "vehicle_getJunctionFoes": (),
         "vehicle_getLength": lambda name: 5.0 if name == "ego" else 4.0,
     }  # fmt: skip
