@@ -41,7 +41,7 @@ def manoeuvre_paths(manoeuvre: str, agent: str, arguments: Mapping[str, Value], 
     """
     names = arguments_of(manoeuvre, arguments)
     values = {name: _number(name, arguments[name]) for name in names}
-    if values.get("slower_kmh", 0.0) > values["ego_kmh"]:
+    if manoeuvre == "cut_in" and values.get("slower_kmh", 0.0) > values["ego_kmh"]:
         raise InvalidEpisodeError(
             f"slower_kmh is {values['slower_kmh']:g} (allowed: 0 to ego_kmh, {values['ego_kmh']:g})",
             fix="give a smaller value",

@@ -128,6 +128,12 @@ def test_speed_of_the_vehicle_ahead_varies(simulate):
     assert leader[[0, 50, 100], 2] * 3.6 == pytest.approx([60, 40, 60])
 
 
+def test_vehicle_ahead_stops_where_it_would_lose_more_than_its_speed(simulate):
+    given = STRAIGHT["following"] | {"ego_kmh": 20.0, "slower_kmh": 60.0}
+    scenes = drive(*simulate("r157-following", **given), KeepsSpeed(), 50)
+    assert min(scene.speeds[scene.roster.index["leader"]] for scene in scenes) == 0.0
+
+
 def test_vehicles_that_stand_in_the_lane_are_where_the_arguments_say(simulate):
     standing = tracks(simulate, "blocked-lane", 1)["standing"]
     assert standing[0] == standing[1] == pytest.approx((404.3, -2.25, 0.0))
