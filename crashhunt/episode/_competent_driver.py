@@ -14,7 +14,8 @@ import numpy as np
 from crashhunt.agents import REFERENCE_MODELS, Closes, Situation
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.simulators import ReportsSurroundings
+from crashhunt.scenario import ACTIONS
+from crashhunt.simulators import MAX_ACCELERATION, ReportsSurroundings, TranslatesMotion
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from crashhunt.trial import Overruled
     from crashhunt.world import Neighbor, Scene, Surroundings
 
+_SPEED_AND_LANE, _SPEED_AND_LATERAL = ACTIONS["speed_and_lane"].names, ACTIONS["speed_and_lateral"].names
+_ACCELERATION = ACTIONS["acceleration"].names
+_FORMS = (_SPEED_AND_LANE, _SPEED_AND_LATERAL, _ACCELERATION)
 _NEAR_M = 30.0  # nearer vehicles are measured by their outlines, and others by the road
 _STRAIGHT_RAD = math.radians(3.0)  # between the headings, for a measurement by outlines
 _PARALLEL_RAD = 1e-6  # between the headings of vehicles on the same straight road
@@ -47,8 +51,13 @@ class CompetentDriver:
     def __init__(self, driver: Agent, simulator: Simulator, overruled: Overruled) -> None:
         if not supports(simulator, ReportsSurroundings):
             raise InvalidEpisodeError("the simulator reports no surroundings of the vehicle")
-        if tuple(simulator.actions[overruled.agent].names) != ("target_speed", "lane_change"):
-            raise InvalidEpisodeError("the actions of the agent set no speed")
+        self._form = simulator.actions[overruled.agent]
+        self._names = tuple(self._form.names)
+        self._steers = (
+            simulator if supports(simulator, TranslatesMotion) and simulator.is_steered(overruled.agent) else None
+        )
+        if self._names not in _FORMS and self._steers is None:
+            raise InvalidEpisodeError("the actions of the agent set neither a speed nor an acceleration")
         self._driver, self._simulator, self._see = driver, simulator, simulator.surroundings
         self._agent, self._other, self._after = overruled.agent, overruled.other, overruled.after
         self._name, self._step_s = overruled.reference, simulator.step_length_s
@@ -119,7 +128,19 @@ class CompetentDriver:
             return action
         if any(crossing.actor == self._other for crossing in around.crossing):
             self._response["in_junction"] = True
-        return max(0.0, speed + acceleration * self._step_s), 0
+        return self._braking(action, speed, acceleration)
+
+    def _braking(self, action: object, speed: float, acceleration: float) -> object:
+        """Return the action with the acceleration of the model; a vehicle that moves freely keeps its lane."""
+        target = max(0.0, speed + acceleration * self._step_s)
+        if self._steers is not None:
+            return self._steers.action_with(self._agent, self._form.encode(action), speed_mps=target, keeps_lane=True)
+        if self._names == _SPEED_AND_LANE:
+            return target, 0
+        if self._names == _SPEED_AND_LATERAL:
+            return target, 0.0
+        value = max(-MAX_ACCELERATION, min(MAX_ACCELERATION, (target - speed) / self._step_s))
+        return value, 0
 
 
 def _measured(

@@ -1,0 +1,71 @@
+"""A model of a competent driver takes control of the speed, whatever form the agent's actions have."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.episode._competent_driver import CompetentDriver
+from crashhunt.scenario import load_scenario
+from crashhunt.sumo import SumoSimulator
+from crashhunt.trial import Overruled
+
+CASE = {"ego_kmh": 60.0, "other_kmh": 20.0, "gap_m": 35.0, "lateral_mps": 1.5, "side": 1}
+KEEPS_SPEED = {
+    "speed_and_lane": (60 / 3.6, 0),
+    "speed_and_lateral": (60 / 3.6, 0.0),
+    "acceleration": (0.0, 0),
+    "acceleration_steering": (0.0, 0.0),
+}
+
+
+class Blind:
+    def __init__(self, action):
+        self.action = action
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return self.action
+
+
+def driven(folder, form):
+    """Return the speeds of the vehicle, and what the driver reports."""
+    scenario = load_scenario("r157-cut-in")
+    scenario = replace(scenario, agents={"ego": replace(scenario.agents["ego"], action=form)})
+    simulator = SumoSimulator(scenario, folder)
+    try:
+        observations, _ = simulator.reset(seed=1, options={"arguments": CASE})
+        driver = CompetentDriver(
+            Blind(KEEPS_SPEED.get(form, 1)), simulator, Overruled("ego", 0, reference="fsm", other="other")
+        )
+        driver.reset(1)
+        speeds = []
+        for _ in range(60):
+            action = simulator.actions["ego"].encode(driver.act(observations["ego"]))
+            observations, *_ = simulator.step({"ego": action})
+            scene = simulator.scene()
+            speeds.append(float(scene.speeds[scene.roster.index["ego"]]))
+        return np.array(speeds), driver.responses[0]
+    finally:
+        simulator.close()
+
+
+@pytest.mark.parametrize("form", [form for form in KEEPS_SPEED if form != "speed_and_lane"])
+def test_driver_brakes_as_with_a_target_speed(tmp_path, form):
+    expected, seen = driven(tmp_path, "speed_and_lane")
+    speeds, also_seen = driven(tmp_path, form)
+    assert expected.min() < 8 < expected[0]  # the driver brakes
+    assert speeds == pytest.approx(expected, abs=0.15)
+    assert also_seen["first"] == seen["first"]
+    assert also_seen["least_gap_m"] == pytest.approx(seen["least_gap_m"], abs=0.3)
+    assert seen["least_gap_m"] > 0
+
+
+def test_driver_has_no_answer_for_actions_without_a_speed(tmp_path):
+    with pytest.raises(InvalidEpisodeError, match="set neither a speed nor an acceleration"):
+        driven(tmp_path, "meta")
