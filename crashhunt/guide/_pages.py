@@ -42,7 +42,7 @@ _PAGE_ORDER = [
     "agent", "exec", "lib", "fmu", "scenario", "map", "searching", "requirements", "disturbances",
     "probes", "branches", "look-into-a-crash",
     "kinds-of-crashes", "notes", "fault", "judge", "shrink", "film", "near-misses",
-    "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "gate", "train",
+    "hand-over", "corpus", "suites", "warm-up", "dashboard", "rate", "rare", "compare", "scorecard", "gate", "train",
     "criticality", "determinism", "search", "counterfactuals", "crash-rates",
     "commands", "api", "toml", "actions", "outcomes", "files", "json", "dashboard-api", "security",
     "exec-protocol", "disturbance-kinds", "requirement-language", "forks", "minimization", "export", "clusters",
