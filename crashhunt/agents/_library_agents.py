@@ -229,6 +229,7 @@ class LibraryAgent:
         # What does not change from step to step, as `crashhunt_act` receives it.
         self._call = library.crashhunt_act
         self._seen_at, self._action_at = ctypes.addressof(self._seen), action.address
+        self._write, self._clear, self._read = parts.write, action.clear, action.read
 
     def reset(self, seed: int) -> None:
         """Begin an episode; the library receives the seed in the first step."""
@@ -244,18 +245,19 @@ class LibraryAgent:
         if step == 0:
             self._begin()
         seen = self._seen
-        seen.step, seen.time_s = step, step * self._step_length_s
-        self._parts.write(observation)
-        self._action.clear()
-        limit_s = self._limit_s
-        latest = 0.0 if limit_s is None else time.monotonic() + limit_s
-        why = self._call(self._handle, self._seen_at, self._action_at)
-        if limit_s is not None and time.monotonic() > latest:
-            raise ProgramError(f"{self._name}: crashhunt_act has not returned within {limit_s:g} s in step {step + 1}")
+        seen.step = step
+        seen.time_s = step * self._step_length_s
+        self._write(observation)
+        self._clear()
+        why = (
+            self._call(self._handle, self._seen_at, self._action_at)
+            if self._limit_s is None
+            else self._call_within(self._limit_s)
+        )
         if why is not None:
             raise self._error(f"crashhunt_act failed in step {step + 1}", why)
         self._step = step + 1
-        action = self._action.read()
+        action = self._read()
         if action is None:
             count = self._action.described.size
             raise ProgramError(
@@ -264,6 +266,15 @@ class LibraryAgent:
                 fix="write as many values as setup->action->size says",
             )
         return action
+
+    def _call_within(self, limit_s: float) -> bytes | None:
+        """Call ``crashhunt_act``; a call that takes longer than a limit is an error."""
+        latest = time.monotonic() + limit_s
+        why: bytes | None = self._call(self._handle, self._seen_at, self._action_at)
+        if time.monotonic() > latest:
+            message = f"crashhunt_act has not returned within {limit_s:g} s in step {self._step + 1}"
+            raise ProgramError(f"{self._name}: {message}")
+        return why
 
     def close(self) -> None:
         """Have the library release the agent."""
@@ -411,13 +422,15 @@ class Action:
         self._all[self._size :] = _GUARD
         self.values = self._all[: self._size]
         self._shaped = self.values.reshape(shape)
+        self.values.fill(math.nan)
+        self._raw, self._unwritten = self._all.data.cast("B"), self._all.tobytes()
         columns = tuple(names) if shape and len(names) == shape[-1] else ()
         self.address: int = self._all.ctypes.data
         self.described = _described("action", shape, columns, None, None)
 
     def clear(self) -> None:
         """Make each value NaN, which is refused, so that a value that the library does not write has no effect."""
-        self.values.fill(math.nan)
+        self._raw[:] = self._unwritten  # in half the time of `ndarray.fill`
 
     def read(self) -> object:
         """Return the action; None if the library has written more values."""
@@ -425,10 +438,11 @@ class Action:
         if values[self._size :] != _GUARD:
             return None
         if self._is_tuple:
+            del values[self._size :]
             for place in self._whole_places:
                 if (value := values[place]).is_integer():  # another number is left to the check of all agents
                     values[place] = int(value)
-            return tuple(values[: self._size])
+            return tuple(values)
         if not self._shaped.shape:
             return _whole_number(values[0]) if self._is_whole[0] else values[0]
         action = self._shaped.copy()
