@@ -45,6 +45,7 @@ from crashhunt.report._words import (
     nearest_to_json,
     window_of,
 )
+from crashhunt.simulators import TRAJECTORY_SHAPE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -373,17 +374,24 @@ class Story:
         channel = next((agent for agent in self.recording.prologue.agents if agent.id == self.agent), None)
         if channel is None:
             return ()
-        if is_opaque(channel.action_shape):
+        if is_opaque(channel.action_shape) or channel.action_shape == TRAJECTORY_SHAPE:
             return ("action",)
         return channel.action_names or tuple(f"action[{n}]" for n in range(math.prod(channel.action_shape)))
 
     def _opaque_action(self, step: int) -> str:
-        """Return the text of an action that is not an array of numbers; empty for other actions."""
+        """Return the text of an action that is a trajectory, or no array of numbers; empty for other actions."""
         channel = next((agent for agent in self.recording.prologue.agents if agent.id == self.agent), None)
-        if channel is None or not is_opaque(channel.action_shape) or not 0 <= step < len(self.recording.all_steps):
+        if channel is None or not 0 <= step < len(self.recording.all_steps):
             return ""
         array = self.recording.all_steps[step].actions.get(self.agent)
-        return "" if array is None else describe_value(array, _MAX_ACTION_CHARACTERS)
+        if array is not None and channel.action_shape == TRAJECTORY_SHAPE:
+            time, x, y, _, speed = array[-1].tolist()
+            return f"to ({x:.1f}, {y:.1f}) at {speed:.1f} m/s in {time:.1f} s"
+        return (
+            describe_value(array, _MAX_ACTION_CHARACTERS)
+            if array is not None and is_opaque(channel.action_shape)
+            else ""
+        )
 
     def _action(self, step: int) -> list[float] | None:
         """Return the action of the agent in a step as text."""

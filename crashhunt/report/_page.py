@@ -38,6 +38,7 @@ from crashhunt.report._words import (
     traffic_of,
 )
 from crashhunt.results import CodeVersions, TrialRow, count_versions, find_crashes
+from crashhunt.simulators import TRAJECTORY_SHAPE
 from crashhunt.trial import Outcome, steps_of
 from crashhunt.world import approaches, join_frames
 
@@ -557,7 +558,7 @@ def _scenes(recording: Recording, agent: str) -> dict[str, object]:
     actions = np.full((len(scenes), 0), np.nan)
     channel = next((found for found in recording.prologue.agents if found.id == agent), None)
     action_names: list[str] = []
-    if channel is not None and not is_opaque(channel.action_shape):
+    if channel is not None and not is_opaque(channel.action_shape) and channel.action_shape != TRAJECTORY_SHAPE:
         size = math.prod(channel.action_shape)
         action_names = list(channel.action_names) or [f"action[{n}]" for n in range(size)]
         size = size if size <= _MAX_SHOWN_ACTIONS else 0  # a trajectory is drawn, and not listed

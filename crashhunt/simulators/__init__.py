@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from ._actions import (
         MAX_ACCELERATION as MAX_ACCELERATION,
         META_ACTIONS as META_ACTIONS,
+        TRAJECTORY_SHAPE as TRAJECTORY_SHAPE,
         AccelerationAndLaneChange as AccelerationAndLaneChange,
         MetaAction as MetaAction,
         NumbersAction as NumbersAction,

@@ -138,6 +138,8 @@ class NumbersAction:
 
 MAX_POINTS = 64  # of a trajectory: each is in the recording of each step
 _WIDTH = 5
+TRAJECTORY_SHAPE = (MAX_POINTS, _WIDTH)
+"""Shape of an encoded trajectory."""
 
 
 class TrajectoryAction:
@@ -152,7 +154,7 @@ class TrajectoryAction:
     """
 
     names: tuple[str, ...] = ()
-    encoded_type = "<f8", (MAX_POINTS, _WIDTH)
+    encoded_type = "<f8", TRAJECTORY_SHAPE
 
     def __init__(self) -> None:
         from gymnasium import spaces
