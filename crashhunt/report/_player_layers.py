@@ -135,17 +135,20 @@ def _observed(recording: Recording, channel: AgentChannel, origin: NDArray[np.fl
     lidar: list[NDArray[np.float64]] = []
     words: list[list[tuple[str, str]]] = []
     lights: list[list[tuple[str, int, int]]] = []
-    steps = recording.all_steps
+    steps, nothing = recording.all_steps, np.zeros(channel.observation_shape)
     for number in range(first, min(recording.steps + 1, len(steps) - 1)):
         observation = steps[number + 1].observations.get(channel.id)
-        seen = {} if observation is None else {name: _present(channel, name, observation) for name in parts}
+        is_missing = observation is None or not observation.any()  # such as of an agent that has left
+        seen = {name: _present(channel, name, nothing if observation is None else observation) for name in parts}
         for name, columns in shown.items():
-            layers[name].append(
-                _columns_of(seen.get(name), parts[name].columns, columns, origin)[..., :: strides[name], :]
-            )
+            layers[name].append(_columns_of(seen[name], parts[name].columns, columns, origin)[..., :: strides[name], :])
         if rays:
-            lidar.append(seen["lidar2d"].ravel() if "lidar2d" in seen else np.full(rays, np.nan))
-        rows = {name: _rows(values, parts[name].columns) for name, values in seen.items() if parts[name].columns}
+            lidar.append(np.full(rays, np.nan) if is_missing else seen["lidar2d"].ravel())
+        rows = (
+            {}
+            if is_missing
+            else {name: _rows(seen[name], part.columns) for name, part in parts.items() if part.columns}
+        )
         words.append(_in_words(rows))
         lights.append(_lights(recording, number, rows.get("actors", [])))
     packed = {
@@ -168,10 +171,9 @@ def _present(channel: AgentChannel, name: str, observation: NDArray[np.generic])
 
 
 def _columns_of(
-    values: NDArray[np.float64] | None, names: Sequence[str], columns: Sequence[str], origin: NDArray[np.float64]
+    values: NDArray[np.float64], names: Sequence[str], columns: Sequence[str], origin: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return some columns of a part; rows without content are NaN, and positions begin at the origin."""
-    assert values is not None
     found = values[..., [names.index(name) for name in columns]].copy()
     found[~values.any(axis=-1)] = np.nan
     found[..., :2] -= origin

@@ -51,3 +51,11 @@ def test_agent_and_collision_partner_differ_by_more_than_their_hue(scheme, peopl
     assert contrast(named["ego"], named["partner"], SEEN_BY[people]) >= 3.0
     for line in ("ego-line", "partner", "accent"):  # curves on a card
         assert contrast(named[line], named["card"], SEEN_BY[people]) >= 3.0
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("people", SEEN_BY)
+def test_observation_and_plan_differ_from_road_and_ground(scheme, people):
+    named = colours()[scheme]
+    for line in ("observed", "plan", "text"):
+        assert min(contrast(named[line], named[ground], SEEN_BY[people]) for ground in ("road", "page")) >= 3.0, line

@@ -13,7 +13,7 @@ from conftest import add_toy
 from crashhunt.crashes import list_bundles
 from crashhunt.recording import AgentChannel, ObservedPart
 from crashhunt.report import player_data
-from crashhunt.report._player_layers import _in_words, _present, _rows
+from crashhunt.report._player_layers import _in_words, _present, _rows, player_layers
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators import PARTS
 
@@ -54,6 +54,16 @@ def test_boxes_of_a_scene_are_where_its_actors_are_and_the_rays_end_at_outlines(
             if scene.centers[row, 0] > scene.centers[ego, 0]
         )
         assert rays[step][0] == pytest.approx(ahead, abs=0.02)  # the toy drives along the x axis
+
+
+def test_recording_without_observations_shows_none(hunt):
+    bundle = list_bundles(hunt.folder / "seen")[0]
+    compact = bundle.recording().compacted([], 1000.0, observations=False)
+    seen = player_layers(bundle, compact, "ego", None, np.zeros(2))["observed"]
+    assert np.isnan(unpacked(seen["layers"]["actors"])).all()
+    assert np.isnan(unpacked(seen["layers"]["lidar2d"])).all()
+    assert not any(seen["words"])
+    assert not any(seen["lights"])
 
 
 def test_crash_without_observed_parts_has_no_layers_of_them(toy):
