@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import math
+import statistics
 import zlib
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,7 @@ _MAX_LANE_STEPS = 100  # steps with the lanes of actors, the last ones
 _REACH_M = 60.0  # stop lines are drawn within this distance of the path of the agent
 _PREDICTION_STRIDE = 5
 _PLAN_SHAPE, _POSE_NAMES = 5, ("x", "y", "heading", "time")
+_PLAN_START_M, _MAX_ACCELERATION_MPS2 = 3.0, 10.0  # bounds of the place of the first planned pose
 _STATES = ("green", "yellow", "red", "off or blinking")
 _LAYERS: Mapping[str, tuple[str, ...]] = {
     "actors": ("x", "y", "heading", "length", "width"),
@@ -103,11 +105,27 @@ def _plan(recording: Recording, channel: AgentChannel, origin: NDArray[np.float6
     first = _first_step(recording, 2 * count)
     steps = recording.all_steps
     points = np.full((recording.steps + 1 - first, count, 2), np.nan)
+    placed = points.copy()  # if they are in the frame of the vehicle
+    in_map, in_frame_of_vehicle = True, True
     for number in range(first, min(recording.steps + 1, len(steps) - 1)):
-        action = steps[number + 1].actions.get(channel.id)
-        if action is not None:
-            columns = slice(0, 2) if is_pose else slice(1, 3)
-            points[number - first] = np.asarray(action, float).reshape(count, -1)[:, columns]
+        action, scene = steps[number + 1].actions.get(channel.id), recording.scene(number)
+        row = scene.roster.index.get(channel.id)
+        if action is None or row is None:
+            continue
+        poses = np.asarray(action, float).reshape(count, -1)
+        points[number - first] = poses[:, 0:2] if is_pose else poses[:, 1:3]
+        time_s, speed = float(poses[0, 3 if is_pose else 0]), scene.speeds[row]
+        reach = _PLAN_START_M + (speed + _MAX_ACCELERATION_MPS2 * time_s) * time_s
+        center, start = scene.centers[row], points[number - first, 0].copy()
+        in_map &= bool(np.hypot(*(start - center)) <= reach)
+        in_frame_of_vehicle &= bool(np.hypot(*start) <= reach)
+        turn, heading = points[number - first], scene.headings[row]
+        placed[number - first] = center + turn @ np.array(
+            [[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]]
+        )
+    if in_map == in_frame_of_vehicle:
+        return {}  # the recording does not state the frame of the action
+    points = points if in_map else placed
     repeated = np.zeros(points.shape[:2], bool)
     repeated[:, 1:] = (points[:, 1:] == points[:, :-1]).all(axis=2)  # an encoded trajectory repeats its last point
     points[repeated] = np.nan
@@ -135,6 +153,7 @@ def _observed(recording: Recording, channel: AgentChannel, origin: NDArray[np.fl
     lidar: list[NDArray[np.float64]] = []
     words: list[list[tuple[str, str]]] = []
     lights: list[list[tuple[str, int, int]]] = []
+    apart: list[float] = []
     steps, nothing = recording.all_steps, np.zeros(channel.observation_shape)
     for number in range(first, min(recording.steps + 1, len(steps) - 1)):
         observation = steps[number + 1].observations.get(channel.id)
@@ -150,7 +169,10 @@ def _observed(recording: Recording, channel: AgentChannel, origin: NDArray[np.fl
             else {name: _rows(seen[name], part.columns) for name, part in parts.items() if part.columns}
         )
         words.append(_in_words(rows))
-        lights.append(_lights(recording, number, rows.get("actors", [])))
+        lights.append(_lights(recording, number, rows.get("actors", []), apart))
+    if not recording.disturbances and statistics.median(apart or [0.0]) > _MATCH_M:
+        # Positions have another reference point than the centre, so boxes would be next to the actors.
+        layers = {name: values for name, values in layers.items() if name not in ("actors", "predictions")}
     packed = {
         name: {"size": list(values[0].shape), "values": packed_floats(np.round(np.array(values, float), 2))}
         for name, values in layers.items()
@@ -214,8 +236,8 @@ def _meters(value: float) -> str:
     return f"{value:.1f} m"
 
 
-def _lights(recording: Recording, step: int, actors: Rows) -> list[tuple[str, int, int]]:
-    """Return the identifier, brake light and indicator of each actor of the scene that the agent observed."""
+def _lights(recording: Recording, step: int, actors: Rows, distances: list[float]) -> list[tuple[str, int, int]]:
+    """Return the identifier, brake light and indicator of each observed actor; add its distance from an actor."""
     scene = recording.scene(step)
     if not actors or not len(scene.roster):
         return []
@@ -223,6 +245,7 @@ def _lights(recording: Recording, step: int, actors: Rows) -> list[tuple[str, in
     for actor in actors:
         apart = np.hypot(*(centers - (actor["x"], actor["y"])).T)
         row = int(apart.argmin())
+        distances.append(float(apart[row]))
         if apart[row] < _MATCH_M and (actor["brake_light"] or actor["indicator"]):
             found.append((scene.roster.actors[row].id, int(actor["brake_light"]), int(actor["indicator"])))
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import xml.etree.ElementTree as ET
 import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from conftest import add_toy
 from crashhunt.crashes import list_bundles
 from crashhunt.recording import AgentChannel, ObservedPart
 from crashhunt.report import player_data
-from crashhunt.report._player_layers import _in_words, _present, _rows, player_layers
+from crashhunt.report._player_layers import _in_words, _plan, _present, _rows, player_layers
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators import PARTS
+from crashhunt.world import Actor, Roster, Scene
 
 
 def unpacked(layer) -> np.ndarray:
@@ -77,6 +79,27 @@ def test_present_values_of_a_history_are_its_last_ones():
     part = ObservedPart("signals", (4, 3, 4), tuple(column.name for column in PARTS["signals"].columns))
     channel = AgentChannel("ego", "<f8", (48,), "<f8", (2,), (), (), (part,))
     assert _present(channel, "signals", np.arange(48.0)).tolist() == np.arange(36.0, 48).reshape(3, 4).tolist()
+
+
+@pytest.mark.parametrize("frame", ["map", "vehicle", "unknown"])
+def test_plan_is_drawn_in_the_frame_that_the_action_has(frame):
+    heading, count = 0.5, 64
+    channel = AgentChannel("ego", "<f8", (1,), "<f8", (count, 5))
+    roster = Roster((Actor("ego", "passenger", 4.0, 2.0),))
+    middle = (1.0, 1.0) if frame == "unknown" else (500.0, 300.0)  # near the origin of the map, it may be either
+    front = (middle[0] + 2 * np.cos(heading), middle[1] + 2 * np.sin(heading))
+    scene = Scene(0.0, roster, [front], [heading], [10.0])
+    ahead = np.arange(1, count + 1) * 1.0
+    offset = np.stack((ahead * np.cos(heading), ahead * np.sin(heading)), axis=1)
+    places = np.stack((ahead, 0 * ahead), axis=1) if frame == "vehicle" else offset + middle
+    action = np.column_stack((ahead / 10, places, np.full(count, heading), np.full(count, 10.0)))
+    steps = [SimpleNamespace(actions={}), SimpleNamespace(actions={"ego": action})]
+    recording = SimpleNamespace(all_steps=steps, steps=1, scene=lambda _: scene)
+    found = _plan(recording, channel, np.zeros(2))
+    if frame == "unknown":
+        assert found == {}
+    else:
+        assert unpacked(found)[0] == pytest.approx(offset + middle, abs=1e-3)
 
 
 def row(part: str, **values: float) -> np.ndarray:
