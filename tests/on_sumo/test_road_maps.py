@@ -18,7 +18,11 @@ from crashhunt.sumo.maps import read_network  # noqa: E402
 from crashhunt.world import lane_lines  # noqa: E402
 
 NETS = Path(__file__).parent / "nets"
-ALL = sorted(path.name for path in NETS.glob("*.net.xml*"))
+LARGE = ("grid-skew", "grid-walks", "rand-wide", "spider-lights")
+ALL = [
+    pytest.param(path.name, marks=pytest.mark.nightly) if path.name.startswith(LARGE) else path.name
+    for path in sorted(NETS.glob("*.net.xml*"))
+]
 CAR = "passenger"
 
 
@@ -61,7 +65,8 @@ def test_lanes_have_the_shape_neighbours_and_classes_that_sumolib_reads(name):
             middle, there = len(lane.center) // 2, lanes[lane.left].center
             along = lane.center[middle] - lane.center[middle - 1]
             across = there[len(there) // 2] - lane.center[middle]
-            assert along[0] * across[1] - along[1] * across[0] > 0
+            if np.hypot(*across) > 1.0:  # lanes inside a junction may cross each other
+                assert along[0] * across[1] - along[1] * across[0] > 0
 
 
 def test_the_edges_of_a_lane_are_half_a_width_from_its_centre_and_never_turn_back():
