@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from conftest import mostly_nightly
+from test_stops import left_in
 
 FINE = ("--scenario", "toy", "--agent", "faulty:Fine", "--seed", "5", "--set", "step_wall_s=0.0005")
 LONG = ("30", *FINE[:-1], "step_wall_s=0.01")  # 0.3 s a trial, most of it asleep
@@ -145,11 +146,11 @@ def test_an_interrupt_while_it_starts_is_not_lost(toy, libraries):
 
 def test_a_killed_hunt_leaves_no_process_and_continues(toy):
     words = ("run", "h", "2", "14", *LONG, "--json")
-    process = toy.begin(*words, start_new_session=True)
+    process = toy.start(*words, start_new_session=True)
     wait_for(lambda: count(toy.folder / "h") >= 4)
     process.kill()
     process.communicate()
-    wait_for(lambda: session_is_gone(process.pid))
+    wait_for(lambda: session_is_gone(process.pid) and not left_in(toy.folder))
     before = ledger(toy.folder / "h")
     assert toy.crashhunt(*words).json["trials_run"] == 14
     after = ledger(toy.folder / "h")

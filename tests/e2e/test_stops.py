@@ -79,14 +79,6 @@ def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, whom):
     assert toy.crashhunt(*words).json["outcomes"] == {"survived": 8}
 
 
-def test_a_killed_hunt_takes_every_process_along(toy):
-    process = toy.start("run", "h", "2", "1000", "40", *FINE, *SLOW)
-    wait_for(lambda: len(rows(toy.folder / "h")) >= 1)
-    process.kill()
-    process.communicate()
-    wait_for(lambda: not left_in(toy.folder))
-
-
 @pytest.mark.parametrize(
     "words",
     [
