@@ -88,7 +88,7 @@ def test_a_program_that_fails_at_once_is_an_error_of_the_agent_and_one_that_is_m
 @pytest.mark.parametrize(
     ("option", "part"),
     [
-        (("--probe", "1"), "probes"),
+        pytest.param(("--probe", "1"), "probes", marks=pytest.mark.nightly),
         pytest.param(("--branch",), "branches", marks=pytest.mark.nightly),
         pytest.param(("--rare",), "rare", marks=pytest.mark.nightly),
     ],
@@ -128,7 +128,7 @@ def test_modules_next_to_a_program_in_python_travel_with_it(toy):
     (toy.folder / "helper.py").write_text("import package\n")
     (toy.folder / "package").mkdir()
     (toy.folder / "package" / "__init__.py").write_text("")
-    toy.crashhunt("run", "h", "1", "3", "200", "--agent", "exec:./planner blind", "--arg", "speed=18.0", *RUN)
+    toy.crashhunt("run", "h", "1", "1", "200", "--agent", "exec:./planner blind", "--arg", "speed=18.0", *RUN)
     (toy.folder / "helper.py").write_text("import missing\n")
     done = toy.crashhunt("replay", "h", "--json").json
     assert (done["verdict"], done["warnings"]) == ("reproduced", [])

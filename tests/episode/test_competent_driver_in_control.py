@@ -122,7 +122,7 @@ def test_paths_that_meet_in_a_junction_are_reported():
 def test_model_needs_actions_with_a_speed_and_a_simulator_that_knows_the_road():
     road = StraightRoad(gap=12.0)
     road.actions = {"ego": MetaAction()}
-    with pytest.raises(InvalidEpisodeError, match="set no speed"):
+    with pytest.raises(InvalidEpisodeError, match="set neither a speed nor an acceleration"):
         overruled_agent(Blind(), road, Overruled("ego", 0, reference="fsm", other="lead"))
     with pytest.raises(InvalidEpisodeError, match="reports no surroundings"):
         overruled_agent(Blind(), SimpleNamespace(), Overruled("ego", 0, reference="fsm", other="lead"))
