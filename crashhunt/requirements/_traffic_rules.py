@@ -3,7 +3,8 @@
 Sources: S. Maierhofer, A.-K. Rettinger, E. C. Mayer and M. Althoff, "Formalization of Interstate Traffic Rules in
 Temporal Logic", IV 2020 (rules R_G1 to R_G3 and R_I1); S. Maierhofer, P. Moosbrugger and M. Althoff, "Formalization of
 Intersection Traffic Rules in Temporal Logic", IV 2022 (traffic lights and priority). The formulas follow the structure
-of these rules with the signals of crashhunt. Where a rule was changed, its entry says how.
+of these rules with the signals of crashhunt. Where a rule was changed, its entry says how. Its limits, such as a
+deceleration of 10 m/s² or a reaction time of 0.3 s, are choices of crashhunt.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ TRAFFIC_RULES = {
                 "Keep the distance in which both vehicles can stop, except for 3 s after the vehicle ahead has changed."
             ),
             source=(
-                f"{_INTERSTATE}, R_G1: deceleration 10 m/s², reaction time 0.3 s. A lane change of ego "
+                f"{_INTERSTATE}, R_G1, with 10 m/s² and a reaction time of 0.3 s. A lane change of ego "
                 "counts as a cut-in."
             ),
             formula=f"always (once[0:3] leader_changed or {_SAFE})",

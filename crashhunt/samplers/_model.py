@@ -120,12 +120,14 @@ TRIALS = 96
 """Trials in the process, and trials in each memory: a solution takes about 0.2 ms."""
 _CANDIDATES = 384  # points from which a proposal is chosen: their worths take about half a millisecond
 
+# As in `_signal_shapes`, chosen on the problems of the page falsification-evaluation.
+_SHAPED = 0.8  # share of candidates that change the signals of a parent, if the space has signals
+
 # The following numbers are part of the method. None was changed when a version was chosen.
 
 _ANYWHERE, _AROUND, _NEAR = 1, 2, 3  # odds of candidates: anywhere, around all parents, near one parent
 _KEEP_SEED = 0.5  # probability that a candidate keeps the seed of its parent: a fair coin
 _KEEP_OTHERS = 0.5  # probability that such a candidate keeps the other arguments of its parent
-_SHAPED = 0.8  # share of candidates that change the signals of a parent, if the space has signals
 _AMBITION = 1.0  # greatest ambition, in standard deviations of scores; it is drawn from 0 on
 _FIRST_ODDS = -2.0  # logarithm of the odds of each share where the fit begins: a share of 0.12
 _STARTS = 5  # length scales at which the fit begins again, each half of the one before

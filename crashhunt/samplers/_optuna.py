@@ -115,7 +115,9 @@ class GuidedSampler(Learning):
     """Proposes trials by models of criticality or robustness, whose share of the trials depends on their success."""
 
     origin = "guided"
-    version = 5  # 2 excluded basins of known crashes, 3 had no mutation, 4 had no niches, 5 has another model
+    # 2 excluded basins of known crashes, 3 had no mutation, 4 had no niches, 5 had another model, 6 searches each
+    # conjunct of a requirement by itself and changes signals by their shape
+    version = 6
 
     def _make(self, space: Space) -> Strategy:
         from crashhunt.samplers._guided import Arms  # its linear algebra takes a fifth of a second to import

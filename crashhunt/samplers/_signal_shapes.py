@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-# The following numbers are part of the method. None was changed when a version was chosen.
+# The following numbers are part of the method. They were chosen on the problems of the page falsification-evaluation.
 
 _MOST_CORNERS = 8  # corners of more signals than three would take too many trials
 _ALL_PIECES = 0.5  # probability that each point of a shape is a piece of its own

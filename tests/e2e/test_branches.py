@@ -24,6 +24,7 @@ default = 12.0
 """
 
 
+@pytest.mark.nightly
 def test_a_hunt_branches_where_trials_come_near_and_confirms_what_it_finds_from_the_start(shell):
     (shell.folder / "toy.toml").write_text(TOY)
     words = ("run", "h", "1", "1", "120", "--scenario", "toy.toml", "--seed", "3", "--arg", "speed=9.5", "--keep-going")

@@ -121,6 +121,7 @@ def test_a_scenario_names_its_program_relative_to_its_own_folder(toy):
     assert 'write agent = { exec = ["./planner", "--mode", "test"] }' in refused.err
 
 
+@pytest.mark.nightly
 def test_modules_next_to_a_program_in_python_travel_with_it(toy):
     planner = toy.folder / "planner"
     write_program(toy.folder)

@@ -94,6 +94,7 @@ def calls(shell, name="calls.log"):
     return lines
 
 
+@pytest.mark.nightly
 def test_an_executor_of_somebodys_own_runs_the_trials(mine):
     usual = mine.crashhunt(*WORDS, "--json").json
     done = mine.crashhunt("run", "g", *WORDS[2:], "--executor", "mine:Logged:there:10001", "--json")

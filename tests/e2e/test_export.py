@@ -178,6 +178,7 @@ def test_file_that_a_module_reads_when_it_is_imported_is_named_once(toy):
     assert done.out.count("weights.npz is ignored by git, so the snapshot lacks it") == 1
 
 
+@pytest.mark.nightly
 def test_program_that_git_ignores_travels_if_the_user_adds_it(toy):
     (toy.folder / "planner.py").write_text(PLANNER)
     (toy.folder / "build").mkdir()

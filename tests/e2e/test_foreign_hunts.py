@@ -166,6 +166,7 @@ def test_trust_for_one_command_makes_nothing_ones_own(theirs):
         theirs.crashhunt("replay", place, expect=2)
 
 
+@pytest.mark.nightly
 def test_hunt_that_continues_runs_no_code_of_another_user(theirs):
     """What is there already would run from the snapshot of the other user, and other code is refused."""
     crash = find_bundle(theirs.folder / "h", "0")

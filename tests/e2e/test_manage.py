@@ -70,6 +70,7 @@ def test_logs_are_found_wherever_they_are(shell):
     assert "contradict" in shell.crashhunt("logs", "h", "--errors-only", "--type", "run", expect=2).err
 
 
+@pytest.mark.nightly
 def test_trials_that_could_not_be_set_up_run_again(toy):
     (toy.folder / "moody.py").write_text(
         "import pathlib\nclass Agent:\n    def __init__(self, number: int = 0):\n"

@@ -128,7 +128,8 @@ def test_every_option_that_is_mentioned_exists(shell):
     known = {"--help", "--help-all", "--upgrade"}
     known = known.union(*map(option.findall, [shell.crashhunt("guide", "commands").out, *scripts]))
     others = re.compile(
-        r"^#SBATCH|\bsrun\b|\bray start\b|\bpytest-xdist\b|\bnetconvert\b|\bpkg-config\b|\brandomTrips\b|\btesting\.r157\b"
+        r"^#SBATCH|\bsrun\b|\bray start\b|\bpytest-xdist\b|\bnetconvert\b|\bpkg-config\b|\brandomTrips\b|"
+        r"\btesting\.r157\b"
     )  # programs
     for topic in PAGES:
         ours = [line for line in Page(topic).text.splitlines() if not others.search(line)]

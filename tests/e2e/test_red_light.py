@@ -6,6 +6,8 @@ import json
 import shutil
 from pathlib import Path
 
+import pytest
+
 from crashhunt.recording import read_log
 
 NET = Path(__file__).parents[1] / "on_sumo" / "signal.net.xml"
@@ -34,6 +36,7 @@ def make(shell):
     (folder / "r.rou.xml").write_text(ROUTES)
 
 
+@pytest.mark.nightly
 def test_a_red_light_from_the_hunt_to_the_report(shell):
     make(shell)
     words = ("--scenario", "signal", "--arg", "speed=10", "--seed", "1", "--no-snapshot")

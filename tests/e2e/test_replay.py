@@ -144,6 +144,7 @@ def edit(path: Path, before: str, after: str) -> None:
     path.write_text(text.replace(before, after))
 
 
+@pytest.mark.nightly
 def test_an_agent_that_is_not_deterministic_is_found_out(toy):
     (toy.folder / "coin.py").write_text(
         "import os\n\nclass Agent:\n    def reset(self, seed): self.step = 0\n\n"

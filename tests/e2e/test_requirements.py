@@ -108,6 +108,7 @@ class Follows:
 """
 
 
+@pytest.mark.nightly
 def test_an_argument_may_be_a_signal_over_time(toy):
     (toy.folder / "driver.py").write_text(DRIVER)
     words = ["--agent", "driver:Follows", "--arg", "speed=signal:0:20:points=3:kind=linear", "--oracle", "none"]

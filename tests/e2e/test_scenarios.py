@@ -105,6 +105,7 @@ agent = "shaky:Swing"
 """
 
 
+@pytest.mark.nightly
 def test_an_environment_of_ones_own_is_part_of_the_snapshot(shell):
     """Its factory, its crash rule and its structured observations; edits of it are seen as such."""
     (shell.folder / "scenario.toml").write_text(SWING)

@@ -116,6 +116,7 @@ def installed(shell) -> Path:
     return shell.folder / "installed" / "site-packages"
 
 
+@pytest.mark.nightly
 def test_its_table_files_and_versions_are_those_of_the_hunt_and_its_crash_is_replayed(mysim):
     hunt = mysim.crashhunt("run", "h", "1", "3", "200", "--scenario", "town", "--seed", "1", "--json")
     assert "the road is roads/short.road" in hunt.err

@@ -86,6 +86,7 @@ def test_a_large_work_tree_is_kept_whole(project):
     assert len(list((snapshot / "code" / "@my project" / "many").rglob("*.txt"))) == 3000
 
 
+@pytest.mark.nightly
 def test_replay_of_todays_code_names_the_files_that_differ(toy):
     def differences(*words):
         return toy.crashhunt("replay", "h", "--code", "current", "--json", *words, expect=None).json["code_differences"]

@@ -80,6 +80,7 @@ def wait_for(condition, timeout_s: float = 300.0) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.nightly
 def test_every_hunt_stops_at_its_own_first_crash(toy):
     written(toy, SUITE)
     done = toy.crashhunt("suite", "run", "suite.toml", "out", "2", "--json").json

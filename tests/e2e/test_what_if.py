@@ -54,6 +54,7 @@ def test_same_agent_from_any_step_on_crashes_as_it_was_recorded(crash, step):
     assert (found["from_step"], found["excluded"]) == (step, {})
 
 
+@pytest.mark.nightly
 def test_another_agent_takes_over_after_the_recorded_actions(crash):
     slow = crash.crashhunt("whatif", "h", "--before", "2", *SPEED, "speed=8", "--json").json
     late = crash.crashhunt("whatif", "h", "--before", "0.1", *SPEED, "speed=8", "--json").json

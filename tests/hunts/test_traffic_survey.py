@@ -73,6 +73,7 @@ def test_trials_replace_vehicles_that_enter_only(town):
     assert {**hunted(town.folder), "trials": 4} == before
 
 
+@pytest.mark.nightly
 def test_a_hunt_of_before_continues_with_the_vehicles_that_its_files_promised(town):
     _, before = surveyed(town.folder, survey=False)
     promised = before.scenario_arguments["vehicle"].spec
@@ -149,6 +150,7 @@ def test_a_survey_that_takes_too_long_is_given_up(town, monkeypatch):
     assert settings == surveyed(town.folder, survey=False, seed=settings.seed)[1]
 
 
+@pytest.mark.nightly
 def test_survey_without_processor_time_warns_that_candidates_depend_on_the_machine(town, monkeypatch):
     assert not [note for note in surveyed(town.folder)[0].notes if "processor time" in note]
     monkeypatch.setattr(_preflight, "MAX_PROCESSOR_TIME_S", 0.0)
@@ -156,6 +158,7 @@ def test_survey_without_processor_time_warns_that_candidates_depend_on_the_machi
     assert note.startswith("warning: the look ahead ended at 5 s")
 
 
+@pytest.mark.nightly
 def test_busy_machine_finds_the_same_candidates(town, monkeypatch):
     before, _ = surveyed(town.folder)
     monkeypatch.setattr(_preflight, "MAX_PROCESSOR_TIME_S", 20.0)
@@ -241,6 +244,7 @@ def test_resumed_hunt_keeps_the_candidates_with_which_it_began_although_its_surv
     assert as_plain_data(other) != as_plain_data(begun)
 
 
+@pytest.mark.nightly
 def test_hunt_of_a_suite_that_was_killed_before_its_snapshot_keeps_its_candidates(town):
     options = HuntOptions(scenario=str(town.folder / "town.sumocfg"), seed=1)
     request = request_of(options, trials=2, max_steps=9)

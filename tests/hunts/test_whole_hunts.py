@@ -119,6 +119,7 @@ def facts_of(hunt):
 
 
 @pytest.mark.long
+@pytest.mark.nightly
 def test_a_hunt_ends_with_its_first_crash_and_does_not_depend_on_how_many_run_at_a_time(tmp_path, monkeypatch, capfd):
     # Hunting from a script without a guard: if a worker imported it again, this would run there.
     (tmp_path / "script.py").write_text(f"print('again')\nopen({str(tmp_path / 'again')!r}, 'w')\n")

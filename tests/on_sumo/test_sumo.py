@@ -197,6 +197,7 @@ def test_leaving_the_road_and_changing_lanes(town):
     assert report["outcomes"] in ({"survived": 1}, {"collision": 1})
 
 
+@pytest.mark.nightly
 def test_two_agents_have_channels_and_arguments_of_their_own(shell):
     words = ("run", "h", "1", "12", "400", "--scenario", "loop-two-agents", "--seed", "2", "--json")
     crowded = ("--set", "vehicles=45")  # so that one of the first trials crashes

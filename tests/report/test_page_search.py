@@ -86,6 +86,7 @@ def test_of_many_trials_those_that_are_drawn_are_of_all_origins(tmp_path, monkey
     assert max(after["number"] - before["number"] for before, after in pairwise(drawn)) < 3 * trials / 40
 
 
+@pytest.mark.nightly
 def test_the_page_knows_from_which_trials_a_crash_was_made(shell):
     (shell.folder / "toy").mkdir()
     toy = 'schema = 1\nsimulator = "toy"\n[agents.ego]\nagent = "crashhunt.agents:KeepLaneWithSpeed"\n'

@@ -224,6 +224,7 @@ def on_a_terminal(shell, *words: str) -> tuple[int, str]:
     return codes[0], shown.decode(errors="replace")
 
 
+@pytest.mark.nightly
 def test_reports_exports_and_films_say_how_far_they_are(toy, made_once):
     pytest.importorskip("PIL")
     made_once(keeps_going, toy)

@@ -174,6 +174,7 @@ def test_versions_are_kept_apart_in_every_figure(agent, tmp_path, capsys):
 
 
 @pytest.mark.long
+@pytest.mark.nightly
 def test_crash_of_earlier_code_does_not_end_the_hunt_for_one_of_the_new_code(agent, tmp_path):
     options = {"keep_going": False}
     report = run(16, **options)
@@ -250,6 +251,7 @@ def test_learning_sampler_receives_no_results_of_earlier_code(agent, tmp_path, m
     assert min(one.spec.number for one in told) >= 4
 
 
+@pytest.mark.nightly
 def test_versions_of_a_hunt_that_recorded_none_are_those_of_its_snapshots(agent, tmp_path):
     """A hunt of an earlier crashhunt, which resumed with any code."""
     hunt = tmp_path / "h"

@@ -176,6 +176,7 @@ def test_vector_environments(crashes):
     vector.close()
 
 
+@pytest.mark.nightly
 def test_a_process_of_its_own_gives_the_same_episodes(crashes):
     found = []
     for process in (False, True):
