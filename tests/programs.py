@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import shlex
 import sys
 from typing import TYPE_CHECKING
 
@@ -185,7 +186,9 @@ def write_program(folder: Path, name: str = "planner") -> Path:
 def write_binary_program(folder: Path, name: str = "binary") -> Path:
     """Write the program with binary messages into a folder, and return its path."""
     path = folder / name
-    path.write_text(f"#!{sys.executable}\n{BINARY}", encoding="utf-8")
+    # As pip starts its scripts: a path with a space cannot follow "#!".
+    start = f"#!/bin/sh\n'''exec' {shlex.quote(sys.executable)} \"$0\" \"$@\"\n' '''\n"
+    path.write_text(f"{start}{BINARY}", encoding="utf-8")
     path.chmod(0o755)
     return path
 
