@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import subprocess
-import shlex
 import sys
 from typing import TYPE_CHECKING
 
