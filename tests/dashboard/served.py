@@ -73,7 +73,7 @@ class Dashboard:
 
 @contextmanager
 def served(*paths: Path, host: str = "127.0.0.1", token: str = "", control: bool = False) -> Iterator[Dashboard]:
-    from crashhunt.dashboard import _server
+    from crashhunt.dashboard import _server, _serving
     from crashhunt.dashboard._application import make_application
     from crashhunt.dashboard._catalog import Catalog
 
@@ -82,7 +82,7 @@ def served(*paths: Path, host: str = "127.0.0.1", token: str = "", control: bool
     listening = socket.create_server(("127.0.0.1", 0))
     application = make_application(Catalog(folders, exported), host=host, token=token, allow_control=control)
     begun = threading.Event()
-    server = _server.make_server(application.asgi, begun.set)
+    server = _serving.make_server(application.asgi, begun.set)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
     thread.start()
     try:

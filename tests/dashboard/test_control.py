@@ -15,7 +15,7 @@ from conftest import _commands, add_toy
 from dashboard_hunts import hunted
 from served import served
 
-from crashhunt.dashboard import _application
+from crashhunt.dashboard import _control
 
 OURS = {"Host": "localhost", "X-Crashhunt": "1"}
 
@@ -84,7 +84,7 @@ def test_commands_are_started_from_the_page_and_run(toy, page, names, monkeypatc
             Popen=lambda words, **streams: Forked(words, toy.environment, **streams),
             DEVNULL=subprocess.DEVNULL, PIPE=subprocess.PIPE, STDOUT=subprocess.STDOUT,
         )  # fmt: skip
-        monkeypatch.setattr(_application, "subprocess", started)
+        monkeypatch.setattr(_control, "subprocess", started)
     words = ("--scenario", "toy", "--arg", "speed=8:20", "--seed", "4")
     toy.crashhunt("run", "one", "1", "1", "99", *words)
     with served(toy.folder / "one", control=True) as dashboard:

@@ -13,7 +13,7 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, UsageError
-from crashhunt.dashboard import _catalog, _crash_list as _crashes, _hunt_page as _hunt, _server
+from crashhunt.dashboard import _catalog, _crash_list as _crashes, _hunt_page as _hunt, _server, _serving
 from crashhunt.dashboard._catalog import Catalog, FoundHunt, is_inside, unreadable, unreadable_below
 from crashhunt.dashboard._hunt_page import HuntView
 from crashhunt.ledger import Ledger
@@ -551,30 +551,30 @@ def test_browser_needs_a_window(monkeypatch):
 
 def test_server_sends_no_header_of_its_own_and_ignores_those_of_proxies():
     """Of the headers of a proxy, a client could make up its address."""
-    config = _server.make_server("app", print).config
+    config = _serving.make_server("app", print).config
     expected = {
         "app": "app", "log_level": "critical", "access_log": False, "server_header": False, "date_header": False,
         "proxy_headers": False, "limit_concurrency": 200, "timeout_keep_alive": 15, "timeout_graceful_shutdown": 1,
         "h11_max_incomplete_event_size": 16_384, "ws": "none", "lifespan": "off", "loop": "asyncio",
-        "http": _server._Protocol,
+        "http": _serving._Protocol,
     }  # fmt: skip
     assert {name: getattr(config, name) for name in expected} == expected
 
 
 def test_server_runs_on_the_socket_that_listens(monkeypatch):
     ran = []
-    monkeypatch.setattr(_server._Server, "run", lambda self, sockets: ran.append((self.config.app, sockets)))
-    _server.run_server("app", "socket", print)
+    monkeypatch.setattr(_serving._Server, "run", lambda self, sockets: ran.append((self.config.app, sockets)))
+    _serving.run_server("app", "socket", print)
     assert ran == [("app", ["socket"])]
 
 
 @pytest.fixture
 def connection(monkeypatch):
     """A connection on a clock of the test: no part of a request has been read."""
-    made = _server._Protocol.__new__(_server._Protocol)
+    made = _serving._Protocol.__new__(_serving._Protocol)
     made.timers, made.closed, made.cycle = [], [], None
     for name in ("connection_made", "data_received", "connection_lost"):
-        monkeypatch.setattr(_server.H11Protocol, name, lambda self, *given: None)
+        monkeypatch.setattr(_serving.H11Protocol, name, lambda self, *given: None)
 
     def call_later(seconds, function):
         assert seconds == 10

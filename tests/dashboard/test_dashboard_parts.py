@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,8 +14,8 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.errors import HuntDirectoryError, UsageError
-from crashhunt.dashboard import _application, _hunt_page as _hunt, _server
-from crashhunt.dashboard._application import Jobs, stop_hunt
+from crashhunt.dashboard import _control, _hunt_page as _hunt, _server
+from crashhunt.dashboard._control import Jobs, stop_hunt
 from crashhunt.dashboard._hunt_page import HuntView, read_tail
 from crashhunt.dashboard._server import Address
 
@@ -27,7 +29,7 @@ def jobs(tmp_path, monkeypatch):
         path = tmp_path / "python"
         path.write_text(f"#!/bin/sh\n{script}\n")
         path.chmod(0o700)
-        monkeypatch.setattr(_application, "sys", SimpleNamespace(executable=str(path)))
+        monkeypatch.setattr(_control, "sys", SimpleNamespace(executable=str(path)))
         made.append(Jobs())
         return made[-1]
 
@@ -84,7 +86,7 @@ def test_characters_and_colours_may_arrive_in_parts(jobs, tmp_path):
 
 def test_command_that_cannot_start_has_failed(jobs, tmp_path, monkeypatch):
     made = jobs("")
-    monkeypatch.setattr(_application, "sys", SimpleNamespace(executable=str(tmp_path / "nothing")))
+    monkeypatch.setattr(_control, "sys", SimpleNamespace(executable=str(tmp_path / "nothing")))
     made.add("h", tmp_path, "c", "replay")
     (found,) = ended(made, 1)
     assert (found["state"], found["exit_code"]) == ("failed", None)
@@ -92,7 +94,7 @@ def test_command_that_cannot_start_has_failed(jobs, tmp_path, monkeypatch):
 
 
 def test_waiting_jobs_are_limited_and_end_with_the_dashboard(jobs, tmp_path, monkeypatch):
-    monkeypatch.setattr(_application, "_MAX_WAITING", 2)
+    monkeypatch.setattr(_control, "_MAX_WAITING", 2)
     made = jobs("trap 'echo stopped; exit 130' INT; echo begun; while :; do sleep 0.01; done")
     made.add("h", tmp_path, "c", "replay")
     wait = threading.Event()
@@ -116,7 +118,7 @@ def hunt_of(state="running", host=None, pid=77):
 
 def test_hunt_of_this_machine_is_interrupted_as_by_ctrl_c(monkeypatch):
     sent = []
-    monkeypatch.setattr(_application.os, "kill", lambda *words: sent.append(words))
+    monkeypatch.setattr(_control.os, "kill", lambda *words: sent.append(words))
     stop_hunt(hunt_of())
     assert sent == [(77, signal.SIGINT)]
     for hunt, told in (
@@ -132,7 +134,7 @@ def test_hunt_of_this_machine_is_interrupted_as_by_ctrl_c(monkeypatch):
     def gone(*_):
         raise ProcessLookupError
 
-    monkeypatch.setattr(_application.os, "kill", gone)
+    monkeypatch.setattr(_control.os, "kill", gone)
     stop_hunt(hunt_of())  # it has ended in the meantime
 
 
@@ -194,7 +196,7 @@ def test_dashboard_on_other_hosts_gets_a_token(monkeypatch, tmp_path):
         served.append(listening.getsockname()[1])
 
     monkeypatch.setattr("crashhunt.dashboard._application.make_application", make_application)
-    monkeypatch.setattr("crashhunt.dashboard._server.run_server", run_server)
+    monkeypatch.setattr("crashhunt.dashboard._serving.run_server", run_server)
     found = []
     for host, token, control in (("127.0.0.1", "", False), ("0.0.0.0", "", True), ("127.0.0.1", "t" * 16, False)):
         _server.serve(
@@ -319,3 +321,11 @@ def test_tail_of_a_log_begins_with_a_whole_line(tmp_path):
     assert read_tail(tmp_path / "inside" / "link", tmp_path / "inside") == ""
     log.write_bytes(b"\xff\n")
     assert read_tail(log, tmp_path) == "\ufffd\n"
+
+
+def test_run_knows_without_the_packages_of_the_dashboard_that_there_is_none():
+    code = "import sys; sys.modules.update(uvicorn=None, starlette=None); from crashhunt.dashboard import has_dashboard"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", f"{code}; print(has_dashboard())"], capture_output=True, text=True
+    )
+    assert (done.stdout, done.stderr) == ("False\n", "")

@@ -14,7 +14,7 @@ from conftest import mostly_nightly
 from dashboard_hunts import hunted, written
 from served import served
 
-from crashhunt.dashboard import _server
+from crashhunt.dashboard import _serving
 
 TOKEN = "a-token-of-a-test-1234"
 
@@ -142,7 +142,7 @@ def test_files_without_an_end_are_not_opened(hunt, name):
 
 
 def test_a_request_that_does_not_end_loses_its_connection(hunt, monkeypatch):
-    monkeypatch.setattr(_server, "_REQUEST_S", 0.2)
+    monkeypatch.setattr(_serving, "_REQUEST_S", 0.2)
     with served(hunt) as dashboard:
         for begun in (
             b"",
