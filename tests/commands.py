@@ -46,7 +46,7 @@ IMPORTED = ("cli", "api", "crashes", "executors", "hunts", "plans", "recording",
 _WHILE_RUNNING = (
     "crashhunt.agents._protocol", "crashhunt.corpus._cases", "crashhunt.corpus._case_runs",
     "crashhunt.dashboard._server",
-    "crashhunt.samplers._space_filling", "crashhunt.sumo._sumocfg",
+    "crashhunt.samplers._space_filling", "crashhunt.sumo._setup_check",
     "crashhunt.sumo._files", "crashhunt.suites._gate_runs", "crashhunt.suites._suite_file",
     "crashhunt.analysis._whatif_runs", "encodings.ascii", "encodings.cp437", "gzip", "numpy.ma", "numpy.random",
     "pydantic.dataclasses", "rich._emoji_codes", "rich.progress", "tomli_w", "urllib.request",

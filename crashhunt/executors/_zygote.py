@@ -6,7 +6,6 @@ The zygote runs no trial.
 from __future__ import annotations
 
 import gc
-import importlib
 import json
 import os
 import select
@@ -24,7 +23,6 @@ from typing import TYPE_CHECKING, Final, NoReturn, TypedDict, cast
 from crashhunt.agents import ProgramFactory, offer_reused
 from crashhunt.base import forks, layout
 from crashhunt.base.capabilities import supports
-from crashhunt.base.codec import prepare
 from crashhunt.base.errors import DISK, CrashhuntError
 from crashhunt.base.exceptions import message_of
 from crashhunt.base.forks import ended
@@ -34,13 +32,11 @@ from crashhunt.base.programs import is_native
 from crashhunt.base.resources import FREE, free_memory, limit_behind
 from crashhunt.base.temporary import SharedMemoryWatch
 from crashhunt.base.text import format_percent
-from crashhunt.episode import Parts, generators, options_of, run_episode, seed_everything, set_generators, stage_of
+from crashhunt.episode import Parts, generators, options_of, seed_everything, set_generators, stage_of
+from crashhunt.executors._rehearsal import rehearse_trial
 from crashhunt.executors._trial_process import TrialProcess
-from crashhunt.oracles import parse_oracle
-from crashhunt.recording import BlackBox
-from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.simulators import CountsSetUp
-from crashhunt.trial import TrialResult, TrialSpec
+from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
     import socket
@@ -53,64 +49,6 @@ if TYPE_CHECKING:
     from crashhunt.simulators import Info, Observations, Simulator
 
     Wait = Callable[[int | None, Callable[[], None]], None]
-    from collections.abc import Callable
-
-
-# Rehearses a trial before the user's modules are imported, so that the processes of trials have less to prepare.
-#
-# Python specializes the bytecode of a function after some calls, fills its caches of attributes, and imports some
-# modules at the first use. A process that is forked for one trial would do all of this for its one trial, and would
-# copy the pages of memory that it changes. The rehearsal does it once, in the process from which all of them are
-# forked.
-#
-# No result depends on the rehearsal: it runs no code of the user, and all generators are seeded after it.
-
-
-_REHEARSALS = 10  # Python specializes a function at its 8th call
-_STEPS = 2
-_AGENT = "crashhunt.agents:KeepLaneWithSpeed"
-
-
-def rehearse_trial(scratch: Path, report: Callable[[str], None]) -> None:
-    """Run short trials of the toy in this process; they take some 20 ms. A failure has no consequence.
-
-    Args:
-        scratch: scratch folder of the hunt.
-        report: function called before the import of Gymnasium, as in `Parts.load`.
-    """
-    report("Gymnasium cannot be imported")
-    path = scratch / f"rehearsal-{os.getpid()}"
-    with suppress(Exception):  # such as a full disk, which the first trial reports
-        importlib.import_module("gymnasium")
-        prepare(TrialResult)
-        try:
-            _rehearse(path)
-        finally:
-            path.unlink(missing_ok=True)
-
-
-def _rehearse(path: Path) -> None:
-    from crashhunt.agents import KeepLaneWithSpeed  # this import, as the next, needs Gymnasium
-    from crashhunt.simulators.toy import ToySimulator
-
-    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent=_AGENT)})
-    simulator, oracle, box = ToySimulator(scenario, path), parse_oracle("overlap"), BlackBox(path)
-    try:
-        for number in range(_REHEARSALS):
-            box.begin(pid=os.getpid(), trial=number, started=time.monotonic())
-            spec = TrialSpec(
-                number=number, seed=number, arguments={"ego": {"speed": 1.0}}, scenario_arguments={}, max_steps=_STEPS
-            )
-            result = run_episode(
-                TrialSpec.from_json(json.loads(json.dumps(spec.to_json()))),
-                simulator=simulator,
-                make_agent=lambda *_: KeepLaneWithSpeed(speed=1.0),
-                box=box,
-                oracles=[oracle.make()],
-            )
-            box.report(json.dumps(result.to_json()).encode())
-    finally:
-        box.close()
 
 
 # Warming up once: forks of a zygote that have reset the simulator, for trials that begin in the same traffic.

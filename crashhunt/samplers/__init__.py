@@ -7,7 +7,7 @@ from crashhunt.base.doors import offer_lazily
 if TYPE_CHECKING:
     from ._boundary import SAMPLE as SAMPLE, BoundarySampler as BoundarySampler, nearest_labels as nearest_labels
     from ._by_name import NamedSampler as NamedSampler, varies_only_asked as varies_only_asked
-    from ._optuna import (
+    from ._learning import (
         CmaEsSampler as CmaEsSampler,
         CrossEntropySampler as CrossEntropySampler,
         GuidedSampler as GuidedSampler,

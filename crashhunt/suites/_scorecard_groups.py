@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_of
 from crashhunt.crashes import COMPETENT_DRIVERS
 from crashhunt.suites._suite_file import SuiteEntry
+from crashhunt.trial import parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -170,8 +172,4 @@ def _parts(group: Group, speeds: Sequence[int]) -> Iterator[tuple[str, Mapping[s
 
 
 def _cells(values: Mapping[str, str]) -> int:
-    from math import prod
-
-    from crashhunt.trial import parse_spec
-
-    return prod(len(parse_spec(text, "float").grid(1)) for text in values.values())
+    return math.prod(len(parse_spec(text, "float").grid(1)) for text in values.values())

@@ -42,7 +42,7 @@ MAP_ARGUMENTS = ("demand", "imperfection", "speed_spread", "trucks_per_100_cars"
 
 
 def _check(scenario: Scenario, where: str) -> None:
-    from crashhunt.sumo._sumocfg import check
+    from crashhunt.sumo._setup_check import check
 
     check(scenario, where)
 

@@ -310,6 +310,8 @@ _TESTS_ELSEWHERE = {
     "testing/_survives.py": ("testing/test_assert_survives.py", "e2e/test_survives.py"),
     "training/_training_episodes.py": ("training/test_draws.py", "training/test_training_env.py"),
     "training/_trained_on.py": ("training/test_draws.py", "training/test_held_out_traffics.py"),
+    "executors/_rehearsal.py": ("executors/test_zygotes.py",),
+    "dashboard/_control.py": ("dashboard/test_dashboard_parts.py", "dashboard/test_control.py"),
     "training/_crash_env.py": ("training/test_draws.py", "training/test_training_env.py"),
     "training/_traffic_split.py": ("training/test_draws.py", "training/test_held_out_traffics.py"),
     "analysis/_avoidability.py": ("analysis/test_avoiding.py", "e2e/test_judging.py"),

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import subprocess
-import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -321,11 +319,3 @@ def test_tail_of_a_log_begins_with_a_whole_line(tmp_path):
     assert read_tail(tmp_path / "inside" / "link", tmp_path / "inside") == ""
     log.write_bytes(b"\xff\n")
     assert read_tail(log, tmp_path) == "\ufffd\n"
-
-
-def test_run_knows_without_the_packages_of_the_dashboard_that_there_is_none():
-    code = "import sys; sys.modules.update(uvicorn=None, starlette=None); from crashhunt.dashboard import has_dashboard"
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", f"{code}; print(has_dashboard())"], capture_output=True, text=True
-    )
-    assert (done.stdout, done.stderr) == ("False\n", "")

@@ -22,7 +22,7 @@ ON_THE_PAGE_OF_THE_CRASH = {
     "When was it too late?": "#avoidable",  # a button that jumps there, with the braking ghost after it
     "What did the agent see?": "#now",  # the values of the step; with --observe, the layer Observed (key o) as well
     "What did it plan?": "#plot",  # the rows "action: …"; a trajectory is drawn in the scene
-    "Whom do I tell, and with what?": "#export",  # the crash as one file; notes name who has written them
+    "How do I pass it on?": "#export",  # the crash as one file; notes name who has written them
     "Is it fixed?": "#commands",  # replay with your present code
 }
 ONE_CLICK_AWAY = {  # on the page of the hunt, behind the link at the top

@@ -15,7 +15,7 @@ import pytest
 from crashhunt.base import forks
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import stage_of
-from crashhunt.executors import _fork_server, _time_limits, _zygote
+from crashhunt.executors import _fork_server, _rehearsal, _time_limits, _zygote
 from crashhunt.executors._time_limits import ImportKilledError
 from crashhunt.executors._zygote import Imported, WarmTraffics
 from crashhunt.trial import TrialSpec
@@ -814,7 +814,7 @@ def test_rehearsal_comes_before_the_imports_and_leaves_nothing(tmp_path, monkeyp
     settings = SimpleNamespace(scenario=SimpleNamespace(backend=SimpleNamespace(forkable=True)), scratch=tmp_path)
     parts = SimpleNamespace(load=lambda report: report(f"a module, {len(rehearsed)} rehearsals"))
     rehearsed = []
-    run = _zygote.run_episode
+    run = _rehearsal.run_episode
 
     def run_episode(*given, **options):
         rehearsed.append(given)
@@ -822,7 +822,7 @@ def test_rehearsal_comes_before_the_imports_and_leaves_nothing(tmp_path, monkeyp
             raise RuntimeError("whatever it is")
         return run(*given, **options)
 
-    monkeypatch.setattr(_zygote, "run_episode", run_episode)
+    monkeypatch.setattr(_rehearsal, "run_episode", run_episode)
     monkeypatch.setattr(_zygote, "Parts", lambda _: parts)
     monkeypatch.setattr(_zygote, "_can_be_forked", lambda: True)
     assert _zygote.import_parts(settings, said.append, rehearses=True) is not None

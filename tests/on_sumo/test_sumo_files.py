@@ -14,8 +14,8 @@ from crashhunt.errors import InvalidEpisodeError, ScenarioError, UsageError
 from crashhunt.plans import Request, plan, with_settings
 from crashhunt.scenario import as_plain_data, load_scenario, shipped_folder
 from crashhunt.sumo import StagedFiles, canonical, is_true, references, rewritten
+from crashhunt.sumo._setup_check import check_options
 from crashhunt.sumo._side_effects import side_effect
-from crashhunt.sumo._sumocfg import check_options
 
 ROUTES = (
     '<routes><route id="way" edges="south east north west"/>{}'

@@ -113,12 +113,12 @@ def words(**parts: np.ndarray) -> dict[str, str]:
 
 
 def test_signals_priority_and_the_lane_goal_are_said_in_words():
-    nobody = row("right_of_way")
+    clear = row("right_of_way")
     assert words(signals=row("signals", present=1, state=2, distance=23.44, time_in_state=3.25)) == {
         "signal": "red for 3.2 s, in 23.4 m"
     }
     assert words(signals=row("signals")) == {}  # no traffic light is ahead
-    assert words(right_of_way=nobody) == {"priority": "no actor to yield to"}
+    assert words(right_of_way=clear) == {"priority": "no actor to yield to"}
     first = row("right_of_way", present=1, must_yield=1, other_arrival=1000)
     other = row("right_of_way", present=1, other_arrival=0.5)
     assert words(right_of_way=np.stack([first, other]))["priority"] == "must yield to 1 actor"  # which stands
