@@ -6,8 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from crashhunt.base.errors import CrashhuntError, PluginError
+from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
 from crashhunt.base.exceptions import blamed
+from crashhunt.base.extras import install_command
 from crashhunt.base.plugins import locate
 from crashhunt.base.processes import exits_refused
 from crashhunt.samplers._protocol import (
@@ -164,6 +165,8 @@ def _maker(name: str) -> Any:
     if not name.lower().startswith("optuna:"):
         with exits_refused():
             return locate("samplers", name)
-    from crashhunt.samplers._optuna import optuna_maker  # no other sampler imports Optuna
-
+    try:
+        from crashhunt.samplers._optuna import optuna_maker  # no other sampler imports Optuna
+    except ModuleNotFoundError:
+        raise UsageError(f"the sampler {name!r} needs the package optuna", fix=install_command("search")) from None
     return optuna_maker(name)

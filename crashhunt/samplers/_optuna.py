@@ -63,14 +63,11 @@ def optuna_maker(name: str) -> OptunaMaker:
     """Return an object that creates samplers of the given name, such as ``optuna:TPESampler`` or ``optuna:tpe``.
 
     Raises:
-        UsageError: Optuna is not installed, or the sampler is not suitable for hunts, or needs a further package.
+        UsageError: the sampler is not suitable for hunts, or needs a further package.
         PluginError: Optuna has no such sampler.
     """
     asked = name[len(PREFIX) :]
-    try:
-        samplers = importlib.import_module("optuna.samplers")
-    except ImportError:
-        raise UsageError(f"the sampler {name!r} needs the package optuna", fix=install_command("search")) from None
+    samplers = importlib.import_module("optuna.samplers")
     kinds = {
         _short(kind): kind
         for kind in samplers.__all__
