@@ -237,6 +237,12 @@ def import_module(name: str, *, shown: str = "", installed: bool = False) -> typ
     Raises:
         PluginError: the import of the module failed.
     """
+    if name.endswith(".py") or "/" in name:  # which importlib would import, and then search for a module 'py' in it
+        given, stem = shown or name, Path(name).stem
+        raise PluginError(
+            f"{given!r} has a file name where a module name belongs",
+            fix=f"give {given.replace(name, stem)!r}, from the folder that holds {stem}.py",
+        )
     if not installed:
         add_current_folder().prefer(name)
     try:

@@ -169,6 +169,13 @@ def test_named_module_of_the_current_folder_comes_before_installed_ones(tmp_path
         ("from json import nothing", "broken:Agent", "broken.py, line 1", "cannot import name 'nothing'"),
         ("", "brokn:Agent", "", "No module named 'brokn'; did you mean 'broken'?"),
         ("", "broken.inner:Agent", "", "No module named 'broken.inner'"),
+        (
+            "",
+            "broken.py:Agent",
+            "",
+            "has a file name where a module name belongs; give 'broken:Agent', from the folder",
+        ),
+        ("", "./in/broken.py:Agent", "", "give 'broken:Agent', from the folder that holds broken.py"),
         ("x\0y", "broken:Agent", "", "null bytes"),
         ("def __getattr__(name):\n  import not_there", "broken:Agent", "broken.py, line 2", "install 'not_there'"),
         (
