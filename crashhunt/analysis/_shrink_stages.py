@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from crashhunt.analysis._delta_debugging import as_type_of, fewest, plainest, with_argument
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.reruns import OutOfTimeError, StoppedError
-from crashhunt.trial import ALL_AGENTS, SENSOR_KINDS
+from crashhunt.trial import ALL_AGENTS, SENSOR_KINDS, with_fewer_points
 from crashhunt.world import paths_of
 
 if TYPE_CHECKING:
@@ -429,6 +429,14 @@ class Minimizer:
                 at_default = with_argument(at_default, key, as_type_of(_value(self.best, key), default))
         if at_default != self.best:
             self._try([at_default])
+        for agent, name in _keys(self.best):
+            given = self.best.arguments[agent] if agent else self.best.scenario_arguments
+            fewer = with_fewer_points(given, name)
+            if agent:
+                agents = self.best.arguments
+                self._try([replace(self.best, arguments={**agents, agent: one}) for one in fewer])
+            else:
+                self._try([replace(self.best, scenario_arguments=one) for one in fewer])
         for key in _keys(self.best):
             best = self.best
             values = plainest(_value(best, key), defaults.get(key))

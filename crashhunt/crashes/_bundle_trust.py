@@ -24,7 +24,7 @@ from crashhunt.crashes._bundle import is_bundle_made_here, snapshot_of
 from crashhunt.oracles import oracle_name
 from crashhunt.plans import read_settings, with_settings
 from crashhunt.scenario import backend_of
-from crashhunt.trial import Choice, Constant
+from crashhunt.trial import Choice, Constant, is_stored_signal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -300,7 +300,7 @@ def _has_known_texts(spec: TrialSpec, settings: HuntSettings, snapshot: Snapshot
     known = _texts([*settings.space.values(), *(argument.distribution for argument in arguments)])
     known |= {argument.default for argument in arguments if isinstance(argument.default, str)}
     values = [*spec.scenario_arguments.values(), *(one for each in spec.arguments.values() for one in each.values())]
-    return all(value in known for value in values if isinstance(value, str))
+    return all(value in known or is_stored_signal(value) for value in values if isinstance(value, str))
 
 
 def _unknown_names(settings: HuntSettings, snapshot: Snapshot) -> list[str]:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         modules_of_models as modules_of_models,
         parse_fixed as parse_fixed,
         parse_rates as parse_rates,
+        signals_of_fixed as signals_of_fixed,
         word_of as word_of,
     )
     from ._models import (

@@ -17,7 +17,7 @@ from crashhunt.base.exceptions import blamed
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.text import one_of
 from crashhunt.disturbances._protocol import Closes, Drawn
-from crashhunt.trial import CELLS, KINDS, SENSOR_KINDS, Disturbance, in_turn, why_not
+from crashhunt.trial import CELLS, KINDS, SENSOR_KINDS, Disturbance, in_turn, is_signal, why_not
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -61,7 +61,10 @@ def parse_fixed(words: Iterable[str], agents: Sequence[str], *, shown: str = "--
 
 
 def word_of(one: Disturbance, agents: Sequence[str]) -> str:
-    """Return the word that describes a disturbance at a given step; it names the agent only if there are several."""
+    """Return the word that describes a disturbance at a given step; it names the agent only if there are several.
+
+    If its strength is a signal, the word has the greatest strength.
+    """
     whose = f"{one.agent}." if len(agents) > 1 else ""
     place = one.who.replace(" ", "_")  # so that no shell needs quotes
     return f"{whose}{one.what}@{one.step}={place}:{one.how_strong!r}:{one.how_long!r}"
@@ -70,7 +73,7 @@ def word_of(one: Disturbance, agents: Sequence[str]) -> str:
 def _parsed(word: str, agents: Sequence[str], shown: str) -> Disturbance:
     name, equals, text = word.partition("=")
     kind, _, step = name.partition("@")
-    parts = [part.strip() for part in text.split(":")]
+    parts = _parts(text)
     agent, what = _agent_and_kind(kind, agents, f"{shown} {word}")
     if not (equals and what and len(parts) == 3 and step.isascii() and step.isdecimal() and int(step) > 0):
         raise UsageError(f"{shown} {word!r} is not a disturbance", fix=_FORM_FIX)
@@ -78,11 +81,48 @@ def _parsed(word: str, agents: Sequence[str], shown: str) -> Disturbance:
     if who not in CELLS:
         raise UsageError(f"{shown} {word}: {parts[0]!r} is not a place around an agent", fix=one_of(who, CELLS))
     one = Disturbance(
-        step=int(step), who=who, what=what, how_strong=_number(parts[1]), how_long=_number(parts[2]), agent=agent
+        step=int(step), who=who, what=what, how_strong=_strongest(parts[1]), how_long=_number(parts[2]), agent=agent
     )
     if reason := why_not(one):
         raise UsageError(f"{shown} {word}: {reason[0]}", fix=reason[1])
     return one
+
+
+def _parts(text: str) -> list[str]:
+    """Return place, strength and duration; a strength that is a signal contains colons."""
+    who, *strength, long = (part.strip() for part in text.split(":")) if ":" in text else (text, "")
+    return [who, ":".join(strength), long] if strength else [who, long]
+
+
+def _strongest(text: str) -> float:
+    """Return a strength; of a signal, the upper bound. `expand_signal` reports an invalid signal."""
+    if not is_signal(text):
+        return _number(text)
+    bounds = [_number(word) for word in text.split(":")[1:] if "=" not in word]
+    if min(bounds, default=0.0) < 0:
+        raise UsageError(f"{_OPTION}: the signal {text!r} is below 0", fix="give LOW of at least 0")
+    return max(bounds, default=0.0)
+
+
+def signals_of_fixed(words: Iterable[str], agents: Sequence[str]) -> dict[str, tuple[Disturbance, str, str]]:
+    """Return the disturbances at given steps whose strength is a signal, with the signal and the word of each.
+
+    The key is the name under which the trial's arguments of the scenario contain the signal.
+
+    Raises:
+        UsageError: a word is invalid, or two signals have the same name.
+    """
+    found: dict[str, tuple[Disturbance, str, str]] = {}
+    for word in filter(is_fixed, words):
+        strength = _parts(word.partition("=")[2])[1]
+        if not is_signal(strength):
+            continue
+        one = _parsed(word, agents, _OPTION)
+        if one.signal in found:
+            fix = "give the signals different steps"
+            raise UsageError(f"{_OPTION} {word}: another signal is already called {one.signal}", fix=fix)
+        found[one.signal] = one, strength, word
+    return found
 
 
 def _agent_and_kind(name: str, agents: Sequence[str], shown: str) -> tuple[str, str]:

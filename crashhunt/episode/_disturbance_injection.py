@@ -18,7 +18,7 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import NamesMetaActions, NamesObservations, ObservesParts, SupportsDisturbances, SupportsHolds
-from crashhunt.trial import HOLD_KINDS, SENSOR_KINDS, Disturbance, in_effect, steps_of
+from crashhunt.trial import HOLD_KINDS, SENSOR_KINDS, Disturbance, InputSignal, fold_signals, in_effect, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -96,6 +96,7 @@ class DisturbanceInjector:
     ) -> None:
         self._advance = advance or simulator.step
         self._seed = spec.seed
+        self._signals = fold_signals(spec.scenario_arguments) if spec.disturbances else {}
         self._simulator = simulator
         self._callbacks = callbacks
         self._dt = simulator.step_length_s
@@ -183,6 +184,9 @@ class DisturbanceInjector:
     def _begin(self, planned: Disturbance) -> None:
         """Disturb a vehicle from the current step on, if there is a suitable vehicle."""
         last = self._step + self._steps(planned.how_long) - 1
+        signal = self._signals.get(planned.signal)
+        if isinstance(signal, InputSignal):
+            planned = planned.following(signal, self._dt)
         vehicle = self._target(planned)
         active = None
         if vehicle and all(going.vehicle != vehicle for going in self._active):  # one at a time

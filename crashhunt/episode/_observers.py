@@ -44,7 +44,7 @@ from crashhunt.simulators import (
     SupportsExclusion,
     SupportsScripts,
 )
-from crashhunt.trial import Outcome
+from crashhunt.trial import STRENGTH_MARK, Outcome
 from crashhunt.world import ApproachMeter, DangerMeter, DrivenMeter
 
 if TYPE_CHECKING:
@@ -141,7 +141,10 @@ def options_of(spec: TrialSpec, simulator: Simulator) -> Options:
     Raises:
         InvalidEpisodeError: the simulator does not support an option.
     """
-    options: Options = {"arguments": spec.scenario_arguments}
+    arguments = spec.scenario_arguments
+    if any(STRENGTH_MARK in name for name in arguments):  # which concern the injector of disturbances only
+        arguments = {name: value for name, value in arguments.items() if STRENGTH_MARK not in name}
+    options: Options = {"arguments": arguments}
     if spec.only is not None:
         if not supports(simulator, SupportsExclusion):
             raise InvalidEpisodeError("the simulator cannot remove actors")

@@ -284,6 +284,7 @@ _SHOW = {
     "nearest": ({"step": int, "danger": float, "agent": str, "other": str}, None),
     "danger": (_DANGER, None),
     "moments": [_MOMENT],
+    "signals?": dict[str, JsonObject],
     "notes?": list[Note],
 }
 _BOTH = {"base": int, "head": int}

@@ -118,6 +118,7 @@ BACKEND: Backend = Backend(
     versions=("gymnasium",),
     reported_events=(),
     disturbances=(),
+    signal_arguments=lambda scenario: scenario.arguments,
     side_effect=_side_effect,
     shows_actors=False,
 )

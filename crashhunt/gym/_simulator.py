@@ -46,6 +46,7 @@ from crashhunt.simulators import (
     reseed_in_place,
     time_limit_of,
 )
+from crashhunt.trial import fold_signals
 from crashhunt.world import Contact, Roster, Scene
 
 if TYPE_CHECKING:
@@ -347,7 +348,7 @@ class GymSimulator:
     def _configured(self, arguments: Mapping[str, Value]) -> tuple[dict[str, object], dict[str, object] | None]:
         """Return the keyword arguments of the environment, and the options of its reset."""
         keywords, options = deepcopy((self._setup.kwargs, self._setup.reset_options))
-        for table in as_tables(self._scenario, arguments):
+        for table in as_tables(self._scenario, fold_signals(arguments)):
             entries = table.get(_RESET_OPTIONS)
             if options is not None and isinstance(entries, dict):
                 merge(options, entries)

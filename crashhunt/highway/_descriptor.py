@@ -104,6 +104,7 @@ BACKEND: Backend = Backend(
     step_length_s=_step_length,
     reported_events=("wrong_way", "not_moving"),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "ignore_priority", "unseen"),
+    varying_disturbances=("brake", "stop"),
     observations=("ego", "actors", "actor_ids", "predictions", "prediction_covariance", "lidar2d"),
     implied={"time_limit": "none"},
     accelerator=Accelerator(switched_off=_as_it_is, note=_not_accelerated),

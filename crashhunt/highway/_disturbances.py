@@ -15,7 +15,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
+    from collections.abc import Callable, Collection, Iterator, Sequence
 
     from highway_env.road.road import Road, RoadNetwork
     from numpy.typing import NDArray
@@ -176,7 +176,10 @@ class HighwayDisturbances:
         hardest = min(strong, float(vehicle.ACC_MAX))
         active: _Active
         if disturbance.what in ("brake", "stop"):
-            active = _Slows(vehicle, self._release, hardest, hardest)
+            limit = float(vehicle.ACC_MAX)
+            active = _Slows(
+                vehicle, self._release, hardest, hardest, strengths=[min(one, limit) for one in disturbance.strengths]
+            )
         elif disturbance.what == "dawdle":
             target = max(0.0, 1.0 - strong) * float(vehicle.speed)
             active = _Slows(vehicle, self._release, strong, _DAWDLING_DECELERATION_MPS2, target=target)
@@ -265,10 +268,15 @@ class _Slows(_Active):
         deceleration: float,
         *,
         target: float = 0.0,
+        strengths: Sequence[float] = (),
     ) -> None:
         super().__init__(vehicle, let_go, how_strong)
-        self._deceleration = deceleration
+        self._later = iter(strengths)
+        self._deceleration = next(self._later, deceleration)
         self._target = target
+
+    def keep(self) -> None:
+        self._deceleration = next(self._later, self._deceleration)
 
     def override(self, dt: float) -> None:
         self._brake(self._deceleration, dt, self._target)

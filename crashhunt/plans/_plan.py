@@ -15,7 +15,15 @@ from crashhunt.base import layout
 from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, UsageError
 from crashhunt.base.plugins import is_foreign, registered
 from crashhunt.base.text import listed, one_of
-from crashhunt.disturbances import ModelApart, disturber_of, locate_model, parse_fixed, parse_rates, word_of
+from crashhunt.disturbances import (
+    ModelApart,
+    disturber_of,
+    locate_model,
+    parse_fixed,
+    parse_rates,
+    signals_of_fixed,
+    word_of,
+)
 from crashhunt.native import HOW_TO_REBUILD, outdated_modules
 from crashhunt.oracles import ORACLES_OF_ACTORS, chosen_oracles, oracle_name, outcomes_brought
 from crashhunt.plans._argument_owners import Owners, Takes, agent_of
@@ -48,6 +56,7 @@ from crashhunt.trial import (
     Outcome,
     Signature,
     expand_signal,
+    is_signal,
     parse_spec,
 )
 from crashhunt.world import LIMITS
@@ -57,7 +66,7 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances import DisturbanceModel, DisturbanceSampler
     from crashhunt.plans._settings import Request
-    from crashhunt.trial import Category, Kind
+    from crashhunt.trial import Category
 
     Surveyor = Callable[[Scenario, Request, HuntSettings], Scenario]
 
@@ -170,7 +179,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
         oracles=oracles,
         events=limits,
         agents=_agents(request, scenario, signatures, hunted=hunted),
-        scenario_arguments=_scenario_arguments(request, scenario, hunted=hunted),
+        scenario_arguments=_scenario_arguments(request, scenario, disturb, hunted=hunted),
         run=request.run,
     )
     if acting:
@@ -350,9 +359,17 @@ def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
         fix = f"give a step up to {request.max_steps}, or more MAX_STEPS"
         raise UsageError(f"--disturb {late.what}@{late.step}: a trial has only {request.max_steps} steps", fix=fix)
     begun = [one for one in fixed if one.step <= request.max_steps]  # a scenario is for trials of any length
+    signals = {name: signal for name, signal in signals_of_fixed(words, agents).items() if signal[0] in begun}
+    able = scenario.backend.varying_disturbances
+    for one, _, word in signals.values():
+        if one.what not in able:
+            message = f"--disturb {word}: the strength of {one.what} cannot vary over time in this scenario"
+            fix = f"give a number, or one of {', '.join(able)}" if able else "give a number"
+            raise UsageError(message, fix=fix)
     return (
         *(f"{name}={rate!r}" for name, rate in parse_rates(words).items()),
-        *(word_of(one, agents) for one in begun),
+        *(word for _, _, word in signals.values()),
+        *(word_of(one, agents) for one in begun if one.signal not in signals),
     )
 
 
@@ -526,9 +543,7 @@ def _agents(
                 )
         specs: dict[str, ArgumentSpec] = {}
         for name, spec in asked[agent].items():
-            signal = expand_signal(name, spec, duration_s, where=f"--arg {name}")
-            kinds: dict[str, Kind] = {name: "str"}
-            specs |= {part: ArgumentSpec(spec=text, kind=kinds.get(part, "float")) for part, text in signal.items()}
+            specs |= _signal_specs(name, spec, duration_s, f"--arg {name}")
         for name in sorted({*signature.arguments, *known, *asked[agent]} - specs.keys()):
             found = _spec(name, signature.arguments.get(name), known.get(name), asked[agent].get(name), hunted=hunted)
             if found is not None:
@@ -589,7 +604,9 @@ def _spec(
     return None
 
 
-def _scenario_arguments(request: Request, scenario: Scenario, *, hunted: bool) -> dict[str, ArgumentSpec]:
+def _scenario_arguments(
+    request: Request, scenario: Scenario, disturb: Sequence[str], *, hunted: bool
+) -> dict[str, ArgumentSpec]:
     known = scenario.scenario_arguments()
     wanted: dict[str, str] = {}
     for name, spec in request.scenario_arguments.items():
@@ -598,8 +615,16 @@ def _scenario_arguments(request: Request, scenario: Scenario, *, hunted: bool) -
             raise ArgumentError(f"--set: the scenario has no argument {name!r}", fix=one_of(name, known, give="it has"))
         wanted[owner[1]] = spec
     specs: dict[str, ArgumentSpec] = {}
+    duration_s = request.max_steps * scenario.backend.step_length_s(scenario)
     for name, argument in known.items():
         asked = wanted.get(name)
+        if asked is not None and is_signal(asked):
+            able = tuple(scenario.backend.signal_arguments(scenario))
+            if name not in able:
+                fix = f"give a range, or vary one of {', '.join(able)}" if able else "give a range"
+                raise ArgumentError(f"--set {name}: the argument cannot vary over time in this scenario", fix=fix)
+            specs |= _signal_specs(name, asked, duration_s, f"--set {name}")
+            continue
         if asked is not None:
             spec = str(parse_spec(asked, argument.kind, where=f"--set {name}"))
         elif argument.distribution is not None and (hunted or argument.default is None):
@@ -613,4 +638,12 @@ def _scenario_arguments(request: Request, scenario: Scenario, *, hunted: bool) -
                 where=scenario.origin,
             )
         specs[name] = ArgumentSpec(spec=spec, kind=argument.kind)
+    for name, (one, signal, word) in signals_of_fixed(disturb, tuple(scenario.agents)).items():
+        specs |= _signal_specs(name, signal, one.how_long, f"--disturb {word}")
     return specs
+
+
+def _signal_specs(name: str, spec: str, duration_s: float, where: str) -> dict[str, ArgumentSpec]:
+    """Return the specifications of a signal and of its points; empty if the specification is no signal."""
+    found = expand_signal(name, spec, duration_s, where=where)
+    return {part: ArgumentSpec(spec=text, kind="str" if part == name else "float") for part, text in found.items()}

@@ -21,7 +21,7 @@ from crashhunt.crashes import (
     subject_of,
 )
 from crashhunt.recording import describe_value, is_opaque
-from crashhunt.report._status_screen import format_inputs
+from crashhunt.report._status_screen import draw_signals, format_inputs, input_signals
 from crashhunt.report._step_table import NEAREST, aligned, stacked, steps_table
 from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import (
@@ -102,6 +102,7 @@ class Story:
             nearest = list(steps_table(self.recording, NEAREST, self.agent))
         moments, tried = self.encounter.moments if self.encounter else [], self.bundle.result.escape
         why_not = tried.why_not if tried is not None else ""
+        signals = input_signals(self.bundle.result)
         tried = None if why_not else tried
         return {
             "crash": self.bundle.id,
@@ -132,6 +133,7 @@ class Story:
                 for moment in moments
                 if self._first <= moment.step <= self._last
             ],
+            **({"signals": {name: asdict(signal) for name, signal in signals.items()}} if signals else {}),
             **({"notes": [note.to_json() for note in self.notes]} if self.notes else {}),
         }
 
@@ -175,7 +177,7 @@ class Story:
         """Return the sentences and the table of the story."""
         lines = [f"{self.bundle.id}  ({self.bundle.result.outcome.category})"]
         lines.append(f"  {format_inputs(self.bundle.result)}")
-        lines += [f"  {line}" for line in describe_programs(self.bundle)]
+        lines += [f"  {line}" for line in (*draw_signals(self.bundle.result), *describe_programs(self.bundle))]
         lines += _shrunk(self.bundle)
         lines += [f"  {describe_note(note)}" for note in self.notes]
         verdict = verdict_of(self)

@@ -503,6 +503,9 @@ class Backend:
         step_length_s: function that returns the control step, in s, if it differs from the scenario's step length.
         reported_events: the types of traffic events that the simulator reports; None if they are unknown.
         disturbances: the types of traffic disturbances that the simulator supports; None if they are unknown.
+        varying_disturbances: the types whose strength may be a signal: `Disturbance.strengths`.
+        signal_arguments: function that returns the scenario arguments that may be signals; the simulator receives the
+            stored form, which `crashhunt.trial.fold_signals` makes a function of the time.
         actions: the forms of actions that ``--action`` may select, as ``crashhunt list actions`` names them; empty if
             the environment defines the form of its actions.
         observations: the parts of observations that ``--observe`` may select.
@@ -548,6 +551,8 @@ class Backend:
     step_length_s: Callable[[Scenario], float] = _own_arguments
     reported_events: tuple[str, ...] | None = None
     disturbances: tuple[str, ...] | None = None
+    varying_disturbances: tuple[str, ...] = ()
+    signal_arguments: Callable[[Scenario], Iterable[str]] = _no_notes
     actions: tuple[str, ...] = ()
     observations: tuple[str, ...] = ()
     accelerator: Accelerator | None = None

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain
     from crashhunt.scenario import Scenario
     from crashhunt.simulators._protocol import ActionForm
-    from crashhunt.trial import Value
 
 
 _ARRAY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
@@ -372,7 +371,7 @@ def _number_of_choices(space: Space[Any]) -> int:
 # Scenario arguments set entries in the configuration of an environment.
 
 
-def as_tables(scenario: Scenario, arguments: Mapping[str, Value]) -> list[dict[str, object]]:
+def as_tables(scenario: Scenario, arguments: Mapping[str, object]) -> list[dict[str, object]]:
     """Return the values of arguments as nested tables; the argument ``a.b`` sets the entry ``b`` of table ``a``."""
     tables = []
     for name, value in arguments.items():

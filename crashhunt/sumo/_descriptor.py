@@ -7,7 +7,7 @@ from importlib import metadata
 from typing import TYPE_CHECKING
 
 from crashhunt.scenario import ACTIONS, Backend, CompiledCore, Configuration, LoadOrder, TrafficSurvey
-from crashhunt.sumo._options import INPUTS, SumoSetup, canonical, writes
+from crashhunt.sumo._options import INPUTS, SIGNAL_ARGUMENTS, SumoSetup, canonical, writes
 from crashhunt.world import EVENT_WORDS
 
 if TYPE_CHECKING:
@@ -218,6 +218,8 @@ BACKEND: Backend = Backend(
             for endings in (OSM_ENDINGS, OPENDRIVE_ENDINGS)
         ),
     ),
+    varying_disturbances=("brake", "stop", "step_out"),
+    signal_arguments=lambda scenario: SIGNAL_ARGUMENTS.get(scenario.table(SumoSetup).manoeuvre or "", ()),
     plays_paths=True,
     forkable=True,
     core=CompiledCore(switched_off=_without_core, why_not=_why_no_core),

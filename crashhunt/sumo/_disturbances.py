@@ -240,22 +240,24 @@ class SteppingOut:
     Args:
         actor: Identifier of a walking person.
         agent: Identifier of the agent into whose path the person walks.
-        speed: The walking speed in m/s, bounded by the person's maximum speed.
-        steps: Number of steps for the way out and back.
+        walks: The walking speed in each step of the way out and back, in m/s, bounded by the person's maximum speed.
         step_length_s: Step length of the simulation, in s.
         speeds: Speeds of moved persons by SUMO id, because SUMO reports 0 for them. The speed of this person is added
             to the collection.
     """
 
     def __init__(
-        self, actor: str, agent: str, speed: float, steps: int, step_length_s: float, speeds: dict[str, float]
+        self, actor: str, agent: str, walks: Sequence[float], step_length_s: float, speeds: dict[str, float]
     ) -> None:
         person = actor.removeprefix(PERSON)
-        self.how_strong = min(speed, float(sumo.person_getMaxSpeed(person)))
+        most = float(sumo.person_getMaxSpeed(person))
+        self.how_strong = min(max(walks), most)
+        self._walks = [min(one, most) for one in walks]
+        self._is_steady = min(walks) == max(walks)
         self._person = person
         self._dt = step_length_s
         self._speeds = speeds
-        self._left = steps
+        self._left = len(walks)
         self._walk = libsumo.person.getStage(person)
         self._edge = str(sumo.person_getRoadID(person))
         self._start, self._way, self._far = _Way.of(person, agent)
@@ -286,10 +288,12 @@ class SteppingOut:
 
     def _command(self) -> None:
         self._left -= 1  # number of steps after this step
-        reach = self.how_strong * self._dt
+        later = self._walks[len(self._walks) - self._left :]
+        reach = self._walks[-1 - self._left] * self._dt
         before = self._out
         # Walk out at most so far that the remaining steps suffice for the way back.
-        self._out = min(self._far, before + reach, self._left * reach)
+        back = self._left * reach if self._is_steady else sum(later) * self._dt
+        self._out = min(self._far, before + reach, back)
         away = self._out - before
         towards = self._way if away >= 0 else (-self._way[0], -self._way[1])
         (x, y), (way_x, way_y) = self._start, self._way
@@ -353,12 +357,16 @@ class SumoDisturbances:
                 if not can_step_out(vehicle, disturbance.agent, strong * disturbance.how_long / 2, self._junctions):
                     return None
                 steps = steps_of(disturbance.how_long, self._dt)
-                return SteppingOut(vehicle, disturbance.agent, strong, steps, self._dt, self.speeds)
+                strengths = [disturbance.strength_in(step) for step in range(steps)]
+                return SteppingOut(vehicle, disturbance.agent, strengths, self._dt, self.speeds)
             if disturbance.what == "late_merge":
                 return _late_merge(vehicle, strong)
             decel = float(sumo.vehicle_getDecel(vehicle))
             if disturbance.what in ("brake", "stop"):
-                return _Slows(vehicle, min(strong, decel), self._dt, how_strong=min(strong, decel))
+                return _Slows(
+                    vehicle, min(strong, decel), self._dt, how_strong=min(strong, decel),
+                    strengths=[min(one, decel) for one in disturbance.strengths],
+                )  # fmt: skip
             if disturbance.what == "dawdle":
                 target = max(0.0, 1.0 - strong) * sumo.vehicle_getSpeed(vehicle)
                 return _Slows(
@@ -398,10 +406,20 @@ class SumoDisturbances:
 class _Slows:
     """Makes the vehicle brake to a target speed and keep it where that is safe."""
 
-    def __init__(self, vehicle: str, deceleration: float, dt: float, *, how_strong: float, target: float = 0.0) -> None:
+    def __init__(
+        self,
+        vehicle: str,
+        deceleration: float,
+        dt: float,
+        *,
+        how_strong: float,
+        target: float = 0.0,
+        strengths: Sequence[float] = (),
+    ) -> None:
         self.how_strong = how_strong
         self._vehicle = vehicle
         self._change = deceleration * dt
+        self._changes = iter([one * dt for one in strengths])
         self._target = target
         self._command()
 
@@ -414,6 +432,7 @@ class _Slows:
             sumo.vehicle_setSpeed(self._vehicle, -1.0)
 
     def _command(self) -> None:
+        self._change = next(self._changes, self._change)
         speed = sumo.vehicle_getSpeed(self._vehicle)
         if speed < self._target:  # a slower vehicle is ahead; SUMO limits the commanded speed to a safe speed
             sumo.vehicle_setSpeed(self._vehicle, min(self._target, sumo.vehicle_getAllowedSpeed(self._vehicle)))

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from libsumo import _libsumo as sumo
 
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.sumo._options import arguments_of
+from crashhunt.trial import InputSignal, fold_signals
 from crashhunt.world import START_M, ActorState, Path, Paths, actor_of_manoeuvre, manoeuvre_motions
 
 if TYPE_CHECKING:
@@ -40,19 +41,22 @@ def manoeuvre_paths(manoeuvre: str, agent: str, arguments: Mapping[str, Value], 
         InvalidEpisodeError: an argument is out of its range.
     """
     names = arguments_of(manoeuvre, arguments)
-    values = {name: _number(name, arguments[name]) for name in names}
-    if manoeuvre == "cut_in" and values.get("slower_kmh", 0.0) > values["ego_kmh"]:
+    folded = fold_signals(arguments)
+    values = {name: _checked(name, folded[name]) for name in names}
+    ego_kmh = cast("float", values["ego_kmh"])
+    slower_kmh = values.get("slower_kmh", 0.0)
+    if manoeuvre == "cut_in" and not callable(slower_kmh) and slower_kmh > ego_kmh:
         raise InvalidEpisodeError(
-            f"slower_kmh is {values['slower_kmh']:g} (allowed: 0 to ego_kmh, {values['ego_kmh']:g})",
+            f"slower_kmh is {slower_kmh:g} (allowed: 0 to ego_kmh, {ego_kmh:g})",
             fix="give a smaller value",
         )
     lanes = sorted(str(lane) for lane in sumo.lane_getIDList() if not str(lane).startswith(":"))
     if len(lanes) != 2:
         raise InvalidEpisodeError(f"the network has {len(lanes)} lanes, and a manoeuvre needs 2")
-    right_to_left = values.get("side", -1.0) < 0
+    right_to_left = cast("float", values.get("side", -1.0)) < 0
     own, next_lane = (lanes[1], lanes[0]) if right_to_left else (lanes[0], lanes[1])
     own_y, next_y = (float(sumo.lane_getShape(lane)[0][1]) for lane in (own, next_lane))
-    speed = values["ego_kmh"] / _KMH
+    speed = ego_kmh / _KMH
     states = manoeuvre_motions(manoeuvre, values, own_y, next_y, step_s)
     rows = [next(states) for _ in range(_STEPS + 1)]
     others = tuple(_path(name, rows, {own: own_y, next_lane: next_y}) for name in dict.fromkeys(chain(*rows)))
@@ -62,7 +66,15 @@ def manoeuvre_paths(manoeuvre: str, agent: str, arguments: Mapping[str, Value], 
     return Paths(time_s=0.0, steps=_STEPS, agents=(start,), others=others)
 
 
-def _number(name: str, value: Value) -> float:
+def _checked(name: str, value: object) -> float | InputSignal:
+    if not isinstance(value, InputSignal):
+        return _number(name, value)
+    for point in value.points:
+        _number(name, point)
+    return value
+
+
+def _number(name: str, value: object) -> float:
     number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
     low, high = (-_SIGNED[name], _SIGNED[name]) if name in _SIGNED else (_ABOVE_ZERO.get(name, 0.0), 1000.0)
     if not low <= number <= high:

@@ -276,6 +276,14 @@ _MANOEUVRE_ARGUMENTS: Mapping[str, tuple[str, ...]] = {
 }
 
 
+SIGNAL_ARGUMENTS: Mapping[str, tuple[str, ...]] = {
+    "deceleration": ("decel_mps2",),
+    "following": ("slower_kmh",),
+    "pedestrian": ("walk_kmh",),
+}
+"""By manoeuvre, the arguments that may be signals over the time of a trial."""
+
+
 def arguments_of(manoeuvre: str, given: Container[str]) -> tuple[str, ...]:
     """Return the arguments that a scenario with a manoeuvre must have.
 

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
         HOLD_KINDS as HOLD_KINDS,
         KINDS as KINDS,
         SENSOR_KINDS as SENSOR_KINDS,
+        STRENGTH_MARK as STRENGTH_MARK,
         Disturbance as Disturbance,
         Manoeuvre as Manoeuvre,
         in_turn as in_turn,
@@ -27,7 +28,10 @@ if TYPE_CHECKING:
         InputSignal as InputSignal,
         expand_signal as expand_signal,
         fold_signals as fold_signals,
+        is_signal as is_signal,
+        is_stored_signal as is_stored_signal,
         point_of_signal as point_of_signal,
+        with_fewer_points as with_fewer_points,
     )
     from ._outcome import (
         CRASHES as CRASHES,

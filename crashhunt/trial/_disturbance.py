@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from crashhunt.base.codec import OMIT_DEFAULT, Serializable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
 _DURATION_DIGITS = 9  # decimal places of a duration in s, so that three steps of 0.1 s are 0.3 s
 
@@ -68,6 +68,9 @@ KINDS: Mapping[str, Kind] = {
 }  # fmt: skip
 """The types of disturbances that crashhunt has, by name; other simulators may add types."""
 
+STRENGTH_MARK = "@"
+"""In the name of a scenario argument that is the strength of a disturbance over time, such as ``brake@50``."""
+
 HOLD_KINDS: Mapping[str, Kind] = {
     "keep_speed": Kind("", "{vehicle} is held to its speed for {long:g} s"),
     "keep_lane": Kind("", "{vehicle} is held in its lane for {long:g} s"),
@@ -111,6 +114,8 @@ class Disturbance(Serializable):
         agent: The controlled vehicle around which the place is chosen.
         vehicle: The vehicle that was at the place. The field is empty if the disturbance is only planned, or if no
             vehicle was at the place. A hold (`HOLD_KINDS`) names its vehicle from the beginning.
+        strengths: The strength in each step, if it follows an `InputSignal`; ``how_strong`` is then the greatest. The
+            field is empty if the strength is constant, or if the disturbance is only planned.
     """
 
     step: int
@@ -120,6 +125,22 @@ class Disturbance(Serializable):
     how_long: float
     agent: str = ""
     vehicle: str = field(default="", metadata=OMIT_DEFAULT)
+    strengths: tuple[float, ...] = field(default=(), metadata=OMIT_DEFAULT)
+
+    @property
+    def signal(self) -> str:
+        """The name of the scenario argument that holds the strength over time, if the strength is a signal."""
+        return f"{self.what}{STRENGTH_MARK}{self.step}"
+
+    def following(self, signal: Callable[[float], float], step_length_s: float) -> Disturbance:
+        """Return the disturbance with a strength that follows a signal, at most as strong as planned."""
+        steps = range(steps_of(self.how_long, step_length_s))
+        strengths = tuple(min(self.how_strong, max(0.0, signal(step * step_length_s))) for step in steps)
+        return replace(self, how_strong=max(strengths), strengths=strengths)
+
+    def strength_in(self, step: int) -> float:
+        """Return the strength in a step of the disturbance, counted from 0."""
+        return self.strengths[min(step, len(self.strengths) - 1)] if self.strengths else self.how_strong
 
     def took_place(self, vehicle: str, how_strong: float, step_length_s: float = 0.0) -> Disturbance:
         """Return the disturbance as it took place, with durations and delays in whole steps.
@@ -144,7 +165,8 @@ class Disturbance(Serializable):
         if kind is None:
             return f"{vehicle}: {self.what} {self.how_strong:g} for {self.how_long:g} s"
         always, _, where_strong = kind.words.partition("|")
-        return (always + where_strong * (self.how_strong > 0)).format(
+        form = always + where_strong * (self.how_strong > 0)
+        return (form.replace(" with ", " with up to ", 1) if self.strengths else form).format(
             vehicle=vehicle, agent=agent, strong=self.how_strong, share=100 * self.how_strong, long=self.how_long
         )
 

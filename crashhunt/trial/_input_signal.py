@@ -3,6 +3,9 @@
 ``--arg throttle=signal:0:1:points=5:kind=linear`` varies five points from 0 to 1. A hunt stores such an argument as the
 text ``signal:KIND:COUNT:DURATION``, and each of its points as an argument of its own: ``throttle[0]``, ``throttle[1]``
 and so on. Samplers, ledger and minimization therefore see numbers, and the agent receives an `InputSignal`.
+
+Arguments of a scenario are stored in the same way. The strength of a disturbance at a given step, such as ``brake@50``,
+is stored as an argument of the scenario with this name.
 """
 
 from __future__ import annotations
@@ -31,12 +34,13 @@ _MAX_POINTS: Final = 200
 _DEFAULT_POINTS: Final = 5
 _STORED: Final = re.compile(r"signal:(constant|linear|pchip):(\d+):([0-9.e+-]+)")
 _POINT: Final = re.compile(r"(.+)\[(\d+)\]")
+_MOST_CANDIDATES: Final = 12
 _NOTATION: Final = "write signal:LOW:HIGH:points=N:kind=constant|linear|pchip, such as signal:0:1:points=5"
 
 
 @dataclass(frozen=True)
 class InputSignal:
-    """A value over time, for an agent that is driven by signals.
+    """A value over time, for an agent, a scenario or a disturbance that is driven by signals.
 
     Args:
         points: values of the signal. With the kind ``constant``, each holds for the same share of the duration.
@@ -108,6 +112,45 @@ def expand_signal(name: str, spec: str, duration_s: float, *, where: str) -> dic
         raise ArgumentError(f"the signal {spec!r} has an unknown kind {settings['kind']!r}", fix=fix, where=where)
     points = {f"{name}[{number}]": f"{low!r}:{high!r}" for number in range(count)}
     return {name: f"{_PREFIX}{settings['kind']}:{count}:{duration_s!r}", **points}
+
+
+def is_signal(spec: object) -> bool:
+    """Return whether a specification or a stored value of an argument is a signal."""
+    return isinstance(spec, str) and spec.startswith(_PREFIX)
+
+
+def is_stored_signal(value: object) -> bool:
+    """Return whether a value of an argument is the stored form of a signal, whose points are further arguments."""
+    return isinstance(value, str) and _STORED.fullmatch(value) is not None
+
+
+def with_fewer_points(arguments: Mapping[str, Value], name: str) -> list[dict[str, Value]]:
+    """Return arguments in which a signal has fewer points, the fewest first; empty if the argument is no signal.
+
+    The points of the smaller signals are values of the signal, at equal distances in time.
+
+    Args:
+        arguments: the arguments, with the stored signal and its points.
+        name: name of the signal.
+    """
+    signal = fold_signals(arguments)[name] if name in arguments and f"{name}[0]" in arguments else None
+    if not isinstance(signal, InputSignal):
+        return []
+    most = len(signal.points) - 1
+    counts = dict.fromkeys(round(math.exp(math.log(max(1, most)) * share / 11)) for share in range(_MOST_CANDIDATES))
+    return [_resampled(arguments, name, signal, count) for count in counts if count <= most]
+
+
+def _resampled(arguments: Mapping[str, Value], name: str, signal: InputSignal, count: int) -> dict[str, Value]:
+    if signal.kind == "constant":
+        times = [(number + 0.5) / count for number in range(count)]
+    else:
+        times = [number / (count - 1) for number in range(count)] if count > 1 else [0.5]
+    points = {f"{name}[{number}]": signal(share * signal.duration_s) for number, share in enumerate(times)}
+    kept = {
+        key: value for key, value in arguments.items() if key in points or (point_of_signal(key) or ("",))[0] != name
+    }
+    return {**kept, name: f"{_PREFIX}{signal.kind}:{count}:{signal.duration_s!r}", **points}
 
 
 def point_of_signal(name: str) -> tuple[str, int] | None:

@@ -7,14 +7,15 @@ and the next lane are given by their middles. The controlled vehicle begins with
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from crashhunt.world._scene import PERSON, Actor
 from crashhunt.world._tracks import ActorState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
 START_M = 300.0
 """Front of the controlled vehicle along the road at the beginning, in m."""
@@ -23,8 +24,12 @@ LENGTH_M, WIDTH_M = 4.3, 1.9
 """Size of a car, in m. Source: the published comparison of the driver models."""
 
 _LATERAL_RATE_MPS2 = 1.5
+_MAX_ACCELERATION_MPS2 = 10.0  # of a speed profile that may jump
 _KMH = 3.6
 _ROUNDING = 1e-9
+
+Given = float | Callable[[float], float]
+"""An argument of a manoeuvre: a number, or a function of the time in s."""
 _OUTSIDE_M = 3.5  # from the middle of the outer lane to a person next to the road
 
 _SHAPES = {"walker": ("pedestrian", 0.5, 0.5), "motorcycle": ("motorcycle", 2.2, 0.9)}
@@ -58,19 +63,26 @@ class _Mover:
         self.y += lateral * step_s
 
 
+def _at(value: Given, time_s: float) -> float:
+    """Return an argument at a time in s: the argument itself, unless it is a function of the time."""
+    return value(time_s) if callable(value) else value
+
+
 def manoeuvre_motions(
-    manoeuvre: str, values: Mapping[str, float], own_y: float, next_y: float, step_s: float
+    manoeuvre: str, values: Mapping[str, Given], own_y: float, next_y: float, step_s: float
 ) -> Iterator[dict[str, ActorState]]:
     """Yield the states of the other road users after each step, without end; a road user may appear later.
 
     Args:
         manoeuvre: name of the manoeuvre.
-        values: arguments of the scenario.
+        values: arguments of the scenario. ``decel_mps2``, ``walk_kmh`` and, for ``following``, ``slower_kmh`` may be
+            functions of the time in s.
         own_y: middle of the lane of the controlled vehicle, in m.
         next_y: middle of the next lane, in m.
         step_s: step length, in s.
     """
-    return _MOTIONS[manoeuvre](values, values["ego_kmh"] / _KMH, own_y, next_y, step_s)
+    constant = cast("Mapping[str, float]", values)
+    return _MOTIONS[manoeuvre](constant, constant["ego_kmh"] / _KMH, own_y, next_y, step_s)
 
 
 def _cut_in(
@@ -119,10 +131,12 @@ def _deceleration(
 ) -> Iterator[dict[str, ActorState]]:
     """Yield states of a vehicle ahead that brakes until it stands."""
     leader = _Mover(START_M + values["headway_s"] * speed + LENGTH_M, own_y, speed)
+    step = 0
     while True:
         yield {"leader": leader.state()}
-        leader.speed = max(0.0, leader.speed - values["decel_mps2"] * step_s)
+        leader.speed = max(0.0, leader.speed - _at(values["decel_mps2"], step * step_s) * step_s)
         leader.drive(step_s)
+        step += 1
 
 
 def _lane_keeping(
@@ -143,14 +157,22 @@ def _lane_keeping(
 def _following(
     values: Mapping[str, float], speed: float, own_y: float, _next_y: float, step_s: float
 ) -> Iterator[dict[str, ActorState]]:
-    """Yield states of a vehicle ahead with a distance to the middle of its lane, whose speed varies."""
+    """Yield states of a vehicle ahead with a distance to the middle of its lane, whose speed varies.
+
+    The speed oscillates, or is slower than at the beginning by a function of the time, as fast as vehicles can follow.
+    """
     leader = _Mover(START_M + values["headway_s"] * speed + LENGTH_M, own_y + values["offset_m"], speed)
     step = 0
     while True:
         yield {"leader": leader.state()}
         step += 1
-        wave = (1 - math.cos(math.tau * step * step_s / values["period_s"])) / 2
-        leader.speed = max(0.0, speed - values["slower_kmh"] / _KMH * wave)
+        slower: Given = values["slower_kmh"]
+        wave = 1.0 if callable(slower) else (1 - math.cos(math.tau * step * step_s / values["period_s"])) / 2
+        wanted = max(0.0, speed - _at(slower, step * step_s) / _KMH * wave)
+        if callable(slower):  # which may jump
+            most = _MAX_ACCELERATION_MPS2 * step_s
+            wanted = min(max(wanted, leader.speed - most), leader.speed + most)
+        leader.speed = wanted
         leader.drive(step_s)
 
 
@@ -181,16 +203,24 @@ def _pedestrian(
 
     The person begins outside the road, and walks until it has left the road on the other side.
     """
-    side, walk = math.copysign(1.0, values["from_side"]), values["walk_kmh"] / _KMH
+    side, walk_kmh = math.copysign(1.0, values["from_side"]), values["walk_kmh"]
+    walk = _at(walk_kmh, 0.0) / _KMH
     right, left = min(own_y, next_y) - _OUTSIDE_M, max(own_y, next_y) + _OUTSIDE_M
     begin = left if side > 0 else right
     # The person stands outside the road until the walk has to begin, and after it.
     y = own_y + side * (values["impact_m"] + walk * values["distance_m"] / speed) if speed > 0 else begin
+    if callable(walk_kmh) and speed > 0:
+        arrival = math.ceil(values["distance_m"] / speed / step_s - _ROUNDING)
+        walked = sum(walk_kmh(number * step_s) for number in range(arrival)) / _KMH * step_s
+        y = own_y + side * (values["impact_m"] + walked)
+    step = 0
     x, heading = START_M + values["distance_m"], -side * math.pi / 2
     while True:
         place = min(max(y, right), left)
         yield {f"{PERSON}walker": ActorState(x, place, heading, walk if place == y else 0.0)}
+        walk = _at(walk_kmh, step * step_s) / _KMH
         y -= side * walk * step_s
+        step += 1
 
 
 def _detection_range(

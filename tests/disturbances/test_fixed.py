@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, strategies as st
 
-from crashhunt.disturbances import disturber_of, is_fixed, parse_fixed, parse_rates, word_of
+from crashhunt.disturbances import disturber_of, is_fixed, parse_fixed, parse_rates, signals_of_fixed, word_of
 from crashhunt.errors import UsageError
-from crashhunt.trial import CELLS, KINDS, Disturbance, TrialResult, TrialSpec, why_not
+from crashhunt.trial import CELLS, KINDS, Disturbance, InputSignal, TrialResult, TrialSpec, why_not
 
 STOP = Disturbance(20, "ahead", "stop", 6.0, 8.0, "ego")
 disturbances = st.builds(
@@ -122,3 +123,18 @@ def test_a_branch_keeps_what_is_fixed_after_it_and_what_has_begun_is_not_reporte
         assert STOP in draws.draw_another(3, number, 10, 5, 40)
         assert STOP not in draws.draw_another(3, number, 20, 5, 40)
         assert all(one.step > 10 for one in draws.draw_another(3, number, 10, 5, 40))
+
+
+def test_a_strength_may_be_a_signal_and_is_at_most_its_upper_bound():
+    words = ["brake=0.1", "brake@20=ahead:signal:0:6:points=3:kind=constant:3", "stop@20=ahead:6:8"]
+    brake, stop = parse_fixed(words, ("ego",))
+    assert (brake, stop) == (Disturbance(20, "ahead", "brake", 6.0, 3.0, "ego"), STOP)
+    assert signals_of_fixed(words, ("ego",)) == {"brake@20": (brake, "signal:0:6:points=3:kind=constant", words[1])}
+    took_place = replace(brake, how_strong=4.0).following(InputSignal((1.0, 5.0, 2.0), "constant", 3.0), 0.5)
+    assert (took_place.strengths, took_place.how_strong) == ((1, 1, 4, 4, 2, 2), 4.0)
+    assert [took_place.strength_in(step) for step in (0, 5, 9)] == [1, 2, 2]
+    assert took_place.words.endswith("brakes with up to 4 m/s² for 3 s")
+    with pytest.raises(UsageError, match="another signal is already called brake@20"):
+        signals_of_fixed([f"{agent}.{words[1]}" for agent in "ab"], ("a", "b"))
+    with pytest.raises(UsageError, match="below 0"):
+        parse_fixed(["brake@20=ahead:signal:-1:6:3"], ("ego",))

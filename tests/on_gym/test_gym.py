@@ -321,6 +321,20 @@ def test_scenario_arguments_are_keywords(tmp_path):
         simulator.reset(seed=1, options={"arguments": {"wide": -1.0}})
 
 
+def test_scenario_argument_that_is_a_signal_is_a_function_of_the_time(tmp_path):
+    arguments = {"wide": ArgumentSetup(default=3.0, option="size")}
+    simulator = simulator_of(tmp_path, f"{__name__}:Wide", arguments=arguments)
+    signal = {"wide": "signal:linear:2:10.0", "wide[0]": 1.0, "wide[1]": 3.0}
+    simulator.reset(seed=1, options={"arguments": signal})
+    assert [simulator._env.unwrapped.wide(time_s) for time_s in (0.0, 2.5, 99.0)] == [1.0, 1.5, 3.0]
+
+
+class Wide(Tray):
+    def __init__(self, size=1.0):
+        super().__init__(size=1.0)
+        self.wide = size
+
+
 def make_nested(config=None, **kwargs):
     """One that takes a table, and refuses what is in it."""
     if config["friction"]["of"] < 0:

@@ -37,7 +37,7 @@ def drive(tmp_path):
     """Starts an episode on a street with a signal; returns it and who watches."""
     made = []
 
-    def begin(*disturbances, traffic=AHEAD + BEHIND, steps=400, dt=0.1, agent=None, driven=()):
+    def begin(*disturbances, traffic=AHEAD + BEHIND, steps=400, dt=0.1, agent=None, driven=(), strength=None):
         folder = tmp_path / f"s{len(made)}"
         (folder / "stage").mkdir(parents=True)
         shutil.copy(NET, folder)
@@ -54,7 +54,7 @@ def drive(tmp_path):
         )
         watch = Watch()
         simulator = SumoSimulator(scenario, folder / "stage")
-        spec = TrialSpec(0, 1, {}, {}, steps, disturbances=disturbances)
+        spec = TrialSpec(0, 1, {}, strength or {}, steps, disturbances=disturbances)
         given = {"simulator": simulator, "make_agent": lambda *_: agent or Steady(), "observers": (watch,)}
         episode = Episode(spec, **given)
         made.append((episode, simulator))
@@ -84,6 +84,17 @@ def drives_by_itself(name):
     modes = libsumo.vehicle.getSpeedMode(name), libsumo.vehicle.getLaneChangeMode(name)
     own = libsumo.vehicle.getSpeedWithoutTraCI(name) == libsumo.vehicle.getSpeed(name)
     return own and modes == (31, 1621) and libsumo.vehicle.getSpeedFactor(name) == 1.0
+
+
+def test_the_vehicle_ahead_brakes_as_a_signal_says_and_no_harder_than_its_type_can(drive):
+    strength = {"brake@6": "signal:constant:3:1.5", "brake@6[0]": 1.0, "brake@6[1]": 9.0, "brake@6[2]": 0.0}
+    episode, watch = drive(planned(6, "brake", strong=9.0, long=1.5), strength=strength)
+    advance(episode, 20)
+    assert np.diff(watch.speeds("lead"))[5:20] / 0.1 == pytest.approx([-1.0] * 5 + [-4.5] * 5 + [0.0] * 5)
+    (told,) = watch.told
+    assert (told.how_strong, told.strengths[5:10]) == (4.5, (9.0,) * 5)
+    advance(episode, 1)
+    assert drives_by_itself("lead")
 
 
 def test_the_one_that_is_ahead_brakes_and_drives_on_by_itself(drive):

@@ -171,3 +171,44 @@ def test_scenario_with_a_manoeuvre_needs_its_arguments(tmp_path):
     less = replace(scenario, arguments={name: one for name, one in scenario.arguments.items() if name != "side"})
     with pytest.raises(ScenarioError, match="has no 'side', which the manoeuvre 'cut_in' needs"):
         less.backend.check(less, "scenario.toml")
+
+
+def signal(name, kind, duration_s, *points):
+    return {name: f"signal:{kind}:{len(points)}:{duration_s}"} | {f"{name}[{at}]": one for at, one in enumerate(points)}
+
+
+def test_vehicle_ahead_drives_a_speed_profile(simulate):
+    profile = signal("slower_kmh", "linear", 8.0, 0.0, 36.0, 18.0, 80.0, 20.0)
+    values = STRAIGHT["following"] | profile
+    scenes = drive(*simulate("r157-following", ego_kmh=60.0, **values), KeepsSpeed(), 80)
+    speeds = [scene.speeds[scene.roster.index["leader"]] for scene in scenes]
+    slower = np.interp(np.arange(81) * 0.1, [0, 2, 4, 6, 8], [0, 36, 18, 80, 20])
+    assert speeds == pytest.approx(np.maximum(0, 60 - slower) / 3.6)
+    jump = STRAIGHT["following"] | signal("slower_kmh", "constant", 8.0, 36.0)
+    scenes = drive(*simulate("r157-following", ego_kmh=60.0, **jump), KeepsSpeed(), 20)
+    speeds = [scene.speeds[scene.roster.index["leader"]] for scene in scenes]
+    assert speeds == pytest.approx(np.maximum(24 / 3.6, 60 / 3.6 - np.arange(21)))  # 10 m/s² at most
+
+
+def test_vehicle_ahead_brakes_as_a_signal_says(simulate):
+    profile = signal("decel_mps2", "constant", 4.0, 2.0, 0.0, 6.0)
+    scenes = drive(*simulate("r157-deceleration", ego_kmh=60.0, headway_s=2.0, **profile), KeepsSpeed(), 40)
+    speeds = [scene.speeds[scene.roster.index["leader"]] for scene in scenes]
+    changes = np.where(np.arange(40) * 0.1 < 4 / 3 - 1e-9, 2.0, np.where(np.arange(40) * 0.1 < 8 / 3 - 1e-9, 0.0, 6.0))
+    assert -np.diff(speeds) / 0.1 == pytest.approx(changes)
+
+
+def test_person_walks_as_a_signal_says_and_is_at_the_place_of_impact_in_time(simulate):
+    profile = signal("walk_kmh", "linear", 12.0, 1.0, 9.0, 3.0)
+    values = STRAIGHT["pedestrian"] | profile
+    scenes = drive(*simulate("r157-pedestrian", ego_kmh=60.0, **values), KeepsSpeed(), 70)
+    y = np.array([scene.points[scene.roster.index["person walker"]][1] for scene in scenes])
+    walks = np.interp(np.arange(70) * 0.1, [0, 6, 12], [1.0, 9.0, 3.0]) / 3.6
+    moving = np.diff(y) > 1e-9
+    assert np.diff(y)[moving][1:] / 0.1 == pytest.approx(walks[moving][1:])
+    assert y[60] == pytest.approx(-1.75 - 0.2)  # 100 m at 60 km/h take 6 s
+
+
+def test_a_point_of_a_signal_out_of_range_is_refused(simulate):
+    with pytest.raises(InvalidEpisodeError, match=r"decel_mps2 is -1\.0 \(allowed: 0 to 1000\)"):
+        simulate("r157-deceleration", ego_kmh=60.0, headway_s=2.0, **signal("decel_mps2", "linear", 4.0, 2.0, -1.0))

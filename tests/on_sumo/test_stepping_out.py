@@ -36,7 +36,7 @@ def drive(tmp_path):
     """Runs an episode on a straight road with a sidewalk; returns its result and who watched."""
     made = []
 
-    def run(traffic, *disturbances, net="sidewalk", speed=5.0, steps=120):
+    def run(traffic, *disturbances, net="sidewalk", speed=5.0, steps=120, strength=None):
         folder = tmp_path / f"s{len(made)}"
         (folder / "stage").mkdir(parents=True)
         shutil.copy(NETS / f"{net}.net.xml", folder / "n.net.xml")
@@ -48,7 +48,7 @@ def drive(tmp_path):
         simulator = SumoSimulator(load_scenario(folder), folder / "stage")
         made.append(simulator)
         watch = Watch()
-        spec = TrialSpec(0, 1, {}, {}, steps, disturbances=disturbances)
+        spec = TrialSpec(0, 1, {}, strength or {}, steps, disturbances=disturbances)
         with Episode(spec, simulator=simulator, make_agent=lambda *_: Steady(speed), observers=(watch,)) as episode:
             episode.start()
             while episode.result is None:
@@ -84,6 +84,20 @@ def test_a_walker_steps_out_and_walks_on_where_it_was_going(drive):
     walked = np.diff(points[80:, 0])  # it goes on where it was going
     assert (len(points), walked.min() > 0.05, walked.max() < 0.2) == (121, True, True)
     assert np.array(plain.of("person walker", "points"))[:20].tolist() == points[:20].tolist()
+
+
+def test_a_person_steps_out_as_fast_as_a_signal_says_and_is_back_in_time(drive):
+    strength = {"step_out@20": "signal:constant:3:6.0"}
+    strength |= {f"step_out@20[{number}]": value for number, value in enumerate((1.2, 0.0, 0.7))}
+    _, watch = drive(EGO + WALKER, stepping(20), strength=strength)
+    points = np.array(watch.of("person walker", "points"))
+    moved = np.hypot(*np.diff(points[19:80], axis=0).T) / 0.1
+    out = points[:, 1] - points[19, 1]
+    assert moved[:11] == pytest.approx(1.2)
+    assert out[39] == pytest.approx(1.4)  # the 2 s of the last part suffice for 1.4 m back
+    assert moved[20:40] == pytest.approx(0.0)
+    assert moved[40:60] == pytest.approx(0.7)
+    assert out[79] == pytest.approx(0.0)
 
 
 def test_scene_has_the_headings_and_speeds_of_persons_and_vehicles(drive):
@@ -210,7 +224,7 @@ def outcome_of_stepping_out(person, vehicle, seconds=6.0):
         code = 1
         try:
             steps = round(seconds / 0.5)
-            stepping = SteppingOut(f"person {person}", vehicle, 1.4, steps, 0.5, {})
+            stepping = SteppingOut(f"person {person}", vehicle, [1.4] * steps, 0.5, {})
             roads = set()
             for _ in range(steps - 1):
                 libsumo.simulationStep()

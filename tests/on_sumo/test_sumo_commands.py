@@ -149,8 +149,8 @@ def test_disturbance_is_made_within_what_the_vehicle_can(disturbances, sumo, mon
     def made(*given, **named):
         return disturbances.disturb("other", planned(*given, **named))
 
-    assert made("brake") == made("stop") == ("_Slows", "other", 3.0, 0.5, {"how_strong": 3.0})
-    assert made("brake", strong=9.0) == ("_Slows", "other", 4.0, 0.5, {"how_strong": 4.0})
+    assert made("brake") == made("stop") == ("_Slows", "other", 3.0, 0.5, {"how_strong": 3.0, "strengths": []})
+    assert made("brake", strong=9.0) == ("_Slows", "other", 4.0, 0.5, {"how_strong": 4.0, "strengths": []})
     assert made("dawdle", strong=0.25) == ("_Slows", "other", 1.5, 0.5, {"how_strong": 0.25, "target": 7.5})
     assert made("dawdle", strong=1.5)[-1] == {"how_strong": 1.5, "target": 0.0}
     assert made("speed", strong=0.25) == ("_Speeds", "other", 0.25, {})
@@ -171,7 +171,7 @@ def test_disturbance_is_made_within_what_the_vehicle_can(disturbances, sumo, mon
     asked = []
     monkeypatch.setattr(_disturbances, "can_step_out", lambda *given: asked.append(given) or len(asked) == 1)
     walks = made("step_out", who="right ahead", strong=1.5, long=3.0)
-    assert walks == ("SteppingOut", "other", "ego", 1.5, 6, 0.5, disturbances.speeds, {})
+    assert walks == ("SteppingOut", "other", "ego", [1.5] * 6, 0.5, disturbances.speeds, {})
     assert asked == [("other", "ego", 2.25, disturbances._junctions)]
     assert made("step_out") is None
     sumo.answers["vehicle_getDecel"] = gone
@@ -283,7 +283,7 @@ def test_person_walks_straight_to_the_agents_axis(person, sumo, turn, side):
 
 def test_person_steps_out_stands_and_is_back_in_time(person, sumo):
     speeds = {}
-    made = SteppingOut("person p", "ego", 9.0, 13, 1.0, speeds)
+    made = SteppingOut("person p", "ego", [9.0] * 13, 1.0, speeds)
     assert made.how_strong == 1.5  # as fast as it can
     moved, shown = [], [speeds["p"]]
     for _ in range(12):
@@ -304,8 +304,8 @@ def test_person_steps_out_stands_and_is_back_in_time(person, sumo):
 
 
 def test_person_that_has_too_little_time_turns_back_before_the_axis(person, sumo):
-    SteppingOut("person p", "ego", 1.0, 6, 0.5, {})  # one metre a second, three seconds in all
-    made = SteppingOut("person p", "ego", 1.0, 6, 0.5, {})
+    SteppingOut("person p", "ego", [1.0] * 6, 0.5, {})  # one metre a second, three seconds in all
+    made = SteppingOut("person p", "ego", [1.0] * 6, 0.5, {})
     sumo.taken()
     for _ in range(5):
         made.keep()
@@ -314,7 +314,7 @@ def test_person_that_has_too_little_time_turns_back_before_the_axis(person, sumo
 
 def test_person_on_a_junction_or_gone_is_not_moved(person, sumo):
     speeds = {}
-    made = SteppingOut("person p", "ego", 1.0, 6, 0.5, speeds)
+    made = SteppingOut("person p", "ego", [1.0] * 6, 0.5, speeds)
     sumo.taken()
     sumo.answers["person_getRoadID"] = ":j_w0"
     made.keep()
@@ -328,11 +328,13 @@ def test_person_on_a_junction_or_gone_is_not_moved(person, sumo):
     assert person.calls == [("append", "p", ("s", "t"), 12.0)]  # the walk before was its last one
     person.stage.edges = ("x", "y")
     other = (
-        SteppingOut("person p", "ego", 1.0, 6, 0.5, speeds) if not callable(sumo.answers["person_getRoadID"]) else None
+        SteppingOut("person p", "ego", [1.0] * 6, 0.5, speeds)
+        if not callable(sumo.answers["person_getRoadID"])
+        else None
     )
     assert other is None
     sumo.answers["person_getRoadID"] = "s"
-    other = SteppingOut("person p", "ego", 1.0, 6, 0.5, speeds)
+    other = SteppingOut("person p", "ego", [1.0] * 6, 0.5, speeds)
     other.end()
     assert person.calls[-1] == ("append", "p", ("x", "y"), 12.0)  # its edge is none of its walk
 

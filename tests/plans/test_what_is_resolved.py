@@ -196,6 +196,8 @@ def test_what_an_agent_needs_has_to_be_given(folder):
         ({"action": "meta"}, "--action meta is for"),
         ({"branch": True}, "--branch needs disturbances, but the hunt has none"),
         ({"disturb": ["brake@101=ahead:4:2"]}, "--disturb brake@101: a trial has only 100 steps"),
+        ({"scenario_arguments": {"gap_m": "signal:0:1"}}, "--set gap_m: the argument cannot vary over time"),
+        ({"disturb": ["brake@10=ahead:signal:0:6:2"]}, "the strength of brake cannot vary over time in this scenario"),
         ({"crash_on": ["red-light"]}, "did you mean 'red_light'"),
     ],
 )
@@ -203,6 +205,22 @@ def test_what_cannot_be_resolved_is_refused(folder, options, says):
     with pytest.raises((ArgumentError, UsageError, ScenarioError)) as refused:
         plan(asked(**options))
     assert says in str(refused.value)
+
+
+def test_points_of_signals_of_scenarios_and_disturbances_are_arguments_of_the_scenario():
+    words = ["brake@10=ahead:signal:0:6:points=2:3.0", "cut_in=0.1"]
+    signals = {"slower_kmh": "signal:0:60:points=3:kind=constant"}
+    request = replace(asked(disturb=words, scenario_arguments=signals), scenario="r157-following")
+    settings = plan(request)[1]
+    found = {name: spec.spec for name, spec in settings.scenario_arguments.items() if "0:" in spec.spec}
+    points = {f"slower_kmh[{number}]": "0.0:60.0" for number in range(3)}
+    points |= {f"brake@10[{number}]": "0.0:6.0" for number in range(2)}
+    assert found.items() >= points.items()
+    assert settings.scenario_arguments["slower_kmh"].spec == "signal:constant:3:10.0"
+    assert settings.scenario_arguments["brake@10"].spec == "signal:linear:2:3.0"
+    assert plan(replace(request, disturb=settings.disturb))[1] == settings
+    with pytest.raises(ArgumentError, match=r"--set headway_s.*give a range, or vary one of slower_kmh"):
+        plan(replace(request, scenario_arguments={"headway_s": "signal:1:2"}))
 
 
 def test_parts_are_those_of_the_command_line_then_of_the_named_class_then_of_the_scenario(folder):

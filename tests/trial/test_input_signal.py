@@ -8,7 +8,7 @@ from hypothesis import given, strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from crashhunt.errors import ArgumentError
-from crashhunt.trial import InputSignal, expand_signal, fold_signals
+from crashhunt.trial import InputSignal, expand_signal, fold_signals, with_fewer_points
 
 
 def expand(spec):
@@ -74,3 +74,17 @@ def test_a_specification_that_is_no_signal_is_refused(spec, message):
         expand(spec)
     assert message in str(refused.value)
     assert refused.value.where == "--arg u"
+
+
+@pytest.mark.parametrize("kind", ["constant", "linear", "pchip"])
+def test_a_signal_with_fewer_points_has_values_of_the_signal(kind):
+    points = [3.0, 1.0, 4.0, 1.0, 5.0]
+    given = {"v": 1.0, "u": f"signal:{kind}:5:10.0", **{f"u[{at}]": value for at, value in enumerate(points)}}
+    whole, smaller = fold_signals(given)["u"], with_fewer_points(given, "u")
+    assert [len(fold_signals(one)["u"].points) for one in smaller] == [1, 2, 3, 4]
+    assert all(one["v"] == 1.0 and len(one) == 2 + count for count, one in enumerate(smaller, 1))
+    assert smaller[0]["u[0]"] == whole(5.0)
+    if kind != "constant":
+        assert fold_signals(smaller[2])["u"].points == (3.0, 4.0, 5.0)
+    assert with_fewer_points(given, "v") == with_fewer_points({"u": given["u"]}, "u") == []
+    assert with_fewer_points(smaller[0], "u") == []
