@@ -86,7 +86,7 @@ def drives_by_itself(name):
     return own and modes == (31, 1621) and libsumo.vehicle.getSpeedFactor(name) == 1.0
 
 
-def test_the_vehicle_ahead_brakes_as_a_signal_says_and_no_harder_than_its_type_can(drive):
+def test_braking_follows_a_signal_within_the_limit_of_the_vehicle_type(drive):
     strength = {"brake@6": "signal:constant:3:1.5", "brake@6[0]": 1.0, "brake@6[1]": 9.0, "brake@6[2]": 0.0}
     episode, watch = drive(planned(6, "brake", strong=9.0, long=1.5), strength=strength)
     advance(episode, 20)

@@ -190,7 +190,7 @@ def test_vehicle_ahead_drives_a_speed_profile(simulate):
     assert speeds == pytest.approx(np.maximum(24 / 3.6, 60 / 3.6 - np.arange(21)))  # 10 m/s² at most
 
 
-def test_vehicle_ahead_brakes_as_a_signal_says(simulate):
+def test_deceleration_of_the_vehicle_ahead_follows_a_signal(simulate):
     profile = signal("decel_mps2", "constant", 4.0, 2.0, 0.0, 6.0)
     scenes = drive(*simulate("r157-deceleration", ego_kmh=60.0, headway_s=2.0, **profile), KeepsSpeed(), 40)
     speeds = [scene.speeds[scene.roster.index["leader"]] for scene in scenes]
@@ -198,7 +198,7 @@ def test_vehicle_ahead_brakes_as_a_signal_says(simulate):
     assert -np.diff(speeds) / 0.1 == pytest.approx(changes)
 
 
-def test_person_walks_as_a_signal_says_and_is_at_the_place_of_impact_in_time(simulate):
+def test_walk_of_the_person_follows_a_signal_to_the_place_of_impact(simulate):
     profile = signal("walk_kmh", "linear", 12.0, 1.0, 9.0, 3.0)
     values = STRAIGHT["pedestrian"] | profile
     scenes = drive(*simulate("r157-pedestrian", ego_kmh=60.0, **values), KeepsSpeed(), 70)

@@ -86,7 +86,7 @@ def test_a_walker_steps_out_and_walks_on_where_it_was_going(drive):
     assert np.array(plain.of("person walker", "points"))[:20].tolist() == points[:20].tolist()
 
 
-def test_a_person_steps_out_as_fast_as_a_signal_says_and_is_back_in_time(drive):
+def test_person_steps_out_as_fast_as_a_signal_and_is_back_in_time(drive):
     strength = {"step_out@20": "signal:constant:3:6.0"}
     strength |= {f"step_out@20[{number}]": value for number, value in enumerate((1.2, 0.0, 0.7))}
     _, watch = drive(EGO + WALKER, stepping(20), strength=strength)
