@@ -116,6 +116,7 @@ class EndedRun:
         folder: folder with the files of the trial; it exists until the next run is requested.
         entered: ids of all actors that entered, if the specification requested them (`EVERYBODY`).
         responses: responses of the reference driver, if the specification has one; None if the trial reported none.
+        lights: contents of `layout.LIGHTS`; empty if the run was not to read the lights, or its simulator has none.
     """
 
     place: int
@@ -124,6 +125,7 @@ class EndedRun:
     folder: Path
     entered: tuple[str, ...] = ()
     responses: tuple[JsonObject, ...] | None = None
+    lights: bytes = b""
 
     @property
     def lanes(self) -> list[Lane]:
@@ -265,6 +267,9 @@ class Reruns:
         if result.spec.overruled is not None and result.spec.overruled.reference:
             with suppress(OSError, ValueError):
                 responses = tuple(json.loads((folder / layout.RESPONSES).read_text(encoding="utf-8")))
+        lights = b""
+        with suppress(OSError):
+            lights = (folder / layout.LIGHTS).read_bytes()
         return EndedRun(
             place=place,
             result=replace(result, spec=replace(result.spec, number=asked.number)),
@@ -272,6 +277,7 @@ class Reruns:
             folder=folder,
             entered=tuple(entered),
             responses=responses,
+            lights=lights,
         )
 
 

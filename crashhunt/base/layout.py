@@ -30,6 +30,8 @@ LOG: Final = "log.mcap"
 RUN_LOG: Final = "run.log"
 ERROR_LOG: Final = "error.log"
 FOXGLOVE_LAYOUT: Final = "foxglove-layout.json"
+LIGHTS: Final = "lights.json"
+"""Traffic lights, lights of vehicles and routes, which the replay that confirms a crash reads from the simulator."""
 
 # Of a case of a corpus, which is a hunt's directory besides.
 CASE: Final = "crashhunt-case.toml"

@@ -18,8 +18,10 @@ if TYPE_CHECKING:
         list_bundles as list_bundles,
         list_near_misses as list_near_misses,
         read_bundle as read_bundle,
+        read_lights as read_lights,
         read_params as read_params,
         snapshot_of as snapshot_of,
+        with_lights as with_lights,
         write_bundle as write_bundle,
         write_trial as write_trial,
     )

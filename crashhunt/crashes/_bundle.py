@@ -18,6 +18,7 @@ from crashhunt.base.integrity import (
     authentication_code,
     changed_file,
     describe_files,
+    digest_of_content,
     digest_of_data,
     is_authentic,
     read_object,
@@ -263,6 +264,7 @@ class Bundle:
         ]
         if self.files:
             names = {path.name for path in self.path.iterdir()} - {layout.CRASH}
+            names.discard(layout.LIGHTS)  # a confirmation that was killed may have written it
             found += [f"{name} was not there" for name in sorted(names - self.files.keys()) if name[0] != "."]
         return found
 
@@ -350,6 +352,30 @@ class Bundle:
         with whole_file(folder / layout.CRASH) as temporary:
             text = json.dumps(whole, indent=2, ensure_ascii=False) + "\n"
             temporary.write_text(text, encoding="utf-8", errors="surrogatepass")
+
+
+def with_lights(bundle: Bundle, content: bytes) -> Bundle:
+    """Write lights and routes into the folder of a bundle; return the bundle with this file, or as it was."""
+    if not bundle.files or not bundle.path.is_dir():
+        return bundle
+    try:
+        with whole_file(bundle.path / layout.LIGHTS) as temporary:
+            temporary.write_bytes(content)
+    except (CrashhuntError, OSError):  # a hunt with ``--keep`` may delete the bundle meanwhile
+        return bundle
+    entry: FileEntry = {"size": len(content), "blake2b": digest_of_content(content)}
+    return replace(bundle, files={**bundle.files, layout.LIGHTS: entry})
+
+
+def read_lights(bundle: Bundle) -> JsonObject:
+    """Return the lights and routes of a bundle; empty if it has none, or if the file has changed."""
+    path, entry = bundle.path / layout.LIGHTS, bundle.files.get(layout.LIGHTS)
+    if entry is None or changed_file(path, entry):
+        return {}
+    with suppress(OSError, ValueError):
+        found: JsonObject = read_object(path, dict)
+        return found
+    return {}
 
 
 def read_bundle(path: Path) -> Bundle:

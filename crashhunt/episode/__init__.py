@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ._forced_onsets import OnsetForcer as OnsetForcer
     from ._forks import FirstCopy as FirstCopy, ForkRunner as ForkRunner
     from ._observers import (
+        LightRecorder as LightRecorder,
         Nearness as Nearness,
         ObservedEpisode as ObservedEpisode,
         Observer as Observer,

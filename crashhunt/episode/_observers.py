@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
@@ -40,6 +40,7 @@ from crashhunt.simulators import (
     ReportsCrashCell,
     ReportsDanger,
     ReportsEvents,
+    ReportsLights,
     RestoresObservations,
     SupportsExclusion,
     SupportsScripts,
@@ -369,6 +370,66 @@ class Recorder(Observer):
         self._box.mark(Phase.DONE)
         digest = digest_of(self._box.evidence()) if result.outcome is not Outcome.INVALID else ""
         return replace(result, digest=digest, events=None if self._events is None else dict(self._events))
+
+
+# The observer that reads lights and routes, in the replay that confirms a crash.
+
+_MAX_LIGHT_STEPS = 6000  # the last steps, of which lights and routes are kept
+_NOT_KEPT = ("present", "goal_x", "goal_y")  # columns that no sentence needs
+_ROUTE_EVERY = 5  # steps; a route changes little in between
+
+
+class LightRecorder(Observer):
+    """Observer that keeps what a simulator reports of traffic lights, the lights of vehicles, and routes."""
+
+    def __init__(self) -> None:
+        self._simulator: ReportsLights | None = None
+        self._signals: dict[str, list[tuple[int, str]]] = {}
+        self._vehicles: dict[str, list[tuple[int, int, int]]] = {}
+        self._parts: dict[str, deque[tuple[int, object]]] = {}
+        self._routes: dict[str, deque[tuple[int, list[float]]]] = {}
+
+    def begin(self, episode: ObservedEpisode) -> None:
+        """Keep the simulator."""
+        self._simulator = episode.simulator if supports(episode.simulator, ReportsLights) else None
+
+    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        """Read the lights and routes of a step."""
+        if self._simulator is None:
+            return
+        try:
+            found = self._simulator.lights()
+        except Exception:  # a picture with less in it is better than a crash that is not confirmed
+            self._simulator = None
+            return
+        for lane, colours in found.signals.items():
+            changes = self._signals.setdefault(lane, [])
+            if not changes or changes[-1][1] != colours:
+                changes.append((step, colours))
+        for vehicle, lit in found.vehicles.items():
+            shown = self._vehicles.setdefault(vehicle, [])
+            if shown[-1][1:] != lit if shown else any(lit):
+                shown.append((step, *lit))
+        for agent, parts in found.parts.items():
+            rounded = {
+                name: [{key: round(value, 1) for key, value in row.items() if key not in _NOT_KEPT} for row in rows[:1]]
+                for name, rows in parts.items()
+            }
+            self._parts.setdefault(agent, deque(maxlen=_MAX_LIGHT_STEPS)).append((step, rounded))
+        for agent, points in found.routes.items() if step % _ROUTE_EVERY == 0 else ():
+            flat = [round(value, 1) for point in points for value in point]
+            self._routes.setdefault(agent, deque(maxlen=_MAX_LIGHT_STEPS // _ROUTE_EVERY)).append((step, flat))
+
+    def data(self) -> dict[str, object] | None:
+        """Return everything that was read, as JSON; None if the simulator reports nothing."""
+        if self._simulator is None or not (self._signals or self._vehicles or self._parts):
+            return None
+        return {
+            "signals": self._signals,
+            "vehicles": self._vehicles,
+            "parts": {agent: list(steps) for agent, steps in self._parts.items()},
+            "routes": {agent: list(steps) for agent, steps in self._routes.items()},
+        }
 
 
 _ready: dict[int, tuple[ActionForm, NDArray[np.generic]]] = {}  # by identity, which holds as long as the form is here

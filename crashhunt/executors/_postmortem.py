@@ -341,6 +341,7 @@ class Report(TypedDict):
     entered: NotRequired[list[str]]
     responses: NotRequired[list[JsonObject]]
     braking: NotRequired[Mapping[str, object] | None]
+    lights: NotRequired[Mapping[str, object]]
 
 
 class FaultReport(TypedDict):

@@ -215,6 +215,8 @@ class Supervisor:
                 (folder / layout.ENTERED).write_text(json.dumps(entered), encoding="utf-8")
             if (responses := report.get("responses")) is not None:
                 (folder / layout.RESPONSES).write_text(json.dumps(responses), encoding="utf-8")
+            if (lights := report.get("lights")) is not None:
+                (folder / layout.LIGHTS).write_text(json.dumps(lights, separators=(",", ":")), encoding="utf-8")
         result = replace(result, kept=kept, failure=failure)
         return EndedTrial(result, tuple(map(str, report["notices"])), report.get("braking"))
 

@@ -34,6 +34,7 @@ from crashhunt.episode import (
     CompetentDriver,
     FirstCopy,
     HandedOver,
+    LightRecorder,
     OnsetForcer,
     Parts,
     Prober,
@@ -116,6 +117,7 @@ class TrialProcess:
         self._made_at = time.time()
         self._opened: OpenedFiles | None = None
         self._reference: ReferenceDriver | CompetentDriver | None = None
+        self._lights: LightRecorder | None = None
         self._fork_runners: tuple[ForkRunner, ...] = ()  # of copies of the trial
         # Line by line, so that what a dying process printed last is in the file.
         sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
@@ -207,6 +209,8 @@ class TrialProcess:
             watchdog.arm(settings.timeout_s, self._stack)
             made = time.monotonic()
             prober, brancher, forcer = self._copies()
+            if settings.find_escapes and spec.overruled is None:
+                self._lights = LightRecorder()
             result = run_episode(
                 spec,
                 simulator=simulator,
@@ -214,6 +218,7 @@ class TrialProcess:
                 box=box,
                 oracles=self._parts.oracles(),
                 crash_on=settings.crash_on,
+                observers=[self._lights] if self._lights is not None else [],
                 reset=reset,
                 prober=prober,
                 brancher=brancher,
@@ -306,6 +311,8 @@ class TrialProcess:
             if braking is not None:
                 said = {"how": braking.how, "deceleration": braking.deceleration}
             report["braking"] = said
+        if kept and self._lights is not None and (lights := self._lights.data()) is not None:
+            report["lights"] = lights
         return report
 
     def _copies(self) -> tuple[Prober | None, Brancher | None, OnsetForcer | None]:

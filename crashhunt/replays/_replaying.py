@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError, UntrustedError, UsageError
+from crashhunt.crashes import with_lights
 from crashhunt.plans import load_order_change
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, values_around
 from crashhunt.replays._prepare import ReplayOptions, Rerun, prepare
@@ -43,6 +44,7 @@ class ReplayReport(Serializable):
         around: values around the divergence: step, recorded value and replayed value of the field that differs.
         reason: the reason why the two runs cannot be compared.
         verdicts: number of runs for each verdict.
+        lights: lights and routes that the replay has read from the simulator, as in `layout.LIGHTS`.
     """
 
     rerun: Rerun
@@ -53,6 +55,7 @@ class ReplayReport(Serializable):
     around: tuple[tuple[int, object, object], ...] = ()
     reason: str = ""
     verdicts: Mapping[Verdict, int] = field(default_factory=dict)
+    lights: bytes = b""
 
     json_keys = (
         "crash=bundle.id", "verdict", "code=rerun.code", "steps_recorded=rerun.recorded.steps", "steps_replayed",
@@ -268,7 +271,8 @@ def confirm(
     now = report.replayed
     escape, why_no_escape = (now.escape, now.why_no_escape) if confirmed else (None, "")
     result = replace(bundle.result, escape=escape, why_no_escape=why_no_escape)
-    return replace(bundle, result=result, confirmed=confirmed, divergence=divergence, why_unconfirmed="")
+    found = replace(bundle, result=result, confirmed=confirmed, divergence=divergence, why_unconfirmed="")
+    return with_lights(found, report.lights) if confirmed and report.lights else found
 
 
 class _NotSetUpError(CrashhuntError):
@@ -299,7 +303,8 @@ def _run(
         raise _not_set_up(rerun, message)
     if rerun.code == "log":
         recorded, replayed = up_to(recorded, recorded.steps), up_to(replayed, replayed.steps)
-    return judged(rerun, recorded, replayed, result)
+    report = judged(rerun, recorded, replayed, result)
+    return replace(report, lights=ended.lights) if ended.lights else report
 
 
 def _look_into(rerun: Rerun, look: Look) -> ReplayReport:

@@ -9,12 +9,12 @@ import base64
 import math
 import statistics
 import zlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
 from crashhunt.base.text import count_of
-from crashhunt.crashes import stop_lines_of, yielding_actor
+from crashhunt.crashes import read_lights, stop_lines_of, yielding_actor
 from crashhunt.recording import is_opaque
 
 if TYPE_CHECKING:
@@ -22,18 +22,23 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, ContactRecord
     from crashhunt.recording import AgentChannel, Recording
 
-    Rows = list[dict[str, float]]
+Rows = list[dict[str, float]]
 
 _MAX_VALUES = 400_000  # of all layers of a crash, the last steps first
 _MATCH_M = 0.3  # an observed actor is the actor of the scene whose centre is nearer
 _MAX_LANE_STEPS = 100  # steps with the lanes of actors, the last ones
 _REACH_M = 60.0  # stop lines are drawn within this distance of the path of the agent
 _PREDICTION_STRIDE = 5
+_MAX_PICTURE_STEPS, _MAX_PICTURE_BYTES = 100, 4_000_000  # of each kind of observed picture
+_COLOURS, _MIN_PICTURE_PIXELS = (1, 3), 16
+_ACTOR_SHADE, _LANE_SHADE = 40, 200  # of the cells of a grid, of 255
 _PLAN_SHAPE, _POSE_NAMES = 5, ("x", "y", "heading", "time")
 _PLAN_START_M, _MAX_ACCELERATION_MPS2 = 3.0, 10.0  # bounds of the place of the first planned pose
+_KM = 1000.0
 _STATES = ("green", "yellow", "red", "off or blinking")
 _LAYERS: Mapping[str, tuple[str, ...]] = {
     "actors": ("x", "y", "heading", "length", "width"),
@@ -61,7 +66,14 @@ def player_layers(
         contact: record of the contact; None if there is none.
         origin: position that becomes (0, 0), in m.
     """
-    found: dict[str, object] = {"stopLines": _stop_lines(bundle, recording, agent, origin)}
+    lights = _checked(read_lights(bundle))
+    found: dict[str, object] = {
+        "stopLines": [
+            (kind, ends, lights["signals"].get(lane, []))
+            for lane, kind, ends in _stop_lines(bundle, recording, agent, origin)
+        ],
+        **_way(lights, agent, origin),
+    }
     found["actorLanes"] = [
         [number, dict(zip((actor.id for actor in scene.roster.actors), scene.lanes, strict=True))]
         for number, scene in enumerate(recording.scenes())
@@ -72,14 +84,18 @@ def player_layers(
     channel = next((one for one in recording.prologue.agents if one.id == agent), None)
     if channel is None:
         return found
+    if lights["vehicles"]:
+        found["vehicleLights"] = lights["vehicles"]
     plan = _plan(recording, channel, origin)
-    return {**found, **({"plan": plan} if plan else {}), **_observed(recording, channel, origin)}
+    pictures = _pictures(recording, channel)
+    more = {**({"plan": plan} if plan else {}), **({"pictures": pictures} if pictures else {})}
+    return {**found, **more, **_observed(recording, channel, origin)}
 
 
 def _stop_lines(
     bundle: Bundle, recording: Recording, agent: str, origin: NDArray[np.float64]
-) -> list[tuple[str, list[float]]]:
-    """Return the kind and the ends of each stop line near the path of the agent."""
+) -> list[tuple[str, str, list[float]]]:
+    """Return the lane, the kind and the ends of each stop line near the path of the agent."""
     scenes = recording.scenes()
     lines = stop_lines_of(bundle) if len(scenes) else ()
     path = np.array([scene.points[scene.roster.index[agent]] for scene in scenes if agent in scene.roster.index])
@@ -89,10 +105,64 @@ def _stop_lines(
     middles = np.array([line.ends.mean(axis=0) for line in lines])
     near = ((middles >= low) & (middles <= high)).all(axis=1)
     return [
-        (line.kind, np.round(line.ends - origin, 2).ravel().tolist())
+        (line.lane, line.kind, np.round(line.ends - origin, 2).ravel().tolist())
         for line, is_near in zip(lines, near.tolist(), strict=True)
         if is_near
     ]
+
+
+class _Lights(TypedDict):
+    """The contents of `layout.LIGHTS`, as `LightRecorder` writes them."""
+
+    signals: dict[str, list[tuple[int, str]]]
+    vehicles: dict[str, list[tuple[int, int, int]]]
+    parts: dict[str, list[tuple[int, dict[str, Rows]]]]
+    routes: dict[str, list[tuple[int, list[float]]]]
+
+
+def _checked(data: JsonObject) -> _Lights:
+    """Return lights and routes; nothing if they have another form, such as in a file of a stranger."""
+    try:
+        return {
+            "signals": {
+                str(lane): [(int(step), str(colours)) for step, colours in changes]
+                for lane, changes in data["signals"].items()
+            },
+            "vehicles": {
+                str(name): [(int(step), int(brake), int(indicator)) for step, brake, indicator in changes]
+                for name, changes in data["vehicles"].items()
+            },
+            "parts": {
+                agent: [
+                    (
+                        int(step),
+                        {name: [{key: float(row[key]) for key in row} for row in parts[name]] for name in parts},
+                    )
+                    for step, parts in steps
+                ]
+                for agent, steps in data["parts"].items()
+            },
+            "routes": {
+                agent: [(int(step), [float(value) for value in points]) for step, points in steps]
+                for agent, steps in data["routes"].items()
+            },
+        }
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return {"signals": {}, "vehicles": {}, "parts": {}, "routes": {}}
+
+
+def _way(lights: _Lights, agent: str, origin: NDArray[np.float64]) -> dict[str, object]:
+    """Return the route of an agent at some steps, and its signals, stop line and goals at each step in words."""
+    try:
+        words = [(step, _in_words(parts)) for step, parts in lights["parts"].get(agent, [])]
+    except (KeyError, ValueError, IndexError, OverflowError):
+        return {}
+    routes = [
+        (step, np.round(np.reshape(points, (-1, 2)) - origin, 1).ravel().tolist())
+        for step, points in lights["routes"].get(agent, [])
+        if len(points) % 2 == 0
+    ]
+    return {"way": {"words": words, "routes": routes}} if words or routes else {}
 
 
 def _plan(recording: Recording, channel: AgentChannel, origin: NDArray[np.float64]) -> dict[str, object]:
@@ -131,6 +201,49 @@ def _plan(recording: Recording, channel: AgentChannel, origin: NDArray[np.float6
     points[repeated] = np.nan
     used = int(max(np.flatnonzero(np.isfinite(points[:, :, 0]).any(axis=0)), default=-1)) + 1
     return {"first": first, "size": [used, 2], "values": packed_floats(points[:, :used] - origin)} if used else {}
+
+
+def _pictures(recording: Recording, channel: AgentChannel) -> dict[str, object]:
+    """Return the observed pictures of the last steps, by name: packed bytes, shape (steps, height, width, colours).
+
+    These are the parts ``grid`` and ``image``, or an observation that is a picture as a whole. Of a grid, cells with an
+    actor are dark, and cells with a lane are grey.
+    """
+    shapes = {part.name: part.shape for part in channel.observation_parts if part.name in ("grid", "image")}
+    if not channel.observation_parts and _is_picture(channel):
+        shapes = {"observation": channel.observation_shape}
+    found: dict[str, object] = {}
+    for name, shape in shapes.items():
+        pixels = math.prod(shape[-3:])
+        first = max(0, recording.steps - min(_MAX_PICTURE_STEPS, _MAX_PICTURE_BYTES // pixels))
+        drawn = []
+        for number in range(first, min(recording.steps + 1, len(recording.all_steps) - 1)):
+            observation = recording.all_steps[number + 1].observations.get(channel.id)
+            if observation is None:
+                break
+            values = observation if name == "observation" else channel.part(name, observation)
+            assert values is not None
+            last = np.asarray(values).reshape(-1, *shape[-3:])[-1]  # of a history
+            if name == "grid":
+                last = np.where(last[0] > 0, _ACTOR_SHADE, np.where(last[1] > 0, _LANE_SHADE, 255))[..., np.newaxis]
+            elif last.shape[-1] not in _COLOURS:  # stacked pictures, the newest last
+                last = last[-1][..., np.newaxis]
+            drawn.append(last.astype(np.uint8))
+        if drawn:
+            packed = base64.b64encode(zlib.compress(np.array(drawn).tobytes(), 6)).decode("ascii")
+            found[name] = {"first": first, "size": list(drawn[0].shape), "bytes": packed}
+    return found
+
+
+def _is_picture(channel: AgentChannel) -> bool:
+    shape = channel.observation_shape
+    if np.dtype(channel.observation_dtype) != np.uint8 or len(shape) != 3:
+        return False
+    return (
+        min(shape[0], shape[1]) >= _MIN_PICTURE_PIXELS
+        if shape[-1] in _COLOURS
+        else min(shape[1:]) >= _MIN_PICTURE_PIXELS
+    )
 
 
 def _first_step(recording: Recording, size: int) -> int:
@@ -215,6 +328,8 @@ def _in_words(rows: Mapping[str, Rows]) -> list[tuple[str, str]]:
         state = _STATES[int(signal["state"])]
         found.append(("signal", f"{state} for {signal['time_in_state']:.1f} s, in {_meters(signal['distance'])}"))
     for line in rows.get("stop_line", []):
+        if not (line["stop_sign"] or line["must_yield"] or line.get("signal")):
+            continue  # nobody has to stop there
         rules = [word for key, word in (("stop_sign", "stop sign"), ("must_yield", "must yield")) if line[key]]
         where = "inside the junction" if line["distance"] < 0 else f"in {_meters(line['distance'])}"
         found.append(("stop line", ", ".join([where, *rules])))
@@ -233,7 +348,7 @@ def _in_words(rows: Mapping[str, Rows]) -> list[tuple[str, str]]:
 
 
 def _meters(value: float) -> str:
-    return f"{value:.1f} m"
+    return f"{value:.1f} m" if value < _KM else f"{value / _KM:.1f} km"
 
 
 def _lights(recording: Recording, step: int, actors: Rows, distances: list[float]) -> list[tuple[str, int, int]]:

@@ -34,6 +34,10 @@ async function unpack(text) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Float32Array(await new Response(stream).arrayBuffer());
 }
+async function unpackBytes(text) {
+  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  return new Uint8Array(await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
+}
 
 function fit(canvas) {
   const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
@@ -70,6 +74,7 @@ async function load(crash) {
   const [own, behind] = crash.danger ? await Promise.all([crash.danger, crash.behind].map(unpack)) : [null, null];
   Object.assign(crash, { values, ttcs: ttc, gaps: gap, acts: actions, dangers: own, behinds: behind });
   for (const layer of [crash.plan, ...Object.values(crash.observed?.layers ?? {})].filter(Boolean)) layer.array = await unpack(layer.values);
+  for (const picture of Object.values(crash.pictures ?? {})) picture.array = await unpackBytes(picture.bytes);
   crash.bent = new Map((crash.bends || []).map(([step, actor, line]) => [step * crash.actors.length + actor, line]));
   crash.road = new Path2D();
   crash.marks = new Path2D();
@@ -110,7 +115,8 @@ function show(crash, rows) {
   $("key-other").textContent = crash.other;
   $("key-other-box").hidden = !crash.other;
   $("key-agents-box").hidden = crash.agents.length < 2;
-  $("key-observed").hidden = !crash.observed;
+  $("key-observed").hidden = !crash.observed && !crash.pictures;
+  $("key-route").hidden = !crash.way?.routes.length;
   $("key-plan").hidden = !crash.plan;
   $("scrub").max = Math.max(0, crash.steps - 1);
   view.crash = crash;
@@ -119,7 +125,8 @@ function show(crash, rows) {
   view.follow = true;
   view.picked = "";
   view.step = begin(crash);
-  $("observed").hidden = !crash.observed;
+  $("pictures").replaceChildren();
+  $("observed").hidden = !crash.observed && !crash.pictures;
   crash.rows ??= rowsOf(crash);
   $("plot").style.height = `${HEAD + crash.rows.length * ROW + BELOW}px`;
   $("avoidable").hidden = $("avoidable-words").hidden = !crash.avoidable;
@@ -209,18 +216,23 @@ function layerAt(layer, first, step = view.step) {
 }
 const seenAt = (name) => layerAt(view.crash.observed?.layers[name], view.crash.observed?.first);
 function wordsAt(step) {
-  const { first, words } = view.crash.observed ?? { first: 0, words: [] };
-  return words[Math.min(step, view.crash.steps - 2) - first] ?? [];
+  const { first, words } = view.crash.observed ?? { first: 0, words: [] }, observed = words[Math.min(step, view.crash.steps - 2) - first] ?? [];
+  const way = until(view.crash.way?.words, step)?.[1] ?? [];
+  return [...observed, ...way.filter(([name]) => !observed.some(([other]) => other === name))];
 }
+/* The last entry of a list of [step, ...] that begins at a step or before it. */
+function until(changes, step) { return (changes ?? []).findLast(([begin]) => begin <= step); }
+/* Brake light and indicator: as the replay has read them from the simulator, or as the agent has observed them. */
 function lightsAt(step, id) {
-  const { first, lights } = view.crash.observed ?? { first: 0 };
-  return lights?.[Math.min(step, view.crash.steps - 2) - first]?.find(([name]) => name === id);
+  const { first, lights } = view.crash.observed ?? { first: 0 }, known = until(view.crash.vehicleLights?.[id], step);
+  return known ? [id, known[1], known[2]] : lights?.[Math.min(step, view.crash.steps - 2) - first]?.find(([name]) => name === id);
 }
 
 /* Stop lines, by the rule at them: solid where a vehicle has to stop, dashed where it has to yield, dotted at traffic lights. */
 const RULES = { stop: [], allway_stop: [], yield: [1.2, 0.6], right_before_left: [1.2, 0.6], traffic_light: [0.4, 0.4] };
+const SIGNAL_COLORS = { g: "#2e9e5b", y: "#e0a800", r: "#d50000", o: "#8593a6" };
 function drawStopLines(context) {
-  for (const [kind, [x0, y0, x1, y1]] of view.crash.stopLines ?? []) {
+  for (const [kind, [x0, y0, x1, y1], changes] of view.crash.stopLines ?? []) {
     context.strokeStyle = css("--text");
     context.lineWidth = Math.max(0.4, 2 / view.scale);
     context.setLineDash(RULES[kind] ?? []);
@@ -228,8 +240,40 @@ function drawStopLines(context) {
     context.moveTo(x0, y0);
     context.lineTo(x1, y1);
     context.stroke();
+    /* A disc per colour that the lane shows: more than one if its directions differ. */
+    const colours = [...(until(changes, view.step)?.[1] ?? "")], radius = Math.max(0.6, 5 / view.scale);
+    context.setLineDash([]);
+    colours.forEach((colour, place) => {
+      const share = (place + 1) / (colours.length + 1), x = x0 + share * (x1 - x0), y = y0 + share * (y1 - y0);
+      context.fillStyle = SIGNAL_COLORS[colour] ?? SIGNAL_COLORS.o;
+      context.lineWidth = 1.5 / view.scale;
+      context.beginPath();
+      context.arc(x, y, radius, 0, 7);
+      context.fill();
+      context.stroke();
+      if (colour !== "r" && colour !== "y") return;
+      /* Red and yellow have a shape besides the colour: a bar, and a dot. */
+      context.fillStyle = "#ffffff";
+      if (colour === "r") context.fillRect(x - 0.55 * radius, y - 0.16 * radius, 1.1 * radius, 0.32 * radius);
+      else { context.beginPath(); context.arc(x, y, 0.3 * radius, 0, 7); context.fill(); }
+    });
   }
   context.setLineDash([]);
+}
+
+/* The route of the agent, as the replay has read it from the simulator; what the agent observes of it is drawn apart. */
+function drawRoute(context) {
+  const points = until(view.crash.way?.routes, view.step)?.[1];
+  if (!points?.length || (view.observed && view.crash.observed?.layers.route)) return;
+  context.strokeStyle = css("--ego-line");
+  context.globalAlpha = 0.55;
+  context.lineWidth = 3 / view.scale;
+  context.setLineDash([10 / view.scale, 6 / view.scale]);
+  context.beginPath();
+  for (let at = 0; at < points.length; at += 2) context[at ? "lineTo" : "moveTo"](points[at], points[at + 1]);
+  context.stroke();
+  context.setLineDash([]);
+  context.globalAlpha = 1;
 }
 
 /* What the agent observed, in its own colour: the route, lanes, boxes, predictions and points of lidar. */
@@ -274,6 +318,36 @@ function drawObserved(context) {
     if (!(distance < reach - 0.01)) return;
     const angle = own[2] + (2 * Math.PI * place) / rays.length;
     context.fillRect(x + distance * Math.cos(angle) - dot, y + distance * Math.sin(angle) - dot, 2 * dot, 2 * dot);
+  });
+}
+
+/* The pictures that the agent observed at this scene, next to each other below the scene. */
+function drawPictures() {
+  const crash = view.crash, known = Object.entries(crash.pictures ?? {});
+  $("pictures").hidden = !known.length || !view.observed;
+  if ($("pictures").hidden) return;
+  if ($("pictures").childElementCount !== known.length) {
+    $("pictures").replaceChildren(...known.map(([name]) => {
+      const box = make("figure"), canvas = make("canvas");
+      canvas.setAttribute("role", "img");
+      canvas.setAttribute("aria-label", `What the agent observed: ${name}`);
+      box.append(canvas, make("figcaption", "", "faint"));
+      return box;
+    }));
+  }
+  known.forEach(([name, { first, size: [height, width, colours], array }], place) => {
+    const box = $("pictures").children[place], canvas = box.firstChild, size = height * width * colours;
+    const number = Math.min(view.step, crash.steps - 2) - first, there = number >= 0 && (number + 1) * size <= array.length;
+    box.lastChild.textContent = there ? `observed: ${name}` : `observed: ${name} (from step ${first} on)`;
+    [canvas.width, canvas.height] = [width, height];
+    canvas.style.width = `${Math.max(160, Math.min(320, 2 * width))}px`;
+    if (!there) return;
+    const context = canvas.getContext("2d"), image = context.createImageData(width, height);
+    for (let at = 0; at < height * width; at++) {
+      for (let colour = 0; colour < 3; colour++) image.data[4 * at + colour] = array[number * size + at * colours + (colours === 3 ? colour : 0)];
+      image.data[4 * at + 3] = 255;
+    }
+    context.putImageData(image, 0, 0);
   });
 }
 
@@ -357,6 +431,7 @@ function drawScene() {
   context.lineWidth = Math.max(0.12, 0.8 / view.scale);
   context.stroke(crash.marks);
   drawStopLines(context);
+  drawRoute(context);
   /* where the two have been */
   for (const id of [crash.agent, crash.other]) {
     const actor = crash.actors.findIndex((entry) => entry[0] === id);
@@ -452,7 +527,7 @@ function drawScene() {
     context.fillStyle = css("--faint");
     context.font = "14px system-ui";
     context.textAlign = "center";
-    context.fillText("this simulator shows no scene", width / 2, height / 2);
+    context.fillText(`this simulator shows no scene${crash.pictures ? "; the agent observed the picture below" : ""}`, width / 2, height / 2);
     context.textAlign = "start";
     return;
   }
@@ -475,7 +550,7 @@ function drawScene() {
     context.textAlign = "right";
     label(context, `signal ${signal}`, width - 30, 24);
     context.textAlign = "start";
-    context.fillStyle = { green: "#2e9e5b", yellow: "#e0a800", red: "#d50000" }[signal.split(" ")[0]] ?? css("--faint");
+    context.fillStyle = SIGNAL_COLORS[signal[0]] ?? SIGNAL_COLORS.o;
     context.beginPath();
     context.arc(width - 18, 20, 7, 0, 7);
     context.fill();
@@ -709,7 +784,7 @@ function go(step) {
   $("scrub").setAttribute("aria-valuetext", `step ${view.step}`);
   draw();
 }
-function draw() { if (view.crash) { drawScene(); drawPlot(); showNow(); showPicked(); $("observed").setAttribute("aria-pressed", String(view.observed)); $("ids").setAttribute("aria-pressed", String(view.ids)); $("follow").setAttribute("aria-pressed", String(view.follow)); } }
+function draw() { if (view.crash) { drawScene(); drawPictures(); drawPlot(); showNow(); showPicked(); $("observed").setAttribute("aria-pressed", String(view.observed)); $("ids").setAttribute("aria-pressed", String(view.ids)); $("follow").setAttribute("aria-pressed", String(view.follow)); } }
 function pause() { view.playing = false; $("play").textContent = "Play"; }
 function play() {
   if (view.step >= view.crash.steps - 1) go(view.crash.nearest === null ? 0 : begin(view.crash));

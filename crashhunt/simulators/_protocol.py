@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypedDict
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypedDict
 
 from numpy.typing import NDArray
 
@@ -326,6 +326,35 @@ class ReportsSurroundings(Protocol):
         Args:
             agent: The identifier of an agent's vehicle that has not left the simulation.
         """
+
+
+class Lights(NamedTuple):
+    """The lights and routes at one step, for the picture of a crash.
+
+    Args:
+        signals: for each lane that ends at a traffic light, its colours, one letter per direction: ``g``, ``y``, ``r``,
+            or ``o`` if it is off or blinks.
+        vehicles: brake light (0 or 1) and indicator of each vehicle, as in the part ``actors`` of observations.
+        parts: the parts of observations that concern the way of each agent that has not left, by name of the part, as
+            rows of columns.
+        routes: the points of the route ahead of each of these agents, in m.
+    """
+
+    signals: Mapping[str, str]
+    vehicles: Mapping[str, tuple[int, int]]
+    parts: Mapping[str, Mapping[str, Sequence[Mapping[str, float]]]]
+    routes: Mapping[str, Sequence[tuple[float, float]]]
+
+
+class ReportsLights(Protocol):
+    """A simulator that reports its traffic lights, the lights of vehicles, and the routes of agents.
+
+    The replay that confirms a crash reads them for the picture of the crash. Contract: `lights` changes nothing in the
+    simulation.
+    """
+
+    def lights(self) -> Lights:
+        """Return the lights and routes after the last `Simulator.reset` or `Simulator.step`."""
 
 
 class ReportsNearestAhead(Protocol):

@@ -191,6 +191,12 @@ def _state_of(actor: str) -> tuple[str, float, float, int]:
         return _UNKNOWN
 
 
+def lights_of(vehicle: str) -> tuple[int, int]:
+    """Return the brake light (0 or 1) and the indicator of a vehicle; the indicator as in ``actors``."""
+    signals = sumo.vehicle_getSignals(vehicle)
+    return int(bool(signals & _BRAKE_LIGHT)), int(_indicator(signals))
+
+
 def _indicator(signals: int) -> float:
     if signals & _HAZARD or (signals & _LEFT and signals & _RIGHT):
         return 2.0

@@ -165,10 +165,14 @@ class ObservedParts:
             for place, reader in places:
                 reader.write(draft, place, moment)
             return np.frombuffer(draft.take())
-        arrays = {name: reader.observe(moment) for name, reader in self._readers[agent].items()}
+        arrays = self.read(agent, moment)
         if layout.reference_share:
             with_reference_point(arrays, layout.columns, layout.reference_share)
         return layout.flat(self._histories[agent].add(arrays))
+
+    def read(self, agent: str, moment: Moment) -> dict[str, NDArray[np.generic]]:
+        """Return the parts of an agent's observation, before modifiers."""
+        return {name: reader.observe(moment) for name, reader in self._readers[agent].items()}
 
     def identifiers(self, agent: str) -> tuple[str, ...] | None:
         """Return the identifiers of the actors in the rows of ``actors``; None if the agent does not observe them."""

@@ -34,7 +34,7 @@ _SQUARE_M = 16.0  # within squares of this size, the same lanes are candidates
 _WINDOW_M = 24.0  # within a square, the nearest point of a lane moves less along the lane
 _NO_PERSON_M = 1000.0  # the distance of the nearest person where there is none
 _STANDING_MPS, NEVER_S = 0.1, 1000.0  # an actor that stands arrives after this time
-_STATES = {"G": 0.0, "g": 0.0, "y": 1.0, "Y": 1.0, "r": 2.0, "R": 2.0, "u": 2.0, "s": 2.0, "o": 3.0, "O": 3.0}
+SIGNAL_STATES = {"G": 0.0, "g": 0.0, "y": 1.0, "Y": 1.0, "r": 2.0, "R": 2.0, "u": 2.0, "s": 2.0, "o": 3.0, "O": 3.0}
 _OFF = 3.0
 _RED_STATES = frozenset("rRus")
 _STOP_STATES = frozenset("sw")
@@ -341,7 +341,7 @@ class SignalsReader(Reader):
             ahead = self._ahead[key] = place.guide.signals(place.number, place.lane, self._setup.limit)
         time_s = moment.scene.time_s
         for distance, light, link in ahead:
-            state = _STATES.get(sumo.trafficlight_getRedYellowGreenState(light)[link], _OFF)
+            state = SIGNAL_STATES.get(sumo.trafficlight_getRedYellowGreenState(light)[link], _OFF)
             last = seen.get((light, link))
             if last is None:
                 last = state, time_s - _time_in_state(light, link, state)
@@ -362,7 +362,7 @@ def _time_in_state(light: str, link: int, state: float) -> float:
         phases, current = program.phases, program.currentPhaseIndex
         for back in range(1, len(phases)):
             phase = phases[(current - back) % len(phases)]
-            if _STATES.get(phase.state[link], _OFF) != state:
+            if SIGNAL_STATES.get(phase.state[link], _OFF) != state:
                 break
             found += phase.duration
     return found

@@ -39,6 +39,7 @@ from crashhunt.sumo._ego_and_actors import vehicle_data_of
 from crashhunt.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.sumo._files import StagedFiles
 from crashhunt.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
+from crashhunt.sumo._lights import LightReader
 from crashhunt.sumo._loading import VERSION, Loading, keep_xml_ready
 from crashhunt.sumo._manoeuvres import manoeuvre_paths
 from crashhunt.sumo._observing import ObservedParts
@@ -59,7 +60,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.errors import EpisodeError
     from crashhunt.scenario import Scenario
-    from crashhunt.simulators import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
+    from crashhunt.simulators import ActionForm, ActiveDisturbance, Info, Lights, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Motion, Neighbor, Paths, RoadMap, Scene, Surroundings, VehicleData
 
@@ -139,6 +140,7 @@ class SumoSimulator:
         self.scripted = False
         self._setups = scenario.agents
         self._look_with: Sight | ScriptedSight = self._sight
+        self._lights: LightReader | None = None
         self._scene: Scene
         self.at_once: UsualSteps | None = None
 
@@ -219,6 +221,7 @@ class SumoSimulator:
         self._off_road: list[str] = []
         steering = {agent: motion.steering for agent, motion in self._driving.moving.items()}
         self._parts.begin(self._start, sumo.simulation_getTime(), steering)
+        self._lights = None
         self._read_scene()
         observations = self._observe_all()
         usual = self._usual_steps()
@@ -310,6 +313,17 @@ class SumoSimulator:
                 for lane in sumo.lane_getIDList()
             ]
         return self._lanes
+
+    def lights(self) -> Lights:
+        """Return traffic lights, the lights of vehicles, and what is ahead of the agents on their routes."""
+        if self._lights is None:
+            self._lights = LightReader(self._scenario, self._start)
+        lanes = {}
+        for agent in self.agents:
+            edge, lane = sumo.vehicle_getRoadID(agent), sumo.vehicle_getLaneIndex(agent)
+            edge, lane = (edge, lane) if lane >= 0 else self._last_lanes.get(agent) or (edge, 0)
+            lanes[agent] = f"{edge}_{lane}"
+        return self._lights.read(self._scene, lanes)
 
     def prepare_road_maps(self) -> None:
         """Read the network."""

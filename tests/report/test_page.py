@@ -365,3 +365,19 @@ def test_click_on_vehicle_shows_its_facts_and_click_on_road_hides_them(hunt, bro
     assert not browser.find_element(By.ID, "vehicle").is_displayed()
     browser.find_element(By.ID, "scene").send_keys("v")
     assert text(browser, "vehicle-facts").split("\n")[1] == "ego"  # the nearest vehicle first
+
+
+def test_route_and_lights_of_vehicles_are_shown_without_observations(hunt, browser):
+    bundle = next(one for one in list_bundles(hunt.folder / "<b>bold&") if one.id == shortest(hunt))
+    assert bundle.faults() == []
+    lights = json.loads((bundle.path / "lights.json").read_text())
+    lit = next(vehicle for vehicle, changes in lights["vehicles"].items() if any(brake for _, brake, _ in changes))
+    step, *_ = next(change for change in lights["vehicles"][lit] if change[1])
+    opened(browser, hunt.folder / hunt.crashhunt("report", "<b>bold&", "--json").json["file"])
+    assert browser.find_element(By.ID, "key-route").is_displayed()
+    browser.execute_script("view.picked = arguments[0]; go(arguments[1])", lit, step)
+    words = text(browser, "vehicle-facts").split("\n")
+    assert "brake" in words[words.index("lights") + 1]
+    browser.execute_script("go(0)")
+    assert "lane goal this lane" in text(browser, "now")
+    assert browser.execute_script("const [, route] = until(view.crash.way.routes, 0); return route.length") == 48

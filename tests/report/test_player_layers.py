@@ -14,7 +14,7 @@ from conftest import add_toy
 from crashhunt.crashes import list_bundles
 from crashhunt.recording import AgentChannel, ObservedPart
 from crashhunt.report import player_data
-from crashhunt.report._player_layers import _in_words, _plan, _present, _rows, player_layers
+from crashhunt.report._player_layers import _checked, _in_words, _pictures, _plan, _present, _rows, _way, player_layers
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators import PARTS
 from crashhunt.world import Actor, Roster, Scene
@@ -130,6 +130,36 @@ def test_signals_priority_and_the_lane_goal_are_said_in_words():
     assert words(stop_line=row("stop_line", present=1, distance=-1, must_yield=1)) == {
         "stop line": "inside the junction, must yield"
     }
+
+
+def test_distance_beyond_a_kilometre_and_stop_line_without_rule_are_short():
+    route = row("route_state", distance_left=100_453.2)
+    assert words(route_state=route)["goal"] == "in 100.5 km"
+    assert words(stop_line=row("stop_line", present=1, distance=72.6)) == {}
+
+
+@pytest.mark.parametrize(
+    "data", [{}, {"signals": []}, {"signals": {"a": [[1]]}, "vehicles": {}, "parts": {}, "routes": {}}]
+)
+def test_lights_of_another_form_are_not_shown(data):
+    assert _checked(data) == {"signals": {}, "vehicles": {}, "parts": {}, "routes": {}}
+    odd = {**_checked({}), "parts": {"ego": [(0, {"signals": [{"state": 9.0}]})]}, "routes": {"ego": [(0, [1.0])]}}
+    assert _way(odd, "ego", np.zeros(2)) == {}
+
+
+@pytest.mark.parametrize("shape", [(4, 20, 30), (20, 30, 3), (20, 30, 1)])
+def test_observed_picture_is_the_newest_one_of_its_step(shape):
+    channel = AgentChannel("car", "|u1", shape, "<f8", (1,))
+    draw = np.random.default_rng(1)
+    seen = [draw.integers(0, 256, shape).astype(np.uint8) for _ in range(3)]
+    steps = [SimpleNamespace(observations={})] + [SimpleNamespace(observations={"car": one}) for one in seen]
+    found = _pictures(SimpleNamespace(all_steps=steps, steps=3), channel)["observation"]
+    size = tuple(found["size"])
+    assert (found["first"], size) == (0, (20, 30, 1) if shape[0] == 4 else shape)
+    shown = np.frombuffer(zlib.decompress(base64.b64decode(found["bytes"])), np.uint8).reshape(-1, *size)
+    assert (shown == np.array([one[-1:].transpose(1, 2, 0) if shape[0] == 4 else one for one in seen])).all()
+    vector = AgentChannel("car", "<f8", (5,), "<f8", (1,))
+    assert _pictures(SimpleNamespace(all_steps=steps, steps=3), vector) == {}
 
 
 def test_stop_lines_are_at_the_ends_of_the_lanes_that_have_to_yield():
