@@ -329,7 +329,7 @@ def _in_words(rows: Mapping[str, Rows]) -> list[tuple[str, str]]:
         found.append(("signal", f"{state} for {signal['time_in_state']:.1f} s, in {_meters(signal['distance'])}"))
     for line in rows.get("stop_line", []):
         if not (line["stop_sign"] or line["must_yield"] or line.get("signal")):
-            continue  # nobody has to stop there
+            continue  # no vehicle has to stop there
         rules = [word for key, word in (("stop_sign", "stop sign"), ("must_yield", "must yield")) if line[key]]
         where = "inside the junction" if line["distance"] < 0 else f"in {_meters(line['distance'])}"
         found.append(("stop line", ", ".join([where, *rules])))
