@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 SUITE = """\
 [[hunts]]
 id = "toy"
@@ -36,6 +38,7 @@ def test_crash_that_is_not_in_the_corpus_ends_the_night_with_1(toy):
     assert (group["known"], group["known_by"]) == (added[0]["path"], "type")
 
 
+@pytest.mark.nightly  # by day, one hunt's are compared
 def test_suite_compares_its_crash_types_with_a_corpus(toy):
     (toy.folder / "suite.toml").write_text(SUITE)
     words = ("suite", "run", "suite.toml", "night", "1", "--known", "corpus", "--fail-on-new")

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import examples
 from hypothesis import given, settings, strategies as st
 from test_fault import LANES, Map, rotated
 
@@ -77,7 +78,7 @@ def same_in_every_view(case, angle):
     return said
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=examples(12), deadline=None)
 @given(step_s=STEPS, phase=PHASES, angle=ANGLES)
 def test_rear_end_has_a_verdict_at_every_phase_of_every_step(step_s, phase, angle):
     case = record(drives(15.0), drives(8.0, x=5.0), step_s=step_s, phase=phase)
@@ -89,7 +90,7 @@ def test_rear_end_has_a_verdict_at_every_phase_of_every_step(step_s, phase, angl
     assert same_in_every_view(again, angle)[:5] == ("rear end", "other", "other", (), "the other")
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(phase=PHASES, angle=ANGLES, speed=st.floats(1.0, 3.0))
 def test_agent_that_starts_off_is_not_driven_into(phase, angle, speed):
     """It stood in all scenes before the contact, and the vehicle ahead crept."""
@@ -105,7 +106,7 @@ def test_agent_that_starts_off_is_not_driven_into(phase, angle, speed):
     assert case.stood_s("ego") == 0.0
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(step_s=STEPS, phase=PHASES)
 def test_time_of_standing_is_that_of_the_stop_between_scenes(step_s, phase):
     """It brakes by 4 m/s² and stops 5.3 s before the contact."""
@@ -129,7 +130,7 @@ def bends(speed, ahead=0.0, radius=9.0):
     return way
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(step_s=st.sampled_from((0.1, 0.2, 0.5)), phase=PHASES, angle=ANGLES)
 def test_leader_on_a_bend_had_been_ahead_at_every_phase_of_every_step(step_s, phase, angle):
     case = record(bends(9.0), bends(6.0, ahead=4.9), step_s=step_s, phase=phase, lanes=Map((), (0.0, 0.0)))
@@ -138,7 +139,7 @@ def test_leader_on_a_bend_had_been_ahead_at_every_phase_of_every_step(step_s, ph
     assert case.in_its_way_s("other") == pytest.approx(4.0)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(step_s=STEPS, angle=ANGLES, side=st.sampled_from((4.0, -4.0)), along=st.floats(-4.5, 4.5), its=st.floats(0, 20))
 def test_jump_into_the_next_lane_is_the_fault_of_the_jumper(step_s, angle, side, along, its):
     jumps, stays = drives(10.0, y=-side, changes_s=0.0), drives(its, x=along)
@@ -149,7 +150,7 @@ def test_jump_into_the_next_lane_is_the_fault_of_the_jumper(step_s, angle, side,
     assert found[:5] == ("side swipe", "other", "", ("other",), "the other")
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(angle=ANGLES, before_s=st.sampled_from((0.0, 0.5, 1.0, 2.0)))
 def test_completed_lane_change_is_no_part_of_both_moved_sideways(angle, before_s):
     """Both jump into the lane between theirs, the other one some steps earlier."""
@@ -169,7 +170,7 @@ def test_completed_lane_change_is_no_part_of_both_moved_sideways(angle, before_s
     assert case.changed_s("ego") == 0.0
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(phase=st.floats(0.1, 0.9), angle=ANGLES)
 def test_lane_change_after_the_contact_has_no_part_in_it(phase, angle):
     """In a step of 1 s the vehicle drives into the one ahead, and then SUMO changes its lane."""
@@ -181,7 +182,7 @@ def test_lane_change_after_the_contact_has_no_part_in_it(phase, angle):
     assert case.changed_s("ego") is None
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(phase=st.floats(0.1, 0.7), angle=ANGLES)
 def test_type_is_that_of_the_contact_not_of_the_end_of_the_step(phase, angle):
     """The vehicle ahead is driven into, and turns off in the rest of the step."""

@@ -108,6 +108,7 @@ def test_forks_of_trials_give_equal_results_with_a_program_and_the_same_agent_in
     assert found[0] == found[1]
 
 
+@pytest.mark.nightly  # by day, test_reused_programs.py has one that does
 def test_a_scenario_names_its_program_relative_to_its_own_folder(toy):
     write_program(toy.folder / "toy")
     file = toy.folder / "toy" / "scenario.toml"

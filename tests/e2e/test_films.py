@@ -176,6 +176,7 @@ sys.meta_path.insert(0, Hide())
     assert "[video]" in done.err
 
 
+@pytest.mark.nightly  # by day, test_log.py has a full disk
 def test_a_full_disk_leaves_no_half_film(crash):
     """A limit on the size of a file stands in for a disk that is full."""
     out, code = crash.folder / "out.json", 99

@@ -144,6 +144,7 @@ def test_an_interrupt_while_it_starts_is_not_lost(toy, libraries):
     wait_for(lambda: session_is_gone(process.pid))
 
 
+@pytest.mark.nightly  # by day, it is interrupted
 def test_a_killed_hunt_leaves_no_process_and_continues(toy):
     words = ("run", "h", "2", "14", *LONG, "--json")
     process = toy.start(*words, start_new_session=True)

@@ -50,6 +50,7 @@ def write_home(folder, *, delete=""):
     return folder
 
 
+@pytest.mark.nightly  # by day, the folder of the hunt
 def test_trials_without_their_current_folder_are_no_results_and_run_again(toy, home):
     write_home(home, delete=home)
     error = hunt(toy, 2)["error"]

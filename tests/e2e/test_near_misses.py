@@ -38,6 +38,7 @@ def test_they_are_the_most_dangerous_survivors(hunt):
     assert hunt.crashhunt("check", "h", "--json").json["fine"]
 
 
+@pytest.mark.nightly  # by day, a crash is
 def test_one_is_replayed_shown_and_exported_by_its_number(hunt):
     number = str(survivors(hunt)[0]["number"])
     replayed = hunt.crashhunt("replay", "h", "--crash", number, "--json").json

@@ -121,6 +121,7 @@ def test_a_damaged_plan_leaves_the_others_untouched(toy):
     assert "no request.json" in toy.crashhunt("logs", "out", "--errors-only").out
 
 
+@pytest.mark.nightly  # by day, test_gate.py interrupts two hunts
 def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
     written(toy, SLOW.replace("80", "5000"))  # so that none ends before it is looked at, on no machine
     process = toy.begin("suite", "run", "suite.toml", "out", "2", "--json")

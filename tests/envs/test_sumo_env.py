@@ -110,6 +110,7 @@ def test_errors_come_through(own):
         SumoEnv(render_mode="human")
 
 
+@pytest.mark.nightly  # by day, in the same process: test_episodes.py
 def test_others_err_where_it_is_asked_for():
     env = SumoEnv("loop", process=True, disturb="brake=2, stop=0.5", max_steps=40)
     found = []
@@ -226,6 +227,7 @@ def test_copies_of_an_episode_are_bit_identical_and_independent(branching):
     assert drive(other, 5) == drive(nested, 5)
 
 
+@pytest.mark.nightly  # by day, copies that are not reseeded
 def test_reseeded_copies_differ_and_can_be_repeated(branching):
     env, made = branching
     made += (copies := [*env.branch(2, seed=5), *env.branch(2, seed=5)])
@@ -322,7 +324,7 @@ IMPORTS = [
     ("imports", "context"),
     mostly_nightly(
         [(imports, context) for imports in IMPORTS for context in ("", "fork", "spawn")],
-        always=[(IMPORTS[0], ""), (IMPORTS[2], "fork")],
+        always=[(IMPORTS[2], "fork")],
     ),
 )
 def test_environment_is_registered_in_either_order_of_imports(tmp_path, imports, context):

@@ -97,6 +97,7 @@ def drive(name, folder, metres, seed):
     return driven, offences
 
 
+@pytest.mark.nightly
 def test_the_driver_of_the_guide_runs_no_red_light(tmp_path):
     driven, offences = drive("grid-lights", tmp_path, 800.0, seed=2)
     assert driven > 250.0

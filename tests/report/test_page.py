@@ -177,6 +177,7 @@ def test_last_avoidable_step_is_one_click_away_and_shows_where_braking_leads(hun
     assert driven < along[-1]
 
 
+@pytest.mark.nightly  # by day, clicks do
 def test_keys_lead_to_the_next_crash_and_show_all_names(hunt, browser):
     done = hunt.crashhunt("report", "<b>bold&", "--json").json
     opened(browser, hunt.folder / done["file"])

@@ -6,6 +6,7 @@ from random import Random
 
 import numpy as np
 import pytest
+from conftest import examples
 from formulas import SIGNALS, ByDefinition, random_formula, random_trace, written
 from hypothesis import given, settings, strategies as st
 
@@ -37,7 +38,7 @@ def assert_at_the_certain_step(seed: int, depth: int, count: int) -> None:
 
 
 @given(seed=st.integers(0, 2**32))
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 def test_a_violation_is_found_at_the_first_step_at_which_it_is_certain(seed):
     assert_at_the_certain_step(seed, 3, 10)
 
@@ -58,7 +59,7 @@ def test_20_000_violations_are_found_at_the_first_certain_step():
 
 
 @given(seed=st.integers(0, 2**32))
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 def test_no_later_sample_undoes_a_violation(seed):
     draw = Random(seed)
     requirement, trace = parse(written(random_formula(draw, 3, bound=3))), random_trace(draw, 8)

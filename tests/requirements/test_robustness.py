@@ -9,6 +9,7 @@ from random import Random
 
 import numpy as np
 import pytest
+from conftest import examples
 from formulas import SIGNALS, ByDefinition, random_formula, random_trace, written
 from hypothesis import given, settings, strategies as st
 
@@ -35,7 +36,7 @@ def assert_as_defined(seed: int, depth: int = 3, count: int = 12, step_s: float 
 
 
 @given(seed=st.integers(0, 2**32), step_s=st.sampled_from([1.0, 0.1, 1 / 15]))
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 def test_every_formula_has_the_value_of_its_definition(seed, step_s):
     assert_as_defined(seed, step_s=step_s)
 

@@ -93,6 +93,7 @@ def test_hunt_does_not_resume_with_other_code_and_loses_nothing(agent, tmp_path)
     assert sum(run(9).outcomes.values()) == 9
 
 
+@pytest.mark.nightly  # by day, the file of an agent
 def test_scenario_that_changed_is_named_by_its_file(agent, tmp_path):
     run(2)
     (tmp_path / "toy.toml").write_text(TOY.replace("30.0", "31.0"))
@@ -108,7 +109,7 @@ def test_hunt_without_results_may_change_its_code(agent, tmp_path):
     with closing(Ledger(tmp_path / "h" / "ledger.sqlite", writable=True)) as ledger:
         ledger.replace([0, 1])
     agent(0, 1, 2, 3)
-    report = run(4)
+    report = run(4, keep=1)
     assert (report.outcomes, report.code_versions) == ({"agent_error": 4}, ())
 
 
@@ -216,7 +217,10 @@ def test_resumed_hunt_names_new_files_that_do_not_count(agent, tmp_path):
         run(4)
 
 
-@pytest.mark.parametrize(("timeout_s", "says"), [(0.5, "2 of the hunt's trials took longer or hung"), (9, "1 of the")])
+@pytest.mark.parametrize(
+    ("timeout_s", "says"),
+    [(0.5, "2 of the hunt's trials took longer or hung"), pytest.param(9, "1 of the", marks=pytest.mark.nightly)],
+)
 def test_other_time_limit_is_refused_where_earlier_trials_would_end_otherwise(agent, tmp_path, timeout_s, says):
     run(3, timeout_s=5)
     run(4, timeout_s=4)  # which changes nothing
@@ -231,6 +235,7 @@ def test_other_time_limit_is_refused_where_earlier_trials_would_end_otherwise(ag
     assert caught.value.fix == "give --timeout 4, or a new directory"
 
 
+@pytest.mark.nightly
 def test_hunt_of_a_gate_names_no_option_that_its_command_lacks(agent, tmp_path, monkeypatch):
     run(2)
     agent(1)
@@ -246,7 +251,7 @@ def test_learning_sampler_receives_no_results_of_earlier_code(agent, tmp_path, m
     agent(0, 1, 2, 3)
     tell = NamedSampler.tell
     monkeypatch.setattr(NamedSampler, "tell", lambda sampler, result: told.append(result) or tell(sampler, result))
-    run(8, sampler="mutation", continue_with_new_code=True)
+    run(8, sampler="mutation", keep=1, continue_with_new_code=True)
     assert {str(one.outcome) for one in told} == {"agent_error"}
     assert min(one.spec.number for one in told) >= 4
 

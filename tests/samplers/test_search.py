@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import examples
 from hypothesis import HealthCheck, example, given, settings, strategies as st
 from spaces import are_inside, ask, spaces, spec_of
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -66,7 +67,7 @@ def test_what_is_rare_is_found_where_danger_leads_to_it(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(deadline=None, max_examples=12, suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=examples(12), suppress_health_check=[HealthCheck.too_slow])
 @given(space=spaces, seed=st.integers(0, 2**40), luck=st.integers(0, 2**20))
 def test_whatever_the_arguments_proposals_are_inside(kind, space, seed, luck):
     dangers = np.random.default_rng(luck)
@@ -115,7 +116,7 @@ def test_the_even_search_leaves_no_part_of_an_argument_out():
 
 @pytest.mark.parametrize("make", [MutationSampler, CrossEntropySampler])
 @pytest.mark.parametrize("crashes", [False, True])
-@settings(deadline=None, max_examples=3)
+@settings(deadline=None, max_examples=examples(3))
 @given(scale=st.floats(0.05, 0.9), power=st.sampled_from([0.2, 0.45, 3.0]), seed=st.integers(0, 2**20))
 @example(scale=0.45, power=1.0, seed=5)
 def test_only_the_order_of_danger_counts_for_the_strategies_alone(make, crashes, scale, power, seed):
@@ -142,6 +143,7 @@ def test_only_the_order_of_danger_counts_for_the_strategies_alone(make, crashes,
     assert hunted(lambda danger: 1.0 - danger) != asked
 
 
+@pytest.mark.nightly  # by day, danger that leads nowhere
 def test_danger_that_states_nothing_gets_probes_only():
     luck = np.random.default_rng(1)
     asked, _ = hunt(GuidedSampler(UNIT), lambda _: luck.random() * 0.9, 450)

@@ -236,6 +236,7 @@ def test_few_undisturbed_crashes_widen_the_interval_and_do_not_withhold_it():
     assert "roots with a crash: 1 (at least 20)" in nothing_weighted.why_not
 
 
+@pytest.mark.nightly  # by day, either part alone
 def test_interval_of_two_parts_covers_where_either_is_large():
     rng = np.random.default_rng(8)
     for chance, weight in ((8e-3, 1e-5), (6e-3, 4e-3), (0.05, 0.2)):

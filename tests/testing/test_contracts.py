@@ -394,6 +394,7 @@ for form in forms:
 NIGHT = [("here", ["continuous"]), ("own", ["meta"])]
 
 
+@pytest.mark.nightly  # by day, test_episodes.py has the checker
 @pytest.mark.parametrize(
     ("where", "forms"),  # by day, the contract above has the continuous form
     [("here", ["meta"]), *(pytest.param(*case, marks=pytest.mark.nightly) for case in NIGHT)],

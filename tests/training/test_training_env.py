@@ -213,6 +213,7 @@ def test_after_an_interrupt_the_next_request_gets_its_own_answer(remote, monkeyp
         assert (again.tobytes(), info_again) == (observation.tobytes(), info)
 
 
+@pytest.mark.nightly  # by day, one between messages
 def test_an_interrupt_in_the_middle_of_a_message_ends_the_process(remote, monkeypatch):
     remote.reset(seed=1)
     with monkeypatch.context() as patch:
