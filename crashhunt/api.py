@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.calls import called_with, clear_calls
-from crashhunt.plans import HuntOptions, Spec, hunt_options, request_of
+from crashhunt.plans import Request, Spec, hunt_options
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -16,15 +16,20 @@ if TYPE_CHECKING:
     from crashhunt.analysis import Counts, Intervention
     from crashhunt.crashes import Bundle
     from crashhunt.hunts import Hunt, HuntReport, HuntStatus
-    from crashhunt.plans import HuntSettings, Request
+    from crashhunt.plans import HuntSettings
     from crashhunt.replays import Code, ReplayReport
     from crashhunt.scenario import Scenario
     from crashhunt.snapshots import SnapshotOptions
 
 
 @dataclass(frozen=True)
-class HuntCall(HuntOptions):
-    """Arguments of `prepare`: all options of hunts, and arguments that only Python has.
+class _Place:
+    directory: Path | str
+
+
+@dataclass(frozen=True)
+class HuntCall(Request, _Place):
+    """Arguments of `prepare`: the request, whose numbers are required and positional, and the directory of the hunt.
 
     Args:
         directory: directory of the hunt, created if it does not exist. An existing hunt with the same settings resumes.
@@ -36,10 +41,9 @@ class HuntCall(HuntOptions):
         command: the command line, which is written to ``hunt.toml`` as a comment.
     """
 
-    directory: Path | str
-    parallel: int
-    trials: int
-    max_steps: int
+    parallel: int = field()
+    trials: int = field()
+    max_steps: int = field()
     _: KW_ONLY
     snapshot: SnapshotOptions | None = None
     overwrite: bool = False
@@ -77,7 +81,7 @@ def prepare(asked: HuntCall) -> Hunt:
 
 def _prepared(asked: HuntCall) -> Hunt:
     # Refuse values out of range before large imports: the user waits at a terminal.
-    request = request_of(asked, trials=asked.trials, max_steps=asked.max_steps, parallel=asked.parallel).checked()
+    request = asked.checked()
     from crashhunt.plans import plan_with_code
 
     def survey(scenario: Scenario, request: Request, settings: HuntSettings) -> Scenario:

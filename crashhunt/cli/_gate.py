@@ -188,19 +188,16 @@ def _of_options(options: argparse.Namespace, folder: Path) -> dict[str, RunReque
     """Return the only hunt, as the options describe it."""
     from dataclasses import replace
 
-    from crashhunt.plans import HuntOptions, SnapshotChoices, fields_of, request_of
+    from crashhunt.plans import Request
     from crashhunt.scenario import shipped_scenarios
     from crashhunt.suites import RunRequest
 
-    asked = HuntOptions(**chosen_options(options, _HUNT_OPTIONS))
     max_steps = _MAX_STEPS if options.max_steps is None else options.max_steps
-    request = request_of(asked, trials=1, max_steps=max_steps).checked()
+    request = Request(trials=1, max_steps=max_steps, **chosen_options(options, _HUNT_OPTIONS)).checked()
     scenario = str(request.scenario)
     if scenario not in shipped_scenarios():
         scenario = str((folder / scenario).resolve())
-    choices = SnapshotChoices(**{name: getattr(asked, name) for name in fields_of(SnapshotChoices)})
-    run = RunRequest(replace(request, scenario=scenario), str(folder), choices)
-    return {Path(scenario).stem or scenario: run}
+    return {Path(scenario).stem or scenario: RunRequest(replace(request, scenario=scenario), str(folder))}
 
 
 def _of_suite(options: argparse.Namespace, words: list[str]) -> dict[str, RunRequest]:

@@ -33,12 +33,12 @@ def add_signals(commands: Commands) -> None:
 
 def _signals(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.hunts import list_signals
-    from crashhunt.plans import HuntOptions, plan, request_of
+    from crashhunt.plans import Request, plan
     from crashhunt.report import aligned
 
     agents = pairs(options.agent, "--agent", named=False)
-    asked = HuntOptions(scenario=options.scenario, ego=options.ego, agents=agents)
-    found = list_signals(*plan(request_of(asked, trials=1, max_steps=1, parallel=1)))
+    asked = Request(scenario=options.scenario, ego=options.ego, agents=agents, trials=1, max_steps=1)
+    found = list_signals(*plan(asked))
     if options.json:
         print(json.dumps(found))
         return 0

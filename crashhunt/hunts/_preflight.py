@@ -300,7 +300,7 @@ class TrafficSurveyor:
         if survey is None or request.ego not in ("", "any") or Path(scenario.file).suffix == ".toml":
             return scenario
         drawn = {setup.replaces for setup in scenario.agents.values() if setup.replaces}
-        if drawn & {name.removeprefix("scenario.") for name in request.scenario_arguments}:
+        if drawn & {name.removeprefix("scenario.") for name in request.scenario_arguments or ()}:
             return scenario  # the user has chosen
         if not self._overwrite and (self._directory / layout.HUNT).exists():
             kept = self._stored_survey()

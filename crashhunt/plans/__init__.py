@@ -41,6 +41,7 @@ if TYPE_CHECKING:
         HuntOptions as HuntOptions,
         SnapshotChoices as SnapshotChoices,
         Spec as Spec,
+        Subject as Subject,
         TrialOptions as TrialOptions,
         hunt_options as hunt_options,
     )
@@ -55,7 +56,6 @@ if TYPE_CHECKING:
         fields_of as fields_of,
         parallel_here as parallel_here,
         read_settings as read_settings,
-        request_of as request_of,
         spec_words as spec_words,
         write_settings as write_settings,
     )

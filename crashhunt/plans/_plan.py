@@ -37,7 +37,15 @@ from crashhunt.plans._choices import (
 )
 from crashhunt.plans._code import IMPORT_S, CodeFacts, describe_code, notes_on_programs, with_reuse
 from crashhunt.plans._run_options import TrialOptions
-from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, fields_of, sized
+from crashhunt.plans._settings import (
+    AgentSettings,
+    ArgumentSpec,
+    HuntSettings,
+    RunSettings,
+    fields_of,
+    sized,
+    spec_words,
+)
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
 from crashhunt.scenario import (
     Scenario,
@@ -150,7 +158,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
         observed = chosen_observations(request.observe, scenario, {})
         code = describe_code(
             with_observations(scenario, observed), oracles=request.oracles, disturb=disturb, sampler=request.sampler,
-            executor=request.run.executor, timeout_s=request.run.timeout_s,
+            executor=request.executor, timeout_s=request.timeout_s,
         )  # fmt: skip
     hunted = not varies_only_asked(request.sampler)
     signatures = {agent: code.signatures[setup.agent] for agent, setup in scenario.agents.items()}
@@ -198,7 +206,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     refuse_late_plans(
         scenario, [*parse_rates(disturb), *(one.what for one in parse_fixed(disturb, tuple(scenario.agents)))]
     )
-    find = partial(_model_apart, code, request.run.timeout_s)
+    find = partial(_model_apart, code, request.timeout_s)
     with _name_scenario_in_errors(request, scenario):
         disturber(scenario, settings.disturb, tuple(settings.agents), find=find)  # it refuses what cannot be meant
     _check_branch(settings)
@@ -509,7 +517,7 @@ def _limit(name: str, text: str) -> float:
 def _locators(request: Request, scenario: Scenario) -> dict[str, str]:
     locators: dict[str, str] = {}
     ids = ", ".join(scenario.agents)
-    for agent, locator in request.agents.items():
+    for agent, locator in request.locators.items():
         if not agent and len(scenario.agents) > 1:
             raise UsageError(
                 f"--agent {locator!r} names no vehicle, but the scenario has several: {ids}",
@@ -526,7 +534,7 @@ def _agents(
     request: Request, scenario: Scenario, signatures: Mapping[str, Signature], *, hunted: bool
 ) -> dict[str, AgentSettings]:
     asked: dict[str, dict[str, str]] = {agent: {} for agent in scenario.agents}
-    for name, spec in request.arguments.items():
+    for name, spec in spec_words(request.arguments).items():
         agent, argument = _owner(name, scenario, signatures)
         asked[agent][argument] = spec
     agents: dict[str, AgentSettings] = {}
@@ -609,7 +617,7 @@ def _scenario_arguments(
 ) -> dict[str, ArgumentSpec]:
     known = scenario.scenario_arguments()
     wanted: dict[str, str] = {}
-    for name, spec in request.scenario_arguments.items():
+    for name, spec in spec_words(request.scenario_arguments).items():
         owner = Owners({}, known).of(name, option="--set")
         if owner is None:
             raise ArgumentError(f"--set: the scenario has no argument {name!r}", fix=one_of(name, known, give="it has"))

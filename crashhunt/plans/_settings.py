@@ -20,14 +20,13 @@ from crashhunt.base.text import command_line, near_path
 from crashhunt.oracles import DEFAULT_ORACLES
 from crashhunt.plans._declaration import at_least
 from crashhunt.plans._durations_and_rates import seconds_of
-from crashhunt.plans._run_options import Driver, HuntOptions, RunOptions, Spec, Subject, TrialOptions
+from crashhunt.plans._run_options import Driver, HuntOptions, RunOptions, Spec, TrialOptions
 from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from crashhunt.base.json_types import Plain
-    from crashhunt.plans._declaration import Given
     from crashhunt.samplers import Space
 
 
@@ -354,24 +353,42 @@ _REQUIRED_NUMBERS = {  # the numbers of a hunt that are no options: everybody ha
 
 @clear_constructor
 @dataclass(frozen=True, kw_only=True)
-class Request(TrialOptions, Subject):
-    """The user's request for a hunt. `plan` determines all further settings.
+class Request(HuntOptions):
+    """The user's request for a hunt: all options as the user gave them. `plan` determines all further settings.
+
+    The agents are their locators, and values of arguments are texts in the syntax of the command line.
 
     Args:
-        trials: maximum number of trials.
+        parallel: number of trials at a time; 0 for one per core.
+        trials: maximum number of trials; 0 for no limit.
         max_steps: maximum number of steps of a trial.
-        agents: locator of each agent, by agent id; the id may be empty if the scenario has one controlled vehicle.
-        arguments: specification of each argument, by ``NAME`` or ``AGENT.NAME``.
-        scenario_arguments: specification of each scenario argument, by name.
-        run: options that determine how the hunt runs.
+
+    Raises:
+        UsageError: the agent is not in a module that workers can import.
     """
 
+    parallel: int = 1
     trials: int
     max_steps: int
-    agents: Mapping[str, str] = field(default_factory=dict)
-    arguments: Mapping[str, str] = field(default_factory=dict)
-    scenario_arguments: Mapping[str, str] = field(default_factory=dict)
-    run: RunSettings = field(default_factory=RunSettings)
+
+    def __post_init__(self) -> None:
+        """Write the only agent, and values that are not texts, in the form of the command line."""
+        super().__post_init__()
+        drivers = {} if self.agent in (None, "") else {"": self.agent}
+        locators = {name: _locator(who) for name, who in {**(self.agents or {}), **drivers}.items() if who is not None}
+        words = {"arguments": spec_words(self.arguments), "scenario_arguments": spec_words(self.scenario_arguments)}
+        for name, value in {"agents": locators, "agent": None, **words}.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def locators(self) -> dict[str, str]:
+        """Locator of each agent, by agent id; the id may be empty if the scenario has one controlled vehicle."""
+        return {name: str(locator) for name, locator in (self.agents or {}).items()}
+
+    @property
+    def run(self) -> RunSettings:
+        """The options that determine how the hunt runs."""
+        return RunSettings(parallel=self.parallel, **{name: getattr(self, name) for name in fields_of(RunOptions)})
 
     def checked(self) -> Self:
         """Return the same request after validation, with plain Python values.
@@ -380,41 +397,23 @@ class Request(TrialOptions, Subject):
             UsageError: a value is invalid.
         """
         for (name, check), value in zip(
-            _REQUIRED_NUMBERS.items(), (self.trials, self.max_steps, self.run.parallel), strict=True
+            _REQUIRED_NUMBERS.items(), (self.trials, self.max_steps, self.parallel), strict=True
         ):
             if not isinstance(value, int) or isinstance(value, bool):
                 raise UsageError(f"{name} is {value!r}", fix="give a whole number")
             if fix := check(value):
                 raise UsageError(f"{name} is {value}", fix=fix)
-        if not self.trials and not self.run.duration and not self.run.until_rate:
+        if not self.trials and not self.duration and not self.until_rate:
             raise UsageError("TRIALS is 0", fix="give at least 1, or 0 (no limit) and a time with --for")
-        checked = super().checked()
-        run = (replace(self.run, keep_going=True) if checked.rare else self.run).checked()
-        if run.until_rate and (checked.sampler != "random" or checked.seeds):
+        checked = super(Request, replace(self, keep_going=True) if self.rare else self).checked()
+        if checked.until_rate and (checked.sampler != "random" or checked.seeds):
             option = "--seeds" if checked.seeds else f"--sampler {checked.sampler}"
             raise UsageError(
                 f"--until-rate needs independent trials, but {option} draws dependent trials",
                 fix=f"omit {option}",
             )
-        limits = [limit for limit in (self.trials, run.most) if limit]
-        return replace(checked, run=run, trials=min(limits, default=0))
-
-
-def request_of(asked: HuntOptions, *, trials: int, max_steps: int, parallel: int = 1) -> Request:
-    """Return the request for options that were given in Python or in a ``suite.toml``.
-
-    Raises:
-        UsageError: the agent is not in a module that workers can import.
-    """
-    drivers = {} if asked.agent in (None, "") else {"": asked.agent}
-    given: Given = {
-        **{name: getattr(asked, name) for name in (*fields_of(Subject), *fields_of(TrialOptions))},
-        "agents": {name: _locator(who) for name, who in {**(asked.agents or {}), **drivers}.items() if who is not None},
-        "arguments": spec_words(asked.arguments),
-        "scenario_arguments": spec_words(asked.scenario_arguments),
-    }
-    run = RunSettings(parallel=parallel, **{name: getattr(asked, name) for name in fields_of(RunOptions)})
-    return Request(trials=trials, max_steps=max_steps, run=run, **given)
+        limits = [limit for limit in (self.trials, checked.most) if limit]
+        return replace(checked, trials=min(limits, default=0))
 
 
 def sized(run: RunSettings) -> RunSettings:

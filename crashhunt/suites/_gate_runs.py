@@ -261,8 +261,8 @@ def _check_request(run: RunRequest, where: str) -> None:
     request = run.request
     options: dict[str, object] = {
         f"the sampler {request.sampler}": request.sampler != "random", "--seeds": request.seeds, "--rare": request.rare,
-        "--until-rate": request.run.until_rate, "--distinct": request.run.distinct,
-        "--only-at-fault": request.run.only_at_fault,
+        "--until-rate": request.until_rate, "--distinct": request.distinct,
+        "--only-at-fault": request.only_at_fault,
     }  # fmt: skip
     if given := next((option for option, value in options.items() if value), ""):
         raise UsageError(f"{where}a gate compares single trials and does not support {given}", fix="omit it")
@@ -378,14 +378,13 @@ class _Run:
         """Return the request of the hunt of one version; ``number`` is its position among the hunts."""
         asked = run.request
         kept = 0 if self._gate.only_preventable else _BUNDLES_PER_TYPE  # 0 keeps all: each crash is judged
-        settings = replace(asked.run, keep_going=True, keep=kept, parallel=1)
         seed = asked.seed
         if seed is None and not self._gate.is_suite:
             seed = self._seed
         elif seed is None:  # each hunt of a suite has its own
             seed = int(np.random.SeedSequence(self._seed, spawn_key=(number,)).generate_state(1)[0])
-        agents = {**asked.agents, **self._versions[side].agents}
-        request = replace(asked, agents=agents, seed=seed, trials=most, run=settings)
+        agents = {**asked.locators, **self._versions[side].agents}
+        request = replace(asked, agents=agents, seed=seed, trials=most, keep_going=True, keep=kept, parallel=1)
         folder = self._folder_of(side, Path(run.folder))
         return replace(run, request=request, folder=str(folder))
 
@@ -720,7 +719,7 @@ def _ended_early(paired: PairedHunts) -> str:
 
 def _modules_of(run: RunRequest) -> set[str]:
     """Return the modules of the agents that drive in a hunt, except crashhunt's own modules."""
-    agents = dict(run.request.agents)
+    agents = run.request.locators
     if not agents:
         try:
             agents = {agent: setup.agent for agent, setup in load_scenario(run.request.scenario).agents.items()}

@@ -13,7 +13,7 @@ import time
 import traceback
 from collections import deque
 from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +30,8 @@ from crashhunt.plans import (
     Request,
     RunSettings,
     SnapshotChoices,
+    Subject,
+    TrialOptions,
     executor_of,
     fields_of,
     plan_with_code,
@@ -64,16 +66,18 @@ class RunRequest:
     Args:
         request: request of the hunt.
         folder: folder from which agents are imported.
-        snapshot: options of the snapshot.
     """
 
     request: Request
     folder: str
-    snapshot: SnapshotChoices = field(default_factory=SnapshotChoices)
 
     def to_json(self) -> dict[str, object]:
-        """Return JSON-compatible data: the request, and the options of the snapshot."""
-        return {"request": asdict(self.request), "folder": self.folder, **asdict(self.snapshot)}
+        """Return JSON-compatible data: the options that determine trials, those of the run, those of the snapshot."""
+        asked = self.request
+        given = {name: getattr(asked, name) for name in (*fields_of(Subject), *fields_of(TrialOptions))}
+        numbers = {"trials": asked.trials, "max_steps": asked.max_steps}
+        snapshot = {name: getattr(asked, name) for name in fields_of(SnapshotChoices)}
+        return {"request": {**given, **numbers, "run": asdict(asked.run)}, "folder": self.folder, **snapshot}
 
     def to_plain(self) -> object:
         """Return the request as the dictionaries, lists, texts and numbers that `json.load` reads from its file."""
@@ -88,10 +92,9 @@ class RunRequest:
         """
         try:
             data = json.loads(read_bounded(file))
-            given = data["request"]
-            run = RunSettings(**given.pop("run"))
-            snapshot = {name: data[name] for name in fields_of(SnapshotChoices) if name in data}
-            return cls(Request(**{**given, "run": run}), data["folder"], SnapshotChoices(**snapshot))
+            run, snapshot = data["request"].pop("run"), fields_of(SnapshotChoices)
+            run |= {name: data[name] for name in snapshot if name in data}
+            return cls(Request(**data["request"], **run), data["folder"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise HuntDirectoryError(f"no {REQUEST}: {error}", fix="plan the suite again", where=str(file)) from None
 
@@ -267,9 +270,9 @@ def _main(folder: Path, run: Given, parent: int) -> None:
         asked = RunRequest.read(folder / REQUEST)
         options = dict(run)
         partner = Path(other) if (other := options.pop("partner", None)) is not None else None
-        new_code = options.pop(_NEW_CODE, asked.snapshot.continue_with_new_code)
+        new_code = options.pop(_NEW_CODE, asked.request.continue_with_new_code)
         scenario, settings, imported = _planned(folder, asked.request, options)
-        snapshot = SnapshotOptions.of(replace(asked.snapshot, continue_with_new_code=new_code))
+        snapshot = SnapshotOptions.of(replace(asked.request, continue_with_new_code=new_code))
         command = ["crashhunt", "suite", "run"]
         hunt = Hunt(folder, scenario, settings, command=command, snapshot=snapshot, imported=imported, partner=partner)
         deadline = time.monotonic() + _BUSY_S
@@ -301,7 +304,7 @@ def _planned(folder: Path, request: Request, machine: Given) -> tuple[Scenario, 
         from crashhunt.hunts import TrafficSurveyor
 
         survey = TrafficSurveyor(folder, overwrite=False)
-        scenario, settings, code = plan_with_code(replace(request, run=replace(request.run, **run)), survey=survey)
+        scenario, settings, code = plan_with_code(replace(request, **run), survey=survey)
         if not begun:
             return scenario, settings, code.imported
     else:
@@ -357,7 +360,7 @@ def refuse_untrusted_hunt(hunt: Path) -> None:
             runs = describe_code(snapshot, read_settings(hunt / layout.HUNT))
         else:
             request = RunRequest.read(hunt / REQUEST)
-            runs = f"{', '.join(request.request.agents.values()) or 'its agents'}, imported from {request.folder}"
+            runs = f"{', '.join(request.request.locators.values()) or 'its agents'}, imported from {request.folder}"
     except CrashhuntError as error:
         runs = f"what cannot be described: {error.message}"
     raise UntrustedError(
@@ -384,7 +387,7 @@ def trust_hunt(hunt: Path, path: Path) -> list[TrustedOrigin]:
         Snapshot(place).verify()
     found = [trust_snapshot(Snapshot(place), path) for place in places]
     if (hunt / REQUEST).is_file():
-        agents = RunRequest.read(hunt / REQUEST).request.agents.values()
+        agents = RunRequest.read(hunt / REQUEST).request.locators.values()
         runs = f"the request of a suite for {', '.join(agents) or 'the agents of its scenario'}"
         found.append(add_trusted(_fingerprint(hunt / REQUEST), path=str(path.resolve()), runs=runs))
     return found

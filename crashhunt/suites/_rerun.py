@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,17 @@ from crashhunt.base.temporary import new_folder
 from crashhunt.base.text import command_line
 from crashhunt.disturbances import NONE
 from crashhunt.ledger import Ledger
-from crashhunt.plans import HuntSettings, Owners, Request, Takes, TrialOptions, fields_of, read_settings, takes_of
+from crashhunt.plans import (
+    HuntSettings,
+    Owners,
+    Request,
+    Takes,
+    TrialOptions,
+    fields_of,
+    read_settings,
+    spec_words,
+    takes_of,
+)
 from crashhunt.results import HuntState, hunt_state
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.snapshots import latest_snapshot
@@ -115,6 +125,7 @@ def _request_of(settings: HuntSettings) -> Request:
     }
     options = {name: getattr(settings, name) for name in fields_of(TrialOptions)}
     return Request(
+        **asdict(settings.run),
         **{**options, "crash_on": settings.crash_on_words, "disturb": settings.disturb or (NONE,)},
         trials=settings.trials,
         max_steps=settings.max_steps,
@@ -124,7 +135,6 @@ def _request_of(settings: HuntSettings) -> Request:
         agents={agent: chosen.agent for agent, chosen in settings.agents.items()},
         arguments=arguments,
         scenario_arguments={name: spec.spec for name, spec in settings.scenario_arguments.items()},
-        run=settings.run,
     )
 
 
@@ -152,7 +162,7 @@ def _with_moved_scenario(asked: RunRequest, hunt: Path, aside: Path) -> RunReque
 
 def _changed(asked: RunRequest, changes: Mapping[str, str], hunt: Path) -> RunRequest:
     request = asked.request
-    arguments, scenario_arguments = dict(request.arguments), dict(request.scenario_arguments)
+    arguments, scenario_arguments = spec_words(request.arguments), spec_words(request.scenario_arguments)
     owners = _Names(asked, hunt) if changes else None
     for name, spec in changes.items():
         if name in _NUMBER_OPTIONS:
@@ -179,7 +189,7 @@ class _Names:
     def __init__(self, asked: RunRequest, hunt: Path) -> None:
         request = asked.request
         scenario = load_scenario(request.scenario, ego=request.ego)
-        given = request.agents
+        given = request.locators
         drivers = {agent: given.get(agent) or given.get("") or setup.agent for agent, setup in scenario.agents.items()}
         scenario = scenario.with_agents(drivers)
         known = {agent: dict.fromkeys(scenario.agent_arguments(agent)) for agent in drivers}

@@ -17,7 +17,7 @@ from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, UsageError
 from crashhunt.base.text import command_line, listed, near_path
 from crashhunt.base.validation import validate
-from crashhunt.plans import HuntOptions, Request, SnapshotChoices, fields_of, hunt_options, request_of
+from crashhunt.plans import HuntOptions, Request, fields_of, hunt_options
 from crashhunt.results import HuntState, find_hunts, hunt_state, is_hunt
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.snapshots import code_differences, latest_snapshot
@@ -102,9 +102,7 @@ class Suite:
             if entry.agent and entry.agents:
                 raise UsageError(f"hunts.{entry.id} has both agent and agents", fix="give one of them")
             try:
-                asked = self.request(entry, 0)
-                asked.request.checked()
-                asked.snapshot.checked()
+                self.request(entry, 0).request.checked()
             except UsageError as error:
                 raise UsageError(f"hunts.{entry.id}: {_in_keys(error.message)}", fix=_in_keys(error.fix)) from None
 
@@ -222,10 +220,15 @@ class Suite:
         Raises:
             UsageError: the agent is not in a module that workers can import.
         """
-        roots = tuple(str((self.folder / root).resolve()) for root in entry.snapshot_roots)
-        snapshot = SnapshotChoices(**{name: getattr(entry, name) for name in fields_of(SnapshotChoices)})
-        snapshot = replace(snapshot, snapshot_roots=roots)
-        return RunRequest(self._request(entry, number), str(self.folder), snapshot)
+        scenario = str(entry.scenario)
+        if scenario not in shipped_scenarios():
+            scenario = str((self.folder / scenario).resolve())
+        seed = entry.seed if entry.seed is not None else secrets.randbits(32)
+        drawn = np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]
+        given = {name: getattr(entry, name) for name in fields_of(HuntOptions)}
+        given |= {"scenario": scenario, "seed": int(drawn)}
+        given["snapshot_roots"] = tuple(str((self.folder / root).resolve()) for root in entry.snapshot_roots)
+        return RunRequest(Request(trials=entry.trials, max_steps=entry.max_steps, **given), str(self.folder))
 
     def _planned(self, entry: SuiteEntry, number: int, folder: Path) -> RunRequest:
         wanted = self.request(entry, number)
@@ -235,8 +238,8 @@ class Suite:
         if entry.seed is None:
             wanted = replace(wanted, request=replace(wanted.request, seed=before.request.seed))
         # A suite may allow new code later; `plan` then writes the request again.
-        new_code = wanted.snapshot.continue_with_new_code
-        before = replace(before, snapshot=replace(before.snapshot, continue_with_new_code=new_code))
+        new_code = wanted.request.continue_with_new_code
+        before = replace(before, request=replace(before.request, continue_with_new_code=new_code))
         if before != replace(wanted, folder=before.folder):
             raise HuntDirectoryError(
                 f"the hunt {entry.id!r} was planned in this folder with other settings",
@@ -244,15 +247,6 @@ class Suite:
                 where=str(folder),
             )
         return before
-
-    def _request(self, entry: SuiteEntry, number: int) -> Request:
-        scenario = str(entry.scenario)
-        if scenario not in shipped_scenarios():
-            scenario = str((self.folder / scenario).resolve())
-        seed = entry.seed if entry.seed is not None else secrets.randbits(32)
-        drawn = np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]
-        asked = replace(entry, scenario=scenario, seed=int(drawn))
-        return request_of(asked, trials=entry.trials, max_steps=entry.max_steps)
 
 
 def describe_finished(directory: Path) -> str:

@@ -14,7 +14,7 @@ from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.text import command_line, one_of, visible
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
-from crashhunt.plans import HuntOptions, plan, request_of
+from crashhunt.plans import Request, plan
 from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
 if TYPE_CHECKING:
@@ -83,12 +83,13 @@ def assert_survives(
         CrashhuntError: no trial could be run.
     """
     __tracebackhide__ = True  # of pytest
-    options = HuntOptions(
-        agent=agent, scenario=scenario, arguments=arguments, scenario_arguments=scenario_arguments, seed=seed
-    )
     call = f"{_word(agent)}, {str(scenario)!r}, max_steps={max_steps}"
     if example is not None:
-        result = _run_one(_asking(options, example), example, max_steps)
+        request = Request(
+            trials=1, max_steps=max_steps, agent=agent, scenario=scenario, arguments=arguments,
+            scenario_arguments=scenario_arguments, seed=seed,
+        )  # fmt: skip
+        result = _run_one(_asking(request, example), example)
         if result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
             raise AssertionError(_told(result, call, ""))
         return
@@ -117,8 +118,8 @@ def _smaller(bundle: Bundle, budget: int, parallel: int) -> Bundle:
         return bundle
 
 
-def _asking(options: HuntOptions, example: Example) -> HuntOptions:
-    """Return the options of a hunt with only the values of an example; an agent may not know all other options.
+def _asking(request: Request, example: Example) -> Request:
+    """Return the request with only the values of an example; an agent may not know all other options.
 
     Raises:
         UsageError: the example has an unknown key, or unknown arguments.
@@ -138,9 +139,9 @@ def _asking(options: HuntOptions, example: Example) -> HuntOptions:
             )
         arguments |= {f"{agent}.{name}": value for name, value in given.items()}
     return replace(
-        options,
-        arguments={**(options.arguments or {}), **_one_each(arguments)},
-        scenario_arguments={**(options.scenario_arguments or {}), **_one_each(example.get("scenario_arguments", {}))},
+        request,
+        arguments={**(request.arguments or {}), **_one_each(arguments)},
+        scenario_arguments={**(request.scenario_arguments or {}), **_one_each(example.get("scenario_arguments", {}))},
     )
 
 
@@ -148,15 +149,15 @@ def _one_each(values: Mapping[str, Value]) -> dict[str, Spec]:
     return {name: value for name, value in values.items() if not (isinstance(value, str) and "|" in value)}
 
 
-def _run_one(options: HuntOptions, example: Example, max_steps: int) -> TrialResult:
-    scenario, settings = plan(request_of(options, trials=1, max_steps=max_steps).checked())
+def _run_one(request: Request, example: Example) -> TrialResult:
+    scenario, settings = plan(request)
     only = example.get("only")
     spec = TrialSpec(
         number=0,
         seed=example.get("seed", 0),
         arguments=example.get("arguments", {}),
         scenario_arguments=example.get("scenario_arguments", {}),
-        max_steps=max_steps,
+        max_steps=request.max_steps,
         only=None if only is None else tuple(only),
         disturbances=tuple(map(Disturbance.from_json, example.get("disturbances", ()))),
     )

@@ -16,7 +16,7 @@ from crashhunt.base.text import any_of, did_you_mean, listed, near_path, one_of
 from crashhunt.cli import main
 from crashhunt.crashes import Bundle, find_bundle
 from crashhunt.errors import BundleError, CallError, CrashhuntError, PluginError, UsageError
-from crashhunt.plans import Request, RunSettings, plan
+from crashhunt.plans import Request, plan
 from crashhunt.samplers import NamedSampler
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
@@ -98,7 +98,7 @@ def test_suites_and_reruns_refuse_the_same_numbers(tmp_path, capsys):
 
 
 def test_none_at_a_time_is_one_per_core():
-    _, settings = plan(Request(trials=1, max_steps=1, run=RunSettings(parallel=0)))
+    _, settings = plan(Request(trials=1, max_steps=1, parallel=0))
     assert settings.run.parallel >= 1
 
 

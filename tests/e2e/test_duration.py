@@ -43,7 +43,7 @@ def test_trials_that_have_all_ended_are_all_trials(toy):
 @pytest.mark.parametrize("text", ["0", "0s", "30x", "m", "-5s", "1m1h", " 5s", "nan", "inf", "1e3s", "1e999s"])
 def test_what_is_no_time_is_refused(text):
     with pytest.raises(UsageError) as refused:
-        Request(trials=1, max_steps=1, run=RunSettings(duration=text)).checked()
+        Request(trials=1, max_steps=1, duration=text).checked()
     assert str(refused.value) == f"--for is {text}; give a time above 0, such as 90s, 30m, 2h or 1h30m"
 
 
@@ -57,4 +57,4 @@ def test_times_are_read(text, seconds):
 def test_no_limit_at_all_is_refused():
     with pytest.raises(UsageError, match=r"TRIALS is 0; give at least 1, or 0 \(no limit\) and a time with --for"):
         Request(trials=0, max_steps=1).checked()
-    assert Request(trials=0, max_steps=1, run=RunSettings(duration="1s")).checked().trials == 0
+    assert Request(trials=0, max_steps=1, duration="1s").checked().trials == 0

@@ -16,8 +16,7 @@ from conftest import mostly_nightly
 from crashhunt.base.processes import children_of
 from crashhunt.base.reaper import Kept
 from crashhunt.hunts import TrafficSurveyor, _preflight
-from crashhunt.plans import plan, request_of, write_settings
-from crashhunt.plans._run_options import HuntOptions
+from crashhunt.plans import Request, plan, write_settings
 from crashhunt.scenario import as_plain_data, shipped_folder
 from crashhunt.snapshots import SnapshotOptions, take_snapshot
 from crashhunt.suites._processes import _planned
@@ -52,7 +51,7 @@ def hunted(folder, hunt="h"):
 
 
 def surveyed(folder, *, hunt="h", survey=True, **options):
-    request = request_of(HuntOptions(scenario=str(folder / "town.sumocfg"), **options), trials=2, max_steps=9)
+    request = Request(scenario=str(folder / "town.sumocfg"), trials=2, max_steps=9, **options)
     surveyor = TrafficSurveyor(folder / hunt, overwrite=False)
     return plan(request, survey=surveyor if survey else None)
 
@@ -91,7 +90,7 @@ def test_no_survey_where_the_user_names_the_vehicle(town, monkeypatch):
     for options in ({"ego": "free.1"}, {"ego": "route=way"}, {"scenario_arguments": {"vehicle": "blocked.1"}},
                     {"scenario_arguments": {"scenario.vehicle": "blocked.1"}}):  # fmt: skip
         surveyed(town.folder, **options)
-    request = request_of(HuntOptions(scenario="loop"), trials=1, max_steps=1)
+    request = Request(scenario="loop", trials=1, max_steps=1)
     plan(request, survey=TrafficSurveyor(town.folder, overwrite=False))
 
 
@@ -246,8 +245,7 @@ def test_resumed_hunt_keeps_the_candidates_with_which_it_began_although_its_surv
 
 @pytest.mark.nightly
 def test_hunt_of_a_suite_that_was_killed_before_its_snapshot_keeps_its_candidates(town):
-    options = HuntOptions(scenario=str(town.folder / "town.sumocfg"), seed=1)
-    request = request_of(options, trials=2, max_steps=9)
+    request = Request(scenario=str(town.folder / "town.sumocfg"), seed=1, trials=2, max_steps=9)
     begun, settings = surveyed(town.folder, seed=1)
     (town.folder / "h").mkdir()
     write_settings(town.folder / "h" / "hunt.toml", settings, ["crashhunt", "suite", "run"])

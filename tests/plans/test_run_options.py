@@ -9,6 +9,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +18,11 @@ import pytest
 import crashhunt
 from crashhunt.base.errors import CallError, UsageError
 from crashhunt.plans import (
-    HuntOptions,
     Request,
     RunSettings,
     hunt_options,
     plan,
     read_settings,
-    request_of,
     write_settings,
 )
 from crashhunt.replays import ReplayOptions
@@ -43,7 +42,7 @@ ASKS = """
 import json, pathlib
 from crashhunt.errors import UsageError
 import crashhunt
-from crashhunt.plans import plan, read_settings, request_of, write_settings
+from crashhunt.plans import plan, read_settings, write_settings
 from crashhunt.replays import ReplayOptions
 from crashhunt.snapshots import SnapshotOptions
 from crashhunt.suites import RunRequest, Suite
@@ -187,12 +186,9 @@ accelerate = false
 
 
 def test_hunt_toml_is_what_it_was_to_the_byte(tmp_path):
-    run = RunSettings(
-        parallel=3, keep_going=True, deterministic=True, keep_trials=True, timeout_s=5.0, audit=0.25,
-        accelerate=False,
-    )  # fmt: skip
     asked = Request(
-        trials=3, max_steps=10, seed=7, action="continuous", sampler="grid", points=4, run=run,
+        parallel=3, keep_going=True, deterministic=True, keep_trials=True, timeout_s=5.0, audit=0.25,
+        accelerate=False, trials=3, max_steps=10, seed=7, action="continuous", sampler="grid", points=4,
         crash_on=["collision", "not_moving:12.5"], arguments={"speed": "3:5"},
     )  # fmt: skip
     _, settings = plan(asked)
@@ -265,9 +261,9 @@ def test_a_request_of_an_older_version_is_read(tmp_path):
     found = RunRequest.read(tmp_path / "request.json")
     assert found.request == Request(
         trials=3, max_steps=9, scenario="toy", arguments={"speed": "4"}, seed=5, crash_on=["collision"],
-        run=RunSettings(keep_going=True, timeout_s=3.0),
+        keep_going=True, timeout_s=3.0, snapshot_roots=["/a/file"],
     )  # fmt: skip
-    assert found.snapshot.snapshot_roots == ("/a/file",)
+    assert json.loads(json.dumps(found.to_json()))["snapshot_roots"] == ["/a/file"]
 
 
 def test_what_has_no_such_option_states_what_it_has():
@@ -284,8 +280,11 @@ def test_what_has_no_such_option_states_what_it_has():
 
 
 def test_options_of_python_become_a_request():
-    asked = HuntOptions(agent="a:B", agents=None, arguments={"x": True, "y": 2}, scenario_arguments=None)
-    request = request_of(asked, trials=1, max_steps=2, parallel=3)
-    assert request.agents == {"": "a:B"}
+    request = Request(
+        agent="a:B", agents=None, arguments={"x": True, "y": 2}, scenario_arguments=None, trials=1, max_steps=2,
+        parallel=3,
+    )  # fmt: skip
+    assert request.agents == request.locators == {"": "a:B"}
+    assert replace(request, trials=4).agents == {"": "a:B"}  # the form of the command line is not changed again
     assert request.arguments == {"x": "true", "y": "2"}
     assert request.run.parallel == 3

@@ -13,7 +13,6 @@ from crashhunt.disturbances import ModelApart
 from crashhunt.errors import ArgumentError, HuntDirectoryError, ScenarioError, UsageError
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.plans import (
-    HuntOptions,
     Owners,
     Request,
     Takes,
@@ -22,7 +21,6 @@ from crashhunt.plans import (
     hunt_options,
     plan,
     read_settings,
-    request_of,
     takes_of,
     write_settings,
 )  # fmt: skip
@@ -119,10 +117,9 @@ def test_how_many_run_here_is_known_of_each_executor(folder, monkeypatch):
     assert [parallel_here("ours:Cluster", count) for count in (0, 2, 9)] == [3, 2, 3]
     sizes = {}
     for word in ("pool", "ours:Cluster", "ours:Alone"):
-        run = replace(asked().run, executor=word, parallel=0)
-        sizes[word] = plan(asked(run=run))[1].run.parallel
+        sizes[word] = plan(asked(executor=word, parallel=0))[1].run.parallel
     assert sizes == {"pool": 3, "ours:Cluster": 0, "ours:Alone": 3}
-    assert plan(asked(run=replace(asked().run, parallel=7)))[1].run.parallel == 7
+    assert plan(asked(parallel=7))[1].run.parallel == 7
 
 
 def test_an_option_states_what_it_means_and_whether_it_may_be_excluded():
@@ -322,30 +319,30 @@ def test_unused_statistics_next_to_a_policy_are_a_note(folder, tmp_path):
 )
 def test_numbers_that_cannot_be_meant_are_refused(numbers, says):
     with pytest.raises(UsageError) as refused:
-        request_of(HuntOptions(), **{"trials": 1, "max_steps": 1, **numbers}).checked()
+        Request(**{"trials": 1, "max_steps": 1, **numbers}).checked()
     assert str(refused.value) == says
 
 
 def test_no_trials_are_fine_with_a_time_and_drivers_have_to_be_importable(folder):
     options = {option.name for option in hunt_options()}
     name = "duration" if "duration" in options else "for"
-    assert request_of(HuntOptions(**{name: "5s"}), trials=0, max_steps=1).checked().trials == 0
+    assert Request(**{name: "5s"}, trials=0, max_steps=1).checked().trials == 0
     sys.modules.pop("drives", None)
     import drives
 
-    assert request_of(HuntOptions(agent=drives.Agent), trials=1, max_steps=1).agents == {"": "drives:Agent"}
-    both = HuntOptions(agent="a:B", agents={"x": "c:D", "y": None})
-    assert request_of(both, trials=1, max_steps=1).agents == {"x": "c:D", "": "a:B"}
-    assert request_of(HuntOptions(agent=""), trials=1, max_steps=1).agents == {}
+    assert Request(agent=drives.Agent, trials=1, max_steps=1).agents == {"": "drives:Agent"}
+    both = Request(agent="a:B", agents={"x": "c:D", "y": None}, trials=1, max_steps=1)
+    assert both.agents == {"x": "c:D", "": "a:B"}
+    assert Request(agent="", trials=1, max_steps=1).agents == {}
 
     class Local: ...
 
     elsewhere = type("Here", (), {"__module__": "__main__"})
     for who in (Local, elsewhere, lambda: None):
         with pytest.raises(UsageError, match="is not in a module that workers can import"):
-            request_of(HuntOptions(agent=who), trials=1, max_steps=1)
+            Request(agent=who, trials=1, max_steps=1)
     with pytest.raises(UsageError, match=r"the agent is an object of class Agent, .*; give the class Agent itself"):
-        request_of(HuntOptions(agent=drives.Agent()), trials=1, max_steps=1)
+        Request(agent=drives.Agent(), trials=1, max_steps=1)
 
 
 def test_an_argument_that_is_nobodys_is_named_with_those_that_exist():

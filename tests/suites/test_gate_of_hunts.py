@@ -11,7 +11,7 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
 from crashhunt.ledger import Ledger
-from crashhunt.plans import HuntSettings, Request, RunSettings, write_settings
+from crashhunt.plans import HuntSettings, Request, write_settings
 from crashhunt.report import describe_gate
 from crashhunt.suites import Gate, GateVersion, RunRequest, _gate_runs as _gate
 from crashhunt.suites._preventable_crashes import PreventableCrashes
@@ -23,8 +23,7 @@ OTHER = {"base": "head", "head": "base"}
 
 def gate(tmp_path, names=("a", "b", "c"), *, most=10, **more):
     hunts = {
-        name: RunRequest(Request(scenario="loop", trials=1, max_steps=9, seed=SEED, run=RunSettings()), str(tmp_path))
-        for name in names
+        name: RunRequest(Request(scenario="loop", trials=1, max_steps=9, seed=SEED), str(tmp_path)) for name in names
     }
     versions = {"base": GateVersion("m:Old", {"": "m:Old"}), "head": GateVersion("m:New", {"": "m:New"})}
     return Gate(**versions, hunts=hunts, folder=tmp_path, most=most, is_suite=len(names) > 1, **more)
@@ -131,7 +130,7 @@ def test_hunts_of_a_suite_have_their_own_seeds_that_come_from_the_gates(tmp_path
     calls, _ = ran
     asked = gate(tmp_path)
     for name, run in asked.hunts.items():
-        asked.hunts[name] = RunRequest(Request(scenario="loop", trials=1, max_steps=9, run=RunSettings()), run.folder)
+        asked.hunts[name] = RunRequest(Request(scenario="loop", trials=1, max_steps=9), run.folder)
     report = asked.run(tmp_path / "g")
     wanted = [int(np.random.SeedSequence(report.seed, spawn_key=(n,)).generate_state(1)[0]) for n in range(3)]
     assert [one.seed for *_, one in calls] == [seed for seed in wanted for _ in range(2)]

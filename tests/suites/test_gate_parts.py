@@ -23,7 +23,7 @@ from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
 
 def request(folder, **more):
-    given = {"scenario": "loop", "trials": 1, "max_steps": 9, "seed": 4, "run": RunSettings()} | more
+    given = {"scenario": "loop", "trials": 1, "max_steps": 9, "seed": 4} | more
     return RunRequest(Request(**given), str(folder))
 
 
@@ -182,9 +182,9 @@ def test_gate_warns_of_equal_commits_and_of_changes_that_it_leaves_out(work):
     ("more", "option"),
     [
         ({"sampler": "guided"}, "the sampler guided"), ({"seeds": 3}, "--seeds"), ({"rare": "forcing"}, "--rare"),
-        ({"run": RunSettings(distinct=2)}, "--distinct"),
-        ({"run": RunSettings(only_at_fault=True)}, "--only-at-fault"),
-        ({"run": RunSettings(until_rate="0.1/trial")}, "--until-rate"),
+        ({"distinct": 2}, "--distinct"),
+        ({"only_at_fault": True}, "--only-at-fault"),
+        ({"until_rate": "0.1/trial"}, "--until-rate"),
     ],
 )  # fmt: skip
 def test_gate_refuses_what_has_no_pairs_of_trials(tmp_path, more, option):

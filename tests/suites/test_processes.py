@@ -15,15 +15,22 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.ledger import Ledger
-from crashhunt.plans import Request, RunSettings, SnapshotChoices, plan
+from crashhunt.plans import Request, plan
 from crashhunt.results import hunt_state
 from crashhunt.suites import RunRequest, Suite, SuiteEntry, _processes, _rerun, rerun, run_all
 from crashhunt.suites._processes import REQUEST, check_machine, set_aside, write_request
 
 ASKED = RunRequest(
-    Request(scenario="loop", trials=7, max_steps=9, seed=3, arguments={"speed": "4"}, run=RunSettings(keep_going=True)),
+    Request(
+        scenario="loop",
+        trials=7,
+        max_steps=9,
+        seed=3,
+        arguments={"speed": "4"},
+        keep_going=True,
+        snapshot_limit_mb=7.0,
+    ),
     "/somewhere",
-    SnapshotChoices(snapshot_limit_mb=7.0),
 )
 
 
@@ -235,7 +242,7 @@ def test_results_are_moved_aside_also_where_names_cannot_be_exchanged(folders, m
 def test_the_request_of_settings_results_in_the_same_settings():
     chosen = {"arguments": {"speed": "4:8"}, "scenario_arguments": {"vehicles": "12"}, "disturb": ("brake=0.1",)}
     given = Request(scenario="loop", trials=7, max_steps=9, seed=3, sampler="sobol", **chosen,
-                    run=RunSettings(keep_going=True))  # fmt: skip
+                    keep_going=True)  # fmt: skip
     scenario, settings = plan(given)
     assert [*scenario.agents] == ["ego"]
     again = _rerun._request_of(settings)

@@ -24,7 +24,6 @@ from crashhunt.suites._processes import REQUEST, refuse_untrusted_hunt, slots_of
 ASKED = RunRequest(
     Request(
         scenario="loop", trials=7, max_steps=9, seed=3, arguments={"ego.speed": "4"}, agents={"ego": "mine:A"},
-        run=RunSettings(),
     ),
     "/somewhere",
 )  # fmt: skip
@@ -370,10 +369,10 @@ def test_plan_of_a_suite_has_a_folder_for_each_run(tmp_path):
         found.plan(tmp_path / "no/out")
     new_code = [replace(entry, continue_with_new_code=True) for entry in found.entries]  # allowed later
     assert Suite(new_code, folder=tmp_path).plan(tmp_path / "out") == folders
-    assert all(RunRequest.read(folder / REQUEST).snapshot.continue_with_new_code for folder in folders)
+    assert all(RunRequest.read(folder / REQUEST).request.continue_with_new_code for folder in folders)
     assert [RunRequest.read(folder / REQUEST).request.seed for folder in folders] == seeds
     roots = Suite([SuiteEntry(id="a", scenario="loop", snapshot_roots=("code", "/abs"))], folder=tmp_path)
-    assert roots.request(roots.entries[0], 0).snapshot.snapshot_roots == (str(tmp_path / "code"), "/abs")
+    assert roots.request(roots.entries[0], 0).request.snapshot_roots == (str(tmp_path / "code"), "/abs")
     (tmp_path / layout.HUNT).touch()
     with pytest.raises(HuntDirectoryError):
         found.plan(tmp_path)

@@ -8,7 +8,7 @@ import pytest
 
 from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.errors import CrashhuntError, UsageError
-from crashhunt.plans import HuntOptions
+from crashhunt.plans import Request
 from crashhunt.testing import _survives, assert_survives
 from crashhunt.trial import Disturbance, Outcome, TrialResult, TrialSpec
 
@@ -93,13 +93,14 @@ def test_crash_that_cannot_be_minimized_is_printed_as_it_is(hunt, monkeypatch):
 
 
 def test_example_replaces_arguments_of_its_names_only():
-    options = HuntOptions(agent="keep-lane", arguments={"speed": 1.0, "ego.speed": 2.0}, scenario_arguments={"a": 1})
+    arguments = {"speed": 1.0, "ego.speed": 2.0}
+    options = Request(agent="keep-lane", arguments=arguments, scenario_arguments={"a": 1}, trials=1, max_steps=9)
     example = {"arguments": {"ego": {"speed": 3.0, "mode": "x|y"}}, "scenario_arguments": {"b": 2}}
     found = _survives._asking(options, example)
-    assert found.arguments == {"speed": 1.0, "ego.speed": 3.0}  # a text with | would be read as a choice
-    assert found.scenario_arguments == {"a": 1, "b": 2}
-    assert found.agent == "keep-lane"
-    assert _survives._asking(HuntOptions(), {}).arguments == {}
+    assert found.arguments == {"speed": "1.0", "ego.speed": "3.0"}  # a text with | would be read as a choice
+    assert found.scenario_arguments == {"a": "1", "b": "2"}
+    assert found.agents == {"": "keep-lane"}
+    assert _survives._asking(Request(trials=1, max_steps=9), {}).arguments == {}
     with pytest.raises(UsageError, match="the example has the unknown key 'seeds'; did you mean 'seed'"):
         _survives._asking(options, {"seeds": 1})
     with pytest.raises(UsageError, match=r"the arguments of 'speed' are 3.0; give the arguments of each agent"):
@@ -116,8 +117,9 @@ def test_example_alone_is_run_and_judged(hunt, monkeypatch, outcome):
     else:
         with pytest.raises(AssertionError, match="This call runs that trial alone"):
             assert_survives("keep-lane", "toy", max_steps=80, example=example)
-    ((options, given, steps),) = asked
-    assert (options.agent, options.scenario, given, steps) == ("keep-lane", "toy", example, 80)
+    ((request, given),) = asked
+    assert (request.agents, request.scenario, given) == ({"": "keep-lane"}, "toy", example)
+    assert request.max_steps == 80
     assert hunt.asked == []
 
 
@@ -177,13 +179,13 @@ def test_trial_of_an_example_has_its_values_and_no_others(toy, monkeypatch, foun
         "arguments": {"ego": {"speed": 21.0}}, "scenario_arguments": {"gap_m": 20.0}, "only": ["left.1"],
         "disturbances": [erring.to_json()], "seed": 3,
     }  # fmt: skip
-    options = HuntOptions(agent="keep-lane", scenario="toy")
+    options = Request(agent="keep-lane", scenario="toy", trials=1, max_steps=77)
     for given in (example, {}):
         if found is Outcome.INVALID:
             with pytest.raises(CrashhuntError, match="the example could not be set up: "):
-                _survives._run_one(options, given, 77)
+                _survives._run_one(options, given)
         else:
-            assert _survives._run_one(options, given, 77).spec == made[-1].spec
+            assert _survives._run_one(options, given).spec == made[-1].spec
         assert made[-1].closed == 1
         assert not made[-1].worker.scratch.exists()
     full, empty = (executor.spec for executor in made[-2:])
