@@ -193,9 +193,10 @@ def write_binary_program(folder: Path, name: str = "binary") -> Path:
     return path
 
 
-def compile_program(folder: Path, name: str = "planner") -> Path:
-    """Compile the program in C into a folder, and return its path."""
-    source = folder / f"{name}.c"
+def compile_program(folder: Path, name: str = "planner", *, in_cpp: bool = False) -> Path:
+    """Compile the program in C, which is also C++, into a folder, and return its path."""
+    source = folder / (f"{name}.cpp" if in_cpp else f"{name}.c")
     source.write_text(IN_C, encoding="utf-8")
-    subprocess.run([str(COMPILER), "-O1", "-o", name, source.name, "-lm"], cwd=folder, check=True)
+    compiler = [str(COMPILER_CXX), "-std=c++17"] if in_cpp else [str(COMPILER)]
+    subprocess.run([*compiler, "-O1", "-o", name, source.name, "-lm"], cwd=folder, check=True)
     return folder / name

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crashhunt.agents._programs import _signature_in
+from crashhunt.agents._programs import _signature_in, write_road_map
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, PluginError, ProgramError
 from crashhunt.base.libraries import describe_library, load_order, path_of
@@ -62,6 +62,7 @@ class _Setup(ctypes.Structure):
         ("part_count", ctypes.c_int64),
         ("parts", ctypes.POINTER(_Array)),
         ("action", ctypes.POINTER(_Array)),
+        ("map", ctypes.c_char_p),
     )
 
 
@@ -79,10 +80,14 @@ class LibraryFactory:
 
     Args:
         locator: the locator, such as ``lib:./libplanner.so``.
+
+    Attributes:
+        reads_map: whether the library, which has been loaded, asks for the road map.
     """
 
     def __init__(self, locator: str) -> None:
         self._locator = locator
+        self.reads_map = False
         self._library: ctypes.CDLL | None = None
         self._defaults: dict[str, Value] = {}
 
@@ -141,7 +146,7 @@ class LibraryFactory:
             name: identifier of the vehicle.
             simulator: the simulator, with the spaces of the vehicle.
             arguments: arguments of the agent.
-            folder: not used, because a library runs in the process of the trial.
+            folder: scratch folder of the trial, for the road map.
             files: file of the snapshot by the text that names the original file.
             limit_s: time limit for each call of ``crashhunt_act``, in s; None if only that of the trial applies.
             is_forked: not used, because a fork of the process contains the agent.
@@ -153,6 +158,7 @@ class LibraryFactory:
             self._library, name=name, parts=Parts.of(simulator, name),
             action=Action(form.space, form.names), step_length_s=simulator.step_length_s,
             arguments={**self._defaults, **arguments}, limit_s=limit_s,
+            road_map=write_road_map(folder, simulator, name) if self.reads_map else None,
         )  # fmt: skip
 
     def _signature(self, declaration: str) -> Signature:
@@ -161,6 +167,7 @@ class LibraryFactory:
             # The macro for an argument ends with a comma, and an argument without a range has an empty text.
             declared = {name: facts for name, facts in ready["arguments"].items() if name}
             observed, action = str(declared.pop("<observation>", "")), str(declared.pop("<action>", ""))
+            self.reads_map = bool(declared.pop("<map>", False))
             ready["arguments"] = {
                 name: {key: value for key, value in facts.items() if value != ""} for name, facts in declared.items()
             }
@@ -206,11 +213,12 @@ class LibraryAgent:
         arguments: arguments of the agent.
         limit_s: time limit for each call of ``crashhunt_act``, in s; None if only that of the trial applies. A call
             cannot be interrupted, so a call that never returns is a hang of the trial.
+        road_map: path of the road map; None if the library does not ask for it, or there is none.
     """
 
     def __init__(
         self, library: ctypes.CDLL, *, name: str, parts: Parts, action: Action, step_length_s: float,
-        arguments: Mapping[str, Value], limit_s: float | None = None,
+        arguments: Mapping[str, Value], limit_s: float | None = None, road_map: str | None = None,
     ) -> None:  # fmt: skip
         self._limit_s = limit_s
         self._library, self._name, self._parts, self._action = library, name, parts, action
@@ -223,6 +231,7 @@ class LibraryAgent:
         self._setup = _Setup(
             name.encode(), step_length_s, len(arguments), self._arguments, len(described),
             (_Array * len(described))(*described), ctypes.pointer(action.described),
+            None if road_map is None else os.fsencode(road_map),
         )  # fmt: skip
         filled = [part.described(with_data=True) for part in parts.leaves]
         self._seen = _Observation(0, 0.0, len(filled), (_Array * len(filled))(*filled))

@@ -16,6 +16,7 @@ import subprocess
 import tempfile
 import time
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
 
@@ -35,16 +36,23 @@ from crashhunt.base.errors import ArgumentError, ProgramError
 from crashhunt.base.processes import descendants_of, kill
 from crashhunt.base.programs import command_of, library_path, words_of
 from crashhunt.base.text import one_line
-from crashhunt.simulators import FlattensObservations, NamesMetaActions, NamesObservations, ObservesParts
+from crashhunt.simulators import (
+    FlattensObservations,
+    NamesMetaActions,
+    NamesObservations,
+    ObservesParts,
+    ProvidesRoadMaps,
+)
 from crashhunt.trial import Argument, Signature, kind_of, parse_spec
+from crashhunt.world import describe_road_map
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from gymnasium import Space
 
     from crashhunt.agents._program_processes import ProgramProcess
-    from crashhunt.base.program_messages import Hello, Observe, ProgramRequest, SpaceDescription
+    from crashhunt.base.program_messages import Hello, Observe, ProgramRequest, Reset, SpaceDescription
     from crashhunt.panels import Panel
     from crashhunt.simulators import ActionForm, Simulator
     from crashhunt.trial import Kind, Value
@@ -138,7 +146,10 @@ class ProgramFactory:
             command_of(self._locator, files), folder / f"agent-{name}", libraries=library_path(self._locator, files),
             is_forked=is_forked,
         )  # fmt: skip
-        return ProgramAgent(process, hello, is_scalar=is_scalar, limit_s=limit_s, reused=reused_folder(name))
+        return ProgramAgent(
+            process, hello, partial(write_road_map, folder, simulator, name), is_scalar=is_scalar, limit_s=limit_s,
+            reused=reused_folder(name),
+        )  # fmt: skip
 
     def reused(self, folder: Path, files: Mapping[str, str]) -> ReusedProgram:
         """Return the program for several trials, which has not been started.
@@ -159,15 +170,20 @@ class ProgramAgent:
     Args:
         process: the process of the program, which has not been started.
         hello: the first message.
+        write_map: function that writes the road map, and returns its path; None if there is none.
         is_scalar: whether an action is one number, which the program sends as a list of one.
         limit_s: time limit for the answer to each observation, in s; None if only that of the trial applies.
         reused: folder of a program that has been started for several trials; None to start a program of its own.
     """
 
     def __init__(
-        self, process: _Process, hello: Hello, *, is_scalar: bool, limit_s: float | None, reused: Path | None = None
-    ) -> None:
+        self, process: _Process, hello: Hello, write_map: Callable[[], str | None], *, is_scalar: bool,
+        limit_s: float | None, reused: Path | None = None,
+    ) -> None:  # fmt: skip
         self._process = process
+        self._write_map = write_map
+        self._reads_map = False
+        self._map: str | None = None
         self._reused = reused
         self._limit_s = limit_s
         self._hello = hello
@@ -211,7 +227,12 @@ class ProgramAgent:
         action = answer["action"]
         return action[0] if self._is_scalar and isinstance(action, list) and len(action) == 1 else action
 
-    def _begin(self) -> None:
+    def _begin(self, *, again: bool = False) -> None:
+        """Start the program unless it runs, and begin the episode.
+
+        Args:
+            again: whether this is a fork of a trial, in which the road map has been written.
+        """
         process = self._process
         if not process.is_started or process.is_inherited:
             if self._reused is None or process.is_inherited:
@@ -219,11 +240,16 @@ class ProgramAgent:
             else:
                 process.attach(self._reused)
             try:
-                _signature_in(process.ask(self._hello, "hello"))
+                ready = process.ask(self._hello, "hello")
+                _signature_in(ready)
             except ProgramError as error:
                 fix = "answer hello before each reset, or omit reuse" if process.is_reused else error.fix
                 raise ProgramError(error.message, fix=fix) from None
-        process.ask({"type": "reset", "seed": self._seed}, "reset")
+            self._reads_map = bool(ready.get("map"))
+        message: Reset = {"type": "reset", "seed": self._seed}
+        if self._reads_map:
+            self._map = message["map"] = self._map if again else self._write_map()
+        process.ask(message, "reset")
 
     def _repeat(self) -> None:
         """Start the program for this fork of the trial, and have it answer all earlier observations again.
@@ -232,7 +258,7 @@ class ProgramAgent:
         """
         exchanges = self._process.exchanges
         try:
-            self._begin()
+            self._begin(again=True)
             for step, (data, action) in enumerate(exchanges):
                 answer = self._process.exchange(data, "act", f"observe of step {step}", self._limit_s)
                 if answer.get("action") != action:
@@ -553,6 +579,19 @@ _PARTS_FIX = "see crashhunt list observations"
 _LOGS_FIX = "write only messages to standard output, and logs to standard error"
 
 
+def write_road_map(folder: Path, simulator: Simulator, agent: str) -> str | None:
+    """Write the road map and the data of a vehicle into a folder as JSON, and return the path of the file.
+
+    Without road maps in the simulator, return None.
+    """
+    if not supports(simulator, ProvidesRoadMaps):
+        return None
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"map-{agent}.json"
+    file.write_bytes(to_json(describe_road_map(simulator.road_map(agent), simulator.vehicle_data(agent))))
+    return str(file)
+
+
 def _hello(agent: str, simulator: Simulator | None, arguments: Mapping[str, Value]) -> Hello:
     found: Hello = {
         "type": "hello", "protocol": PROTOCOL, "agent": agent, "arguments": dict(arguments), "observation": {},
@@ -602,6 +641,8 @@ def _signature_in(ready: Mapping[str, Any]) -> Signature:
     revision = ready.get("revision") or ""
     if not isinstance(revision, str):
         raise ProgramError(f"its revision is {_shown(revision)}, not a text")
+    if not isinstance(ready.get("map", False), bool):
+        raise ProgramError(f"its map is {_shown(ready['map'])} (allowed: true, false)", fix='send "map": true')
     if not isinstance(observation, list) or not all(isinstance(part, str) for part in observation):
         raise ProgramError(f"its observation is {_shown(observation)}, not a list of names", fix=_PARTS_FIX)
     if not isinstance(action, str):

@@ -57,6 +57,7 @@ struct crashhunt_setup {
     int64_t part_count;
     const struct crashhunt_array *parts;   /* the parts of an observation */
     const struct crashhunt_array *action;  /* the names and the number of the values of an action */
+    const char *map;      /* path of the road map as JSON; NULL without CRASHHUNT_MAP, or if the simulator has no map */
 };
 
 /* The observation of a step. */
@@ -85,7 +86,7 @@ CRASHHUNT_EXPORT void crashhunt_destroy(void *agent);
        CRASHHUNT_AGENT(CRASHHUNT_ARGUMENT("speed", "5.0:25.0", "m/s", 12.0) CRASHHUNT_ARGUMENT("mode", "a|b", "", "a"))
 
    A hunt varies the arguments within their ranges. CRASHHUNT_AGENT() declares none, and accepts any argument. It may
-   also contain CRASHHUNT_OBSERVES and CRASHHUNT_ACTS. */
+   also contain CRASHHUNT_OBSERVES, CRASHHUNT_ACTS and CRASHHUNT_MAP. */
 #define CRASHHUNT_AGENT(...)                       \
     CRASHHUNT_EXPORT const char crashhunt_agent[]; \
     const char crashhunt_agent[] = "{\"protocol\": " CRASHHUNT_PROTOCOL ", \"arguments\": {" __VA_ARGS__ "\"\": null}}";
@@ -98,6 +99,9 @@ CRASHHUNT_EXPORT void crashhunt_destroy(void *agent);
    see crashhunt list observations and crashhunt list actions. --observe, --action and the scenario take precedence. */
 #define CRASHHUNT_OBSERVES(parts) "\"<observation>\": \"" parts "\", "
 #define CRASHHUNT_ACTS(form) "\"<action>\": \"" form "\", "
+
+/* Have crashhunt write the road map and the data of the vehicle to the file that setup->map names. */
+#define CRASHHUNT_MAP "\"<map>\": true, "
 
 /* Return the value of a numeric argument. */
 static inline double crashhunt_number(const struct crashhunt_setup *setup, const char *name, double otherwise) {

@@ -1,4 +1,4 @@
-"""Messages of protocol 1, which crashhunt and the program of an agent exchange."""
+"""Messages of protocol 1, which crashhunt and the program of an agent exchange, and the road map."""
 
 from __future__ import annotations
 
@@ -32,10 +32,14 @@ class Hello(TypedDict):
 
 
 class Reset(TypedDict):
-    """The beginning of an episode."""
+    """The beginning of an episode.
+
+    ``map`` is the path of the road map if ``ready`` asks for it; null if the simulator has none.
+    """
 
     type: Literal["reset"]
     seed: int
+    map: NotRequired[str | None]
 
 
 class Observe(TypedDict):
@@ -65,7 +69,7 @@ class Ready(TypedDict):
     """The answer to ``hello``.
 
     ``observation`` lists the parts that the program observes, and ``action`` is the form of its actions, if neither the
-    command line nor the scenario names others.
+    command line nor the scenario names others. With ``map``, each ``reset`` has the path of the road map.
     """
 
     type: Literal["ready"]
@@ -74,6 +78,7 @@ class Ready(TypedDict):
     arguments: NotRequired[dict[str, DeclaredArgument]]
     observation: NotRequired[list[str]]
     action: NotRequired[str]
+    map: NotRequired[bool]
     revision: NotRequired[str]
 
 
@@ -89,6 +94,53 @@ class Act(TypedDict):
     type: Literal["act"]
     action: Any
     panels: NotRequired[Any]
+
+
+class MapLaneData(TypedDict):
+    """A lane of the road map; lines are lists of points, and a point is a list of x and y."""
+
+    id: str
+    road: str
+    index: int
+    center: list[list[float]]
+    left_line: list[list[float]]
+    right_line: list[list[float]]
+    width: float
+    speed_limit: float
+    length: float
+    successors: list[str]
+    predecessors: list[str]
+    left: str
+    right: str
+    can_change_left: bool
+    can_change_right: bool
+    allowed: list[str]
+    is_open: bool
+    is_internal: bool
+
+
+class StopLineData(TypedDict):
+    """The end of a lane at which a vehicle may have to stop."""
+
+    lane: str
+    junction: str
+    ends: list[list[float]]
+    kind: str
+    signal: str
+
+
+class RoadMapData(TypedDict):
+    """The road map, in the file that ``reset`` names: x to the east, y to the north, in m.
+
+    ``vehicle`` has the size and the limits of the vehicle.
+    """
+
+    lanes: dict[str, MapLaneData]
+    stop_lines: list[StopLineData]
+    route: list[str]
+    reference_path: list[list[float]]
+    is_left_hand: bool
+    vehicle: dict[str, float | str]
 
 
 ProgramRequest = Hello | Reset | Observe | Close

@@ -243,11 +243,14 @@ class Parts:
         stage.mkdir(parents=True, exist_ok=True)
         scenario = self._settings.scenario
         made: Simulator = locate("simulators", scenario.simulator)(scenario, stage)
-        if supports(made, ProvidesRoadMaps) and any(
-            "map" in self._factory(agent)[1].given for agent in scenario.agents
-        ):
+        if supports(made, ProvidesRoadMaps) and any(self._reads_map(agent) for agent in scenario.agents):
             made.prepare_road_maps()
         return made
+
+    def _reads_map(self, agent: str) -> bool:
+        """Return whether an agent receives the road map; a program asks for it only when it runs."""
+        factory, signature = self._factory(agent)
+        return factory.reads_map if isinstance(factory, LibraryFactory) else "map" in signature.given
 
     def agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Value]) -> Agent:
         """Create the agent of a vehicle; files that its arguments name come from the snapshot.

@@ -33,7 +33,7 @@ from typing import (
 from crashhunt.analysis import Counts, Shrunk
 from crashhunt.base.codec import JsonObject, Serializable, names_of_tuple, written_keys
 from crashhunt.base.json_types import ErrorData, Plain
-from crashhunt.base.program_messages import ProgramAnswer, ProgramRequest
+from crashhunt.base.program_messages import ProgramAnswer, ProgramRequest, RoadMapData
 from crashhunt.corpus import Bisected, CaseReport
 from crashhunt.crashes import COMPETENT_DRIVERS, CrashSummary, Fault, Group, Judgement, Note, TrustedOrigin
 from crashhunt.hunts import AuditReport, Checked, SignalList, StoppedBecause
@@ -451,6 +451,7 @@ SCHEMAS: dict[str, object] = {
 MESSAGES: dict[str, tuple[str, object]] = {
     "messages/exec-request": ("Message of crashhunt to the program of an agent (protocol 1)", ProgramRequest),
     "messages/exec-answer": ("Message of the program of an agent to crashhunt (protocol 1)", ProgramAnswer),
+    "messages/road-map": ("Road map for agents that are not Python", RoadMapData),
 }
 """The messages that crashhunt exchanges with other programs, each with the title of its schema."""
 

@@ -58,6 +58,7 @@ if TYPE_CHECKING:
         RoadMap as RoadMap,
         StopLine as StopLine,
         VehicleData as VehicleData,
+        describe_road_map as describe_road_map,
         lane_lines as lane_lines,
         spaced_line as spaced_line,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
+
+    from crashhunt.base.program_messages import RoadMapData
 
     Line = NDArray[np.float64]
 
@@ -139,6 +141,30 @@ class VehicleData:
     max_steering: float
     max_steering_rate: float
     max_jerk: float
+
+
+def describe_road_map(road_map: RoadMap, vehicle: VehicleData) -> RoadMapData:
+    """Return a map and the data of a vehicle as JSON-compatible data, always in the same order."""
+    return {
+        "lanes": {
+            name: {
+                "id": lane.id, "road": lane.road, "index": lane.index, "center": lane.center.tolist(),
+                "left_line": lane.left_line.tolist(), "right_line": lane.right_line.tolist(), "width": lane.width,
+                "speed_limit": lane.speed_limit, "length": lane.length, "successors": list(lane.successors),
+                "predecessors": list(lane.predecessors), "left": lane.left, "right": lane.right,
+                "can_change_left": lane.can_change_left, "can_change_right": lane.can_change_right,
+                "allowed": sorted(lane.allowed), "is_open": lane.is_open, "is_internal": lane.is_internal,
+            }
+            for name, lane in road_map.lanes.items()
+        },
+        "stop_lines": [
+            {"lane": one.lane, "junction": one.junction, "ends": one.ends.tolist(), "kind": one.kind,
+             "signal": one.signal}
+            for one in road_map.stop_lines
+        ],
+        "route": list(road_map.route), "reference_path": road_map.reference_path.tolist(),
+        "is_left_hand": road_map.is_left_hand, "vehicle": asdict(vehicle),
+    }  # fmt: skip
 
 
 class LaneLines(NamedTuple):

@@ -52,6 +52,7 @@ CRASHHUNT_EXPORT const char *crashhunt_act(void *agent, const struct crashhunt_o
     if (n < kept->action->size) action[n++] = crashhunt_number(kept, "flag", 7.0);
     if (n < kept->action->size) action[n++] = (double)strlen(crashhunt_text(kept, "word", ""));
     if (n < kept->action->size) action[n++] = crashhunt_number(kept, "none", 3.0);
+    if (n < kept->action->size) action[n++] = kept->map ? (double)strlen(kept->map) : -1.0;
     return NULL;
 }
 CRASHHUNT_EXPORT void crashhunt_destroy(void *agent) { (void)agent; }
@@ -143,7 +144,7 @@ def test_nested_observations_step_time_and_arguments_arrive_in_order(echo):
     image = spaces.Box(0, 255, (2, 2), np.uint8)
     camera = spaces.Dict({"gain": spaces.Discrete(5), "image": image})
     space = spaces.Dict({"bits": spaces.MultiBinary(2), "camera": camera, "xy": spaces.Tuple((SPACE, SPACE))})
-    form = SpaceAction(spaces.Box(-np.inf, np.inf, (2 + 1 + 4 + 56 + 56 + 6,), np.float64))
+    form = SpaceAction(spaces.Box(-np.inf, np.inf, (2 + 1 + 4 + 56 + 56 + 7,), np.float64))
     agent = agent_of(echo, form=form, space=space, flag=True, word="é")
     rows = observations(2)
     seen = {
@@ -152,8 +153,8 @@ def test_nested_observations_step_time_and_arguments_arrive_in_order(echo):
         "xy": (rows[0], rows[1]),
     }
     flat = [1, 0, 3, 1, 2, 3, 255, *rows[0].ravel(), *rows[1].ravel()]
-    assert form.encode(agent.act(seen)).tolist() == [*flat, 2, 0, 0.0, 1.0, 2, 3.0]
-    assert form.encode(agent.act(seen)).tolist() == [*flat, 2, 1, 0.25, 1.0, 2, 3.0]
+    assert form.encode(agent.act(seen)).tolist() == [*flat, 2, 0, 0.0, 1.0, 2, 3.0, -1.0]
+    assert form.encode(agent.act(seen)).tolist() == [*flat, 2, 1, 0.25, 1.0, 2, 3.0, -1.0]
 
 
 def test_the_parts_that_an_agent_observes_have_their_columns(tmp_path):

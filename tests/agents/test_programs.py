@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import pytest
 from gymnasium import spaces
+from json_schemas import validator
 from programs import COMPILER, DRIVER, compile_program, write_binary_program, write_program
 
 import crashhunt
@@ -24,6 +26,7 @@ from crashhunt.panels import labelled
 from crashhunt.plans import Request, plan_with_code, takes_of
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.trial import Range, signature_of
+from crashhunt.world import MapLane, RoadMap, StopLine, VehicleData
 
 COLUMNS = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
 SPACE = spaces.Box(-np.inf, np.inf, (8, 7), np.float32)
@@ -43,6 +46,32 @@ class Simulated:
 
     def __init__(self, form):
         self.actions = {"ego": form}
+
+
+class WithRoads(Simulated):
+    """A simulator whose map has as many lanes as `lanes` says."""
+
+    lanes = 1
+
+    def prepare_road_maps(self): ...
+
+    def road_map(self, agent):
+        lines = np.array([[0.0, 1.0], [2.0, 1.0], [4.0, 1.0]])
+        lane = MapLane(
+            id="0", road="r", index=0, center=lines, left_line=lines + 1.5, right_line=lines - 1.5, width=3.0,
+            speed_limit=13.9, length=4.0, successors=("1",), predecessors=(), left="", right="", can_change_left=False,
+            can_change_right=False, allowed=frozenset({"passenger", "bus"}), is_open=True, is_internal=False,
+        )  # fmt: skip
+        stop = StopLine(lane="0", junction="j", ends=lines[:2], kind="yield", signal="")
+        names = map(str, range(self.lanes))
+        return RoadMap(
+            lanes={name: replace(lane, id=name) for name in names}, stop_lines=(stop,), route=("0",),
+            reference_path=lines, is_left_hand=False,
+        )  # fmt: skip
+
+    def vehicle_data(self, agent):
+        numbers = dict.fromkeys((field.name for field in fields(VehicleData)), 1.0)
+        return VehicleData(**{**numbers, "kind": "passenger", "wheelbase": 2.8})
 
 
 def agent_of(locator, folder, *, form=None, limit_s=None, is_forked=False, **arguments):
@@ -326,6 +355,55 @@ def test_a_process_cannot_be_forked_if_its_program_has_seen_too_much(tmp_path, p
     with pytest.raises(forks.CannotForkError, match="a process with child processes cannot be forked"):
         forks.Copy(dict, known)
     agent.close()
+
+
+WITH_MAP = """\
+#!/bin/sh
+read -r hello; echo '{"type": "ready", "map": true}'
+while read -r line && [ "$line" != '{"type":"close"}' ]; do case $line in
+  *reset*) map=${line#*'"map":"'} lanes=$(grep -o '"is_internal":' "${map%%'"'*}" | wc -l); echo '{"type": "ok"}' ;;
+  *) echo "{\\"type\\": \\"act\\", \\"action\\": [$lanes, 0]}" ;;
+esac; done
+"""
+
+
+def test_a_program_that_asks_for_the_map_receives_its_path_with_each_reset_and_in_forks(tmp_path):
+    program = tmp_path / "a program"
+    program.write_text(WITH_MAP, encoding="utf-8")
+    program.chmod(0o755)
+    simulator = WithRoads(SpeedAndLaneChange())
+    agent = ProgramFactory(f"exec:'{program}'").agent("ego", simulator, {}, folder=tmp_path, files={}, is_forked=True)
+    known = replace(forks.held(), threads=forks.threads())
+    seen = observations(2)
+    simulator.lanes = 3
+    agent.reset(1)
+    assert agent.act(seen[0]) == [3, 0]
+    simulator.lanes = 2  # a fork must receive the map of the beginning
+    assert forks.Copy(lambda: {"action": agent.act(seen[1])}, known).answer(20) == {"action": [3, 0]}
+    agent.reset(2)
+    assert agent.act(seen[0]) == [2, 0]
+    agent.close()
+    data = json.loads((tmp_path / "map-ego.json").read_text())
+    validator("messages/road-map").validate(data)
+    assert (data["lanes"]["1"]["center"][1], data["lanes"]["1"]["allowed"]) == ([2.0, 1.0], ["bus", "passenger"])
+    assert (data["route"], data["vehicle"]["wheelbase"]) == (["0"], 2.8)
+
+
+def test_a_simulator_without_a_map_sends_none_and_other_programs_receive_no_key(tmp_path):
+    for wanted, expected in (("", ""), (', "map": true', ',"map":null')):
+        program = tmp_path / "tells"
+        program.write_text(
+            f'#!/bin/sh\nread -r line; echo \'{{"type": "ready"{wanted}}}\'; read -r line; echo $line >&2\n'
+        )
+        program.chmod(0o755)
+        agent = agent_of(f"exec:{program}", tmp_path)
+        agent.reset(1)
+        with (tmp_path / "log").open("w+b") as log:
+            agent._process._log = log.fileno()
+            with pytest.raises(ProgramError, match="exited with 0 instead of answering reset"):
+                agent.act(observations(1)[0])
+        agent.close()
+        assert (tmp_path / "log").read_text() == f'{{"type":"reset","seed":1{expected}}}\n'
 
 
 @pytest.mark.parametrize("kind", ["NaN", "shape"])

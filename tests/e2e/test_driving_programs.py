@@ -7,8 +7,12 @@ import io
 import json
 import shutil
 import subprocess
+from collections import Counter
+from importlib.util import find_spec
 
 import pytest
+from built_fmus import build_fmu
+from compiled_libraries import compile_library
 from json_schemas import validator
 from pages import Page
 from programs import COMPILER, COMPILER_CXX, DRIVER, compile_program, write_binary_program, write_program
@@ -184,41 +188,130 @@ def test_bisect_builds_the_program_of_each_revision(toy):
     assert found["subject"] == "change 1"
 
 
-def same_driver(shell, trials, scenario, *, max_steps=200):
-    """The digests of trials that one driver drives: in Python, and as programs in Python, with MessagePack and in C."""
+def same_driver(shell, trials, scenario, *words, max_steps=200):
+    """The trials that one driver drives: in Python, and in each way in which an agent need not be Python."""
     (shell.folder / "driver.py").write_text(DRIVER)
     write_program(shell.folder)
     write_binary_program(shell.folder)
     agents = ["driver:Driver", "exec:./planner", "exec:./binary"]
-    if COMPILER:
-        compile_program(shell.folder, "compiled")
-        agents.append("exec:./compiled")
-    found = []
+    for compiler, in_cpp in ((COMPILER, False), (COMPILER_CXX, True)):
+        if compiler:
+            language = "cpp" if in_cpp else "c"
+            compile_program(shell.folder, f"program_in_{language}", in_cpp=in_cpp)
+            compile_library(shell.folder, f"lib_in_{language}.so", words=("-DHARMLESS",), in_cpp=in_cpp)
+            agents += [f"exec:./program_in_{language}", f"lib:./lib_in_{language}.so"]
+    if COMPILER and find_spec("fmpy"):
+        for version in (2, 3):
+            (shell.folder / f"fmi{version}").mkdir()
+            agents.append(f"fmu:{build_fmu(shell.folder / f'fmi{version}', version).relative_to(shell.folder)}")
+    found = {}
     for number, agent in enumerate(agents):
         shell.crashhunt(
             "run", f"h{number}", "2", str(trials), str(max_steps), "--scenario", scenario, "--agent", agent, "--arg",
-            "speed=8.0:20.0", "--seed", "5", "--crash-on", "off_road",
+            "speed=8.0:20.0", "--seed", "5", "--keep-going", "--keep", "1", *words,
         )  # fmt: skip
-        found.append([(row["outcome"], row["steps"], row["digest"]) for row in rows_of(shell, f"h{number}")])
+        found[agent] = [(row["outcome"], row["steps"], row["digest"]) for row in rows_of(shell, f"h{number}")]
+        shutil.rmtree(shell.folder / f"h{number}")
     return found
 
 
 @pytest.mark.nightly
-@pytest.mark.long
-def test_one_driver_in_python_and_as_a_program_has_equal_digests(toy):
-    first, *others = same_driver(toy, 3, "toy")
-    assert len(set(first)) == 3
-    assert {"collision", "survived"} >= {outcome for outcome, _, _ in first}
-    assert all(other == first for other in others)
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize(
+    ("scenario", "words"),
+    [
+        ("motorway", ("--action", "speed_and_lane")),
+        ("merge", ()),
+        ("intersection", ()),
+        ("toy", ("--set", "gap_m=2.0:25.0")),
+    ],
+)
+def test_one_driver_has_equal_digests_over_200_trials_in_every_language_and_form(toy, scenario, words):
+    found = same_driver(toy, 200, scenario, *words)
+    first = found.pop("driver:Driver")
+    assert (len(first), len(set(first)) > 190) == (200, True)
+    assert {outcome for outcome, _, _ in first} <= {"survived", "collision", "off_road"}
+    assert found == dict.fromkeys(found, first)
+    print(f"{scenario}: {dict(Counter(outcome for outcome, _, _ in first))}, {len(found)} other forms: {[*found]}")
+
+
+WITH_MAP = {
+    "driver.py": """\
+class Driver:
+    def __init__(self, map, vehicle):
+        lane = map.lanes[map.route[-1]]
+        self.speed = len(map.lanes) % 7 + lane.speed_limit / 3 + vehicle.wheelbase + lane.center[1, 0] / 1000
+
+    def reset(self, seed): ...
+
+    def act(self, observation):
+        return self.speed, 0
+""",
+    "program": """\
+#!/usr/bin/env python3
+import json, sys
+for line in sys.stdin:
+    message = json.loads(line)
+    answer = {"type": "ready", "map": True}
+    if message["type"] == "reset":
+        with open(message["map"]) as file:
+            road = json.load(file)
+        lane, answer = road["lanes"][road["route"][-1]], {"type": "ok"}
+        speed = len(road["lanes"]) % 7 + lane["speed_limit"] / 3 + road["vehicle"]["wheelbase"]
+        speed += lane["center"][1][0] / 1000
+    elif message["type"] == "observe":
+        answer = {"type": "act", "action": [speed, 0]}
+    elif message["type"] == "close":
+        break
+    print(json.dumps(answer), flush=True)
+""",
+    "library.cpp": r"""
+#include <fstream>
+#include <iterator>
+#include <string>
+#include "crashhunt_agent.h"
+
+CRASHHUNT_AGENT(CRASHHUNT_MAP)
+
+const char* crashhunt_create(const crashhunt_setup* setup, void** agent) {
+    std::ifstream file(setup->map);
+    const std::string text{std::istreambuf_iterator<char>(file), {}};
+    const auto number = [&](std::size_t from, const std::string& key) {
+        return std::stod(text.substr(text.find(key, from) + key.size()));
+    };
+    int lanes = 0;
+    for (std::size_t at = 0; (at = text.find("\"is_internal\":", at)) != std::string::npos; at++) lanes++;
+    const auto end = text.find("\"]", text.find("\"route\":[")), begin = text.rfind('"', end - 1);
+    const auto lane = text.find("{\"id\":" + text.substr(begin, end - begin + 1));
+    *agent = new double(lanes % 7 + number(lane, "\"speed_limit\":") / 3 + number(0, "\"wheelbase\":")
+                        + number(text.find("],[", text.find("\"center\"", lane)), "],[") / 1000);
+    return nullptr;
+}
+const char* crashhunt_reset(void*, uint64_t) { return nullptr; }
+const char* crashhunt_act(void* agent, const crashhunt_observation*, double* action) {
+    action[0] = *static_cast<double*>(agent);
+    action[1] = 0;
+    return nullptr;
+}
+void crashhunt_destroy(void* agent) { delete static_cast<double*>(agent); }
+""",
+}
 
 
 @pytest.mark.nightly
-@pytest.mark.timeout(1800)
-@pytest.mark.parametrize("scenario", ["motorway", "merge", "toy"])
-def test_one_driver_has_equal_digests_over_200_trials(toy, scenario):
-    first, *others = same_driver(toy, 200, scenario)
-    assert len(set(first)) > 190
-    assert all(other == first for other in others)
+@pytest.mark.skipif(COMPILER_CXX is None, reason="no compiler for C++")
+def test_agents_in_python_and_cpp_receive_the_same_map(toy):
+    for name, text in WITH_MAP.items():
+        (toy.folder / name).write_text(text)
+    (toy.folder / "program").chmod(0o755)
+    compile_library(toy.folder, "library.so", WITH_MAP["library.cpp"], in_cpp=True)
+    found = []
+    for number, agent in enumerate(("driver:Driver", "exec:./program", "lib:./library.so")):
+        words = ("--scenario", "intersection", "--agent", agent, "--seed", "5", "--keep-going")
+        toy.crashhunt("run", f"h{number}", "1", "4", "40", *words)
+        found.append([(row["outcome"], row["digest"]) for row in rows_of(toy, f"h{number}")])
+    assert found == [found[0]] * 3
+    assert {outcome for outcome, _ in found[0]} <= {"survived", "collision"}
 
 
 @pytest.mark.skipif(COMPILER_CXX is None, reason="no compiler for C++")

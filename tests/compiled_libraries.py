@@ -1,11 +1,11 @@
-"""The driver of ``programs.py`` as a shared library in C; the library also does harm when told."""
+"""The driver of ``programs.py`` as a shared library in C and C++; the library also does harm when told."""
 
 from __future__ import annotations
 
 import subprocess
 from typing import TYPE_CHECKING
 
-from programs import COMPILER
+from programs import COMPILER, COMPILER_CXX
 
 import crashhunt.agents
 
@@ -58,7 +58,7 @@ static const char *harm(const char *kind, double *action) {
 }
 
 CRASHHUNT_EXPORT const char *crashhunt_create(const struct crashhunt_setup *setup, void **agent) {
-    struct driver *made = malloc(sizeof *made);
+    struct driver *made = (struct driver *)malloc(sizeof *made);
     const struct crashhunt_array *part;
     made->speed = crashhunt_number(setup, "speed", 0.0) + needed();
     made->at = crashhunt_number(setup, "at", 0.0);
@@ -75,13 +75,13 @@ CRASHHUNT_EXPORT const char *crashhunt_create(const struct crashhunt_setup *setu
 }
 
 CRASHHUNT_EXPORT const char *crashhunt_reset(void *agent, uint64_t seed) {
-    struct driver *self = agent;
+    struct driver *self = (struct driver *)agent;
     self->seed = seed;
     return strcmp(self->harm, "reset") == 0 ? "no map" : NULL;
 }
 
 CRASHHUNT_EXPORT const char *crashhunt_act(void *agent, const struct crashhunt_observation *seen, double *action) {
-    struct driver *self = agent;
+    struct driver *self = (struct driver *)agent;
     const struct crashhunt_array *part = &seen->parts[self->kinematics];
     double nearest = HUGE_VAL;
     int64_t i;
@@ -103,11 +103,14 @@ CRASHHUNT_EXPORT void crashhunt_destroy(void *agent) {
 """
 
 
-def compile_library(folder: Path, name: str = "libplanner.so", source: str = IN_C, words: tuple[str, ...] = ()) -> Path:
+def compile_library(
+    folder: Path, name: str = "libplanner.so", source: str = IN_C, words: tuple[str, ...] = (), *, in_cpp: bool = False
+) -> Path:
     """Compile the library into a folder, and return its path."""
-    file = folder / f"{name}.c"
+    file = folder / (f"{name}.cpp" if in_cpp else f"{name}.c")
     file.write_text(source, encoding="utf-8")
-    command = [str(COMPILER), "-std=c99", "-D_GNU_SOURCE", "-g", "-O1", "-Wall", "-Werror", "-fvisibility=hidden"]
+    compiler = [str(COMPILER_CXX), "-std=c++17"] if in_cpp else [str(COMPILER), "-std=c99"]
+    command = [*compiler, "-D_GNU_SOURCE", "-g", "-O1", "-Wall", "-Werror", "-fvisibility=hidden"]
     command += ["-shared", "-fPIC", f"-I{HEADER_FOLDER}", "-o", name, file.name, *words, "-lm"]
     subprocess.run(command, cwd=folder, check=True)
     return folder / name
