@@ -304,6 +304,11 @@ PARTS: Mapping[str, Part] = {
             settings=(
                 Setting("points", 50, 2, 1000, "", "number of points"),
                 Setting("spacing", 2.0, 0.1, 50.0, "m", "distance between two points"),
+                Setting(
+                    "behind", 0.0, 0.0, 200.0, "m",
+                    "distance of the first point behind the point that is nearest to the vehicle, less where no lane "
+                    "leads there",
+                ),
             ),
         ),
         Part(

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 _GRID_M = 0.5  # upper bound of the distance of two prepared points
-_BEHIND_M = 8.0  # the centre of a vehicle may be this far behind its front, which is on the lane
+CENTER_BEHIND_M = 8.0  # the centre of a vehicle may be this far behind its front, which is on the lane
 _NONE = -1
 
 
@@ -93,7 +93,7 @@ class LanePaths:
 
     def _made(self, lane: GraphLane) -> LanePath:
         sampling = self._sampling
-        reach_behind = max(_BEHIND_M, (sampling.before + 1) * sampling.spacing_m)
+        reach_behind = max(CENTER_BEHIND_M, (sampling.before + 1) * sampling.spacing_m)
         reach_ahead = (sampling.points - sampling.before + 1) * sampling.spacing_m
         ahead = iter(self._ahead(lane))
         own = next(ahead, lane)
@@ -124,7 +124,7 @@ class LanePaths:
         data = np.array([(one.data.width_m, one.data.speed_mps, one.index) for one in lanes])[owner[segment]]
         rows = np.column_stack((np.ones(count), place, np.arctan2(step[:, 1], step[:, 0]), data))
         last = min(count - 1, first + math.ceil((end - start) / grid - 1e-9))
-        begin = max(0, first - math.ceil(_BEHIND_M / grid))
+        begin = max(0, first - math.ceil(CENTER_BEHIND_M / grid))
         return LanePath(rows, begin, first, last)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from libsumo import _libsumo as sumo
 
 from crashhunt.sumo._lane_graph import is_open
-from crashhunt.sumo._lane_paths import LanePaths, Sampling, straight_ahead, straight_behind
+from crashhunt.sumo._lane_paths import CENTER_BEHIND_M, LanePaths, Sampling, straight_ahead, straight_behind
 from crashhunt.sumo._reader_protocol import Reader
 from crashhunt.world import PERSON, is_person
 
@@ -229,8 +229,11 @@ class RouteReader(Reader):
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
-        self._sampling = Sampling(setup.settings["spacing"], setup.shape[0], 0)
-        self._steps = np.arange(setup.shape[0]) * self._sampling.stride
+        spacing, points = setup.settings["spacing"], setup.shape[0]
+        self._before = min(points - 1, math.floor(setup.settings["behind"] / spacing + 1e-9))
+        rear = self._before + math.ceil(CENTER_BEHIND_M / spacing) if self._before else 0
+        self._sampling = Sampling(spacing, points - self._before + rear, rear)
+        self._steps = np.arange(points) * self._sampling.stride
         self._paths: dict[tuple[int, int], LanePaths] = {}
 
     def observe(self, moment: Moment) -> Array:
@@ -241,13 +244,17 @@ class RouteReader(Reader):
             return found
         path = self._path(place)
         part = path.rows[path.begin : path.last + 1]
-        nearest = path.begin + int(((part[:, 1] - place.x) ** 2 + (part[:, 2] - place.y) ** 2).argmin())
-        rows = path.rows[nearest + self._steps[self._steps < len(path.rows) - nearest]]
+        start = path.begin + int(((part[:, 1] - place.x) ** 2 + (part[:, 2] - place.y) ** 2).argmin())
+        start -= min(self._before, start // self._sampling.stride) * self._sampling.stride
+        rows = path.rows[start + self._steps[self._steps < len(path.rows) - start]]
         found[: len(rows)] = rows[:, _ROUTE_COLUMNS]
         return found
 
     def write(self, draft: Draft, at: int, moment: Moment) -> None:
         """Write the columns of ``route``."""
+        if self._before:  # the core writes the points ahead only
+            super().write(draft, at, moment)
+            return
         place = self._setup.places.find(moment)
         if place is not None and place.number >= 0:
             path = self._path(place)

@@ -105,20 +105,16 @@ class Town:
             yield [one for one in libsumo.vehicle.getIDList() if libsumo.vehicle.getLaneID(one)]
 
     def reader(self, vehicle, part):
-        found = self._readers.get(vehicle)
+        found = self._readers.get((vehicle, part))
         if found is None:
-            places = Places(self.graph, vehicle)
-            found = self._readers[vehicle] = {
-                name: kind(
-                    ReaderSetup(
-                        agent=vehicle, request=parse_parts([name], where="here")[0], graph=self.graph, places=places,
-                        conflicts=self.conflicts,
-                        step_length_s=STEP_S, start_m=0.0, start_s=0.0,
-                    )
+            found = self._readers[vehicle, part] = READERS[part.partition(":")[0]](
+                ReaderSetup(
+                    agent=vehicle, request=parse_parts([part], where="here")[0], graph=self.graph,
+                    places=Places(self.graph, vehicle), conflicts=self.conflicts,
+                    step_length_s=STEP_S, start_m=0.0, start_s=0.0,
                 )
-                for name, kind in READERS.items()
-            }  # fmt: skip
-        return found[part]
+            )  # fmt: skip
+        return found
 
     def read(self, vehicle, part):
         return self.reader(vehicle, part).observe(moment_of(vehicle))
@@ -263,6 +259,19 @@ def test_route_points_follow_the_edges_of_the_route(town):
             present = shown[:, 0].astype(bool)
             assert not present[np.argmin(present) :].any() or present.all()
     assert checked > 1000
+
+
+def test_route_points_behind_lead_to_the_points_ahead(town):
+    checked = 0
+    for vehicles in (vehicles for number, vehicles in enumerate(town.steps(60)) if number % 20 == 19):
+        for vehicle in vehicles:
+            ahead, around = (town.read(vehicle, part) for part in ("route", "route:points=40:behind=15"))
+            behind = int(np.hypot(*(around[:8, 1:3] - ahead[0, 1:3]).T).argmin())
+            assert around[behind:, :3] == pytest.approx(ahead[: 40 - behind, :3], abs=1e-6)
+            assert np.hypot(*np.diff(around[: behind + 1, 1:3], axis=0).T).max(initial=0.0) < 2.0 + 1e-9
+            assert behind == 7 or libsumo.vehicle.getDistance(vehicle) < 20.0
+            checked += behind
+    assert checked > 100
 
 
 def crossing(mine, theirs):
