@@ -216,12 +216,12 @@ def test_attack_on_the_processes_above_costs_no_other_trial(run, attack):
 
 def test_handler_that_raises_again_and_again_is_the_agents(run):
     """Also while crashhunt finds out whose exception it is, and what it says."""
-    found = run([("raises_forever", "fifth act")] * 6)
+    found = run([("raises_forever", "fifth act")] * 6, timeout_s=60.0)  # none of these hangs
     assert {(str(result.outcome), result.failure.agent) for result in found.values()} == {(ERROR, "ego")}
 
 
 def test_fatal_signal_in_a_signal_handler_is_named_as_the_agents(run):
-    (result,) = run([("segfaults", "signal handler")]).values()
+    (result,) = run([("segfaults", "signal handler")], timeout_s=60.0).values()
     assert (str(result.outcome), result.failure.agent) == (DIED, "ego")
     # The signal arrives after a time, not at a place: now and then in the middle of a call of act().
     assert re.match(r"the process died of SIGSEGV in ego's (code at|act\(\) of) step \d+$", result.failure.message)

@@ -219,20 +219,20 @@ def test_resumed_hunt_names_new_files_that_do_not_count(agent, tmp_path):
 
 @pytest.mark.parametrize(
     ("timeout_s", "says"),
-    [(0.5, "2 of the hunt's trials took longer or hung"), pytest.param(9, "1 of the", marks=pytest.mark.nightly)],
+    [(5, "2 of the hunt's trials took longer or hung"), pytest.param(90, "1 of the", marks=pytest.mark.nightly)],
 )
 def test_other_time_limit_is_refused_where_earlier_trials_would_end_otherwise(agent, tmp_path, timeout_s, says):
-    run(3, timeout_s=5)
-    run(4, timeout_s=4)  # which changes nothing
+    run(3, timeout_s=50)
+    run(4, timeout_s=40)  # which changes nothing
     with closing(Ledger(tmp_path / "h" / "ledger.sqlite", writable=True)) as ledger:
         snapshot = ledger.snapshot_of(0)
         for number, outcome, wall_s in (
-            (0, Outcome.HANG, 3.0), (1, Outcome.SURVIVED, 3.0), (2, Outcome.SURVIVED, 0.1), (3, Outcome.SURVIVED, 0.1),
+            (0, Outcome.HANG, 30.0), (1, Outcome.SURVIVED, 30.0), (2, Outcome.SURVIVED, 0.1), (3, Outcome.SURVIVED, 0.1),
         ):  # fmt: skip
             ledger.record(replace(ledger.result(number), outcome=outcome, wall_s=wall_s), snapshot=snapshot)
-    with pytest.raises(HuntDirectoryError, match=f"--timeout was 4 and is now {timeout_s}, but {says}") as caught:
+    with pytest.raises(HuntDirectoryError, match=f"--timeout was 40 and is now {timeout_s}, but {says}") as caught:
         run(5, timeout_s=timeout_s)
-    assert caught.value.fix == "give --timeout 4, or a new directory"
+    assert caught.value.fix == "give --timeout 40, or a new directory"
 
 
 @pytest.mark.nightly
