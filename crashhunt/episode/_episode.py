@@ -136,7 +136,11 @@ class Episode(Forkable, Ending):
         setup_s: wall time that `start` took, in s.
         setup_steps: number of simulated steps before the first step of the trial; None if the simulator does not report
             it.
+        live: x, y, heading and speed of the only agent while the requirements read a step whose scene is not made;
+            otherwise None.
     """
+
+    live: tuple[float, float, float, float] | None = None
 
     def __init__(
         self,
@@ -324,6 +328,10 @@ class Episode(Forkable, Ending):
             return self._judge(finding, actions, truncations)
         except BaseException as error:
             return self._break(error)
+
+    def look_ahead(self) -> tuple[str, float, float] | None:
+        """Return name, gap and speed of the vehicle ahead if `live` is not None; None if they cannot be read."""
+        return None
 
     def close(self) -> None:
         """Close the agents; a second call does nothing. The result of the episode does not change."""

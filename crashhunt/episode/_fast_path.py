@@ -28,6 +28,7 @@ from crashhunt.oracles import (
     Overlap,
     RedLight,
     ReportedCollision,
+    RequirementOracle,
     Teleport,
     TrafficEvents,
     WrongWay,
@@ -140,7 +141,8 @@ def make_fast_path(
     if any(overrides_hook(one, "observation") or overrides_hook(one, "action") for one in rest):
         return None
     always = any(overrides_hook(one, "scene") for one in rest)
-    always = always or any(type(one) is not Overlap and type(one) not in _EVENT_ORACLES for one in oracles)
+    by_themselves = (Overlap, RequirementOracle, *_EVENT_ORACLES)
+    always = always or any(type(one) not in by_themselves for one in oracles)
     overlaps = any(type(one) is Overlap for one in oracles)
     simulator.at_once.core.judge(overlaps, MAX_BRAKING_MPS2, always, max_steps, Nearness.EVERY)
     return FastPath(simulator.at_once, first, simulator.agents[0], encoders[0])
@@ -154,6 +156,8 @@ class FastEpisode(Episode):
     """Runs a step in the core; None where steps run in Python."""
     _is_behind = False
     """Whether the core has run steps whose state is not read yet."""
+    _requirements: Sequence[RequirementOracle] = ()
+    """The requirements, which read their signals after each step of the core."""
 
     @property
     def observations(self) -> Observations:
@@ -188,7 +192,30 @@ class FastEpisode(Episode):
             return self._finish_step(come)
         self._is_behind = True
         self.steps += 1
-        return None
+        return self._watch_requirements()
+
+    def look_ahead(self) -> tuple[str, float, float] | None:
+        """Return name, gap and speed of the vehicle ahead, in a step of the core."""
+        assert self._fast is not None
+        return self._fast.at_once.core.ahead()
+
+    def _watch_requirements(self) -> TrialResult | None:
+        """Let the requirements read a step of the core, mostly without its scene."""
+        if not self._requirements:
+            return None
+        assert self._fast is not None
+        try:
+            self.live = self._fast.at_once.core.state()
+            violated = [one.watch() for one in self._requirements]
+        except BaseException as error:
+            return self._break(error)
+        finally:
+            self.live = None
+        if True not in violated:
+            return None
+        for one in self._requirements:
+            one.hold()
+        return self._show_step()
 
     def _catch_up(self) -> None:
         """Update the episode to the state of the core."""
@@ -208,7 +235,7 @@ class FastEpisode(Episode):
         if come in (DONE, ASK):
             self._is_behind = True
             self.steps += 1
-            return self._show_step() if come == ASK else None
+            return self._show_step() if come == ASK else self._watch_requirements()
         self._catch_up()
         if actions is None:
             return super().step()
@@ -256,6 +283,7 @@ class FastEpisode(Episode):
         if result is None and self._disturbed is None:
             self._fast = make_fast_path(self.simulator, self._observers, self._oracles, self._max_steps, self._encoders)
             self._take = None if self._fast is None else self._fast.at_once.core.take
+            self._requirements = [one for one in self._oracles if type(one) is RequirementOracle]
         return result
 
     def _add(self, result: TrialResult) -> TrialResult:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol, cast
 
 import numpy as np
 
@@ -86,6 +86,11 @@ class SignalledEpisode(Protocol):
     simulator: Simulator
     names: tuple[str, ...]
     steps: int
+    live: tuple[float, float, float, float] | None
+    """x, y, heading and speed of the only agent in a step without an event, whose scene is made when it is read."""
+
+    def look_ahead(self) -> tuple[str, float, float] | None:
+        """Return name, gap and speed of the vehicle ahead, if `live` is not None; None if they cannot be read."""
 
     @property
     def scene(self) -> Scene | None:
@@ -123,14 +128,17 @@ class TrialSignals:
         has_actors = agent in self._scene().roster.index
 
         def read() -> Sequence[float] | None:
-            if has_actors and agent not in self._scene().roster.index:
+            if has_actors and episode.live is None and agent not in self._scene().roster.index:
                 return None
             row = [one() for one in readers]
-            return (
-                None
-                if None in row and not episode.steps
-                else [_known(value, name) for value, name in zip(row, names, strict=True)]
-            )
+            for value in row:
+                if value is None or value != value:
+                    break
+            else:
+                return cast("list[float]", row)
+            if None in row and not episode.steps:
+                return None
+            return [_known(value, name) for value, name in zip(row, names, strict=True)]
 
         return read
 
@@ -201,7 +209,10 @@ class TrialSignals:
                 self._readers[agent] = _SceneReader(self._episode, agent)
             return self._readers[agent].read(name)
         if name in self._events():
-            return lambda: any(event.kind == name and event.agent == agent for event in self._scene().events)
+            return lambda: (
+                self._episode.live is None
+                and any(event.kind == name and event.agent == agent for event in self._scene().events)
+            )
         if name == _REWARD:
             return lambda: self._episode.rewards.get(agent) if self._episode.steps else None
         element = _OBSERVATION.fullmatch(name)
@@ -281,13 +292,13 @@ class _SceneReader:
         """Return the function that reads a signal."""
         simple: dict[str, Read] = {
             "time_s": lambda: self._episode.steps * self._step_s,
-            "x": lambda: self._scene.points[self._row][0],
-            "y": lambda: self._scene.points[self._row][1],
-            "heading": lambda: self._scene.headings[self._row],
+            "x": lambda: self._place()[0],
+            "y": lambda: self._place()[1],
+            "heading": self._heading,
             "speed": self._speed,
             "acceleration": _Rate(self._speed, self._step_s),
             "jerk": _Rate(_Rate(self._speed, self._step_s), self._step_s, unknown=1),
-            "yaw_rate": _Rate(lambda: self._scene.headings[self._row], self._step_s, turn=True),
+            "yaw_rate": _Rate(self._heading, self._step_s, turn=True),
             "gap_m": lambda: self._ahead()[0],
             "headway_s": self._headway,
             "ttc_s": self._time_to_collision,
@@ -314,8 +325,18 @@ class _SceneReader:
     def _row(self) -> int:
         return self._scene.roster.index[self._agent]
 
+    def _place(self) -> tuple[float, float]:
+        state = self._episode.live
+        x, y = self._scene.points[self._row] if state is None else state[:2]
+        return x, y
+
+    def _heading(self) -> float:
+        state = self._episode.live
+        return self._scene.headings[self._row] if state is None else state[2]
+
     def _speed(self) -> float:
-        return self._scene.speeds[self._row]
+        state = self._episode.live
+        return self._scene.speeds[self._row] if state is None else state[3]
 
     def _nearest(self, kind: str) -> Neighbor | None:
         simulator = self._episode.simulator
@@ -328,9 +349,15 @@ class _SceneReader:
     def _ahead(self) -> tuple[float, float]:
         """Return the gap to the nearest vehicle ahead, in m, and its speed, in m/s; both infinite without one."""
         if self._ahead_at != self._episode.steps:  # several signals need it in each step
-            self._ahead_at, nearest = self._episode.steps, self._nearest("vehicle")
-            self._last_ahead = (math.inf, math.inf) if nearest is None else (nearest.gap_m, nearest.speed_mps)
-            self._leader = "" if nearest is None else nearest.actor
+            self._ahead_at = self._episode.steps
+            found = self._episode.look_ahead() if self._episode.live is not None else None
+            if found is None:
+                nearest = self._nearest("vehicle")
+                found = (
+                    ("", math.inf, math.inf) if nearest is None else (nearest.actor, nearest.gap_m, nearest.speed_mps)
+                )
+            self._leader, *ahead = found
+            self._last_ahead = ahead[0], ahead[1]
         return self._last_ahead
 
     def _leader_change(self) -> tuple[float, bool]:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 11
+_INTERFACE = 12
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -166,6 +166,16 @@ class UsualSteps(Protocol):
 
     def stop(self) -> None:
         """Run no further steps; completed steps are still reported."""
+
+    def ahead(self) -> tuple[str, float, float] | None:
+        """Return name, gap (m) and speed (m/s) of the vehicle ahead of the agent, in a complete step without persons.
+
+        Without a vehicle ahead, the name is empty, and the numbers are infinite. The method returns None if libsumo
+        fails.
+        """
+
+    def state(self) -> tuple[float, float, float, float] | None:
+        """Return x and y (m), heading (rad) and speed (m/s) of the agent; None if the core runs no steps."""
 
     def told(
         self,

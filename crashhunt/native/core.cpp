@@ -69,11 +69,11 @@ typedef const void *(*Singleton)();
 struct Sumo {
     PositionOf position;
     NumberOf angle, speed;
-    NumberOf driven, aside, aside_speed, along, decel, acceleration;
+    NumberOf driven, aside, aside_speed, along, decel, acceleration, min_gap;
     WholeOf lane_index, stop_state, signals;
     NameOf road, lane;
     NumberAt lane_angle;
-    NeighborOf follower;
+    NeighborOf follower, leader;
     Command set_speed;
     Number time;
     Count departed, arrived, vanishing, appearing, parking, unparking, on_foot, emergencies;
@@ -139,6 +139,8 @@ PyObject *bind(PyObject *, PyObject *path) {
                  find(library, "_ZN7libsumo7Vehicle9getRoadIDE" STRING, found.road) &&
                  find(library, "_ZN7libsumo7Vehicle9getLaneIDE" STRING, found.lane) &&
                  find(library, "_ZN7libsumo7Vehicle11getFollowerE" STRING "d", found.follower) &&
+                 find(library, "_ZN7libsumo7Vehicle9getLeaderE" STRING "d", found.leader) &&
+                 find(library, "_ZN7libsumo7Vehicle9getMinGapE" STRING, found.min_gap) &&
                  find(library, "_ZN7libsumo7Vehicle8setSpeedE" STRING "d", found.set_speed) &&
                  find(library, "_ZN7libsumo4Lane8getAngleE" STRING "d", found.lane_angle) &&
                  find(library, "_ZN7libsumo6Helper10getVehicleE" STRING, found.vehicle) &&

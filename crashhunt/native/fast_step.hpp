@@ -9,6 +9,7 @@
 enum Come { DONE, ASK, REFUSED, ANSWERED, SIMULATED };
 enum Phase { ACTING = 1, SIMULATING = 2 }; // as BlackBoxHeader has them
 
+const double LOOK_M = 60.0, LOOK_S = 6.0; // as in _surroundings.py
 const int LANES_EVERY = 10, DIRECTION_EVERY = 10; // steps
 const double STANDING = 0.1;                      // m/s, as Standstill.SPEED
 const double LOOKED_INTO = 2.0, TOLERANCE = 0.01; // m/s², as of HardBraking
@@ -713,6 +714,38 @@ PyObject *usual_columns(PyObject *object, PyObject *back) {
     return reinterpret_cast<PyObject *>(new_columns(vehicles, std::vector<double>(moment.values)));
 }
 
+// state() -> (x, y, heading, speed) of the agent in the step that is complete
+PyObject *usual_state(PyObject *object, PyObject *) {
+    const Steps &steps = steps_of(object);
+    const std::vector<double> &values = steps.now.values;
+    const size_t count = values.size() / 4, row = steps.sight.row;
+    if (!steps.ready || row >= count) {
+        Py_RETURN_NONE;
+    }
+    return Py_BuildValue("(dddd)", values[2 * row], values[2 * row + 1], values[2 * count + row],
+                         values[3 * count + row]);
+}
+
+// ahead() -> (name, gap, speed) of the vehicle ahead, as `_surroundings.nearest_ahead_of` returns them; there are no
+// persons in a step that is complete here, so none of them can be ahead
+PyObject *usual_ahead(PyObject *object, PyObject *) {
+    const Steps &steps = steps_of(object);
+    if (unbound()) {
+        return nullptr;
+    }
+    try {
+        const double look = std::max(LOOK_M, LOOK_S * std::max(0.0, sumo.speed(steps.agent)));
+        const std::pair<std::string, double> found = sumo.leader(steps.agent, look);
+        if (found.first.empty()) {
+            return Py_BuildValue("(sdd)", "", HUGE_VAL, HUGE_VAL);
+        }
+        return Py_BuildValue("(Ndd)", text_of(found.first), found.second + sumo.min_gap(steps.agent),
+                             std::max(0.0, sumo.speed(found.first)));
+    } catch (...) {
+        Py_RETURN_NONE;
+    }
+}
+
 // reads(vehicles) -> what libsumo says of them and of the agent, by the functions that are used here alone
 PyObject *usual_reads(PyObject *object, PyObject *given) {
     const Steps &steps = steps_of(object);
@@ -762,6 +795,8 @@ PyMethodDef usual_methods[] = {
     {"stop", usual_stop, METH_NOARGS, "Take no further steps."},
     {"told", usual_told, METH_NOARGS, "Return what is known about the step that is complete."},
     {"columns", usual_columns, METH_O, "Return where everybody is, or was a step before."},
+    {"ahead", usual_ahead, METH_NOARGS, "Return name, gap and speed of the vehicle ahead."},
+    {"state", usual_state, METH_NOARGS, "Return position, heading and speed of the agent."},
     {"reads", usual_reads, METH_O, "Return what is read here alone, to be compared."},
     {nullptr, nullptr, 0, nullptr},
 };

@@ -48,7 +48,8 @@ class RequirementOracle:
         self._title = title
         self._requirement = _parsed(formula)
         self._watched: list[_Watched] = []
-        self._has_begun = False
+        self._has_begun = self._is_held = False
+        self._violated: list[_Watched] = []  # in this step
         self._at_start: list[Finding] = []  # a trial cannot end before its first step, so they are returned after it
 
     def read_signals(self, source: SignalSource, agents: Sequence[str]) -> None:
@@ -67,6 +68,25 @@ class RequirementOracle:
     def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
         """Return a finding for each agent whose requirement is certainly violated."""
         found, self._at_start = self._at_start, []
+        if not self._is_held:
+            self._advance()
+        self._is_held = False
+        found += [self._finding(watched, scene) for watched in self._violated]
+        self._violated.clear()
+        if not self._has_begun:
+            self._has_begun, self._at_start, found = True, found, []
+        return found
+
+    def watch(self) -> bool:
+        """Read the signals of a step instead of `check`; return whether `check` must follow `hold` in this step."""
+        self._advance()
+        return bool(self._violated or self._at_start)
+
+    def hold(self) -> None:
+        """Keep the next `check` from reading the signals of the step, which `watch` has read."""
+        self._is_held = True
+
+    def _advance(self) -> None:
         for watched in self._watched:
             try:
                 row = watched.read()
@@ -76,10 +96,7 @@ class RequirementOracle:
             except (FormulaError, UnusableValueError) as error:
                 raise self._unusable(error) from None
             if watched.is_violated:
-                found.append(self._finding(watched, scene))
-        if not self._has_begun:
-            self._has_begun, self._at_start, found = True, found, []
-        return found
+                self._violated.append(watched)
 
     def check_end(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
         """Return a finding for each agent whose requirement is violated because the trial ends here."""

@@ -376,12 +376,10 @@ class SumoSimulator:
 
     def nearest_ahead(self, agent: str, kind: str) -> Neighbor | None:
         """Return the vehicle ahead, or the next red light; None without one."""
-        self.scene()  # brings SUMO to the current step
         return nearest_ahead_of(agent, kind)
 
     def speed_limit(self, agent: str) -> float:
         """Return the speed limit of the vehicle's lane, which can differ from that of the network file."""
-        self.scene()
         return float(libsumo.lane.getMaxSpeed(libsumo.vehicle.getLaneID(agent)))
 
     def resolve_target(self, disturbance: Disturbance) -> str:

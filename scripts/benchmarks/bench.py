@@ -337,8 +337,8 @@ def bench_requirement() -> Iterator[Figure]:
         note = f"formula {found['formula']:.1f} µs, step without a requirement {found['whole']:.0f} µs"
         name = f"requirement_{scenario}"
         yield Figure(name=f"{name}_share", value=found["share"], unit="%", better="lower", target=3.0, note=note)
-        note = "with the Python part of each step, which the compiled core omits without a requirement"
-        yield Figure(name=f"{name}_ratio", value=found["ratio"], unit="x", better="lower", target=None, note=note)
+        note = "whole trials of 1,000 steps; the compiled core runs the steps, and Python reads two signals"
+        yield Figure(name=f"{name}_ratio", value=found["ratio"], unit="x", better="lower", target=1.1, note=note)
 
 
 def bench_step() -> Iterator[Figure]:

@@ -16,7 +16,7 @@ from crashhunt.base.errors import RecorderError
 from crashhunt.crashes import own_frames
 from crashhunt.episode import FastEpisode, Nearness, Observer, Recorder
 from crashhunt.native import ANSWERED, ASK, DONE, REFUSED, SIMULATED
-from crashhunt.oracles import OffRoad, Overlap, RedLight, ReportedCollision, TooClose
+from crashhunt.oracles import OffRoad, Overlap, RedLight, ReportedCollision, RequirementOracle, TooClose
 from crashhunt.recording import BlackBox, Tag
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators import SpeedAndLaneChange
@@ -131,6 +131,75 @@ def test_most_steps_are_taken_at_once(street):
     assert street.comes[DONE] > 80  # with those in which somebody comes
     assert not street.comes[SIMULATED]
     assert street.comes[ASK] == 1  # the last one
+
+
+ALL_SIGNALS = (
+    "always (time_s + x + y + heading + speed + acceleration + jerk + yaw_rate < 1e6 and min(gap_m, headway_s, ttc_s, "
+    "leader_speed, priority_m, priority_arrival_s, red_light_m) + abs(leader_acceleration) + speed_limit >= 0 and "
+    "clearance_m > -9 and lane < 9 and abs(lane_offset_m) < 9 and reward > -1e9 and observation[1] < 1e9 and "
+    "not hard_braking and (leader_changed or not leader_changed))"
+)
+LEAD = (
+    '<vehicle id="lead" depart="0" departPos="95" departLane="0" departSpeed="5"><route edges="west east"/></vehicle>'
+)
+REQUIREMENTS = {
+    "all signals": ("steady", [ALL_SIGNALS]),
+    "violated": ("steady", ["always (time_s < 4.05)", "always (x < 1e6)"]),
+    "violated by the gap": ("steady", ["always (gap_m > 31 or time_s < 1)", "always (gap_m > -1)"]),
+    "violated later": ("brakes hard", ["always (speed < 5 -> eventually[0:2] (speed > 6))", "always (jerk > -1e9)"]),
+    "violated by the jerk": ("brakes hard", ["always (abs(jerk) < 30)"]),
+    "violated at the end": ("steady", ["eventually (x > 1e6)", "always[0:1] (speed > 0)"]),
+    "violated at the start": ("steady", ["speed > 1e6"]),
+    "violated in one step": ("steady", ["always (time_s < 4.05)", "always (not time_s >= 4.05)"]),
+}
+
+
+@pytest.fixture
+def follow(tmp_path, monkeypatch):
+    """A street with a vehicle ahead."""
+    monkeypatch.setitem(globals(), "TRAFFIC", TRAFFIC.replace('<vehicle id="behind"', f'{LEAD}<vehicle id="behind"'))
+    made = Street(tmp_path)
+    yield made
+    made.box.close()
+    made.simulator.close()
+
+
+@pytest.mark.parametrize("how", REQUIREMENTS)
+def test_requirements_read_the_same_with_steps_of_the_core(follow, how):
+    answer, formulas = REQUIREMENTS[how]
+
+    def run(*, at_once):
+        oracles = [RequirementOracle(f"r{number}", formula) for number, formula in enumerate(formulas)]
+        found = follow.run(
+            ANSWERS[answer], oracles=oracles, crash_on=[*CRASHES, Outcome("requirement")], at_once=at_once
+        )
+        return found, [bytes(one) for oracle in oracles for one in oracle._watched[0].monitor.samples]
+
+    ours = run(at_once=True)
+    assert ours == run(at_once=False)
+    assert ("ego violates r0" in ours[0][0]) == how.startswith("violated")
+    assert follow.comes[DONE] > 5 or how == "violated at the start"
+
+
+def test_requirement_without_a_value_ends_an_episode_of_the_core(street):
+    formula = "always (1 / (time_s - 4) < 1e9)"
+    results = [
+        street.run(ANSWERS["steady"], oracles=[RequirementOracle("r", formula)], at_once=at_once)
+        for at_once in (True, False)
+    ]
+    assert results[0] == results[1]
+    assert "it divides by zero at sample 40" in results[0][0]
+
+
+def test_requirements_of_ordinary_signals_keep_the_steps_of_the_core(follow, monkeypatch):
+    formula = "always (speed < 99 and abs(jerk) < 1e9 and headway_s + ttc_s >= 0 and red_light_m > -9 and x < 1e9)"
+    with follow.episode(ANSWERS["steady"], oracles=[RequirementOracle("calm", formula)], steps=500) as episode:
+        episode.step()
+        monkeypatch.setattr(follow.simulator.at_once, "catch_up", None)  # which makes the scene
+        follow.comes.clear()
+        for _ in range(8):
+            assert episode.step() is None
+    assert follow.comes == {DONE: 8}
 
 
 @pytest.mark.parametrize("every", [1, 7, 10, 11])
