@@ -58,7 +58,7 @@ def process(tmp_path, monkeypatch):
         found = TrialProcess.__new__(TrialProcess)
         found._settings, found._notices, found._reference, found._fork_runners = settings, ["a notice"], None, ()
         found._box, found._pid, found._has_begun, found._shared = None, 0, False, None
-        found._simulator = found._parts = None
+        found._simulator = found._parts = found._lights = None
         found._modules = frozenset(sys.modules)
         found._opened = None
         found._home = tmp_path

@@ -227,7 +227,8 @@ def test_other_time_limit_is_refused_where_earlier_trials_would_end_otherwise(ag
     with closing(Ledger(tmp_path / "h" / "ledger.sqlite", writable=True)) as ledger:
         snapshot = ledger.snapshot_of(0)
         for number, outcome, wall_s in (
-            (0, Outcome.HANG, 30.0), (1, Outcome.SURVIVED, 30.0), (2, Outcome.SURVIVED, 0.1), (3, Outcome.SURVIVED, 0.1),
+            (0, Outcome.HANG, 30.0), (1, Outcome.SURVIVED, 30.0),
+            (2, Outcome.SURVIVED, 0.1), (3, Outcome.SURVIVED, 0.1),
         ):  # fmt: skip
             ledger.record(replace(ledger.result(number), outcome=outcome, wall_s=wall_s), snapshot=snapshot)
     with pytest.raises(HuntDirectoryError, match=f"--timeout was 40 and is now {timeout_s}, but {says}") as caught:
