@@ -1,8 +1,8 @@
 """A parallel crash-hunting fuzzer for traffic agents.
 
-``crashhunt.run``, ``prepare``, ``replay``, ``what_if``, ``load``, ``compare``, ``Hunt`` and ``Suite`` provide the
-functions of the command line. ``accelerate`` speeds up highway-env in your own process. ``make_training_env`` returns
-an environment to train an agent on crashes.
+``crashhunt.run``, ``prepare``, ``replay``, ``what_if``, ``judge``, ``shrink``, ``load``, ``compare``, ``Hunt`` and
+``Suite`` provide the functions of the command line. ``accelerate`` speeds up highway-env in your own process.
+``make_training_env`` returns an environment to train an agent on crashes.
 
 >>> import crashhunt
 >>> report = crashhunt.run(
@@ -24,7 +24,14 @@ from crashhunt.base.doors import offer_lazily
 from crashhunt.base.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from crashhunt.api import prepare as prepare, replay as replay, run as run, what_if as what_if
+    from crashhunt.api import (
+        judge as judge,
+        prepare as prepare,
+        replay as replay,
+        run as run,
+        shrink as shrink,
+        what_if as what_if,
+    )
     from crashhunt.highway.accelerator import accelerate as accelerate
     from crashhunt.hunts import Hunt as Hunt
     from crashhunt.results import load as load

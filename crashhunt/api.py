@@ -13,8 +13,8 @@ from crashhunt.plans import Request, Spec, hunt_options
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from crashhunt.analysis import Counts, Intervention
-    from crashhunt.crashes import Bundle
+    from crashhunt.analysis import Counts, Form, Intervention, Shrunk
+    from crashhunt.crashes import Bundle, Judgement
     from crashhunt.hunts import Hunt, HuntReport, HuntStatus
     from crashhunt.plans import HuntSettings
     from crashhunt.replays import Code, ReplayReport
@@ -151,17 +151,15 @@ def replay(
         UntrustedError: the code of the crash would run, but the crash is neither made on this machine nor trusted.
         CrashhuntError: the crash cannot be run.
     """
-    from crashhunt.crashes import Bundle, find_bundle
     from crashhunt.plans import spec_words
     from crashhunt.replays import ReplayOptions, replay as replayed
 
-    bundle = crash if isinstance(crash, Bundle) else find_bundle(Path(crash), crash_id)
     edits = spec_words(changes)
     options = ReplayOptions(
         code=code, changes=edits, times=times, force=force, scenario=str(scenario), accelerate=accelerate,
         trusted=True if trust else None,
     )  # fmt: skip
-    return replayed(bundle, options)
+    return replayed(_bundle_of(crash, crash_id), options)
 
 
 @clear_calls()
@@ -216,10 +214,9 @@ def what_if(
         CrashhuntError: the crash cannot be run, or the simulator does not support the change.
     """
     from crashhunt.analysis import WhatIfOptions, interventions_of, what_if as counted
-    from crashhunt.crashes import Bundle, find_bundle
     from crashhunt.plans import spec_words
 
-    bundle = crash if isinstance(crash, Bundle) else find_bundle(Path(crash), crash_id)
+    bundle = _bundle_of(crash, crash_id)
     asked = interventions_of(
         bundle, changes=spec_words(changes), from_step=from_step, before_s=before_s, agent=agent,
         arguments=spec_words(arguments), futures=futures, overrule=overrule, leave_out=tuple(leave_out), code=code,
@@ -230,3 +227,94 @@ def what_if(
         parallel=parallel or len(os.sched_getaffinity(0)), trusted=True if trust else None,
     )  # fmt: skip
     return counted(bundle, asked, options)
+
+
+@clear_calls()
+def judge(
+    crash: Bundle | Path | str,
+    crash_id: str = "",
+    *,
+    runs: int = 60,
+    why: int = 80,
+    reference: int = 20,
+    drivers: bool = True,
+    parallel: int = 0,
+    trust: bool = False,
+) -> Judgement:
+    """Find the last avoidable step and the causes of a crash, as ``crashhunt judge`` does.
+
+    The answers are written to ``crash.json``.
+
+    Args:
+        crash: directory of a hunt or of one crash, or a crash of a hunt that `load` returned.
+        crash_id: id of a crash of the hunt; by default the crash with the fewest steps.
+        runs: maximum number of trials to find the last avoidable step.
+        why: maximum number of trials to find the causes; 0 for none.
+        reference: maximum number of trials with a reference driver, to find what the agent omitted to do; 0 for none.
+        drivers: whether models of a competent driver are asked whether they would have prevented a collision.
+        parallel: number of trials at a time; 0 for one per core.
+        trust: whether to run the crash's code even if it is neither made here nor trusted.
+
+    Returns:
+        The judgement, together with the answers of earlier calls.
+
+    Raises:
+        UntrustedError: the code of the crash would run, but the crash is neither made on this machine nor trusted.
+        CrashhuntError: the crash cannot be judged.
+    """
+    from crashhunt.analysis import judge_bundle
+    from crashhunt.crashes import judgement_of
+    from crashhunt.replays import ReplayOptions
+
+    options = ReplayOptions(force=True, trusted=True if trust else None)
+    judged = judge_bundle(
+        _bundle_of(crash, crash_id), options, runs=runs, why=why, reference=reference, drivers=drivers,
+        parallel=parallel,
+    )  # fmt: skip
+    judgement = judgement_of(judged)
+    assert judgement is not None
+    return judgement
+
+
+@clear_calls()
+def shrink(
+    crash: Bundle | Path | str,
+    crash_id: str = "",
+    *,
+    budget: int = 500,
+    time_s: float | None = None,
+    form: Form = "either",
+    parallel: int = 0,
+    trust: bool = False,
+) -> Shrunk:
+    """Minimize a crash, as ``crashhunt shrink`` does, and write the minimized crash next to it.
+
+    Args:
+        crash: directory of a hunt or of one crash, or a crash of a hunt that `load` returned.
+        crash_id: id of a crash of the hunt; by default the crash with the fewest steps.
+        budget: maximum number of trials.
+        time_s: maximum wall time of the search, in s.
+        form: how the other actors move: by themselves (``traffic``), along recorded paths (``scripted``), or depending
+            on the number of remaining actors (``either``).
+        parallel: number of trials at a time; 0 for one per core.
+        trust: whether to run the crash's code even if it is neither made here nor trusted.
+
+    Returns:
+        The minimized crash in ``small``, and what was removed.
+
+    Raises:
+        UntrustedError: the code of the crash would run, but the crash is neither made on this machine nor trusted.
+        CrashhuntError: the crash cannot be minimized.
+    """
+    from crashhunt.analysis import shrink as shrunk
+
+    return shrunk(
+        _bundle_of(crash, crash_id), budget=budget, time_s=time_s, form=form, parallel=parallel,
+        trusted=True if trust else None,
+    )  # fmt: skip
+
+
+def _bundle_of(crash: Bundle | Path | str, crash_id: str) -> Bundle:
+    from crashhunt.crashes import Bundle, find_bundle
+
+    return crash if isinstance(crash, Bundle) else find_bundle(Path(crash), crash_id)

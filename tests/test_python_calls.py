@@ -18,7 +18,7 @@ from crashhunt.plans import HuntOptions
 @pytest.fixture
 def work(monkeypatch):
     """Replace the parts that do the work; each call is noted."""
-    calls = SimpleNamespace(found=[], replayed=[], asked=[], counted=[])
+    calls = SimpleNamespace(found=[], replayed=[], asked=[], counted=[], judged=[], shrunk=[])
 
     def find(path, crash_id):
         calls.found.append((path, crash_id))
@@ -35,6 +35,9 @@ def work(monkeypatch):
     monkeypatch.setattr(replays, "replay", note(calls.replayed, "report"))
     monkeypatch.setattr(analysis, "interventions_of", note(calls.asked, ("change",)))
     monkeypatch.setattr(analysis, "what_if", note(calls.counted, "counts"))
+    monkeypatch.setattr(analysis, "judge_bundle", note(calls.judged, "judged"))
+    monkeypatch.setattr(analysis, "shrink", note(calls.shrunk, "shrunk"))
+    monkeypatch.setattr(crashes, "judgement_of", "the judgement of {}".format)
     return calls
 
 
@@ -80,6 +83,24 @@ def test_what_if_passes_on_what_is_given(work, monkeypatch):
     assert plain == analysis.WhatIfOptions(code="snapshot", times=0, time_s=None, parallel=6, trusted=None)
     assert full == analysis.WhatIfOptions(code="current", times=7, time_s=9.0, parallel=2, trusted=True)
     assert chosen.code == "snapshot"
+
+
+def test_judge_and_shrink_pass_on_what_is_given(work):
+    assert crashhunt.judge("h") == "the judgement of judged"
+    crashhunt.judge("h", "3", runs=1, why=2, reference=3, drivers=False, parallel=4, trust=True)
+    ((plain, first), (full, second)) = work.judged
+    assert (plain, full) == (
+        ("found", replays.ReplayOptions(force=True)), ("found", replays.ReplayOptions(force=True, trusted=True)),
+    )  # fmt: skip
+    assert first == {"runs": 60, "why": 80, "reference": 20, "drivers": True, "parallel": 0}
+    assert second == {"runs": 1, "why": 2, "reference": 3, "drivers": False, "parallel": 4}
+    assert crashhunt.shrink("h") == "shrunk"
+    crashhunt.shrink("h", "3", budget=9, time_s=5.0, form="scripted", parallel=2, trust=True)
+    assert [words for words, _ in work.shrunk] == [("found",), ("found",)]
+    assert [more for _, more in work.shrunk] == [
+        {"budget": 500, "time_s": None, "form": "either", "parallel": 0, "trusted": None},
+        {"budget": 9, "time_s": 5.0, "form": "scripted", "parallel": 2, "trusted": True},
+    ]
 
 
 def test_crash_of_a_hunt_is_taken_as_it_is(work, monkeypatch):
@@ -180,4 +201,4 @@ def test_values_out_of_range_are_refused_before_anything_is_made(hunt):
         with pytest.raises(UsageError):
             crashhunt.prepare("h", *words)
     assert made == []
-    assert vars(api).keys() >= {"prepare", "run", "replay", "what_if"}
+    assert vars(api).keys() >= {"prepare", "run", "replay", "what_if", "judge", "shrink"}

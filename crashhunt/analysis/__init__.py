@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._avoidability import judge as judge
+    from ._avoidability import check_numbers as check_numbers, judge as judge, judge_bundle as judge_bundle
     from ._delta_debugging import Tried as Tried, fewest as fewest, plainest as plainest
     from ._driver_runs import judge_preventability as judge_preventability
     from ._interventions import (
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         interventions_of as interventions_of,
     )
     from ._minimization import Shrunk as Shrunk, shrink as shrink
+    from ._shrink_stages import Form as Form
     from ._types_by_cause import (
         REPRESENTATIVES as REPRESENTATIVES,
         divide_by_cause as divide_by_cause,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+import os
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -18,12 +19,15 @@ from crashhunt.crashes import (
     LaneMap,
     StepBisection,
     changes_of,
+    changing,
     ending_of,
+    judgement_of,
     last_avoiding,
     last_escape,
     overruled_trial,
     slowing,
     visible_from,
+    with_judgement,
 )
 from crashhunt.replays import ReplayOptions, prepare, reruns_of
 from crashhunt.reruns import NotUnderstoodError, StoppedError
@@ -271,6 +275,74 @@ def judge(
         )
     visible = visible_from(rerun.recorded, hit.agent, hit.other) if of_two and hit is not None else None
     return replace(search.judgement(), why=found, visible_step=visible, reference=omitted, drivers=prevented)
+
+
+def check_numbers(*, runs: int, why: int, reference: int, parallel: int) -> None:
+    """Refuse numbers of `judge_bundle` that are out of their range.
+
+    Raises:
+        UsageError: a number is too small.
+    """
+    if runs < 1:
+        raise UsageError(f"--runs is {runs}", fix="give at least 1")
+    for option, number, meaning in (
+        ("--why", why, "do not search for the causes"),
+        ("--reference", reference, "no reference driver"),
+        ("--parallel", parallel, "one per core"),
+    ):
+        if number < 0:
+            raise UsageError(f"{option} is {number}", fix=f"give at least 0 (0: {meaning})")
+
+
+def judge_bundle(
+    bundle: Bundle,
+    options: ReplayOptions | None = None,
+    *,
+    runs: int = 60,
+    why: int = 80,
+    reference: int = 20,
+    drivers: bool = True,
+    parallel: int = 0,
+    write: bool = True,
+    watch: Watch | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Bundle:
+    """Judge a crash, write the judgement to its ``crash.json``, and return the bundle with the judgement.
+
+    Parts that this call does not compute keep the answers of earlier calls. If the call is stopped, its answers do not
+    replace earlier ones. Another process may judge the same crash at the same time.
+
+    Args:
+        bundle: the bundle of a crash.
+        options: options of the replays, as for `judge`.
+        runs: maximum number of trials for avoiding the crash.
+        why: maximum number of trials for the causes; 0 for none.
+        reference: maximum number of trials with a reference driver; 0 for none.
+        drivers: whether models of a competent driver are asked whether they would have prevented a collision.
+        parallel: number of runs at a time; 0 for one per core.
+        write: whether to write the judgement.
+        watch: function called with the number of finished runs and the maximum number.
+        stopped: function that returns whether to stop; called repeatedly.
+
+    Raises:
+        UsageError: a number is out of its range, or no run is possible.
+        CrashhuntError: the trials could not be run, or the bundle is damaged or cannot be written.
+    """
+    check_numbers(runs=runs, why=why, reference=reference, parallel=parallel)
+    found = judge(
+        bundle, options, runs=runs, why=why, reference=reference, drivers=drivers,
+        parallel=parallel or len(os.sched_getaffinity(0)), watch=watch, stopped=stopped,
+    )  # fmt: skip
+    with changing(bundle) if write else nullcontext(bundle) as stored:
+        known = judgement_of(stored)
+        ran = found.runs or (found.why is not None and found.why.runs) or found.reference is not None
+        if known is not None:
+            kept = {name: getattr(known, name) for name in ("why", "reference", "drivers")}
+            found = replace(found, **{name: value for name, value in kept.items() if getattr(found, name) is None})
+        judged = with_judgement(stored, found)
+        if write and ran and (known is None or not stopped()):
+            judged.write()
+    return judged
 
 
 def _require_judgeable(bundle: Bundle, *, of_two: bool, why: int) -> None:

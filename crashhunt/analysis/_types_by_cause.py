@@ -13,8 +13,8 @@ from crashhunt.crashes import (
     CauseGroup,
     Division,
     Judgement,
-    as_stored,
     cause_of,
+    changing,
     features_of,
     judgement_of,
     with_judgement,
@@ -103,8 +103,9 @@ def divide_by_cause(
             break  # what was interrupted says nothing
         division.settle(place, cause)
         if write and judged is not bundles[place]:
-            stored, judgement = as_stored(judged), judgement_of(judged)
-            (judged if judgement is None else with_judgement(stored, judgement)).write()
+            judgement = judgement_of(judged)
+            with changing(judged) as stored:
+                (judged if judgement is None else with_judgement(stored, judgement)).write()
     members: dict[Cause, list[int]] = {}
     for place, cause in division.causes().items():
         members.setdefault(cause, []).append(place)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -26,7 +24,7 @@ if TYPE_CHECKING:
     import argparse
 
     from crashhunt.cli._common import Commands
-    from crashhunt.crashes import Bundle, Judgement
+    from crashhunt.crashes import Bundle
 
 
 def add_judge(commands: Commands) -> None:
@@ -36,8 +34,8 @@ def add_judge(commands: Commands) -> None:
         help="find the last avoidable step and the causes of a crash, by running it again",
         description="Find the last avoidable step and the causes of a crash. First run the trial of a collision many "
         "times, and override the agent from another step each time: full braking, or a lane change and braking. "
-        "Report the last step from which such a maneuver avoids the collision. Then run the trial again and "
-        "remove one element each time: a decision of the agent, a maneuver of another vehicle, or the value of an "
+        "Report the last step from which such a manoeuvre avoids the collision. Then run the trial again and "
+        "remove one element each time: a decision of the agent, a manoeuvre of another vehicle, or the value of an "
         "argument. For crashes that are not collisions, only the causes are analysed. The results are "
         "written to crash.json, and crashhunt show prints them.",
     )
@@ -78,16 +76,10 @@ def add_judge(commands: Commands) -> None:
 
 
 def _judge(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.analysis import check_numbers
     from crashhunt.base.signals import stop_requests
 
-    if options.runs < 1:
-        raise UsageError(f"--runs is {options.runs}", fix="give at least 1")
-    if options.why < 0:
-        raise UsageError(f"--why is {options.why}", fix="give at least 0 (0: do not search for the causes)")
-    if options.reference < 0:
-        raise UsageError(f"--reference is {options.reference}", fix="give at least 0 (0: no reference driver)")
-    if options.parallel < 0:
-        raise UsageError(f"--parallel is {options.parallel}", fix="give at least 0 (0: one per core)")
+    check_numbers(runs=options.runs, why=options.why, reference=options.reference, parallel=options.parallel)
     if options.all and options.crash:
         raise UsageError(f"--all and --crash {options.crash} contradict each other", fix="omit one of them")
     answers: list[dict[str, object]] = []
@@ -133,34 +125,26 @@ def _unjudged(options: argparse.Namespace) -> list[Bundle]:
 def _judge_one(
     options: argparse.Namespace, bundle: Bundle, stops: list[int], trusted: bool | None, *, write: bool
 ) -> dict[str, object]:
-    from crashhunt.analysis import judge
-    from crashhunt.crashes import as_stored, judgement_of, with_judgement
+    from crashhunt.analysis import judge_bundle
+    from crashhunt.crashes import judgement_of
     from crashhunt.replays import ReplayOptions
     from crashhunt.report import Story
 
     with shown_progress(f"running {bundle.id}", as_json=options.json) as watch:
-        found: Judgement = judge(
+        bundle = judge_bundle(
             bundle,
             ReplayOptions(force=True, trusted=trusted),
             runs=options.runs,
             why=options.why,
             reference=options.reference,
             drivers=not options.no_drivers,
-            parallel=options.parallel or len(os.sched_getaffinity(0)),
+            parallel=options.parallel,
+            write=write,
             watch=watch,
             stopped=lambda: bool(stops),
         )
-    known = judgement_of(bundle)
-    ran = found.runs or (found.why is not None and found.why.runs) or found.reference is not None
-    if found.why is None and known is not None:  # not asked for this time
-        found = replace(found, why=known.why)
-    if found.reference is None and known is not None:
-        found = replace(found, reference=known.reference)
-    if found.drivers is None and known is not None:
-        found = replace(found, drivers=known.drivers)
-    bundle = with_judgement(as_stored(bundle) if write else bundle, found)
-    if write and ran and (not stops or known is None):  # half an answer does not replace a whole one
-        bundle.write()
+    found = judgement_of(bundle)
+    assert found is not None
     story = Story(bundle)
     say(
         "\n".join([f"{bundle.id}: {bundle.result.summary}", *(f"  {line}" for line in story.about_judgement())]),

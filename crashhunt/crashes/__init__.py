@@ -9,8 +9,8 @@ if TYPE_CHECKING:
     from ._bundle import (
         Bundle as Bundle,
         CrashSummary as CrashSummary,
-        as_stored as as_stored,
         authenticate_bundle as authenticate_bundle,
+        changing as changing,
         crash_folders as crash_folders,
         files_of as files_of,
         find_bundle as find_bundle,

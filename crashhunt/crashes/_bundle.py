@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 import re
 import shutil
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NotRequired, TypedDict
 
@@ -43,7 +45,7 @@ from crashhunt.trial import (
 from crashhunt.world import ClosestApproach, Event, Paths
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
@@ -420,6 +422,20 @@ def as_stored(bundle: Bundle) -> Bundle:
         return bundle
     is_same = (stored.id, stored.result.digest) == (bundle.id, bundle.result.digest)
     return stored if is_same else bundle
+
+
+@contextmanager
+def changing(bundle: Bundle) -> Iterator[Bundle]:
+    """Yield a bundle as it is on the disk now, to be changed and written; other processes wait until it is written."""
+    folder: int | None = None
+    with suppress(OSError):  # a hunt has deleted the bundle, or the file system has no locks
+        folder = os.open(bundle.path, os.O_RDONLY | os.O_CLOEXEC)
+        fcntl.flock(folder, fcntl.LOCK_EX)
+    try:
+        yield as_stored(bundle)
+    finally:
+        if folder is not None:
+            os.close(folder)
 
 
 def _bundle(path: Path, data: JsonObject) -> Bundle:

@@ -15,7 +15,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError
 from crashhunt.base.temporary import remove_at_once, remove_scratch
 from crashhunt.base.text import command_line
-from crashhunt.crashes import as_stored, is_bundle_made_here, is_snapshot_trusted, write_bundle
+from crashhunt.crashes import changing, is_bundle_made_here, is_snapshot_trusted, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.hunts._next_trials import settings_again
@@ -280,15 +280,15 @@ def _write_if_kept(found: Bundle, folder: Path) -> bool:
     """Write a bundle into its folder; return whether it is there: a hunt with ``--keep`` may delete it meanwhile."""
     if not folder.is_dir():
         return False
-    stored = as_stored(found)
-    if stored is not found:  # a command may have judged it in the meantime
-        found = replace(found, added={**stored.added, **found.added})
-    try:
-        found.write()
-    except CrashhuntError:
-        if folder.is_dir():
-            raise
-        return False
+    with changing(found) as stored:
+        if stored is not found:  # a command may have judged it in the meantime
+            found = replace(found, added={**stored.added, **found.added})
+        try:
+            found.write()
+        except CrashhuntError:
+            if folder.is_dir():
+                raise
+            return False
     return True
 
 

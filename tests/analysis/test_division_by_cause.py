@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -45,7 +46,7 @@ def bundles(monkeypatch):
 
     monkeypatch.setattr(_types_by_cause, "find_cause", find_cause)
     monkeypatch.setattr(_types_by_cause, "features_of", lambda bundle: None)
-    monkeypatch.setattr(_types_by_cause, "as_stored", lambda bundle: bundle)
+    monkeypatch.setattr(_types_by_cause, "changing", nullcontext)
     monkeypatch.setattr(_types_by_cause, "judgement_of", lambda bundle: None)
     monkeypatch.setattr(_types_by_cause, "Division", AllChosen)
     return SimpleNamespace(group=SimpleNamespace(bundles=made), written=written, made=made)

@@ -6,18 +6,23 @@ import dataclasses
 import json
 import math
 import shutil
+import threading
 from typing import TYPE_CHECKING
 
 import pytest
 from episodes import Episode, write
 
+from crashhunt.analysis import _avoidability
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError
+from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.integrity import digest_of_data
 from crashhunt.base.older_formats import HOW_TO_READ
 from crashhunt.crashes import (
+    Attempt,
     Judgement,
-    as_stored,
+    Reference,
+    Why,
+    changing,
     files_of,
     find_bundle,
     judgement_of,
@@ -29,6 +34,7 @@ from crashhunt.crashes import (
     write_bundle,
     write_trial,
 )
+from crashhunt.crashes._bundle import as_stored
 from crashhunt.hunts import _verification
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.trial import Collision, Escape, Failure, Outcome, TrialResult, TrialSpec
@@ -128,12 +134,53 @@ def test_a_crash_that_is_confirmed_or_not_states_so(tmp_path):
 def test_judgement_and_confirmation_of_two_processes_are_both_kept(bundle):
     judgement = Judgement(why_not="it was interrupted")
     dataclasses.replace(bundle, confirmed=True).write()
-    with_judgement(as_stored(bundle), judgement).write()  # the judgement began before the confirmation
+    with changing(bundle) as stored:  # the judgement began before the confirmation
+        with_judgement(stored, judgement).write()
     assert (read_bundle(bundle.path).confirmed, judgement_of(read_bundle(bundle.path))) == (True, judgement)
     bundle.write()
     with_judgement(bundle, judgement).write()
     assert _verification._write_if_kept(dataclasses.replace(bundle, confirmed=True), bundle.path)  # the other way round
     assert (read_bundle(bundle.path).confirmed, judgement_of(read_bundle(bundle.path))) == (True, judgement)
+
+
+def test_second_writer_of_a_crash_waits_for_the_first(bundle):
+    def judge():
+        with changing(bundle) as stored:
+            with_judgement(stored, Judgement(visible_step=3)).write()
+
+    other = threading.Thread(target=judge)
+    with changing(bundle) as stored:
+        other.start()
+        other.join(0.2)
+        assert other.is_alive()
+        dataclasses.replace(stored, confirmed=True).write()
+    other.join(30)
+    found = read_bundle(bundle.path)
+    assert (found.confirmed, judgement_of(found)) == (True, Judgement(visible_step=3))
+
+
+def test_judgement_keeps_the_parts_that_another_process_has_found_meanwhile(bundle, monkeypatch):
+    found, other = Judgement(why=Why(steps=7)), Judgement(reference=Reference(why_not="no lanes"))
+    known = []
+
+    def judge(bundle, options, **_numbers):
+        with changing(bundle) as stored:
+            with_judgement(stored, known[-1]).write()
+        return found
+
+    monkeypatch.setattr(_avoidability, "judge", judge)
+    known.append(other)
+    judged = _avoidability.judge_bundle(bundle, write=False)
+    assert (judgement_of(judged), judgement_of(read_bundle(bundle.path))) == (found, other)
+    assert judgement_of(_avoidability.judge_bundle(bundle)) == dataclasses.replace(found, reference=other.reference)
+    assert judgement_of(read_bundle(bundle.path)) == other  # nothing was run
+    found = dataclasses.replace(found, attempts=(Attempt("brake", 6, {4: "avoided"}, 8.0),))
+    _avoidability.judge_bundle(bundle, stopped=lambda: True)
+    assert judgement_of(read_bundle(bundle.path)) == other  # half an answer does not replace a whole one
+    _avoidability.judge_bundle(bundle)
+    assert judgement_of(read_bundle(bundle.path)) == dataclasses.replace(found, reference=other.reference)
+    with pytest.raises(UsageError, match="--parallel is -1; give at least 0"):
+        _avoidability.judge_bundle(bundle, parallel=-1)
 
 
 def test_bundle_that_is_gone_damaged_or_of_another_crash_is_not_taken_from_the_disk(bundle):
@@ -143,7 +190,8 @@ def test_bundle_that_is_gone_damaged_or_of_another_crash_is_not_taken_from_the_d
     (bundle.path / layout.CRASH).write_text("{")
     assert as_stored(bundle) is bundle
     shutil.rmtree(bundle.path)
-    assert as_stored(bundle) is bundle
+    with changing(bundle) as stored:
+        assert stored is bundle
 
 
 def test_a_trial_that_printed_nothing_has_no_empty_log(tmp_path):
