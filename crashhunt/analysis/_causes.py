@@ -47,7 +47,7 @@ _MIN_SPEED_CHANGE_MPS = 1.0  # m/s in all; less makes no difference
 
 
 @dataclass(frozen=True, slots=True)
-class Maneuver:
+class Manoeuvre:
     """A manoeuvre of an actor.
 
     Args:
@@ -90,7 +90,7 @@ def relevant_actors(recording: Recording, agent: str, other: str, most: int) -> 
     ]
 
 
-def maneuvers_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> list[Maneuver]:
+def manoeuvres_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> list[Manoeuvre]:
     """Return an actor's manoeuvres in the last seconds before a step: the last manoeuvre of each type.
 
     Args:
@@ -114,11 +114,11 @@ def maneuvers_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> 
     for what, limit in (("braked", _BRAKES), ("sped up", _SPEEDS_UP)):
         place = _onset(np.diff(speeds) / dt, limit, max(1, round(_PAUSE_S / dt)), dt)
         if place is not None:
-            found.append(Maneuver(actor=actor, what=what, step=steps[place], speed=float(speeds[place])))
+            found.append(Manoeuvre(actor=actor, what=what, step=steps[place], speed=float(speeds[place])))
     place = _change(recording, scenes, actor, lanes)
     if place is not None:
         found.append(
-            Maneuver(
+            Manoeuvre(
                 actor=actor, what="changed lanes", step=steps[place], speed=float(speeds[min(place, len(speeds) - 1)])
             )
         )
@@ -158,8 +158,8 @@ _GONE_S = (3.0, 4.0, 5.0)  # an actor is removed at these times before the colli
 _LONGER_S = 5.0  # simulation time past the collision, so that one that only comes later is seen
 _TRAFFIC_STREAM = 0x776879  # apart from what else is drawn of a trial's seed
 INCONCLUSIVE_OUTCOMES = (Outcome.INVALID, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
-_HOLD_BY_MANEUVER = {"braked": "keep_speed", "sped up": "keep_speed", "changed lanes": "keep_lane"}
-_FACULTY_BY_MANEUVER = {"braked": "speed", "sped up": "speed", "changed lanes": "lane"}
+_HOLD_BY_MANOEUVRE = {"braked": "keep_speed", "sped up": "keep_speed", "changed lanes": "keep_lane"}
+_FACULTY_BY_MANOEUVRE = {"braked": "speed", "sped up": "speed", "changed lanes": "lane"}
 
 
 @dataclass(slots=True)
@@ -329,12 +329,12 @@ class _Search:
     def _agents(self) -> Iterator[_Candidate]:
         """Return the decisions of the agent as candidate causes; also of the collision partner, if it is an agent."""
         agents = [name for name in (self._agent, self._other) if name in self._recording.agents]
-        for doing in (doing for agent in agents for doing in self._maneuver_factors(agent)):
+        for doing in (doing for agent in agents for doing in self._manoeuvre_factors(agent)):
             runs = [
                 (
                     step,
                     replace(
-                        self._inside, overruled=Overruled(doing.actor, step, keeps=_FACULTY_BY_MANEUVER[doing.what])
+                        self._inside, overruled=Overruled(doing.actor, step, keeps=_FACULTY_BY_MANOEUVRE[doing.what])
                     ),
                 )
                 for step in self._earlier(doing.step, _EARLIER_S)
@@ -348,8 +348,8 @@ class _Search:
     def _others(self, name: str) -> list[_Candidate]:
         """Return another actor's manoeuvres and its presence as candidate causes."""
         found = []
-        for doing in self._maneuver_factors(name):
-            what = _HOLD_BY_MANEUVER[doing.what]
+        for doing in self._manoeuvre_factors(name):
+            what = _HOLD_BY_MANOEUVRE[doing.what]
             held = name if what == "keep_speed" else ""
             runs = [(step, self._held(name, what, step)) for step in self._earlier(doing.step, _EARLIER_S)]
             found.append(
@@ -365,8 +365,8 @@ class _Search:
         found.append(_Candidate(Factor(kind="other", name=name, what="there", step=self._end), runs, True))
         return found
 
-    def _maneuver_factors(self, actor: str) -> list[Maneuver]:
-        return maneuvers_of(self._recording, actor, self._lanes, self._end)
+    def _manoeuvre_factors(self, actor: str) -> list[Manoeuvre]:
+        return manoeuvres_of(self._recording, actor, self._lanes, self._end)
 
     def _is_present(self, name: str, step: int) -> bool:
         return name in self._recording.scene(step).roster.index

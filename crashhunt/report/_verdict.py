@@ -25,7 +25,7 @@ _MAX_MERGE_ANGLE_RAD = math.radians(30)  # between their headings, as in the rul
 _SIDEWAYS_M = 1.0  # less does not say to which side
 _MOVES_MPS = 1.0  # a time gap to a slower vehicle is no useful number
 _SHORT_S = 0.1  # a shorter time gap is given in m
-_MANEUVER_WORDS = {
+_MANOEUVRE_WORDS = {
     "brake": "brakes",
     "left": "changes to the lane on the left and brakes",
     "right": "changes to the lane on the right and brakes",
@@ -213,7 +213,7 @@ def _avoided(story: CrashFacts, omission: Omission | None) -> str:
             return f"when {story.agent} first observed {story.other}, no run avoided it any more"
         best = judgement.best
         if best is not None and best.last_step is not None:
-            how = _MANEUVER_WORDS.get(best.manoeuvre, best.manoeuvre)
+            how = _MANOEUVRE_WORDS.get(best.manoeuvre, best.manoeuvre)
             return _if_it(story, how, best.last_step, best.changed)
         return "no run avoids it" if judgement.avoidable is False else ""
     if tried is None or tried.why_not or tried.step is None:
@@ -235,7 +235,7 @@ def last_avoidable(story: CrashFacts) -> tuple[int, str, float | None] | None:
         best = judgement.best
         if best is None or best.last_step is None:
             return None
-        how = _MANEUVER_WORDS.get(best.manoeuvre, best.manoeuvre)
+        how = _MANOEUVRE_WORDS.get(best.manoeuvre, best.manoeuvre)
         only_brakes = best.manoeuvre == "brake" and not best.changed
         return best.last_step, how, best.deceleration if only_brakes else None
     if tried is None or tried.why_not or tried.step is None:

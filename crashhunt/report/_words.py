@@ -492,7 +492,7 @@ _OMISSION_WORDS = {
     "sped up": "it keeps its speed",
     "changed lanes": "it stays in its lane",
 }
-_MANEUVER_NOUNS = {"braked": "braking", "sped up": "speeding up", "changed lanes": "change of lanes"}
+_MANOEUVRE_NOUNS = {"braked": "braking", "sped up": "speeding up", "changed lanes": "change of lanes"}
 
 
 def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
@@ -585,7 +585,7 @@ def _short(factor: Factor, runs: int, when: Callable[[int], str]) -> str:
     if what == "there":
         return who
     assert factor.step is not None
-    return f"the {_MANEUVER_NOUNS.get(what, what)} of {who} at {when(factor.step)}"
+    return f"the {_MANOEUVRE_NOUNS.get(what, what)} of {who} at {when(factor.step)}"
 
 
 def _number(value: Value | None) -> str:

@@ -252,7 +252,7 @@ def search(_folder: Path) -> str:
 
 
 def counterfactuals(folder: Path) -> str:
-    """Draw the runs of judge: one row per maneuver, one mark per run."""
+    """Draw the runs of judge: one row per manoeuvre, one mark per run."""
     hunted(CROSSING, folder)
     words = ("judge", "crossing", "--crash", JUDGED, "--runs", "120", "--why", "0", "--reference", "0")
     (judged,) = command_line(*words, folder=folder)["judged"]
@@ -279,8 +279,8 @@ def counterfactuals(folder: Path) -> str:
     legend = bottom + 30
     parts += [f'<circle cx="18" cy="{legend - 5}" r="6" class="green"/>', text(32, legend, "crash avoided")]
     parts += [cross(152, legend - 5), text(166, legend, "still a crash")]
-    parts += [f'<circle cx="282" cy="{legend - 5}" r="5" class="open"/>', text(296, legend, "maneuver not possible")]
-    return drawing("Runs of crashhunt judge: after which step a maneuver avoids the crash", legend + 14, parts)
+    parts += [f'<circle cx="282" cy="{legend - 5}" r="5" class="open"/>', text(296, legend, "manoeuvre not possible")]
+    return drawing("Runs of crashhunt judge: after which step a manoeuvre avoids the crash", legend + 14, parts)
 
 
 def rates(folder: Path) -> str:

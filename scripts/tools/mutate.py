@@ -315,7 +315,7 @@ _TESTS_ELSEWHERE = {
     "training/_crash_env.py": ("training/test_draws.py", "training/test_training_env.py"),
     "training/_traffic_split.py": ("training/test_draws.py", "training/test_held_out_traffics.py"),
     "analysis/_avoidability.py": ("analysis/test_avoiding.py", "e2e/test_judging.py"),
-    "analysis/_causes.py": ("analysis/test_maneuvers.py", "e2e/test_judging.py"),
+    "analysis/_causes.py": ("analysis/test_recorded_manoeuvres.py", "e2e/test_judging.py"),
     "analysis/_whatif_runs.py": ("analysis/test_what_is_counted.py", "analysis/test_reruns.py", "e2e/test_what_if.py"),
     "analysis/_interventions.py": (
         "analysis/test_what_is_counted.py",

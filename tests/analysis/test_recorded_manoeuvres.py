@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.analysis._causes import Maneuver, maneuvers_of, relevant_actors
+from crashhunt.analysis._causes import Manoeuvre, manoeuvres_of, relevant_actors
 from crashhunt.world import Actor, Roster, Scene
 
 DT = 0.1
@@ -44,12 +44,12 @@ def speeds(*parts):
 def found(*parts, count=120, end=110):
     return [
         (one.what, one.step, round(one.speed, 3))
-        for one in maneuvers_of(recording({"x": speeds(*parts)}, count), "x", (), end)
+        for one in manoeuvres_of(recording({"x": speeds(*parts)}, count), "x", (), end)
     ]
 
 
 @pytest.mark.parametrize(
-    ("parts", "maneuvers"),
+    ("parts", "manoeuvres"),
     [
         ([], []),
         ([(0, 5), (-3, 1)], [("braked", 50, 20.0)]),
@@ -65,8 +65,8 @@ def found(*parts, count=120, end=110):
     ],
     ids=str,
 )
-def test_last_maneuver_of_each_type_begins_where_the_speed_begins_to_change(parts, maneuvers):
-    assert found(*parts) == maneuvers
+def test_last_manoeuvre_of_each_type_begins_where_the_speed_begins_to_change(parts, manoeuvres):
+    assert found(*parts) == manoeuvres
 
 
 def test_only_the_ten_seconds_before_the_crash_count():
@@ -74,8 +74,8 @@ def test_only_the_ten_seconds_before_the_crash_count():
     assert found((0, 2.1), (-3, 1), count=150, end=120) == [("braked", 21, 20.0)]
     assert found((0, 5), (-3, 1), end=50) == []  # the collision itself changes speeds
     assert found((0, 5), (-3, 1), end=1) == []
-    maneuver = maneuvers_of(recording({"x": speeds((0, 5), (-3, 1))}, 120), "x", (), 110)[0]
-    assert maneuver == Maneuver(actor="x", what="braked", step=50, speed=20.0)
+    manoeuvre = manoeuvres_of(recording({"x": speeds((0, 5), (-3, 1))}, 120), "x", (), 110)[0]
+    assert manoeuvre == Manoeuvre(actor="x", what="braked", step=50, speed=20.0)
 
 
 def stands(x, y=0.0, *, since=0.0, until=99.0):
