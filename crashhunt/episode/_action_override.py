@@ -125,9 +125,10 @@ class Keeping(_Overruling):
     def __init__(self, driver: Agent, simulator: Simulator, agent: str, after: int, keeps: str) -> None:
         form = simulator.actions[agent]
         self._idle = _idle(form)
-        if self._idle is None and tuple(form.names) not in _WITH_SPEED:
+        self._steers = _steered(simulator, agent)
+        if self._idle is None and self._steers is None and tuple(form.names) not in _WITH_SPEED:
             raise InvalidEpisodeError(
-                f"the speed of {agent} cannot be held: it is unknown which lanes and speeds its actions choose"
+                f"the {keeps} of {agent} cannot be held: it is unknown which lanes and speeds its actions choose"
             )
         self._driver, self._simulator, self._agent, self._form = driver, simulator, agent, form
         self._after, self._stays = after, keeps == "lane"
@@ -144,6 +145,9 @@ class Keeping(_Overruling):
 
     def _kept(self, action: object) -> object:
         encoded = self._form.encode(action)
+        if self._steers is not None:
+            speed = None if self._stays else self._speed
+            return self._steers.action_with(self._agent, encoded, speed_mps=speed, keeps_lane=self._stays)
         if self._idle is None:
             value, change = encoded.tolist()
             kept = 0.0 if tuple(self._form.names) == _ACCELERATION else self._speed
@@ -193,6 +197,11 @@ def _idle(form: ActionForm) -> int | None:
     return (
         tuple(space.meanings).index("IDLE") if supports(space, NamesMetaActions) and "IDLE" in space.meanings else None
     )
+
+
+def _steered(simulator: Simulator, agent: str) -> TranslatesMotion | None:
+    """Return what translates the actions of a vehicle that moves freely; None for other vehicles."""
+    return simulator if supports(simulator, TranslatesMotion) and simulator.is_steered(agent) else None
 
 
 def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
@@ -270,9 +279,7 @@ class ReferenceDriver(_Overruling):
         form = simulator.actions[overruled.agent]
         self._meanings = tuple(form.space.meanings) if supports(form.space, NamesMetaActions) else ()
         has_speeds = tuple(form.names) in _WITH_LANE_CHANGE or {"IDLE", "SLOWER"} <= {*self._meanings}
-        self._steers = (
-            simulator if supports(simulator, TranslatesMotion) and simulator.is_steered(overruled.agent) else None
-        )
+        self._steers = _steered(simulator, overruled.agent)
         if not has_speeds and self._steers is None:
             raise InvalidEpisodeError(
                 f"a reference driver cannot drive {overruled.agent}: the lanes and speeds that its actions mean are "

@@ -78,6 +78,8 @@ class Driving:
             elif form in FREE_FORMS:
                 settings = self._setups[agent].action_settings
                 self.moving[agent] = FreeMotion(agent, form, self._step_length_s, self._area, settings)
+        if self.moving:
+            self._area.read_obstacles()
 
     def apply(self, agent: str, action: NDArray[np.generic]) -> bool:
         """Apply an encoded action; return whether the vehicle stays on the road."""

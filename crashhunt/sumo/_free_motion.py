@@ -35,6 +35,7 @@ _OVER_M = 1.0  # a vehicle so far over the side of its lane is in the way of the
 _LOOK_S, _MIN_LOOK_M = 0.5, 4.0  # how far ahead a vehicle that keeps its lane looks
 _MAX_LANES_AHEAD = 10
 _MAX_GAP_M = 5.0  # distance of a pursued trajectory from the vehicle
+_OBSTACLES = ("building", "obstacle")  # types of polygons
 _STANDING_M = 0.01  # a vehicle that moves by less in a step does not turn
 _MAX_SLIDE_M, _MAX_TURN_RAD = 0.2, 0.05  # distance of a trajectory's start from the vehicle, as plans predict
 
@@ -61,7 +62,7 @@ class FreeMotion:
         self._vehicle, self._form, self._dt, self._area = vehicle, form, step_length_s, area
         self._is_relative = settings.get("frame") == "ego"
         self._pursues = settings.get("tracker") == "pure_pursuit"
-        self._half = sumo.vehicle_getLength(vehicle) / 2
+        self._half, self._half_width = sumo.vehicle_getLength(vehicle) / 2, sumo.vehicle_getWidth(vehicle) / 2
         heading = math.radians(90.0 - sumo.vehicle_getAngle(vehicle))
         x, y = sumo.vehicle_getPosition(vehicle)
         self.state = MotionState(
@@ -79,10 +80,12 @@ class FreeMotion:
         self._route, self._goal, self._last = sumo.vehicle_getRouteID(vehicle), route[-1], len(route) - 1
         self.edges = frozenset(route)
         """The edges of the route; SUMO gives a vehicle that leaves its route another one."""
+        self.hit = ""
+        """Type and identifier of the obstacle that the vehicle has driven into; empty if there is none."""
         sumo.vehicle_setSpeedMode(vehicle, 0)  # SUMO would otherwise report a speed within its own limits
 
     def apply(self, action: NDArray[np.generic]) -> bool:
-        """Move the vehicle by an encoded action; return whether its centre stays on the road."""
+        """Move the vehicle by an encoded action; return whether its centre stays on the road, and it hits no obstacle."""
         state = self._next(action.tolist())
         if self._arrives(state):
             sumo.vehicle_remove(self._vehicle, _ARRIVED)
@@ -96,7 +99,19 @@ class FreeMotion:
                 raise
             return False  # no lane is within 100 m
         sumo.vehicle_setSpeed(self._vehicle, state.speed)
-        return self._area.contains(state.x, state.y, self._kind)
+        self.hit = self._area.obstacle_at(self._corners())
+        return not self.hit and self._area.contains(state.x, state.y, self._kind)
+
+    def _corners(self) -> list[tuple[float, float]]:
+        """Return the corners of the vehicle's outline, counter-clockwise."""
+        state, (cos, sin) = self.state, (math.cos(self.state.heading), math.sin(self.state.heading))
+        return [
+            (state.x + ahead * cos - left * sin, state.y + ahead * sin + left * cos)
+            for ahead, left in (
+                (self._half, self._half_width), (-self._half, self._half_width),
+                (-self._half, -self._half_width), (self._half, -self._half_width),
+            )
+        ]  # fmt: skip
 
     def steering(self) -> float:
         """Return the steering angle of the last step in rad, positive to the left."""
@@ -335,15 +350,38 @@ class FreeMotion:
 
 
 class DrivableArea:
-    """The lanes that a class of vehicles may use, and the junctions between them.
+    """The lanes that a class of vehicles may use, the junctions between them, and the obstacles.
 
-    SUMO finds the lane below a point; of each lane that was below one, the geometry is kept.
+    SUMO finds the lane below a point; of each lane that was below one, the geometry is kept. Obstacles are the polygons
+    of additional files whose type is ``building`` or ``obstacle``, or begins so, such as ``building.school``.
     """
 
     def __init__(self) -> None:
+        self._obstacles: list[tuple[str, Sequence[tuple[float, float]]]] = []
+        self._boxes = np.zeros((0, 4))  # least and largest x and y of each obstacle
         self._lanes: dict[str, tuple[Sequence[tuple[float, float]], float]] = {}
         self._junctions: dict[str, Sequence[tuple[float, float]]] = {}
         self._nearest = ""
+
+    def read_obstacles(self) -> None:
+        """Read the obstacles of the episode."""
+        self._obstacles.clear()
+        for name in sorted(sumo.polygon_getIDList()):
+            kind, shape = sumo.polygon_getType(name), [tuple(point[:2]) for point in sumo.polygon_getShape(name)]
+            if kind.partition(".")[0] in _OBSTACLES and len(shape) > 2:
+                self._obstacles.append((f"{kind} {name!r}", shape))
+        boxes = [(*np.min(shape, axis=0), *np.max(shape, axis=0)) for _, shape in self._obstacles]
+        self._boxes = np.array(boxes).reshape(-1, 4)
+
+    def obstacle_at(self, corners: Sequence[tuple[float, float]]) -> str:
+        """Return type and identifier of the first obstacle that an outline touches; empty if there is none."""
+        if not self._obstacles:
+            return ""
+        (low_x, low_y), (high_x, high_y) = np.min(corners, axis=0), np.max(corners, axis=0)
+        x0, y0, x1, y1 = self._boxes.T
+        near = np.flatnonzero((x0 <= high_x) & (x1 >= low_x) & (y0 <= high_y) & (y1 >= low_y))
+        found = (self._obstacles[one] for one in near)
+        return next((name for name, shape in found if _overlap(corners, shape)), "")
 
     def contains(self, x: float, y: float, kind: str) -> bool:
         """Return whether a point is on a lane that a class of vehicles may use, or inside a junction.
@@ -402,10 +440,30 @@ def _distance_squared(x: float, y: float, ax: float, ay: float, bx: float, by: f
     return (ax + share * dx - x) ** 2 + (ay + share * dy - y) ** 2
 
 
+def _overlap(one: Sequence[tuple[float, float]], two: Sequence[tuple[float, float]]) -> bool:
+    """Return whether two polygons overlap: their sides cross, or a corner of one is inside the other."""
+    if any(_is_inside(*corner, two) for corner in one) or any(_is_inside(*corner, one) for corner in two):
+        return True
+    return any(_cross(a, b, c, d) for a, b in _sides(one) for c, d in _sides(two))
+
+
+def _sides(shape: Sequence[tuple[float, float]]) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    return list(zip(shape, [*shape[1:], *shape[:1]], strict=True))
+
+
+def _cross(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float], d: tuple[float, float]) -> bool:
+    """Return whether two lines between points cross."""
+
+    def side(p: tuple[float, float], q: tuple[float, float], r: tuple[float, float]) -> float:
+        return (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
+
+    return side(a, b, c) * side(a, b, d) < 0 and side(c, d, a) * side(c, d, b) < 0
+
+
 def _is_inside(x: float, y: float, shape: Sequence[tuple[float, float]]) -> bool:
     """Return whether a point is inside a polygon, by the number of its sides to the right of the point."""
     inside = False
-    for (ax, ay), (bx, by) in zip(shape, [*shape[1:], *shape[:1]], strict=True):
+    for (ax, ay), (bx, by) in _sides(shape):
         if (ay > y) != (by > y) and x < ax + (y - ay) / (by - ay) * (bx - ax):
             inside = not inside
     return inside

@@ -291,6 +291,9 @@ class SumoSimulator:
             rewards[agent] = 0.0 if row is None else scene.speed(row) * self.step_length_s
             terminations[agent] = row is None
         scene.events = self._events.look(scene, tuple(actions))
+        for agent in self._off_road:
+            if (motion := self._driving.moving.get(agent)) and motion.hit:
+                scene.events += (self._events.hit(scene, agent, motion.hit),)
         self._shown = observations
         if scene.contacts or self._off_road:
             hit = {name for contact in scene.contacts for name in (contact.collider, contact.victim)}

@@ -262,6 +262,10 @@ class SumoEvents:
         self._last = scene
         return tuple(found)
 
+    def hit(self, scene: Scene, agent: str, obstacle: str) -> Event:
+        """Return the event that tells which obstacle an agent has driven into."""
+        return self._of(scene, agent, "off_road", f"{agent} drove into the {obstacle}")
+
     def _of(self, scene: Scene, agent: str, kind: str, what: str, others: tuple[str, ...] = ()) -> Event:
         row = scene.roster.index.get(agent)
         if row is None:

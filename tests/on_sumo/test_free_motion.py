@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 
 import libsumo
 import numpy as np
@@ -13,7 +14,7 @@ from crashhunt.oracles import Overlap
 from crashhunt.scenario import AgentSetup, argument_values, load_scenario
 from crashhunt.simulators import BicycleModel, MotionState
 from crashhunt.sumo import SumoSimulator
-from crashhunt.sumo._free_motion import DrivableArea, FreeMotion, _is_inside
+from crashhunt.sumo._free_motion import DrivableArea, FreeMotion, _is_inside, _overlap
 
 EMPTY = {"priority_demand": 1, "minor_demand": 1}
 
@@ -124,6 +125,63 @@ def test_followers_brake_for_a_vehicle_that_moves_freely_and_contacts_are_found(
     assert gap >= 0
     assert libsumo.vehicle.getLeader(follower, 100.0)[0] == "ego"
     assert found == []
+
+
+def box(x, y, length, width, turn):
+    c, s = math.cos(turn), math.sin(turn)
+    signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    return [(x + a * length / 2 * c - b * width / 2 * s, y + a * length / 2 * s + b * width / 2 * c) for a, b in signs]
+
+
+def test_overlap_of_outlines_is_that_of_separating_lines():
+    """Two convex polygons are apart if and only if a side of one of them has the other one wholly on its outer side."""
+
+    def separates(one, two):
+        sides = zip(one, [*one[1:], one[0]], strict=True)
+        return any(
+            all((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) <= 0 for x, y in two) for a, b in sides
+        )
+
+    rng, seen = np.random.default_rng(4), set()
+    for values in rng.uniform((-4, -4, 1, 0.5, -3, 1, 0.2), (4, 4, 6, 3, 3, 6, 3), (400, 7)).tolist():
+        one, two = box(0.0, 0.0, *values[5:], 0.3), box(*values[:5])
+        apart = separates(one, two) or separates(two, one)
+        assert _overlap(one, two) == _overlap(two, one) == (not apart)
+        seen.add(apart)
+    assert seen == {True, False}
+
+
+@pytest.mark.parametrize(("kind", "harms"), [("building", True), ("obstacle.wall", True), ("park", False)])
+def test_vehicle_that_drives_into_a_building_is_off_the_road_and_the_event_names_it(start, tmp_path, kind, harms):
+    simulator, step = start("acceleration_steering", **EMPTY)
+    x, y, heading = centre()
+    ahead, left = (math.cos(heading), math.sin(heading)), (-math.sin(heading), math.cos(heading))
+    half = libsumo.vehicle.getLength("ego") / 2
+    width = libsumo.vehicle.getWidth("ego") / 2
+    at = [30.0 * ahead[one] + (width + 1.9) * left[one] for one in (0, 1)]  # it reaches 0.1 m into the vehicle's path
+    shape = box(x + at[0], y + at[1], 4.0, 4.0, heading)
+    folder = tmp_path / "with-polygon"
+    shutil.copytree(load_scenario("intersection").folder, folder)
+    points = " ".join(f"{px},{py}" for px, py in shape)
+    polygon = f'<additional><poly id="b1" type="{kind}" color="red" shape="{points}"/></additional>'
+    (folder / "polygons.add.xml").write_text(polygon)
+    toml = folder / "scenario.toml"
+    toml.write_text(toml.read_text().replace("[sumo]\n", '[sumo]\nadditional = ["polygons.add.xml"]\n'))
+    simulator.close()
+    simulator, step = start("acceleration_steering", str(folder), **EMPTY)
+    driven = 0.0
+    for _ in range(60):
+        ended = step((0.0, 0.0))
+        driven += libsumo.vehicle.getSpeed("ego") * simulator.step_length_s
+        if ended["ego"]:
+            break
+    if not harms:
+        assert driven > 40.0
+        return
+    assert simulator.scene().off_road == ("ego",)
+    assert 28.0 - half < driven < 28.0 - half + 1.5  # the front has passed the near side of the building
+    (event,) = simulator.scene().events
+    assert (event.kind, event.what) == ("off_road", f"ego drove into the {kind} 'b1'")
 
 
 def test_two_vehicles_that_move_freely_collide_by_their_outlines(start):
