@@ -142,8 +142,8 @@ _THROTTLE = ActionComponent(name="throttle", low=0.0, high=1.0, help="share of t
 _BRAKE = ActionComponent(name="brake", low=0.0, high=1.0, help="share of the largest deceleration of the type")
 _STEERING = ActionComponent(name="steering", low=-1.0, high=1.0, help="share of 0.6 rad, positive to the left")
 _TIME = ActionComponent(name="time", low=0.0, high=10.0, unit="s", help="from the step of the answer on")
-_X = ActionComponent(name="x", low=-1e7, high=1e7, unit="m", help="centre of the rectangle, to the east")
-_Y = ActionComponent(name="y", low=-1e7, high=1e7, unit="m", help="centre of the rectangle, to the north")
+_X = ActionComponent(name="x", low=-1e7, high=1e7, unit="m", help="of the reference point, to the east")
+_Y = ActionComponent(name="y", low=-1e7, high=1e7, unit="m", help="of the reference point, to the north")
 _HEADING = ActionComponent(
     name="heading", low=-1e3, high=1e3, unit="rad", help="counter-clockwise from east; turns by 2 pi are equal"
 )
@@ -166,6 +166,13 @@ _FRAME = ActionSetting(
     default="map",
     choices=("map", "ego"),
     help="ego: positions and headings are relative to the vehicle, x ahead and y to the left",
+)
+_REFERENCE_POINT = ActionSetting(
+    name="reference_point",
+    default="center",
+    choices=("center", "rear_axle", "front_bumper"),
+    help="the point of the vehicle that x and y are of: the centre of the rectangle, the middle of the rear axle or of "
+    "the front bumper",
 )
 _TRACKER = ActionSetting(
     name="tracker",
@@ -208,13 +215,13 @@ ACTIONS: dict[str, ActionDescription] = {
         components=(_TIME, _X, _Y, _HEADING, _SPEED),
         shape="K rows of time, x, y, heading, speed; K up to 64",
         moves_freely=True,
-        settings=(_FRAME, _TRACKER),
+        settings=(_FRAME, _REFERENCE_POINT, _TRACKER),
     ),
     "target_pose": ActionDescription(
         title="A pose to reach at a time, on a smooth curve; the vehicle moves freely.",
         components=(_X, _Y, _HEADING, _TIME),
         moves_freely=True,
-        settings=(_FRAME,),
+        settings=(_FRAME, _REFERENCE_POINT),
     ),
     "sumo": ActionDescription(
         title="SUMO's driver model drives. None leaves the whole step to it; a speed or lane change overrides it.",

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
         MODIFIERS as MODIFIERS,
         PARTS as PARTS,
         REACH_M as REACH_M,
+        REFERENCE_SHARES as REFERENCE_SHARES,
         History as History,
         ObservationLayout as ObservationLayout,
         RequestedPart as RequestedPart,

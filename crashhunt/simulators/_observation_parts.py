@@ -181,7 +181,7 @@ HISTORY = Part(
 """A word that names no array of its own."""
 
 CENTER, REAR_AXLE, FRONT_BUMPER = "center", "rear_axle", "front_bumper"
-_REFERENCE_SHARES = {CENTER: 0.0, REAR_AXLE: -WHEELBASE_SHARE / 2, FRONT_BUMPER: 0.5}
+REFERENCE_SHARES = {CENTER: 0.0, REAR_AXLE: -WHEELBASE_SHARE / 2, FRONT_BUMPER: 0.5}
 """How far each reference point is ahead of the centre, as a share of the length."""
 
 REFERENCE_POINT = Part(
@@ -626,7 +626,7 @@ class ObservationLayout:
         history = int(modifiers.get(HISTORY.name, 0))
         self.occlusion_rays = int(modifiers.get(OCCLUSION.name, 0))
         point = REFERENCE_POINT.settings[0].choices[int(modifiers.get(REFERENCE_POINT.name, 0))]
-        self.reference_share = _REFERENCE_SHARES[point]
+        self.reference_share = REFERENCE_SHARES[point]
 
         self.reach_m = max((one.settings.get(name, 0.0) for one in parts for name in ("radius", "range")), default=0.0)
         self.parts = {one.part.name: one for one in sorted(parts, key=lambda one: one.part.name)}

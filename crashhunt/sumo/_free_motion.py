@@ -18,7 +18,7 @@ import numpy as np
 from libsumo import _libsumo as sumo
 
 from crashhunt.base.errors import ActionError
-from crashhunt.simulators import MAX_STEERING_RAD, WHEELBASE_SHARE, BicycleModel, MotionState
+from crashhunt.simulators import MAX_STEERING_RAD, REFERENCE_SHARES, WHEELBASE_SHARE, BicycleModel, MotionState
 from crashhunt.world import Motion
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ class FreeMotion:
         self._is_relative = settings.get("frame") == "ego"
         self._pursues = settings.get("tracker") == "pure_pursuit"
         self._half, self._half_width = sumo.vehicle_getLength(vehicle) / 2, sumo.vehicle_getWidth(vehicle) / 2
+        self._ahead = 2 * self._half * REFERENCE_SHARES[str(settings.get("reference_point", "center"))]
         heading = math.radians(90.0 - sumo.vehicle_getAngle(vehicle))
         x, y = sumo.vehicle_getPosition(vehicle)
         self.state = MotionState(
@@ -141,7 +142,7 @@ class FreeMotion:
         if not least <= moved <= most:
             message = f"the {self._words} moves the vehicle by {moved:.2f} m in a step of {dt:g} s"
             fix = f"return a pose between {max(0.0, least):.2f} and {most:.2f} m away"
-            raise ActionError(message, fix=f"{fix}; positions are those of the centre, in the map's frame")
+            raise ActionError(message, fix=f"{fix}; positions are those of {self._point}")
         turned = math.remainder(following.heading - state.heading, math.tau)
         if abs(turned) > _MAX_YAW_RATE_RADPS * dt + _MAX_TURN_RAD:
             message = f"the {self._words} turns the vehicle by {turned:.2f} rad in a step of {dt:g} s"
@@ -193,21 +194,27 @@ class FreeMotion:
         return [self._as_returned([self._dt, after.x, after.y, after.heading, after.speed])]
 
     def _as_returned(self, row: list[float]) -> list[float]:
-        """Return a point of a trajectory in the frame in which the agent returns it."""
-        if not self._is_relative:
-            return row
+        """Return a point of a trajectory in the frame, and with the reference point, in which the agent returns it."""
         state, (time, x, y, heading, speed) = self.state, row
-        dx, dy, cos, sin = x - state.x, y - state.y, math.cos(state.heading), math.sin(state.heading)
-        return [time, dx * cos + dy * sin, dy * cos - dx * sin, heading - state.heading, speed]
+        x, y = x + self._ahead * math.cos(heading), y + self._ahead * math.sin(heading)
+        if not self._is_relative:
+            return [time, x, y, heading, speed]
+        cos, sin = math.cos(state.heading), math.sin(state.heading)
+        dx, dy = x - state.x, y - state.y
+        return [time, dx * cos + dy * sin - self._ahead, dy * cos - dx * sin, heading - state.heading, speed]
 
     def _in_map(self, points: NDArray[np.generic]) -> NDArray[np.float64]:
-        """Return the points of a trajectory in the frame of the map."""
+        """Return the poses of the centre at the points of a trajectory, in the frame of the map."""
         found = np.array(points, np.float64)
         if self._is_relative:
             state, (x, y) = self.state, found[:, 1:3].T.copy()
+            x += self._ahead
             cos, sin = math.cos(state.heading), math.sin(state.heading)
             found[:, 1], found[:, 2] = state.x + x * cos - y * sin, state.y + x * sin + y * cos
             found[:, 3] += state.heading
+        if self._ahead:
+            found[:, 1] -= self._ahead * np.cos(found[:, 3])
+            found[:, 2] -= self._ahead * np.sin(found[:, 3])
         return found
 
     def _lane_keeping_angle(self) -> float:
@@ -250,6 +257,12 @@ class FreeMotion:
     def is_planned(self) -> bool:
         """Whether the actions are poses, which the vehicle may be unable to reach."""
         return self._form in ("trajectory", "target_pose")
+
+    @property
+    def _point(self) -> str:
+        """The reference point and the frame of the actions, in words."""
+        point = "the centre" if not self._ahead else "the rear axle" if self._ahead < 0 else "the front bumper"
+        return f"{point}, in the frame of the {'vehicle' if self._is_relative else 'map'}"
 
     @property
     def _words(self) -> str:

@@ -354,6 +354,37 @@ def test_trajectory_in_the_frame_of_the_vehicle_is_the_same_motion(start, tracke
     assert np.allclose(*courses, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize(("point", "share"), [("rear_axle", -0.3), ("front_bumper", 0.5)])
+@pytest.mark.parametrize("form", ["trajectory", "trajectory:tracker=pure_pursuit", "target_pose"])
+@pytest.mark.parametrize("frame", ["map", "ego"])
+def test_plan_for_another_reference_point_is_the_same_motion(start, form, frame, point, share):
+    """The plan in the map is moved along its headings; in the vehicle's frame, its own point is the origin."""
+    courses = []
+    for name in (form, f"{form}:frame={frame}:reference_point={point}"):
+        simulator, step = start(name, **EMPTY)
+        x, y, _ = centre()
+        speed, ahead, course = libsumo.vehicle.getSpeed("ego"), 0.0, []
+        if "reference" in name:
+            ahead = share * libsumo.vehicle.getLength("ego")
+        for number in range(15):
+            times = np.arange(0.1, 2.05, 0.1) if form != "target_pose" else [2.0 - 0.1 * number]
+            rows = []
+            for t in times:
+                s = (t + 0.1 * number) * speed if form != "target_pose" else 2.0 * speed
+                turn = 0.01 * s / speed
+                rows.append([t, x + s + ahead * math.cos(turn), y + 0.2 * turn + ahead * math.sin(turn), turn, speed])
+            if ahead and frame == "ego":
+                rows = [[t, a - ahead, *rest] for t, a, *rest in relative(rows)]
+            step(rows if form != "target_pose" else (*rows[0][1:4], rows[0][0]))
+            course.append(centre())
+            if ahead:
+                motion = simulator._driving.moving["ego"]
+                row = [0.1, motion.state.x + 1.0, motion.state.y, motion.state.heading + 0.02, speed]
+                assert np.allclose(motion._in_map([motion._as_returned(row)]), [row], rtol=0, atol=1e-9)
+        courses.append(course)
+    assert np.allclose(*courses, rtol=0, atol=1e-6)
+
+
 def test_pose_in_the_frame_of_the_vehicle_is_the_same_motion(start):
     courses = []
     for frame, change in (("map", list), ("ego", relative)):
