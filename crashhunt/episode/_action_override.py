@@ -34,8 +34,10 @@ if TYPE_CHECKING:
 
 
 _SPEED_AND_LANE, _ACCELERATION = ACTIONS["speed_and_lane"].names, ACTIONS["acceleration"].names
+_SUMO = ACTIONS["sumo"].names  # without an override, SUMO also changes lanes
 _WITH_LANE_CHANGE = (_SPEED_AND_LANE, _ACCELERATION)
-_WITH_SPEED = (*_WITH_LANE_CHANGE, ACTIONS["speed_and_lateral"].names)
+_WITH_LANE = (*_WITH_LANE_CHANGE, ACTIONS["speed_and_lateral"].names)
+_WITH_SPEED = (*_WITH_LANE, _SUMO)
 _LANE_ACTIONS = ("LANE_LEFT", "LANE_RIGHT")
 _SPEED_ACTIONS = ("FASTER", "SLOWER")
 
@@ -126,7 +128,8 @@ class Keeping(_Overruling):
         form = simulator.actions[agent]
         self._idle = _idle(form)
         self._steers = _steered(simulator, agent)
-        if self._idle is None and self._steers is None and tuple(form.names) not in _WITH_SPEED:
+        known = _WITH_LANE if keeps == "lane" else _WITH_SPEED
+        if self._idle is None and self._steers is None and tuple(form.names) not in known:
             raise InvalidEpisodeError(
                 f"the {keeps} of {agent} cannot be held: it is unknown which lanes and speeds its actions choose"
             )
@@ -151,7 +154,7 @@ class Keeping(_Overruling):
         if self._idle is None:
             value, change = encoded.tolist()
             kept = 0.0 if tuple(self._form.names) == _ACCELERATION else self._speed
-            change = int(change) if tuple(self._form.names) in _WITH_LANE_CHANGE else change
+            change = int(change) if tuple(self._form.names) in (*_WITH_LANE_CHANGE, _SUMO) else change
             return (value, 0) if self._stays else (kept, change)
         space = self._form.space
         assert supports(space, NamesMetaActions)
@@ -211,7 +214,7 @@ def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
         InvalidEpisodeError: the vehicle has no action for a lane change.
     """
     form = simulator.actions[agent]
-    if tuple(form.names) == _SPEED_AND_LANE:
+    if tuple(form.names) in (_SPEED_AND_LANE, _SUMO):
         return 0.0, 1 if side == "left" else -1
     if tuple(form.names) == _ACCELERATION:
         return -MAX_ACCELERATION, 1 if side == "left" else -1

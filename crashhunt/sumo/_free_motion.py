@@ -86,7 +86,7 @@ class FreeMotion:
         sumo.vehicle_setSpeedMode(vehicle, 0)  # SUMO would otherwise report a speed within its own limits
 
     def apply(self, action: NDArray[np.generic]) -> bool:
-        """Move the vehicle by an encoded action; return whether its centre stays on the road, and it hits no obstacle."""
+        """Move the vehicle by an encoded action; return whether it stays on the road and hits no obstacle."""
         state = self._next(action.tolist())
         if self._arrives(state):
             sumo.vehicle_remove(self._vehicle, _ARRIVED)

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import libsumo
 import pytest
 
-from crashhunt.scenario import argument_values, load_scenario, with_action
+import crashhunt.guide
+from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.episode import overruled_agent
+from crashhunt.scenario import ACTIONS, argument_values, load_scenario, with_action
 from crashhunt.sumo import SumoSimulator
+from crashhunt.trial import Overruled
 
 
 @pytest.fixture
@@ -14,16 +21,17 @@ def start(tmp_path):
     """Return a function that begins an episode in a form of actions, and returns a function that takes a step."""
     made = []
 
-    def begin(form, scenario="loop", seed=3):
+    def begin(form, scenario="loop", seed=3, **values):
         chosen = with_action(load_scenario(scenario), "ego", form)
         simulator = SumoSimulator(chosen, tmp_path)
         made.append(simulator)
-        simulator.reset(seed=seed, options={"arguments": argument_values(chosen)})
+        simulator.reset(seed=seed, options={"arguments": {**argument_values(chosen), **values}})
 
         def step(action):
             simulator.step({"ego": simulator.actions["ego"].encode(action)})
             return simulator
 
+        step.simulator = simulator
         return step
 
     yield begin
@@ -144,3 +152,51 @@ def test_override_holds_for_one_step_and_sumo_drives_again_afterwards(start):
     assert libsumo.vehicle.getLaneChangeMode("ego") == 0
     step(None)
     assert libsumo.vehicle.getLaneChangeMode("ego") == 0b011001010101
+
+
+PAGE = Path(crashhunt.guide.__file__).parent / "reference" / "actions.md"
+HOWS = {
+    "brake": {}, "left": {"manoeuvre": "left"}, "keep_lane": {"keeps": "lane"}, "keep_speed": {"keeps": "speed"},
+    "reference": {"reference": "both"},
+}  # fmt: skip
+
+
+def refused_on_page(how):
+    """The forms for which the table of the page says that an agent cannot be overruled in this way."""
+    rows = PAGE.read_text(encoding="utf-8").splitlines()
+    (row,) = [row for row in rows if row.startswith("| `whatif --overrule") and re.search(rf"\b{how}\b", row)]
+    cell = row.split("|")[2]
+    free = {name for name, form in ACTIONS.items() if form.moves_freely and "move freely" in cell}
+    return free | set(re.findall(r"`(\w+)`", cell))
+
+
+class FullBraking:
+    """Answers with full braking in any form."""
+
+    def __init__(self, simulator):
+        self.simulator = simulator
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        braking = self.simulator.full_braking("ego")
+        return braking.choose() if braking.choose else braking.action
+
+
+@pytest.mark.parametrize("form", ACTIONS)
+def test_agent_is_overruled_in_every_form_or_refused_as_the_page_says(start, form):
+    step = start(form, "intersection", priority_demand=200, minor_demand=100)
+    refused = {}
+    for how, chosen in HOWS.items():
+        overruled = Overruled("ego", 1, **chosen)
+        try:
+            driver = overruled_agent(FullBraking(step.simulator), step.simulator, overruled)
+        except InvalidEpisodeError as error:
+            refused[how] = str(error)
+            continue
+        driver.reset(0)
+        for _ in range(3):  # the last two are overruled
+            step(driver.act(None))
+    assert {how for how in HOWS if form in refused_on_page(how)} == set(refused)
+    assert not [said for said in refused.values() if "ego" not in said or "\n" in said]

@@ -138,9 +138,7 @@ def test_overlap_of_outlines_is_that_of_separating_lines():
 
     def separates(one, two):
         sides = zip(one, [*one[1:], one[0]], strict=True)
-        return any(
-            all((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) <= 0 for x, y in two) for a, b in sides
-        )
+        return any(all((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) <= 0 for x, y in two) for a, b in sides)
 
     rng, seen = np.random.default_rng(4), set()
     for values in rng.uniform((-4, -4, 1, 0.5, -3, 1, 0.2), (4, 4, 6, 3, 3, 6, 3), (400, 7)).tolist():
