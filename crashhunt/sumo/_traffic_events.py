@@ -263,7 +263,7 @@ class SumoEvents:
         return tuple(found)
 
     def hit(self, scene: Scene, agent: str, obstacle: str) -> Event:
-        """Return the event that tells which obstacle an agent has driven into."""
+        """Return the event that names the obstacle into which an agent has driven."""
         return self._of(scene, agent, "off_road", f"{agent} drove into the {obstacle}")
 
     def _of(self, scene: Scene, agent: str, kind: str, what: str, others: tuple[str, ...] = ()) -> Event:

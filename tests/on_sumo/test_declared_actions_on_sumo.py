@@ -185,7 +185,7 @@ class FullBraking:
 
 
 @pytest.mark.parametrize("form", ACTIONS)
-def test_agent_is_overruled_in_every_form_or_refused_as_the_page_says(start, form):
+def test_an_override_works_in_every_form_that_the_page_does_not_exclude(start, form):
     step = start(form, "intersection", priority_demand=200, minor_demand=100)
     refused = {}
     for how, chosen in HOWS.items():
