@@ -12,7 +12,7 @@ from crashhunt.agents import REFERENCE_MODELS, Closes, Recorded
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.episode._competent_driver import CompetentDriver
-from crashhunt.scenario import ACTIONS
+from crashhunt.scenario import ACTIONS, OVERRIDES_ONLY
 from crashhunt.simulators import (
     MAX_ACCELERATION,
     NamesMetaActions,
@@ -34,10 +34,9 @@ if TYPE_CHECKING:
 
 
 _SPEED_AND_LANE, _ACCELERATION = ACTIONS["speed_and_lane"].names, ACTIONS["acceleration"].names
-_SUMO = ACTIONS["sumo"].names  # without an override, SUMO also changes lanes
 _WITH_LANE_CHANGE = (_SPEED_AND_LANE, _ACCELERATION)
 _WITH_LANE = (*_WITH_LANE_CHANGE, ACTIONS["speed_and_lateral"].names)
-_WITH_SPEED = (*_WITH_LANE, _SUMO)
+_WITH_SPEED = (*_WITH_LANE, OVERRIDES_ONLY)  # whose driver also changes lanes
 _LANE_ACTIONS = ("LANE_LEFT", "LANE_RIGHT")
 _SPEED_ACTIONS = ("FASTER", "SLOWER")
 
@@ -154,7 +153,7 @@ class Keeping(_Overruling):
         if self._idle is None:
             value, change = encoded.tolist()
             kept = 0.0 if tuple(self._form.names) == _ACCELERATION else self._speed
-            change = int(change) if tuple(self._form.names) in (*_WITH_LANE_CHANGE, _SUMO) else change
+            change = int(change) if tuple(self._form.names) in (*_WITH_LANE_CHANGE, OVERRIDES_ONLY) else change
             return (value, 0) if self._stays else (kept, change)
         space = self._form.space
         assert supports(space, NamesMetaActions)
@@ -214,7 +213,7 @@ def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
         InvalidEpisodeError: the vehicle has no action for a lane change.
     """
     form = simulator.actions[agent]
-    if tuple(form.names) in (_SPEED_AND_LANE, _SUMO):
+    if tuple(form.names) in (_SPEED_AND_LANE, OVERRIDES_ONLY):
         return 0.0, 1 if side == "left" else -1
     if tuple(form.names) == _ACCELERATION:
         return -MAX_ACCELERATION, 1 if side == "left" else -1

@@ -7,6 +7,7 @@ from crashhunt.base.doors import offer_lazily
 if TYPE_CHECKING:
     from ._action_forms import (
         ACTIONS as ACTIONS,
+        OVERRIDES_ONLY as OVERRIDES_ONLY,
         ActionComponent as ActionComponent,
         ActionDescription as ActionDescription,
         action_settings as action_settings,

@@ -7,7 +7,7 @@ spaces take their bounds from it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import any_of, one_of
@@ -230,6 +230,8 @@ ACTIONS: dict[str, ActionDescription] = {
     ),
 }
 """All forms by name, in the order in which they are listed."""
+OVERRIDES_ONLY: Final = ACTIONS["sumo"].names
+"""The components of the form in which the simulator's driver drives, and an action overrides it."""
 
 
 def canonical_action(name: str | None) -> str:

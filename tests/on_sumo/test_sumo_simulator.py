@@ -193,7 +193,7 @@ def running(make, sumo, monkeypatch):
     sumo.answers |= {"vehicle_getRoadID": "e", "vehicle_getLaneIndex": 1, "vehicle_getDistance": 130.0}
     made._driving = SimpleNamespace(
         apply=lambda agent, action: made.applied.append((agent, action)) or action != "off", lanes=lambda edge: 3,
-        from_left=lambda edge, lane: 3.5, aside=lambda agent: (0.25, -0.5),
+        from_left=lambda edge, lane: 3.5, aside=lambda agent: (0.25, -0.5), moving={},
     )  # fmt: skip
 
     def look(steps, off_road):

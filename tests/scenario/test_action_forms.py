@@ -36,7 +36,8 @@ def test_agent_that_names_its_forms_is_refused_with_another_form():
 
 
 def test_settings_follow_the_name_of_the_form():
-    assert action_settings("trajectory:frame=ego") == {"frame": "ego", "tracker": "interpolation"}
+    defaults = {"reference_point": "center", "tracker": "interpolation"}
+    assert action_settings("trajectory:frame=ego") == {"frame": "ego", **defaults}
     assert action_settings(None) == action_settings("continuous") == {"lane_change_duration_s": 0.0}
     assert AgentSetup(action="speed_and_lane:lane_change_duration_s=3").action_settings == {"lane_change_duration_s": 3}
     assert canonical_action("target_pose:frame=ego") == "target_pose"
