@@ -147,6 +147,7 @@ class Curve(Panel):
         low: lower end of the vertical axis; by default the least value.
         high: upper end of the vertical axis; by default the greatest value.
         cursor: position of a vertical line on the x axis.
+        colors: red, green and blue (0 to 255) of some curves, by name.
     """
 
     series: Mapping[str, ArrayLike] | ArrayLike
@@ -154,6 +155,7 @@ class Curve(Panel):
     low: float | None = None
     high: float | None = None
     cursor: float | None = None
+    colors: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
 
 
 @dataclass
@@ -354,6 +356,7 @@ def _one_line(text: object) -> str:
 
 
 _TOP, _LEFT, _BOTTOM, _RIGHT = 20, 38, 18, 10  # room for title and labels, in pixels
+_LEGEND_FONT_PIXELS, _LEGEND_ROW_PIXELS, _LEGEND_GAP_PIXELS, _MAX_LEGEND_ROWS = 11, 13, 10, 3
 _NAME_ROW_PIXELS = 11  # height of a row of names below bars
 _LARGE_NAME_CHARACTERS = 12  # characters of a name that are written large
 _MAX_DRAWN_VALUE = 1e100  # beyond it, the difference of two numbers may overflow; drawn as missing
@@ -418,15 +421,16 @@ def _paint_curve(panel: Curve, canvas: Canvas) -> None:
     x = np.arange(longest) if panel.x is None else _numbers(panel.x).ravel()
     everything = np.concatenate(list(series.values())) if series else np.zeros(0)
     low, high = _limits(everything, panel.low, panel.high)
-    frame = _Axes(canvas, *_limits(x, None, None), low, high)
-    for place, (name, values) in enumerate(series.items()):
+    colors = {name: panel.colors.get(name, COLORS[place % len(COLORS)]) for place, name in enumerate(series)}
+    top = _draw_legend(canvas, list(colors.items()))
+    frame = _Axes(canvas, *_limits(x, None, None), low, high, top)
+    for name, values in series.items():
         count = min(len(x), len(values))
         for part in _finite_runs(x[:count], values[:count]):
-            frame.line(part, COLORS[place % len(COLORS)])
-        _draw_legend(canvas, place, name)
+            frame.line(part, colors[name])
     if panel.cursor is not None:
         at = frame.x(panel.cursor)
-        canvas.draw.line((at, _TOP, at, canvas.height - _BOTTOM), FAINT)
+        canvas.draw.line((at, top, at, canvas.height - _BOTTOM), FAINT)
 
 
 @_paint.register(Curve3D)
@@ -515,11 +519,11 @@ def _paint_distribution(panel: ActionDistribution, canvas: Canvas) -> None:
     low, high = float((mean - 3 * std)[there].min()), float((mean + 3 * std)[there].max())
     x = np.linspace(low, high, 120)
     density = np.exp(-(((x[None] - mean[:, None]) / std[:, None]) ** 2) / 2) / (std[:, None] * math.sqrt(math.tau))
-    frame = _Axes(canvas, low, high, 0.0, float(density[there].max()))
+    colors = [(_name(panel.names, place), COLORS[place % len(COLORS)]) for place in range(len(density))]
+    frame = _Axes(canvas, low, high, 0.0, float(density[there].max()), _draw_legend(canvas, colors))
     for place, curve in enumerate(density):
         if there[place]:
-            frame.line(np.stack((x, curve), 1), COLORS[place % len(COLORS)])
-        _draw_legend(canvas, place, _name(panel.names, place))
+            frame.line(np.stack((x, curve), 1), colors[place][1])
 
 
 @_paint.register(Picture)
@@ -553,11 +557,11 @@ def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int, bool]]:
 class _Axes:
     """Axes with labels, and the conversion of values to pixel positions."""
 
-    def __init__(self, canvas: Canvas, left: float, right: float, low: float, high: float) -> None:
-        self._draw = canvas.draw
+    def __init__(self, canvas: Canvas, left: float, right: float, low: float, high: float, top: int) -> None:
+        self._draw, self._top = canvas.draw, top
         self._left, self._low = left, low
         self._scale_x = (canvas.width - _LEFT - _RIGHT) / span_of(left, right)
-        self._scale_y = (canvas.height - _TOP - _BOTTOM) / span_of(low, high)
+        self._scale_y = (canvas.height - top - _BOTTOM) / span_of(low, high)
         self._bottom = canvas.height - _BOTTOM
         for tick in ticks(low, high):
             at = self._bottom - (tick - low) * self._scale_y
@@ -565,7 +569,7 @@ class _Axes:
             canvas.text((_LEFT - 4, at), number(tick), FAINT, 10, anchor="rm")
         for tick in ticks(left, right):
             canvas.text((self.x(tick), canvas.height - _BOTTOM + 3), number(tick), FAINT, 10, anchor="mt")
-        canvas.draw.rectangle((_LEFT, _TOP, canvas.width - _RIGHT, self._bottom), outline=FAINT)
+        canvas.draw.rectangle((_LEFT, top, canvas.width - _RIGHT, self._bottom), outline=FAINT)
 
     def x(self, value: float) -> float:
         return _LEFT + (value - self._left) * self._scale_x
@@ -574,7 +578,7 @@ class _Axes:
         placed = np.empty_like(points)
         placed[:, 0] = _LEFT + (points[:, 0] - self._left) * self._scale_x
         heights = self._bottom - (points[:, 1] - self._low) * self._scale_y
-        placed[:, 1] = np.clip(heights, _TOP, self._bottom)
+        placed[:, 1] = np.clip(heights, self._top, self._bottom)
         if len(placed) == 1:
             placed, heights = np.repeat(placed, 2, axis=0), np.repeat(heights, 2)
         is_cut = np.abs(heights - placed[:, 1]) > _CUT_PIXELS
@@ -684,8 +688,20 @@ def _color_bar(canvas: Canvas, low: float, high: float) -> None:
     canvas.text((canvas.width - 37, canvas.height - 8), number(low), FAINT, 10, anchor="ls")
 
 
-def _draw_legend(canvas: Canvas, place: int, name: str) -> None:
-    canvas.text((canvas.width - _RIGHT - 3, _TOP + 1 + 12 * place), name, COLORS[place % len(COLORS)], 10, anchor="ra")
+def _draw_legend(canvas: Canvas, names: Sequence[tuple[str, tuple[int, int, int]]]) -> int:
+    """Write the names of curves in rows between title and axes, never over a curve; return the top of the axes."""
+    left, row = float(_LEFT), 0
+    for name, color in names:
+        if not name:
+            continue
+        width = font(_LEGEND_FONT_PIXELS).getlength(_one_line(name)) + _LEGEND_GAP_PIXELS
+        if left > _LEFT and left + width > canvas.width - _RIGHT:
+            left, row = float(_LEFT), row + 1
+        if row == _MAX_LEGEND_ROWS:
+            break
+        canvas.text((left, _TOP - 1 + _LEGEND_ROW_PIXELS * row), name, color, _LEGEND_FONT_PIXELS)
+        left += width
+    return _TOP + (_LEGEND_ROW_PIXELS * min(row + 1, _MAX_LEGEND_ROWS) if left > _LEFT or row else 0)
 
 
 def _name(names: Sequence[str], place: int) -> str:

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 _SHOWN_S = 10.0  # of the built-in curves
 _TTC_CUT_S, _GAP_CUT_M, _ACCELERATION_CUT_MPS2 = 10.0, 100.0, 12.0  # as in the player of the report
+_AGENT_CURVE, _PARTNER_CURVE = (154, 91, 0), (143, 15, 63)  # as the vehicles, in colours that are legible on white
 _MOTION = ("speed (m/s)", "acceleration (m/s^2)", "criticality", "action")  # the font has no ²
 _WITH_OTHER = ("time to collision (s)", "gap (m)", *_MOTION)
 _WITH_NEAREST = ("least time to collision (s)", "nearest gap (m)", *_MOTION)  # a crash without a partner
@@ -89,6 +90,7 @@ class BuiltinPanels:
                 for name in ("gap_m", "time_to_collision_s")
             )
         self._speeds = {name: _speeds_of(scenes, name) for name in (agent, other) if name}
+        self._colors = {agent: _AGENT_CURVE, **({other: _PARTNER_CURVE} if other else {})}
         self._accelerations = {
             name: np.append(np.nan, np.diff(speeds)) / self._dt for name, speeds in self._speeds.items()
         }
@@ -121,8 +123,8 @@ class BuiltinPanels:
         curves = [
             Curve(self._times[part], x, low=0.0, high=_TTC_CUT_S),
             Curve(gaps, x, low=0.0, high=min(_GAP_CUT_M, float(gaps[np.isfinite(gaps)].max(initial=1.0)))),
-            Curve({name: values[part] for name, values in self._speeds.items()}, x, low=0.0),
-            Curve(pulls, x, low=-bound, high=bound),
+            Curve({name: values[part] for name, values in self._speeds.items()}, x, low=0.0, colors=self._colors),
+            Curve(pulls, x, low=-bound, high=bound, colors=self._colors),
             *([Curve(self._danger[part], x, low=0.0, high=1.0)] if is_whole else []),
         ]
         if not self._recording.actors:

@@ -53,17 +53,23 @@ def test_each_bar_is_in_the_middle_of_its_room_with_its_number_above(count, widt
         assert ink[1].mean() == pytest.approx(room / 2, abs=4)
 
 
-def test_names_are_below_their_bars_and_legends_at_the_right_in_their_colours():
+def test_names_are_below_their_bars_and_names_of_curves_above_the_axes_in_their_colours():
     plain, named = (Bar({name: 1.0}).draw() for name in ("", "name"))
     rows, columns = np.nonzero((plain != named).any(axis=2))
     bar = np.nonzero(where(named, BLUE))[0].max()
     assert bar < rows.min() <= bar + 8
     assert columns.mean() == pytest.approx(120, abs=2)
-    legend = Curve({"speed": [0, 0], "limit": [1, 1]}, low=-9, high=9).draw()
-    for place, color in enumerate(COLORS[:2]):
-        rows, columns = np.nonzero((np.abs(legend[:70, 150:].astype(int) - color) < 60).all(axis=2))
-        assert rows.mean() == pytest.approx(32 + 12 * place, abs=8)
-        assert 225 <= 150 + columns.max() <= 238
+    names, mine = {"speed": [0, 0], "limit": [1, 1]}, {"limit": (143, 15, 63)}
+    legend = Curve(names, low=-9, high=9, colors=mine).draw()
+    lines = Curve({f"{name} {'x' * 40}": values for name, values in names.items()}, low=-9, high=9).draw()
+    axes = min(np.nonzero((legend == (93, 107, 125)).all(axis=2).sum(axis=1) > 150)[0])
+    lefts = []
+    for color in (COLORS[0], mine["limit"]):
+        rows, columns = np.nonzero((np.abs(legend[:axes].astype(int) - color) < 60).all(axis=2))
+        assert rows.max() < axes
+        lefts.append(columns.min())
+    assert 38 <= lefts[0] < lefts[1] - 20
+    assert min(np.nonzero((lines == (93, 107, 125)).all(axis=2).sum(axis=1) > 150)[0]) == axes + 13  # a row for each
     nothing = Heatmap([[np.nan, np.nan]]).draw()
     unit = Heatmap([[np.nan, np.nan]], low=0.0, high=1.0).draw()
     assert np.array_equal(nothing, unit)  # without values, the scale is from 0 to 1
