@@ -8,14 +8,18 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, UsageError
+from crashhunt.base.text import count_of, listed
 from crashhunt.cli._common import add_json, integer, opened_hunt, say
 from crashhunt.cli._exit_codes import DONE
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Sequence
 
     from crashhunt.cli._common import Commands
     from crashhunt.crashes import Note
+
+_MAX_KNOWN, _MAX_TEXT = 8, 40  # tags and texts, and characters of a text, in the answer to --find
 
 
 def add_note_command(commands: Commands) -> None:
@@ -59,11 +63,13 @@ def _note(options: argparse.Namespace, _words: list[str]) -> int:
     if options.text and options.remove:
         raise UsageError("TEXT and --remove cannot be combined", fix="run the command once with each of them")
     if not changes:
-        found = [(place, note) for place, notes in _listed(options) for note in notes]
+        known = [(place, note) for place, notes in _listed(options) for note in notes]
+        words = options.find.split()
+        found = [(place, note) for place, note in known if note.matches(words)]
         for place, note in found:
             say(f"{place}: {describe_note(note)}", as_json=options.json)
         if not found:
-            say("no note was found" if options.find else "There are no notes.", as_json=options.json)
+            say(_nothing_found(options.find, [note for _, note in known]), as_json=options.json)
         if options.json:
             print(json.dumps({"notes": [{"hunt": place, **note.to_json()} for place, note in found]}))
         return DONE
@@ -75,6 +81,17 @@ def _note(options: argparse.Namespace, _words: list[str]) -> int:
         key = "removed" if options.remove else "added"
         print(json.dumps({key: [{"hunt": str(hunt), **note.to_json()} for note in changed]}))
     return DONE
+
+
+def _nothing_found(words: str, known: Sequence[Note]) -> str:
+    """Return the answer to a list without notes: which tags and words there are to look for."""
+    if not known:
+        return "There are no notes."
+    tags = sorted({tag for note in known for tag in note.tags})
+    texts = [note.text for note in known if note.text]
+    what = [f"tags: {listed(tags[:_MAX_KNOWN])}"] if tags else []
+    what += [f"texts: {listed(repr(text[:_MAX_TEXT]) for text in texts[:_MAX_KNOWN])}"] if texts else []
+    return f"no note of {count_of(len(known), 'note')} contains {words!r} ({'; '.join(what)})"
 
 
 def _added(options: argparse.Namespace, hunt: Path, crash: str, tags: list[str]) -> Note:
@@ -123,8 +140,8 @@ def _subject(options: argparse.Namespace) -> tuple[Path, str]:
     return directory, ""
 
 
-def _listed(options: argparse.Namespace) -> list[tuple[str, list[Note]]]:
-    """Return the notes of each hunt in the directory that match the options."""
+def _listed(options: argparse.Namespace) -> list[tuple[str, tuple[Note, ...]]]:
+    """Return the notes of each hunt in the directory, or of the crash that the user names."""
     from crashhunt.crashes import find_bundle, read_notes, subject_of
     from crashhunt.results import find_hunts
 
@@ -141,5 +158,4 @@ def _listed(options: argparse.Namespace) -> list[tuple[str, list[Note]]]:
                 raise BundleError("--crash needs the directory of one hunt", fix=f"give one, such as {hunts[0]}")
             crash = subject_of(find_bundle(hunts[0], options.crash))
         notes = {str(hunt): read_notes(hunt, crash or None) for hunt in hunts}
-    words = options.find.split()
-    return [(hunt, [note for note in found if note.matches(words)]) for hunt, found in notes.items()]
+    return list(notes.items())

@@ -45,6 +45,8 @@ def add_trials(commands: Commands) -> None:
 
 def _trials(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.base.files import whole_file
+    from crashhunt.crashes import read_notes
+    from crashhunt.report import describe_note
     from crashhunt.results import HuntResults, write_parquet, write_text
     from crashhunt.trial import Outcome, in_order
 
@@ -57,6 +59,8 @@ def _trials(options: argparse.Namespace, _words: list[str]) -> int:
         if name not in known:
             raise UsageError(f"--outcome: there is no outcome {name!r}", fix=one_of(name, known, give="give some of"))
     hunt = HuntResults(options.directory)
+    for note in read_notes(options.directory):  # the table is for programs, so notes are next to it
+        print(describe_note(note), file=sys.stderr)
     if options.out is None:
         if options.format == "parquet":
             raise UsageError("--format parquet cannot be printed on a terminal", fix="give --out FILE")

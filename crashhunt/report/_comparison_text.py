@@ -228,18 +228,20 @@ def _argument_plot(
             if inside.any():
                 middle = (place + 0.5) / (len(edges) - 1)
                 lines[hunt].append((middle, float(crashed[inside].mean()), int(inside.sum())))
-    most = max([rate for line in lines.values() for _, rate, _ in line] + [1e-9])
-    parts = ['<path class="axis" d="M40 8V148H268"/>',
-             f'<text x="154" y="180" text-anchor="middle">{html.escape(label)}</text>',
+    most = (
+        max((rate for line in lines.values() for _, rate, _ in line), default=0.0) or 1.0
+    )  # of an axis without crashes
+    parts = ['<path class="axis" d="M52 8V148H268"/>',
+             f'<text x="160" y="180" text-anchor="middle">{html.escape(label)}</text>',
              '<text transform="translate(11 78) rotate(-90)" text-anchor="middle">crash rate</text>',
-             f'<text x="36" y="16" text-anchor="end">{format_percent(most)}</text>',
-             '<text x="36" y="150" text-anchor="end">0</text>']  # fmt: skip
+             f'<text x="48" y="16" text-anchor="end">{format_percent(most)}</text>',
+             '<text x="48" y="150" text-anchor="end">0</text>']  # fmt: skip
     for place, end in enumerate(labels):
-        x = 40 + 228 * (place / (len(labels) - 1) if numeric else (place + 0.5) / len(labels))
+        x = 52 + 216 * (place / (len(labels) - 1) if numeric else (place + 0.5) / len(labels))
         anchor = ("start" if not place else "end") if numeric else "middle"
         parts.append(f'<text x="{x:.0f}" y="163" text-anchor="{anchor}">{html.escape(end)}</text>')
     for hunt, line in lines.items():
-        at = [(40 + 228 * x, 148 - 136 * rate / most, count, rate) for x, rate, count in line]
+        at = [(52 + 216 * x, 148 - 136 * rate / most, count, rate) for x, rate, count in line]
         path = "L".join(f"{x:.1f} {y:.1f}" for x, y, _, _ in at)
         parts.append(f'<path d="M{path}" fill="none" stroke="{colors[hunt]}" stroke-width="2"/>')
         parts += [

@@ -64,7 +64,7 @@ function showTip(x, y, text) {
 function hideTip() { $("tip").hidden = true; }
 
 /* What is shown of the crash */
-const view = { crash: null, step: 0, playing: false, follow: true, ids: false, observed: true, picked: "", scale: 6, x: 0, y: 0, last: 0, clock: 0, frames: 0 };
+const view = { crash: null, step: 0, playing: false, follow: true, ids: false, observed: true, whole: false, picked: "", scale: 6, x: 0, y: 0, last: 0, clock: 0, frames: 0 };
 window.crashhuntView = view;
 
 /* Unpacks what a crash came with; once. */
@@ -635,23 +635,30 @@ function rowsOf(crash) {
   });
   return rows.filter((row) => row.series.some((one) => one.values.some(Number.isFinite)));
 }
+/* The steps that the curves show: of a long trial the last seconds, unless the user wants it whole or is before them. */
+const SHOWN_S = 15, LONG_S = 20;
+function shownSteps(crash) {
+  const last = Math.max(1, crash.steps - 1), from = end(crash) - Math.round(SHOWN_S / crash.dt);
+  return view.whole || last * crash.dt <= LONG_S || view.step < from ? [0, last] : [Math.max(0, from), Math.min(last, end(crash) + Math.round(2 / crash.dt))];
+}
 function drawPlot() {
   const crash = view.crash, [context, width, height] = fit($("plot"));
   if (!crash) return;
-  const right = width - RIGHT, last = Math.max(1, crash.steps - 1), x = (step) => LEFT + ((right - LEFT) * step) / last;
+  const right = width - RIGHT, [from, last] = shownSteps(crash), x = (step) => LEFT + ((right - LEFT) * (step - from)) / (last - from);
   const bottom = HEAD + crash.rows.length * ROW;
-  copied("plot", crash, context, width, height, (context) => {
+  $("whole").hidden = (crash.steps - 1) * crash.dt <= LONG_S;
+  copied("plot", `${crash.id} ${from}`, context, width, height, (context) => {
     context.font = "11px system-ui";
-    crash.rows.forEach((row, place) => drawRow(context, row, HEAD + place * ROW + TITLE, HEAD + (place + 1) * ROW - 4, x, right));
+    crash.rows.forEach((row, place) => drawRow(context, row, HEAD + place * ROW + TITLE, HEAD + (place + 1) * ROW - 4, x, right, from, last));
     context.fillStyle = css("--faint");
     context.textAlign = "center";
     const ticks = right - LEFT < 300 ? 2 : 4;
-    for (let part = 0; part <= ticks; part++) context.fillText(`${(crash.time0 + (part * last * crash.dt) / ticks).toFixed(1)} s`, Math.min(right - 14, Math.max(LEFT + 14, LEFT + ((right - LEFT) * part) / ticks)), bottom + 12);
-    if (crash.avoidable) mark(context, x(crash.avoidable[0]), "last avoidable step", "--faint", [3, 3], bottom, right);
+    for (let part = 0; part <= ticks; part++) context.fillText(`${(crash.time0 + (from + (part * (last - from)) / ticks) * crash.dt).toFixed(1)} s`, Math.min(right - 14, Math.max(LEFT + 14, LEFT + ((right - LEFT) * part) / ticks)), bottom + 12);
+    if (crash.avoidable && crash.avoidable[0] >= from) mark(context, x(crash.avoidable[0]), "last avoidable step", "--faint", [3, 3], bottom, right);
     if (crash.nearest !== null || COLORS[crash.category] === "--crash") mark(context, x(crash.nearest ?? last), crash.nearest === null ? "crash" : "nearest", "--crash", [], bottom, right);
     /* when others erred, or the agent saw or acted late; the scene of a step is what has come of it */
     context.fillStyle = css("--fault");
-    for (const [from, to] of crash.disturbances) context.fillRect(x(Math.min(from, last)), bottom - 3, Math.max(2, x(Math.min(to, last)) - x(Math.min(from, last))), 3);
+    for (const [begun, to] of crash.disturbances) if (to >= from && begun <= last) context.fillRect(x(Math.max(begun, from)), bottom - 3, Math.max(2, x(Math.min(to, last)) - x(Math.max(begun, from))), 3);
   });
   drawCursor(context, x(view.step), HEAD, bottom - 4);
 }
@@ -671,7 +678,7 @@ function mark(context, x, words, color, dashes, bottom, right) {
   context.fillText(words, x + away, HEAD - 4);
 }
 
-function drawRow(context, row, top, bottom, x, right) {
+function drawRow(context, row, top, bottom, x, right, from, last) {
   const { low, high } = row, y = (value) => bottom - ((bottom - top) * (Math.min(high, Math.max(low, value)) - low)) / (high - low);
   context.lineWidth = 1;
   context.strokeStyle = css("--line");
@@ -710,7 +717,7 @@ function drawRow(context, row, top, bottom, x, right) {
     let down = false, wasCut = false;
     const begin = (isOut) => { context.lineWidth = isOut ? 1.2 : 1.6; context.setLineDash(isOut ? [1, 3] : dash ?? []); context.beginPath(); };
     begin(false);
-    for (let step = 0; step < values.length; step++) {
+    for (let step = from; step <= Math.min(last, values.length - 1); step++) {
       const value = values[step], there = Number.isFinite(value), isOut = there && (value > high || value < low);
       if (there && down && isOut !== wasCut) {
         context.lineTo(x(step), y(value));
@@ -784,7 +791,7 @@ function go(step) {
   $("scrub").setAttribute("aria-valuetext", `step ${view.step}`);
   draw();
 }
-function draw() { if (view.crash) { drawScene(); drawPictures(); drawPlot(); showNow(); showPicked(); $("observed").setAttribute("aria-pressed", String(view.observed)); $("ids").setAttribute("aria-pressed", String(view.ids)); $("follow").setAttribute("aria-pressed", String(view.follow)); } }
+function draw() { if (view.crash) { drawScene(); drawPictures(); drawPlot(); showNow(); showPicked(); $("observed").setAttribute("aria-pressed", String(view.observed)); $("ids").setAttribute("aria-pressed", String(view.ids)); $("whole").setAttribute("aria-pressed", String(view.whole)); $("follow").setAttribute("aria-pressed", String(view.follow)); } }
 function pause() { view.playing = false; $("play").textContent = "Play"; }
 function play() {
   if (view.step >= view.crash.steps - 1) go(view.crash.nearest === null ? 0 : begin(view.crash));
@@ -815,6 +822,7 @@ $("out").onclick = () => zoom(1 / 1.4);
 $("follow").onclick = () => { view.follow = !view.follow; draw(); };
 $("fit").onclick = () => { fitEncounter(); draw(); };
 $("ids").onclick = () => { view.ids = !view.ids; draw(); };
+$("whole").onclick = () => { view.whole = !view.whole; draw(); };
 $("observed").onclick = () => { view.observed = !view.observed; draw(); };
 function pickNext() {
   const there = view.crash.actors.map(([id], actor) => [id, state(view.step, actor)]).filter(([, pose]) => pose), own = there.find(([id]) => id === view.crash.agent)?.[1] ?? [view.x, view.y];
@@ -848,8 +856,8 @@ $("scene").onpointerup = (event) => {
 };
 {
   const stepAt = (event) => {
-    const box = $("plot").getBoundingClientRect(), last = view.crash.steps - 1;
-    return Math.min(Math.max(0, Math.round(((event.clientX - box.left - LEFT) / (box.width - LEFT - RIGHT)) * last)), last);
+    const box = $("plot").getBoundingClientRect(), [from, last] = shownSteps(view.crash);
+    return Math.min(Math.max(from, from + Math.round(((event.clientX - box.left - LEFT) / (box.width - LEFT - RIGHT)) * (last - from))), Math.min(last, view.crash.steps - 1));
   };
   const seek = (event) => { pause(); go(stepAt(event)); };
   $("plot").onpointerdown = (event) => { seek(event); $("plot").setPointerCapture(event.pointerId); };

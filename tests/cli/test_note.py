@@ -34,12 +34,16 @@ def test_notes_are_added_found_shown_and_removed(hunt):
     assert [one["number"] for one in hunt.crashhunt("note", ".", "--find", "TO-FIX late", "--json").json["notes"]] == [
         2
     ]
+    assert hunt.crashhunt("note", ".", "--find", "blue").out == (
+        "no note of 2 notes contains 'blue' (tags: ci, loop, to-fix; texts: 'nightly run', 'brakes too late')\n"
+    )
     assert hunt.crashhunt("note", f"out/crashes/{crash}", "--json").json["notes"][0]["number"] == 2
 
     for words in (("show", "out", "--crash", crash), ("crashes", "out"), ("status", "out")):
         assert "brakes too late #to-fix" in hunt.crashhunt(*words).out
         assert "brakes too late" in hunt.crashhunt(*words, "--json").out
     assert "nightly run" not in hunt.crashhunt("show", "out", "--crash", crash).out
+    assert "brakes too late #to-fix" in hunt.crashhunt("trials", "out").err
     report = hunt.folder / hunt.crashhunt("report", "out", "--json").json["file"]
     assert "brakes too late #to-fix" in report.read_text()
     assert "nightly run #ci #loop" in report.read_text()

@@ -95,10 +95,10 @@ def test_plot_of_a_number_has_the_rate_of_each_bin():
     assert [title for *_, title in found] == ["0 % of 10 trials"] * 5 + ["100 % of 10 trials"] * 4 + [
         "100 % of 11 trials"
     ]
-    assert found[0][:2] == pytest.approx((40 + 228 * 0.05, 148), abs=0.06)
-    assert found[-1][:2] == pytest.approx((40 + 228 * 0.95, 12), abs=0.06)
+    assert found[0][:2] == pytest.approx((52 + 216 * 0.05, 148), abs=0.06)
+    assert found[-1][:2] == pytest.approx((52 + 216 * 0.95, 12), abs=0.06)
     assert re.findall(r'x="(\d+)" y="163" text-anchor="(\w+)">([\d.]+)<', figure) == [
-        ("40", "start", "0"), ("268", "end", "10")
+        ("52", "start", "0"), ("268", "end", "10")
     ]  # fmt: skip
     assert ">100 %</text>" in figure
 
@@ -108,9 +108,15 @@ def test_plot_of_words_has_a_place_for_each_word_of_all_hunts():
     crashed = np.array([True, False, False, False])
     figure = _argument_plot("ego.mode", "mode", {"a": (one, crashed), "b": (other, crashed)}, COLORS)
     assert re.findall(r'x="(\d+)" y="163" text-anchor="(\w+)">(\w)<', figure) == [
-        ("78", "middle", "x"), ("154", "middle", "y"), ("230", "middle", "z")
+        ("88", "middle", "x"), ("160", "middle", "y"), ("232", "middle", "z")
     ]  # fmt: skip
     assert [(x, title) for x, _, title in points_of(figure)] == [
         (78.0, "33.3 % of 3 trials"), (154.0, "0 % of 1 trials"), (230.0, "25 % of 4 trials")
     ]  # fmt: skip
     assert figure.count('stroke="#a00"') == figure.count('stroke="#0b0"') == 1
+
+
+def test_axis_without_crashes_reaches_from_0_to_100_percent():
+    values = np.linspace(0.0, 10.0, 101)
+    figure = _argument_plot("ego.speed", "speed (m/s)", {"a": (values, values > 99.0)}, COLORS)
+    assert ">100 %</text>" in figure
