@@ -111,7 +111,7 @@ def test_plot_of_words_has_a_place_for_each_word_of_all_hunts():
         ("88", "middle", "x"), ("160", "middle", "y"), ("232", "middle", "z")
     ]  # fmt: skip
     assert [(x, title) for x, _, title in points_of(figure)] == [
-        (78.0, "33.3 % of 3 trials"), (154.0, "0 % of 1 trials"), (230.0, "25 % of 4 trials")
+        (88.0, "33.3 % of 3 trials"), (160.0, "0 % of 1 trials"), (232.0, "25 % of 4 trials")
     ]  # fmt: skip
     assert figure.count('stroke="#a00"') == figure.count('stroke="#0b0"') == 1
 
