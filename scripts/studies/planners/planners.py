@@ -1,54 +1,89 @@
 """Hunt for crashes of planners of others, and print a row for each hunt.
 
 Prints the table of crashhunt/guide/reference/evaluation/planner-evaluation.md. Each planner needs its own package: see
-the page. The hunts are kept in the folder ``planners``.
-usage: scripts/studies/run planners PLANNER|all SCENARIO [TRIALS]   (40 trials unless given)
+the page. The hunts are kept in the folder ``planners``, and each takes at most TIME, such as 60s. ``traffic`` instead
+of a planner counts the collisions of SUMO's own cars in as many episodes.
+usage: scripts/studies/run planners PLANNER SCENARIO TRIALS [TIME]
 """
 
 from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
-import time
+import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).parent
-SPEEDS, FAST = "desired_speed=10:25", "desired_speed=20:34"
+PROGRAM = HERE.parents[2] / "crashhunt" / "agents" / "planners" / "commonroad_program.py"
+STEPS = 300
 PLANNERS = {
-    "fiss_plus": ("fiss_agent:FissPlanner", "trajectory", ["planner=fiss_plus"]),
-    "fop_plus": ("fiss_agent:FissPlanner", "trajectory", ["planner=fop_plus"]),
-    "mpc": ("mpc_agent:Mpc", "acceleration_steering", ["headway=0.3:1.5"]),
-    "frenetix": ("frenetix_agent:Frenetix", "trajectory", []),
-    "commonroad": (f"exec:commonroad/bin/python {HERE / 'commonroad_program.py'}", "trajectory", []),
+    "fiss_plus": ("crashhunt.agents.planners.fiss_agent:FissPlanner", "trajectory", ["desired_speed=10:25"]),
+    "fop_plus": ("crashhunt.agents.planners.fiss_agent:FopPlanner", "trajectory", ["desired_speed=10:25"]),
+    "mpc": (
+        "crashhunt.agents.planners.mpc_agent:Mpc",
+        "acceleration_steering",
+        ["desired_speed=10:25", "headway=0.3:1.5"],
+    ),
+    "frenetix": ("crashhunt.agents.planners.frenetix_agent:Frenetix", "trajectory", ["desired_speed=10:25"]),
+    "commonroad": (f"exec:commonroad/bin/python {PROGRAM}", "trajectory", []),
     "sb3": ("sb3_agent:Policy", "acceleration_steering", ["path=policy.zip"]),
     "sumo": ("sumo_agent:SumoDriver", "sumo", []),
 }
 """Agent, form of actions and arguments of each planner; ``commonroad`` is a virtual environment."""
-WITHOUT_SPEED = ("commonroad", "sb3", "sumo")
 
 
-def hunt(planner: str, scenario: str, trials: int) -> str:
-    """Return a row of the table: planner, scenario, trials, steps per second and outcomes of a hunt."""
+def hunt(planner: str, scenario: str, trials: int, time: str) -> str:
+    """Return a row of the table: planner, scenario, trials, steps per second of CPU, outcomes and first crash."""
     agent, action, arguments = PLANNERS[planner]
-    given = [*arguments, *([] if planner in WITHOUT_SPEED else [FAST if scenario == "motorway" else SPEEDS])]
+    if scenario == "motorway":
+        arguments = [one.replace("=10:25", "=20:34") for one in arguments]
     out = Path("planners") / f"{planner}-{Path(scenario).stem}"
+    out.parent.mkdir(exist_ok=True)
     command = [
-        "crashhunt", "run", str(out), "1", str(trials), "300", "--scenario", scenario, "--agent", agent,
-        "--action", action, *(word for one in given for word in ("--arg", one)), "--seed", "1", "--keep-going",
-        "--timeout", "900", "--json",
+        "crashhunt", "run", str(out), "1", str(trials), str(STEPS), "--scenario", scenario, "--agent", agent,
+        "--action", action, *(word for one in arguments for word in ("--arg", one)), "--seed", "1", "--keep-going",
+        "--timeout", "900", *(("--for", time) if time else ()), "--json",
     ]  # fmt: skip
-    begin = time.monotonic()
+    if planner == "commonroad":
+        command.append("--reuse")  # it imports for seconds
     path = os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True)
-    found = json.loads(done.stdout)
+    if done.returncode == 2:
+        raise SystemExit(done.stderr)
+    found, used = json.loads(done.stdout), resource.getrusage(resource.RUSAGE_CHILDREN)
     outcomes = ", ".join(f"{name} {count}" for name, count in found["outcomes"].items() if count)
-    return f"| {planner} | {scenario} | {found['trials_run']} | {found['steps_total'] / (time.monotonic() - begin):.0f} | {outcomes} |"
+    rate = found["steps_total"] / (used.ru_utime + used.ru_stime)
+    first = min((one.name for one in (out / "crashes").glob("*")), default="-")
+    return f"| {planner} | {scenario} | {found['trials_run']} | {rate:.0f} | {outcomes} | {first} |"
+
+
+def traffic(scenario: str, episodes: int) -> str:
+    """Return a row of the table: collisions of SUMO's cars with each other, and the hours that they drove."""
+    from crashhunt.scenario import load_scenario
+    from crashhunt.sumo import SumoSimulator
+
+    loaded, pairs, hours = load_scenario(scenario), set[tuple[int, str, str]](), 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        simulator = SumoSimulator(loaded, Path(folder))
+        action = simulator.actions["ego"].encode(None if loaded.agents["ego"].action == "sumo" else (14.0, 0))
+        for seed in range(episodes):
+            simulator.reset(seed=seed, options={})
+            for _ in range(STEPS):
+                if not simulator.agents:
+                    break
+                simulator.step({"ego": action})
+                scene = simulator.scene()
+                hours += (len(scene.roster.index) - 1) * loaded.step_length_s / 3600
+                names = ((one.collider, one.victim) for one in scene.contacts)
+                pairs |= {(seed, *sorted(pair)) for pair in names if "ego" not in pair}  # type: ignore[misc]
+        simulator.close()
+    return f"| traffic | {scenario} | {episodes} | {len(pairs)} collisions in {hours:.1f} h |"
 
 
 if __name__ == "__main__":
-    which, scenario, *rest = sys.argv[1:]
-    print("| planner | scenario | trials | steps/s | outcomes |\n| --- | --- | --- | --- | --- |")
-    for planner in PLANNERS if which == "all" else [which]:
-        print(hunt(planner, scenario, int(rest[0]) if rest else 40), flush=True)
+    which, place, count, *rest = sys.argv[1:]
+    row = traffic(place, int(count)) if which == "traffic" else hunt(which, place, int(count), rest[0] if rest else "")
+    print(row, flush=True)

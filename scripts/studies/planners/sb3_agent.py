@@ -1,9 +1,5 @@
-"""A policy of Stable-Baselines3 that accelerates and steers: ``python sb3_agent.py POLICY.zip STEPS`` trains it."""
+"""A policy of Stable-Baselines3 as an agent that accelerates and steers; sb3_training.py trains it."""
 
-import sys
-from pathlib import Path
-
-import gymnasium
 import numpy as np
 from stable_baselines3 import PPO
 
@@ -25,23 +21,6 @@ def features(observation):
     return np.array([*room, *(points[[2, 4, 7, 12]] / 10).ravel()], np.float32).clip(-5, 5)
 
 
-class Seen(gymnasium.ObservationWrapper):
-    """The features as observation, and shares of the limits as action; off the lane or slow is worth nothing."""
-
-    def __init__(self, env):
-        super().__init__(env)
-        self.observation_space = gymnasium.spaces.Box(-5, 5, (12,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
-
-    def observation(self, observation):
-        return features(observation)
-
-    def step(self, action):
-        seen, reward, ended, cut, info = self.env.step(np.clip(action, -1, 1) * LIMITS)
-        offset = abs(features(seen)[5]) * 10
-        return features(seen), reward * (1 - min(1, offset)) - 10.0 * ended, ended, cut, info
-
-
 class Policy:
     """Drives with a trained policy."""
 
@@ -55,12 +34,3 @@ class Policy:
     def act(self, observation):
         action, _ = self.model.predict(features(observation), deterministic=True)
         return np.clip(action, -1, 1).astype(float) * LIMITS
-
-
-if __name__ == "__main__":
-    name = "crashhunt:crashhunt/SUMO-v0"
-    env = gymnasium.make(name, scenario="loop", action="acceleration_steering", observation=PARTS, max_steps=300)
-    model = PPO("MlpPolicy", Seen(env), n_steps=1024, seed=1, device="cpu")
-    for _ in range(int(sys.argv[2]) // 2048):
-        model.learn(2048, reset_num_timesteps=False)
-        model.save(Path(sys.argv[1]))
