@@ -47,6 +47,7 @@ _AGENT_CURVE, _PARTNER_CURVE = (154, 91, 0), (143, 15, 63)  # as the vehicles, i
 _MOTION = ("speed (m/s)", "acceleration (m/s^2)", "criticality", "action")  # the font has no ²
 _WITH_OTHER = ("time to collision (s)", "gap (m)", *_MOTION)
 _WITH_NEAREST = ("least time to collision (s)", "nearest gap (m)", *_MOTION)  # a crash without a partner
+_PLAN_COLUMNS = 5  # a trajectory: time, x, y, heading and speed of each point
 _PANELS_WITHOUT_SCENE = ("reward", "action")
 
 
@@ -134,7 +135,10 @@ class BuiltinPanels:
         if action is not None and self._plots_actions:
             value = action.reshape(-1)
             if value.size == 1 and np.issubdtype(value.dtype, np.integer):
-                drawn = Action(int(value[0]), names=self._meanings)
+                drawn: Panel = Action(int(value[0]), names=self._meanings)
+            elif action.ndim == 2 and action.shape[1] == _PLAN_COLUMNS and not self._names:
+                rising = np.append(True, np.diff(action[:, 0]) > 0)  # an encoded trajectory repeats its last point
+                drawn = Curve({"planned m/s": action[rising, -1]}, action[rising, 0], low=0.0)
             else:
                 drawn = Action(value=value, low=self._low, high=self._high, names=self._names)
             found.append((self._labels[-1], drawn))

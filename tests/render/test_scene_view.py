@@ -214,6 +214,16 @@ def test_lane_change_of_0_is_in_the_middle_of_its_axis():
     assert (panels._low[1], panels._high[1]) == (-1.0, 1.0)
 
 
+def test_a_planned_trajectory_is_drawn_as_its_speed_over_time():
+    found = following(steps=4).recording
+    plan = np.array([[0.1, 1.0, 0.0, 0.0, 9.0], [0.2, 2.0, 0.0, 0.0, 8.0], [0.2, 2.0, 0.0, 0.0, 8.0]])
+    for step in found.all_steps[1:]:
+        step.actions["ego"] = plan
+    panel = dict(BuiltinPanels(found, agent="ego", other="").panels(2))["action"]
+    assert np.array_equal(panel.series["planned m/s"], [9.0, 8.0])
+    assert np.array_equal(panel.x, [0.1, 0.2])
+
+
 def test_ring_of_a_crash_is_where_the_outlines_meet():
     # ego, 5 m long and 2 m wide, drives east and touches with its left front corner a truck that crosses ahead.
     step = {"ego": (2.5, 0.0, 0.0, 10.0), "other": (4.0, 0.9, -np.pi / 2, 5.0)}
