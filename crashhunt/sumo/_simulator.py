@@ -50,7 +50,7 @@ from crashhunt.sumo._reader_protocol import Moment
 from crashhunt.sumo._scripted import ScriptedSight, place_agents
 from crashhunt.sumo._surroundings import nearest_ahead_of, surroundings_of, unregulated_junctions
 from crashhunt.sumo._traffic_events import SumoEvents
-from crashhunt.world import PERSON, Lane, is_person
+from crashhunt.world import PERSON, Lane, first_contact, is_person
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.simulators import ActionForm, ActiveDisturbance, Info, Lights, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Motion, Neighbor, Paths, RoadMap, Scene, Surroundings, VehicleData
+    from crashhunt.world import Contact, Motion, Neighbor, Paths, RoadMap, Scene, Surroundings, VehicleData
 
 guard_against_agents()
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
@@ -540,6 +540,19 @@ class SumoSimulator:
         except libsumo.TraCIException:
             self._sight.look_around()  # an agent's own code has removed a vehicle, which SUMO does not report
             self._scene = self._look_with.look(self._steps, self._off_road)
+        if self._scene.contacts and self._driving.moving:
+            self._scene.contacts = tuple(one for one in self._scene.contacts if self._is_contact(one))
+
+    def _is_contact(self, contact: Contact) -> bool:
+        """Return whether a reported collision is one; only outlines tell for a vehicle that moves freely.
+
+        SUMO examines collisions before it places the vehicle, and turns it as its lane.
+        """
+        scene, names = self._scene, (contact.collider, contact.victim)
+        rows = [scene.roster.index[name] for name in names if name in scene.roster.index]
+        if len(rows) < 2 or self._driving.moving.keys().isdisjoint(names):
+            return True
+        return first_contact(scene.previous if scene.swept else None, scene, rows[0], rows[1]) is not None
 
     def _observe(self, agent: str, row: int) -> NDArray[np.generic]:
         edge, lane = sumo.vehicle_getRoadID(agent), sumo.vehicle_getLaneIndex(agent)

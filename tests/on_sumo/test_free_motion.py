@@ -15,6 +15,7 @@ from crashhunt.scenario import AgentSetup, argument_values, load_scenario
 from crashhunt.simulators import BicycleModel, MotionState
 from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._free_motion import DrivableArea, FreeMotion, _is_inside, _overlap
+from crashhunt.world import Contact
 
 EMPTY = {"priority_demand": 1, "minor_demand": 1}
 
@@ -196,6 +197,19 @@ def test_two_vehicles_that_move_freely_collide_by_their_outlines(start):
         if found:
             break
     assert {found[0].collision.collider, found[0].collision.victim} == {one, other}
+
+
+def test_a_reported_collision_of_a_free_vehicle_counts_only_if_the_outlines_touch(start, monkeypatch):
+    simulator, step = start("acceleration_steering", "loop")
+    ahead = libsumo.vehicle.getLeader("ego", 1000.0)[0]
+    reported = (Contact("ego", ahead, "junction", "south_0", 5.0, 15.0),)
+    monkeypatch.setattr(simulator._sight, "_contacts", lambda: reported)
+    assert step((0.0, 0.0)) == {"ego": False}
+    assert simulator.scene().contacts == ()
+    x, y, _ = centre()
+    libsumo.vehicle.moveToXY(ahead, "", -1, x + 3.0, y + 0.5, libsumo.vehicle.getAngle("ego"), 2)
+    assert step((0.0, 0.0)) == {"ego": True}
+    assert simulator.scene().contacts == reported
 
 
 @pytest.mark.parametrize(
