@@ -13,6 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from conftest import mostly_nightly
 from gymnasium import spaces
 from json_schemas import validator
 from programs import COMPILER, DRIVER, compile_program, write_binary_program, write_program
@@ -188,27 +189,30 @@ def test_messages_are_those_of_the_protocol(tmp_path):
     ]
 
 
+HARMS = [
+    ("garbage", "observe", "its answer to observe of step 3 is not JSON: thinking"),
+    (
+        "half",
+        "observe",
+        'exited with 0 instead of answering observe of step 3, in the middle of a message: {"type": ',
+    ),
+    ("closes", "observe", "has closed its end instead of answering observe of step 3, and is still running"),
+    ("SIGSEGV", "observe", "died of SIGSEGV instead of answering observe of step 3"),
+    ("SIGSEGV", "reset", "died of SIGSEGV instead of answering reset"),
+    ("exits", "hello", "exited with 3 instead of answering hello"),
+    ("protocol", "hello", "its protocol is 2 (allowed: 1)"),
+    ("format", "hello", 'its format is "xml" (allowed: json or msgpack)'),
+    ("other", "observe", "its answer to observe of step 3 is not of type 'act'"),
+    ("without", "observe", "its answer to observe of step 3 has no action"),
+    ("twice", "observe", "it has sent something before observe of step 4"),
+    ("long", "observe", "its answer to observe of step 3 is longer than 16 MB"),
+    ("flood", "observe", "instead of answering observe of step 3"),
+]
+
+
 @pytest.mark.parametrize(
     ("kind", "when", "message"),
-    [
-        ("garbage", "observe", "its answer to observe of step 3 is not JSON: thinking"),
-        (
-            "half",
-            "observe",
-            'exited with 0 instead of answering observe of step 3, in the middle of a message: {"type": ',
-        ),
-        ("closes", "observe", "has closed its end instead of answering observe of step 3, and is still running"),
-        ("SIGSEGV", "observe", "died of SIGSEGV instead of answering observe of step 3"),
-        ("SIGSEGV", "reset", "died of SIGSEGV instead of answering reset"),
-        ("exits", "hello", "exited with 3 instead of answering hello"),
-        ("protocol", "hello", "its protocol is 2 (allowed: 1)"),
-        ("format", "hello", 'its format is "xml" (allowed: json or msgpack)'),
-        ("other", "observe", "its answer to observe of step 3 is not of type 'act'"),
-        ("without", "observe", "its answer to observe of step 3 has no action"),
-        ("twice", "observe", "it has sent something before observe of step 4"),
-        ("long", "observe", "its answer to observe of step 3 is longer than 16 MB"),
-        ("flood", "observe", "instead of answering observe of step 3"),
-    ],
+    mostly_nightly(HARMS, HARMS[::2]),
 )
 def test_harm_is_an_error_that_names_the_agent_and_the_message(planner, tmp_path, kind, when, message):
     agent = agent_of(f"exec:{planner} {kind} {when}", tmp_path)

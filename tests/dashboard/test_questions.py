@@ -41,6 +41,7 @@ GUIDE = Path(crashhunt.__file__).parent / "guide"
 MAX_WORDS = 600
 
 
+@pytest.mark.nightly  # by day, test_browser.py opens these pages
 @pytest.mark.long
 def test_ten_questions_at_a_crash_are_answered_on_its_page_or_one_click_away(shell, made_once, page):
     hunts = made_once(hunted, shell).folder / "runs"

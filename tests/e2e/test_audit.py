@@ -16,6 +16,7 @@ from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 WORDS = ("run", "h", "2", "6", "20", "--scenario", "toy", "--seed", "4", "--json")
 
 
+@pytest.mark.nightly  # by day, test_reused_programs.py has differences
 def test_a_difference_is_reported_with_the_first_step_and_field(toy):
     done = toy.crashhunt(*WORDS, "--agent", "faulty:Remembers", "--audit", "1")
     audit = done.json["audit"]

@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 from browsers import needed
-from conftest import CRASHHUNT
+from conftest import CRASHHUNT, mostly_nightly
 
 # Everything that bash would set when somebody presses the key at the end of the line.
 ASK = """
@@ -35,28 +35,31 @@ def press(toy):
     return ask
 
 
+LINES = [
+    ("crashhunt rep", ["replay", "report"]),
+    ("crashhunt suite ", ["run", "defaults"]),
+    ("crashhunt run out 1 1 9 --scen", ["--scenario"]),
+    ("crashhunt run out 1 1 9 --scenario merge", ["merge", "merge-highway-env"]),
+    ("crashhunt run out 1 1 9 --scenario to", ["toy/"]),
+    ("crashhunt run out 1 1 9 --agent id", ["idm"]),
+    ("crashhunt run out 1 1 9 --sampler s", ["sobol", "sweep"]),
+    ("crashhunt run out 1 1 9 --crash-on hang,col", ["hang,collision"]),
+    ("crashhunt run out 1 1 9 --crash-on red", ["red_light"]),
+    ("crashhunt run out 1 1 9 --scenario toy --set g", ["gap_m="]),
+    ("crashhunt run out 1 1 9 --scenario merge --arg head", ["headway_s="]),
+    ("crashhunt trials h --outcome sur", ["survived"]),
+    ("crashhunt replay h --crash ", ["000004-collision", "000017-hang"]),
+    ("crashhunt replay h --code c", ["current"]),
+    ("crashhunt show ", ["h/", "h.zip", "toy/"]),
+    ("crashhunt export h f", ["faulty.py"]),
+    ("crashhunt guide det", ["determinism"]),
+    ("crashhunt run out 1 1 9 --seed ", []),
+]
+
+
 @pytest.mark.parametrize(
     ("line", "found"),
-    [
-        ("crashhunt rep", ["replay", "report"]),
-        ("crashhunt suite ", ["run", "defaults"]),
-        ("crashhunt run out 1 1 9 --scen", ["--scenario"]),
-        ("crashhunt run out 1 1 9 --scenario merge", ["merge", "merge-highway-env"]),
-        ("crashhunt run out 1 1 9 --scenario to", ["toy/"]),
-        ("crashhunt run out 1 1 9 --agent id", ["idm"]),
-        ("crashhunt run out 1 1 9 --sampler s", ["sobol", "sweep"]),
-        ("crashhunt run out 1 1 9 --crash-on hang,col", ["hang,collision"]),
-        ("crashhunt run out 1 1 9 --crash-on red", ["red_light"]),
-        ("crashhunt run out 1 1 9 --scenario toy --set g", ["gap_m="]),
-        ("crashhunt run out 1 1 9 --scenario merge --arg head", ["headway_s="]),
-        ("crashhunt trials h --outcome sur", ["survived"]),
-        ("crashhunt replay h --crash ", ["000004-collision", "000017-hang"]),
-        ("crashhunt replay h --code c", ["current"]),
-        ("crashhunt show ", ["h/", "h.zip", "toy/"]),
-        ("crashhunt export h f", ["faulty.py"]),
-        ("crashhunt guide det", ["determinism"]),
-        ("crashhunt run out 1 1 9 --seed ", []),
-    ],
+    mostly_nightly(LINES, LINES[::2]),
 )
 def test_the_tab_key_completes(press, toy, line, found):
     for name in ("000004-collision", "000017-hang"):

@@ -120,7 +120,7 @@ def strange_folder(shell):
 
 def test_no_command_imports_from_the_current_folder_what_the_user_has_not_named(strange_folder, shell):
     for words in (
-        ["agents"], ["run", "out", "1", "30", "100", "--scenario", "highway"],
+        ["agents"], ["run", "out", "1", "2", "100", "--scenario", "highway", "--seed", "3"],
         ["replay", "out", "--code", "current", "--set", "initial_spacing=2"], ["report", "out"],
     ):  # fmt: skip
         shell.process(*words, expect=None)

@@ -14,14 +14,13 @@ MODELS = {"cc_human", "fsm", "rss", "reg157"}
 
 @pytest.mark.long
 def test_crash_of_a_blind_agent_is_preventable_in_all_outputs(shell):
-    shell.crashhunt("run", "h", "2", "40", "400", "--scenario", "loop", "--arg", "speed=22:25", "--seed", "1")
+    shell.crashhunt("run", "h", "2", "2", "60", "--scenario", "r157-cut-in", "--agent", "keep-lane", "--seed", "1")
     few = ("--runs", "1", "--why", "0", "--reference", "0")
     (judged,) = shell.crashhunt("judge", "h", *few, "--json").json["judged"]
-    assert judged["preventable_by"] == {"cc_human": True, "fsm": True, "rss": True, "reg157": None}
+    assert judged["preventable_by"] == dict.fromkeys(MODELS, True)
     runs = {run["model"]: run for run in judged["drivers"]["runs"]}
-    assert "did not cut in" in runs["reg157"]["why_not"]
-    assert all(runs[model]["margin_m"] > 0 for model in MODELS - {"reg157"})
-    assert all(runs[model]["perceived_step"] >= judged["drivers"]["since_step"] for model in MODELS - {"reg157"})
+    assert all(runs[model]["margin_m"] > 0 for model in MODELS)
+    assert all(runs[model]["perceived_step"] >= judged["drivers"]["since_step"] for model in MODELS)
     shown = shell.crashhunt("show", "h").out
     assert "Preventable by a competent driver (careful human: yes, by " in " ".join(shown.split())
     assert "careful human: yes, FSM: yes, RSS: yes" in shell.crashhunt("crashes", "h").out
@@ -29,7 +28,7 @@ def test_crash_of_a_blind_agent_is_preventable_in_all_outputs(shell):
     assert group["preventable_by"] == judged["preventable_by"]
     (alert,) = json.loads((shell.folder / "s.sarif").read_text())["runs"][0]["results"]
     assert alert["properties"]["preventable_by"] == judged["preventable_by"]
-    assert "Preventable (careful human: yes, FSM: yes, RSS: yes)." in alert["message"]["text"]
+    assert "Preventable (careful human: yes, FSM: yes, RSS: yes, R157 5.2.5.2: yes)." in alert["message"]["text"]
     rows = [json.loads(line) for line in shell.crashhunt("trials", "h", "--format", "jsonl").out.splitlines()]
     answers = {name: row[f"preventable_by.{name}"] for row in rows if row["outcome"] == "collision" for name in MODELS}
     assert answers == judged["preventable_by"]

@@ -28,6 +28,7 @@ def hunt(toy, made_once, monkeypatch):
     return toy
 
 
+@pytest.mark.nightly  # by day, test_shrink_bundle.py shrinks one
 def test_a_crash_becomes_smaller_and_replays(shell):
     """A crash that an older version recorded, so that no hunt is needed."""
     shutil.copytree(Path(__file__).parent / "frozen" / "version-1" / "hunt", shell.folder / "h")

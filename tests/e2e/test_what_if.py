@@ -185,6 +185,7 @@ def test_ctrl_c_counts_the_runs_that_ended(toy):
         assert int(out.split(" of ")[1].split(" runs")[0]) > 0
 
 
+@pytest.mark.nightly
 def test_python_counts_as_the_command_does(crash):
     folder = crash.folder / "h"
     told = crash.crashhunt(

@@ -74,6 +74,7 @@ def test_a_network_that_no_one_wrote_for_us(town, agent, ego):
     assert sorted(path.name for path in town.folder.iterdir() if path.name != "__pycache__") == sorted([*before, "h"])
 
 
+@pytest.mark.nightly  # by day, test_traffic_survey.py replaces vehicles
 def test_another_vehicle_is_driven_in_each_trial(town):
     words = ("--scenario", "town.sumocfg", "--arg", "speed=5:9", "--keep-going", "--keep-trials", "--seed", "3")
     done = town.crashhunt("run", "h", "2", "6", "100", *words, "--json")

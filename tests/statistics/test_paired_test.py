@@ -137,9 +137,9 @@ def watched(rng, base, head, pairs, margin=0.0):
 
 def test_different_agents_get_a_verdict_and_equal_ones_seldom_do():
     rng = np.random.default_rng(26)
-    assert sum(watched(rng, 0.2, 0.2, 300).verdict != "undecided" for _ in range(100)) <= 12
-    found = [watched(rng, 0.02, 0.005, 2000) for _ in range(30)]
-    assert sum(watch.verdict == "better" for watch in found) >= 26  # 28.5 on average at least
+    assert sum(watched(rng, 0.2, 0.2, 300).verdict != "undecided" for _ in range(40)) <= 5
+    found = [watched(rng, 0.02, 0.005, 2000) for _ in range(12)]
+    assert sum(watch.verdict == "better" for watch in found) >= 10  # 11.4 on average at least
     assert not any(watch.verdict == "worse" for watch in found)
 
 

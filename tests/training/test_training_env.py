@@ -242,7 +242,7 @@ def test_requests_of_several_threads_do_not_mix(remote):
 
     def ask(name, words, kind):
         try:
-            for _ in range(60):
+            for _ in range(20):
                 assert isinstance(remote._episodes._ask(name, *words), kind)
         except Exception as error:
             failed.append(error)

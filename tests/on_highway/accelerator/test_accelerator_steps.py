@@ -8,6 +8,7 @@ import highway_env
 import numpy as np
 import pytest
 from compiled import needs_kernel
+from conftest import mostly_nightly
 from highway_env.envs.common import observation
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.action import ActionType, DiscreteMetaAction
@@ -165,20 +166,23 @@ def planning(env):
     env.action_type.act = lambda action: (env._simulate(None), push(env.road), act(action))
 
 
+BETWEEN = [
+    (Simulating, lambda env: None),
+    (Showing, lambda env: None),
+    (Looking, lambda env: setattr(env, "looks", True)),
+    (Planning, lambda env: None),
+    (HighwayEnvFast, simulating),
+    (HighwayEnvFast, observing),
+    (HighwayEnvFast, looking_on),
+    (HighwayEnvFast, planning),
+    (HighwayEnvFast, foreign),
+    (HighwayEnvFast, removing),
+]
+
+
 @pytest.mark.parametrize(
     ("kind", "change"),
-    [
-        (Simulating, lambda env: None),
-        (Showing, lambda env: None),
-        (Looking, lambda env: setattr(env, "looks", True)),
-        (Planning, lambda env: None),
-        (HighwayEnvFast, simulating),
-        (HighwayEnvFast, observing),
-        (HighwayEnvFast, looking_on),
-        (HighwayEnvFast, planning),
-        (HighwayEnvFast, foreign),
-        (HighwayEnvFast, removing),
-    ],
+    mostly_nightly(BETWEEN, BETWEEN[::2]),
 )
 def test_change_between_sub_steps_and_observation_is_observed(kind, change):
     slow, fast = both(lambda: made(kind), change, ACTIONS[:3])
@@ -273,25 +277,28 @@ def nowhere(env):
     env.vehicle.target_lane_index = ("nowhere", "1", 0)
 
 
+META_ACTIONS = [
+    lambda env: None,
+    ego_of(Own),
+    ego_of(Fast),
+    at_the_end_of_its_lane,
+    with_speeds(np.array([10, 20, 30, 40])),
+    with_speeds(np.linspace(20, 24, 9)),
+    with_speeds(np.array([25.0, 25.0])),
+    with_speeds(np.array([25.0])),
+    with_speeds(np.array([20.0, 30.0], np.float32)),
+    with_speeds([20.0, 25.0, 30.0]),
+    off_the_road,
+    with_its_own_method,
+    with_its_own_names,
+    whole,
+    nowhere,
+]
+
+
 @pytest.mark.parametrize(
     "change",
-    [
-        lambda env: None,
-        ego_of(Own),
-        ego_of(Fast),
-        at_the_end_of_its_lane,
-        with_speeds(np.array([10, 20, 30, 40])),
-        with_speeds(np.linspace(20, 24, 9)),
-        with_speeds(np.array([25.0, 25.0])),
-        with_speeds(np.array([25.0])),
-        with_speeds(np.array([20.0, 30.0], np.float32)),
-        with_speeds([20.0, 25.0, 30.0]),
-        off_the_road,
-        with_its_own_method,
-        with_its_own_names,
-        whole,
-        nowhere,
-    ],
+    mostly_nightly(META_ACTIONS, META_ACTIONS[::3]),
 )
 def test_meta_actions_have_the_effect_that_they_have_in_highway_env(change):
     slow, fast = both(made, change)
