@@ -111,12 +111,8 @@ class RequirementOracle:
 
     def complete(self, result: TrialResult) -> TrialResult:
         """Add the least robustness of all agents to the result, and let it take the place of criticality."""
-        rows = tuple(
-            row
-            for watched in self._watched
-            if watched.monitor.count
-            for row in self._requirement.parts(watched.monitor.trace(), watched.monitor.step_length_s)
-        )
+        traces = [(one.monitor.trace(), one.monitor.step_length_s) for one in self._watched if one.monitor.count]
+        rows = [row for trace, step_s in traces for row in self._requirement.parts(trace, step_s)]
         if result.outcome is Outcome.INVALID or not rows:
             return result
         least = min(map(max, rows))
@@ -124,9 +120,10 @@ class RequirementOracle:
         if result.robustness is not None:  # of another requirement, which may be nearer to its violation
             danger = max(danger, result.danger or 0.0)
         robustness = {**(result.robustness or {}), self._title: least if math.isfinite(least) else None}
-        limited = tuple(tuple(max(-MAX_ROBUSTNESS, min(MAX_ROBUSTNESS, one)) for one in row) for row in rows)
-        conjuncts = {**(result.conjuncts or {}), self._title: limited}
-        return replace(result, robustness=robustness, danger=danger, conjuncts=conjuncts)
+        slack_s = [one for trace, step_s in traces for one in self._requirement.slack_s(trace, step_s)]
+        conjuncts = {**(result.conjuncts or {}), self._title: tuple(map(_limited, rows))}
+        slacks = {**(result.slack_s or {}), self._title: _limited(slack_s)}
+        return replace(result, robustness=robustness, danger=danger, conjuncts=conjuncts, slack_s=slacks)
 
     def _unusable(self, error: CrashhuntError) -> UnusableValueError:
         what = "the requirement" if self._title == REQUIREMENT else f"the requirement {self._title}"
@@ -147,6 +144,10 @@ class RequirementOracle:
             details=(f"robustness {robustness:.4g}", *(_described(part, watched.first, step_s) for part in parts)),
         )  # fmt: skip
         return Finding(Outcome(REQUIREMENT), event=event)
+
+
+def _limited(values: Iterable[float]) -> tuple[float, ...]:
+    return tuple(max(-MAX_ROBUSTNESS, min(MAX_ROBUSTNESS, one)) for one in values)
 
 
 class _Watched:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,12 +29,13 @@ from crashhunt.requirements._formula import (
 from crashhunt.requirements._robustness import (
     Evaluation,
     checked_signals,
+    lasting,
     proposition_values,
     steps_of,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection, Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -123,6 +125,26 @@ class Requirement:
             for conjunct in conjuncts(self.formula)
         )
 
+    def slack_s(self, signals: Mapping[str, object], step_length_s: float) -> tuple[float, ...]:
+        """Return the time by which each conjunct holds, in s; negative if it is violated; arguments as in `robustness`.
+
+        A comparison has the time for which it was, plus the time for which it will be, as it is at a sample. What an
+        implication assumes counts as true or false. Space robustness cannot rank traces whose signals are flags or
+        whole numbers, and this can.
+        """
+        truths = self._evaluation(signals, step_length_s, truth=True)
+        assumed = {id(part) for part in _assumptions(self.formula)}
+
+        def leaf(formula: Formula, order: slice) -> NDArray[np.float64]:
+            values = truths.values(formula)
+            return values if id(formula) in assumed else step_length_s * lasting(values[order])[order]
+
+        def is_leaf(formula: Formula) -> bool:
+            return id(formula) in assumed or truths.is_leaf(formula)
+
+        ways = [replace(truths, leaf=partial(leaf, order=slice(None, None, way)), is_leaf=is_leaf) for way in (1, -1)]
+        return tuple(sum(float(way.values(part)[0]) for way in ways) for part in conjuncts(self.formula))
+
     def require_known(self, known: Collection[str]) -> None:
         """Check that all signals are known.
 
@@ -177,6 +199,14 @@ class Requirement:
             return steps_of(window, step_length_s, self.text)
 
         return Evaluation(leaf, lambda formula: isinstance(formula, Compare | Proposition | Truth), bounds)
+
+
+def _assumptions(formula: Formula) -> Iterator[Formula]:
+    """Yield the negated parts of disjunctions."""
+    for node in nodes_of(formula):
+        if isinstance(node, Join) and node.operator == "or":
+            negated = [part for part in node.parts if isinstance(part, Not)]
+            yield from negated if len(negated) < len(node.parts) else ()
 
 
 def _require_step_length(step_length_s: float) -> None:

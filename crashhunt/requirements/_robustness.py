@@ -134,6 +134,18 @@ def proposition_values(
     return -np.abs(distance) if operator == "==" else np.abs(distance)
 
 
+def lasting(truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return for how many samples a truth value stays as it is, from each sample on: negative where it is false.
+
+    What holds at the end of the trace counts as if it stayed for the length of the trace.
+    """
+    count, holds = len(truth), truth > 0
+    ends = np.append(np.flatnonzero(holds[1:] != holds[:-1]) + 1, 2 * count)
+    at = np.arange(count)
+    lasts = ends[np.searchsorted(ends, at, side="right")] - at
+    return np.where(holds, lasts, -lasts).astype(float)
+
+
 _TRUTHS: dict[str, np.ufunc] = {
     "<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal, "==": np.equal, "!=": np.not_equal,
 }  # fmt: skip

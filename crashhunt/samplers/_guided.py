@@ -24,6 +24,7 @@ are our own, measured with `scripts/studies/run search`. Cost: about a milliseco
 from __future__ import annotations
 
 import math
+import sys
 from bisect import bisect_left, bisect_right, insort
 from collections import deque
 from dataclasses import replace
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 
     from crashhunt.samplers._protocol import HuntFacts, Space
     from crashhunt.samplers._space_filling import Cube
-    from crashhunt.samplers._strategies import ScoredTrial
+    from crashhunt.samplers._strategies import Conjunct, ScoredTrial
 
     Floats = NDArray[np.float64]
     Seeds = NDArray[np.int64]
@@ -208,6 +209,7 @@ class Peaks:
 
 _WORTHWHILE = 1.5  # mean payoff: below that, the even search proposes, because criticality cannot mislead it
 _FEW = 5  # trials that may have equal scores by chance
+_CORNER_EVERY = 4  # where robustness ranks no trials, one proposal of so many is a corner
 _PRIOR = 2.0  # payoff of one imagined trial of the model, so that it is tried
 
 
@@ -255,20 +257,32 @@ class Portfolio:
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft:
         """Return a proposal of the model, or the next point of the even search."""
-        if self._shapes is not None and place < len(self._shapes.corners):
-            return Draft(self._shapes.with_corner(self._even.point(place), place), origin=_EVEN)
+        if self._shapes is not None and (corner := self._corner(place)) < len(self._shapes.corners):
+            return Draft(self._shapes.with_corner(self._even.point(place), corner), origin=_EVEN)
         draft = self._guided(rng) if self._is_worthwhile(rng) else None
         if draft is not None:
             return replace(draft, origin=_MODEL)
         point = self._even.point(place)
-        if self._shapes is not None and self._differ:
+        if self._shapes is not None and self._ranks:
             point = self._shapes.with_shapes(point, rng)
         return Draft(point, origin=_EVEN)
 
+    def _corner(self, place: int) -> int:
+        """Return the number of the corner of signals to propose: it may be above all numbers."""
+        if self._ranks:
+            return place
+        turn, rest = divmod(place, _CORNER_EVERY)
+        return turn + 1 if rest == _CORNER_EVERY - 1 else sys.maxsize
+
     @property
-    def _differ(self) -> bool:
-        """Whether scores differ: where none does, such as for gears, shapes have no advantage over even points."""
-        return len(self._unguided) < _FEW or self._unguided[0] < self._unguided[-1]
+    def _ranks(self) -> bool:
+        """Whether robustness differs in the better half of the unguided trials, of the first few in the best two.
+
+        Where it does not, such as for gears, corners and shapes of signals have no advantage over even points.
+        """
+        scores = self._unguided
+        worse = len(scores) // 2 if len(scores) >= _FEW else len(scores) - 2
+        return len(scores) < 2 or scores[-1] - scores[worse] > _TIME
 
     def _is_worthwhile(self, rng: np.random.Generator) -> bool:
         """Draw whether the model finds more than the even search."""
@@ -335,9 +349,13 @@ class Portfolio:
 # (the scale problem). Zhang, Hasuo and Arcaini, "Multi-armed bandits for Boolean connectives in hybrid system
 # falsification", CAV 2019, choose between the conjuncts by their progress. In a disjunction all parts must be violated,
 # so its parts are divided by the range that was seen of each, and the greatest counts.
+#
+# The robustness of flags and whole numbers is often equal in all trials. Between equal robustness, the time by which a
+# conjunct holds decides, as in the time robustness of Donzé and Maler (FORMATS 2010).
 
 _SCALED_AFTER = 20  # trials from which the ranges are computed
 _MOST_ARMS = 16
+_TIME = 1e-6  # share of time in the distance to a violation: it decides only between equal robustness
 _FORGET = 0.95  # factor of earlier rewards of a conjunct at each of its proposals
 
 
@@ -351,28 +369,28 @@ class _Arm:
     def __init__(self, make: Callable[[], Portfolio]) -> None:
         self._make = make
         self._portfolio = make()
-        self._early: list[tuple[ScoredTrial, tuple[float, ...]]] = []
+        self._early: list[tuple[ScoredTrial, Conjunct]] = []
         self._scales: NDArray[np.float64] | None = None
         self._best = -1.0
         self._gained, self._lost = 1.0, 1.0  # as in a uniform prior of the probability of progress
 
-    def tell(self, trial: ScoredTrial, parts: tuple[float, ...], *, is_own: bool) -> None:
-        """Learn from a trial in which the conjunct has the given robustness, by disjunct."""
+    def tell(self, trial: ScoredTrial, conjunct: Conjunct, *, is_own: bool) -> None:
+        """Learn from a trial in which the conjunct has the given robustness."""
         if is_own:
             self._gained, self._lost = _FORGET * self._gained, _FORGET * self._lost
         if self._scales is None:
-            self._early.append((trial, parts))
+            self._early.append((trial, conjunct))
             if len(self._early) < _SCALED_AFTER:
-                self._portfolio.tell(self._scored(trial, parts))
+                self._portfolio.tell(self._scored(trial, conjunct))
                 return
-            self._scales = _scales([one for _, one in self._early])
+            self._scales = _scales([one.parts for _, one in self._early])
             self._portfolio, self._best = self._make(), -1.0
-            for earlier, earlier_parts in self._early:
-                scored = self._scored(earlier, earlier_parts)
+            for earlier, as_it_was in self._early:
+                scored = self._scored(earlier, as_it_was)
                 self._portfolio.tell(scored)
                 self._best = max(self._best, scored.score)
             return
-        scored = self._scored(trial, parts)
+        scored = self._scored(trial, conjunct)
         if is_own:
             self._gained += scored.score > self._best
             self._lost += scored.score <= self._best
@@ -387,11 +405,12 @@ class _Arm:
         """Draw the probability of progress of the next proposal (Thompson 1933)."""
         return float(rng.beta(self._gained + 1.0, self._lost + 1.0))
 
-    def _scored(self, trial: ScoredTrial, parts: tuple[float, ...]) -> ScoredTrial:
+    def _scored(self, trial: ScoredTrial, conjunct: Conjunct) -> ScoredTrial:
         if trial.crashed:
             return trial
-        scales = self._scales if self._scales is not None else np.ones(len(parts))
-        distance = max(0.0, float(np.max(np.array(parts) / scales)))
+        scales = self._scales if self._scales is not None else np.ones(len(conjunct.parts))
+        distance = max(0.0, float(np.max(np.array(conjunct.parts) / scales)))
+        distance += _TIME * (1.0 - 1.0 / (1.0 + max(0.0, conjunct.slack_s)))
         return replace(trial, score=min(1.0 / (1.0 + distance), NEAREST))
 
 
@@ -440,7 +459,7 @@ class Arms:
             origin = trial.origin
             if origin.startswith(_MODEL):
                 origin = _MODEL if is_own else _OTHER
-            self._arms[name].tell(replace(trial, origin=origin), conjunct.parts, is_own=is_own and origin == _MODEL)
+            self._arms[name].tell(replace(trial, origin=origin), conjunct, is_own=is_own and origin == _MODEL)
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft:
         """Return a proposal of the portfolio whose conjunct is most likely to make progress."""

@@ -102,8 +102,8 @@ class GuidedSampler(Learning):
 
     origin = "guided"
     # 2 excluded basins of known crashes, 3 had no mutation, 4 had no niches, 5 had another model, 6 searches each
-    # conjunct of a requirement by itself and changes signals by their shape
-    version = 6
+    # conjunct of a requirement by itself and changes signals by their shape, 7 ranks equal robustness by time
+    version = 7
 
     def _make(self, space: Space) -> Strategy:
         from crashhunt.samplers._guided import Arms  # its linear algebra takes a fifth of a second to import

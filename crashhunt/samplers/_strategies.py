@@ -82,10 +82,12 @@ class Conjunct(NamedTuple):
     Args:
         requirement: name of the requirement.
         parts: robustness of its disjuncts; the conjunct is violated if all of them are negative.
+        slack_s: the time by which it holds, in s.
     """
 
     requirement: str
     parts: tuple[float, ...]
+    slack_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,11 +140,16 @@ def scored_trial(result: TrialResult, cube: Cube, hunt: HuntFacts) -> ScoredTria
         origin=spec.origin,
         parent=spec.parent,
         kind=kind,
-        conjuncts=tuple(
-            Conjunct(requirement, parts) for requirement, rows in (result.conjuncts or {}).items() for parts in rows
-        ),
+        conjuncts=tuple(_conjuncts(result)),
         violated=result.event.name if kind and result.event is not None else "",
     )
+
+
+def _conjuncts(result: TrialResult) -> Iterator[Conjunct]:
+    for requirement, rows in (result.conjuncts or {}).items():
+        slack_s = (result.slack_s or {}).get(requirement) or (0.0,) * len(rows)
+        for parts, its_slack_s in zip(rows, slack_s, strict=True):
+            yield Conjunct(requirement, parts, its_slack_s)
 
 
 def _kind(result: TrialResult) -> str:

@@ -315,6 +315,7 @@ class TrialResult(Serializable):
             mapping is None if the trial had no requirements.
         conjuncts: For each requirement, a row per conjunct with the robustness of its disjuncts. Infinite values are
             `MAX_ROBUSTNESS`, with their sign.
+        slack_s: For each requirement, the time by which each conjunct holds, in s, limited in the same way.
     """
 
     spec: TrialSpec
@@ -345,12 +346,13 @@ class TrialResult(Serializable):
     forced: Forced | None = field(default=None, metadata=OMIT_DEFAULT)
     robustness: Mapping[str, float | None] | None = field(default=None, metadata=OMIT_DEFAULT)
     conjuncts: Mapping[str, tuple[tuple[float, ...], ...]] | None = field(default=None, metadata=OMIT_DEFAULT)
+    slack_s: Mapping[str, tuple[float, ...]] | None = field(default=None, metadata=OMIT_DEFAULT)
 
     json_keys = (
         "steps", "sim_time_s", "digest", "wall_s", "setup_s", "worker", "kept", "outcome", "category?", "spec",
         "closest", "collision", "failure", "escape", "event", "events", "disturbances", "log_likelihood", "danger",
         "stress", "branches", "setup_steps", "why_no_escape", "driven_m", "driven_s",
-        "step_length_s", "forced", "robustness", "conjuncts",
+        "step_length_s", "forced", "robustness", "conjuncts", "slack_s",
     )  # fmt: skip
 
     @classmethod

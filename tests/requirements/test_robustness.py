@@ -15,6 +15,7 @@ from hypothesis import given, settings, strategies as st
 
 from crashhunt.errors import CrashhuntError
 from crashhunt.requirements import parse
+from crashhunt.requirements._formula import looks_ahead_s
 
 
 def arrays(trace):
@@ -33,6 +34,7 @@ def assert_as_defined(seed: int, depth: int = 3, count: int = 12, step_s: float 
     assert requirement.robustness(signals, step_s) == values[0]
     assert min(map(max, requirement.parts(signals, step_s))) == values[0]
     assert requirement.satisfied(signals, step_s) == (ByDefinition(trace, truth=True).value(tree, 0)[0] > 0)
+    assert requirement.satisfied(signals, step_s) == (min(requirement.slack_s(signals, step_s)) > 0)
 
 
 @given(seed=st.integers(0, 2**32), step_s=st.sampled_from([1.0, 0.1, 1 / 15]))
@@ -47,30 +49,59 @@ def test_20_000_formulas_have_the_value_of_their_definition():
         assert_as_defined(seed, depth=4, count=25)
 
 
-def _in_rtamt(tree, trace):
-    import rtamt
-
-    monitor = rtamt.StlDiscreteTimeOfflineSpecification()
+def _specified(specification, tree):
     for name in SIGNALS:
-        monitor.declare_var(name, "float")
-    monitor.set_sampling_period(1, "s", 0.1)
-    monitor.spec = written(tree)
-    monitor.parse()
-    times = list(range(len(trace["a"])))
-    return [value for _, value in monitor.evaluate({"time": times, **trace})]
+        specification.declare_var(name, "float")
+    specification.set_sampling_period(1, "s", 0.1)
+    specification.spec = written(tree)
+    specification.parse()
+    return specification
+
+
+def _known_to_rtamt(*, past: bool):
+    """Yield 20,000 formulas without ``min`` and ``max``, which rtamt does not know, and a trace for each."""
+    trees = (random_formula(Random(seed), 3, past=past) for seed in itertools.count())
+    known = (tree for tree in trees if "min(" not in written(tree) and "max(" not in written(tree))
+    for seed, tree in enumerate(itertools.islice(known, 20_000)):
+        draw = Random(seed)
+        yield tree, random_trace(draw, draw.randint(2, 25))
 
 
 @pytest.mark.nightly
 @pytest.mark.skipif(importlib.util.find_spec("rtamt") is None, reason="pip install rtamt")
 @pytest.mark.filterwarnings("ignore")
 def test_20_000_formulas_have_the_value_that_rtamt_computes():
-    trees = (random_formula(Random(seed), 3) for seed in itertools.count())
-    known = (tree for tree in trees if "min(" not in written(tree) and "max(" not in written(tree))
-    for seed, tree in enumerate(itertools.islice(known, 20_000)):
-        draw = Random(seed)
-        trace = random_trace(draw, draw.randint(2, 25))
-        values = np.broadcast_to(parse(written(tree)).values(arrays(trace), 1.0), len(trace["a"]))
-        assert values == pytest.approx(_in_rtamt(tree, trace), abs=1e-9)
+    import rtamt
+
+    for tree, trace in _known_to_rtamt(past=True):
+        count = len(trace["a"])
+        values = np.broadcast_to(parse(written(tree)).values(arrays(trace), 1.0), count)
+        specification = _specified(rtamt.StlDiscreteTimeOfflineSpecification(), tree)
+        found = specification.evaluate({"time": [*range(count)], **trace})
+        assert values == pytest.approx([value for _, value in found], abs=1e-9)
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(importlib.util.find_spec("rtamt") is None, reason="pip install rtamt")
+@pytest.mark.filterwarnings("ignore")
+def test_formulas_have_the_value_that_rtamt_computes_sample_by_sample():
+    """Of bounded formulas of the future: their value at a sample is known when their windows have passed."""
+    import rtamt
+
+    checked = 0
+    for tree, trace in _known_to_rtamt(past=False):
+        requirement, count = parse(written(tree)), len(trace["a"])
+        ahead = looks_ahead_s(requirement.formula)
+        if ahead >= count:
+            continue
+        specification = _specified(rtamt.StlDiscreteTimeOnlineSpecification(), tree)
+        specification.pastify()
+        rows = ([(name, values[at]) for name, values in trace.items()] for at in range(count))
+        found = [specification.update(at, row) for at, row in enumerate(rows)]
+        values = np.broadcast_to(requirement.values(arrays(trace), 1.0), count)
+        assert values[: count - round(ahead)] == pytest.approx(found[round(ahead) :], abs=1e-9)
+        checked += 1
+    assert checked > 8_000
 
 
 def test_the_sign_of_the_robustness_agrees_with_the_truth():
@@ -173,3 +204,20 @@ def test_a_step_length_that_is_not_above_zero_is_refused(step_s):
 def test_conjuncts_and_disjuncts_are_those_that_a_minimum_would_mix(text, sizes):
     signals = {"a": np.array([1.0, 2.0]), "b": np.array([-1.0, 3.0]), "c": np.array([0.5, -0.5])}
     assert [len(row) for row in parse(text).parts(signals, 1.0)] == sizes
+
+
+def test_slack_says_how_near_whole_numbers_came_to_a_violation():
+    """A stay of at least 2.5 s is required; the robustness of both sides is 0."""
+    requirement = parse(
+        "always ((gear != 2 and eventually[0.1:0.1] (gear == 2)) -> eventually[0.1:0.1] always[0:2.4] (gear == 2))"
+    )
+
+    def stayed(seconds):
+        return {"gear": np.array([1] * 10 + [2] * round(10 * seconds) + [3] * 20)}
+
+    assert [requirement.robustness(stayed(seconds), 0.1) for seconds in (2.4, 2.6, 3.0)] == [0, 0, 0]
+    assert not requirement.satisfied(stayed(2.4), 0.1)
+    # It may leave 0.1 or 0.5 s earlier; a sample of each side counts as well.
+    assert requirement.slack_s(stayed(2.6), 0.1) == pytest.approx((0.3,))
+    assert requirement.slack_s(stayed(3.0), 0.1) == pytest.approx((0.7,))
+    assert requirement.slack_s({"gear": np.ones(50)}, 0.1) == (math.inf,)  # it never has to hold

@@ -128,7 +128,7 @@ def test_where_all_trials_are_as_critical_there_is_no_peak_that_is_worth_a_trial
     assert share_of_the_model(portfolio_told(*[("random", 0.0)] * 40, ("random", 0.1)), 41) > 0.5
 
 
-@pytest.mark.parametrize(("name", "version"), [("guided", 6), ("mutation", 2), ("cross-entropy", 2), ("cma-es", 2)])
+@pytest.mark.parametrize(("name", "version"), [("guided", 7), ("mutation", 2), ("cross-entropy", 2), ("cma-es", 2)])
 def test_hunts_of_another_version_are_recognized(name, version):
     assert NamedSampler(name, SPACE, points=4).version == version
 
