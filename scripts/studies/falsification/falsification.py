@@ -119,7 +119,7 @@ def result_of(
     violated = least < 0 or (least == 0 and not requirement.satisfied(trace, step_s))
     return TrialResult(
         spec, _VIOLATED if violated else Outcome.SURVIVED, robustness={name: least}, conjuncts={name: rows},
-        danger=1.0 if least <= 0 else 1 / (1 + least),
+        slack_s={name: requirement.slack_s(trace, step_s)}, danger=1.0 if least <= 0 else 1 / (1 + least),
         event=Event(REQUIREMENT, "car", name, name=name) if violated else None,
     )  # fmt: skip
 
@@ -131,13 +131,18 @@ def is_confirmed(name: str, spec: TrialSpec) -> bool:
     return not parse(chasing_cars.REQUIREMENTS[name]).satisfied(trace, chasing_cars.STEP_S)
 
 
-def measured(found: Callable[[int], TrialSpec | None], name: str, repetitions: int) -> dict[str, object]:
+def measured(found: Callable[[int], TrialSpec | None], name: str, repetitions: range) -> dict[str, object]:
     """Return the numbers of trials of some hunts, and how many violations are confirmed."""
     began = time.process_time()
-    violating = [spec for number in range(repetitions) if (spec := found(number)) is not None]
+    violating = [spec for number in repetitions if (spec := found(number)) is not None]
     confirmed = sum(is_confirmed(name, spec) for spec in violating) if name.startswith("CC") else None
     done = [spec.number + 1 for spec in violating]
-    return {"trials": done, "of": repetitions, "confirmed": confirmed, "cpu_s": round(time.process_time() - began, 1)}
+    return {
+        "trials": done,
+        "of": len(repetitions),
+        "confirmed": confirmed,
+        "cpu_s": round(time.process_time() - began, 1),
+    }
 
 
 def main() -> None:
@@ -145,12 +150,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trials", type=int, default=1500)
     parser.add_argument("--repetitions", type=int, default=30)
+    parser.add_argument("--first", type=int, default=0, help="the first repetition, to add hunts to earlier ones")
     parser.add_argument("--instance", type=int, choices=(1, 2), default=2)
     parser.add_argument("--requirements", default=",".join(BENCHMARKS))
     parser.add_argument("--samplers", default="random,guided,optuna-tpe,optuna-cma-es,verifai-ce")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     print("| requirement | sampler | violated | mean | median | confirmed |\n| --- | --- | --- | --- | --- | --- |")
+    chosen = range(given.first, given.first + given.repetitions)
     with tempfile.TemporaryDirectory() as temporary:
         hunts = Trials(Path(temporary), given.trials, given.instance)
         for name in given.requirements.split(","):
@@ -158,7 +165,7 @@ def main() -> None:
                 if missing := missing_packages(sampler):
                     print(f"{sampler} is skipped: pip install {' '.join(missing)}", file=sys.stderr)
                     continue
-                row = measured(partial(hunts.first_violation, name, sampler), name, given.repetitions)
+                row = measured(partial(hunts.first_violation, name, sampler), name, chosen)
                 done = row["trials"]
                 assert isinstance(done, list)
                 figures = f"{statistics.mean(done):.1f} | {statistics.median(done):g}" if done else " | "
