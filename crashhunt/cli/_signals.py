@@ -31,13 +31,16 @@ def add_signals(commands: Commands) -> None:
     signals.set_defaults(command=_signals)
 
 
+_ANY_STEPS = 1_000_000  # so that windows of requirements in the scenario fit; only one step runs
+
+
 def _signals(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.hunts import list_signals
     from crashhunt.plans import Request, plan
     from crashhunt.report import aligned
 
     agents = pairs(options.agent, "--agent", named=False)
-    asked = Request(scenario=options.scenario, ego=options.ego, agents=agents, trials=1, max_steps=1)
+    asked = Request(scenario=options.scenario, ego=options.ego, agents=agents, trials=1, max_steps=_ANY_STEPS)
     found = list_signals(*plan(asked))
     if options.json:
         print(json.dumps(found))

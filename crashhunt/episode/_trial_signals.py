@@ -248,7 +248,7 @@ class TrialSignals:
 
 
 _MAX_ELEMENTS = 1000
-_NAME = re.compile(r"[A-Za-z_]\w*")
+_NAME = re.compile(r"[^\W\d]\w*")
 _SURROUNDINGS = (
     "gap_m", "headway_s", "ttc_s", "leader_speed", "leader_acceleration", "leader_changed", "red_light_m", "priority_m",
     "priority_arrival_s",

@@ -18,12 +18,15 @@ from crashhunt.world import Event
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from crashhunt.oracles._protocol import SignalSource
     from crashhunt.requirements import Violation
     from crashhunt.trial import Category, TrialResult
     from crashhunt.world import Scene
 
-_TITLE = re.compile(r"\s*([A-Za-z_]\w*)\s*=(?!=)\s*(.*)", re.DOTALL)
+_TITLE = re.compile(r"\s*([^\W\d]\w*)\s*=(?!=)\s*(.*)", re.DOTALL)
 _parsed = cache(parse)  # once per process, because each trial creates the oracle
 
 
@@ -124,6 +127,20 @@ class RequirementOracle:
         conjuncts = {**(result.conjuncts or {}), self._title: tuple(map(_limited, rows))}
         slacks = {**(result.slack_s or {}), self._title: _limited(slack_s)}
         return replace(result, robustness=robustness, danger=danger, conjuncts=conjuncts, slack_s=slacks)
+
+    def comparisons(self) -> dict[str, tuple[int, dict[str, NDArray[np.float64]]]]:
+        """Return the comparisons of the formula: by their text, the step of the first value, and both sides.
+
+        With several agents, the name of the agent precedes the text.
+        """
+        return {
+            f"{watched.agent}: {text}" if len(self._watched) > 1 else text: (watched.first, sides)
+            for watched in self._watched
+            if watched.monitor.count
+            for text, sides in self._requirement.comparisons(
+                watched.monitor.trace(), watched.monitor.step_length_s
+            ).items()
+        }
 
     def _unusable(self, error: CrashhuntError) -> UnusableValueError:
         what = "the requirement" if self._title == REQUIREMENT else f"the requirement {self._title}"

@@ -18,6 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, TypedDict, cast, final
 
+import numpy as np
+
 from crashhunt.agents import DrawsPanels
 from crashhunt.base import layout
 from crashhunt.base.capabilities import supports
@@ -29,16 +31,17 @@ from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.episode import Observer, Parts, WorkerSettings, run_episode, seal
 from crashhunt.executors import snapshot_environment
-from crashhunt.panels import labelled, scope
+from crashhunt.oracles import RequirementOracle
+from crashhunt.panels import Curve, labelled, scope
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.render import explanation, save_meanings, save_panels
 from crashhunt.simulators import HasWindow, NamesMetaActions
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from typing import TextIO
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
@@ -54,6 +57,9 @@ if TYPE_CHECKING:
 #
 # The debugger continues in a fork while the process waits for its end. If the fork ends in order to go back, the
 # process gets the terminal again. So the user finds the exact earlier state, without effects of later steps.
+
+_SHOWN_S = 10.0  # of the curves of a requirement, as of those that every film has
+_MOST_COMPARISONS = 6  # of requirements that a film shows
 
 _MAX_STEPS_BACK = 50  # steps; what has changed since is kept for each
 _BACK_EXIT_CODE = 78  # exit code
@@ -312,19 +318,23 @@ class _Stopped:
 
 
 class _Panels(Observer):
-    """Draws the panels of the agents after every action.
+    """Draws the panels of the agents after every action, and the signals of requirements at the end.
 
     Args:
         first: the first step whose panels are drawn.
         folder: folder for the pictures of the panels.
+        requirements: the requirements of the episode.
     """
 
-    def __init__(self, first: int, folder: Path) -> None:
+    def __init__(self, first: int, folder: Path, requirements: Sequence[RequirementOracle] = ()) -> None:
         self._first = first
         self._folder = folder
+        self._requirements = requirements
+        self._began_s = 0.0
 
     def begin(self, episode: ObservedEpisode) -> None:
         self._episode = episode
+        self._began_s = episode.simulator.scene().time_s
         for name in episode.names:
             space = episode.simulator.actions[name].space
             save_meanings(self._folder, name, space.meanings if supports(space, NamesMetaActions) else ())
@@ -341,6 +351,18 @@ class _Panels(Observer):
             except Exception as error:  # a picture that fails is no crash of the agent
                 panels = labelled({"panels": explanation(error)})
         save_panels(self._folder, step, panels)
+
+    def end(self, result: TrialResult) -> TrialResult:
+        step_s = self._episode.simulator.step_length_s
+        shown = {text: one for oracle in self._requirements for text, one in oracle.comparisons().items()}
+        for text, (begin, sides) in [*shown.items()][:_MOST_COMPARISONS]:
+            count = len(next(iter(sides.values())))
+            seconds = self._began_s + step_s * np.arange(begin, begin + count)
+            for last in range(max(self._first - begin, 0), count):
+                part = slice(max(0, last - round(_SHOWN_S / step_s)), last + 1)
+                curves = Curve({side: values[part] for side, values in sides.items()}, seconds[part])
+                save_panels(self._folder, begin + last, [(text, curves)])
+        return result
 
 
 @final
@@ -458,8 +480,10 @@ def main() -> None:
         observers: list[Observer] = [stop.backwards, stop] if job["stop_at"] and job["window"] is None else [stop]
         if job["stop_at"] and not sys.stdin.isatty():
             sys.stdin = cast("TextIO", OneLine())
+        oracles = parts.oracles()
         if job["panels"] is not None:
-            observers.append(_Panels(job["panels"][0], Path(job["panels"][1])))
+            requirements = [one for one in oracles if isinstance(one, RequirementOracle)]
+            observers.append(_Panels(job["panels"][0], Path(job["panels"][1]), requirements))
         window = _open_window(simulator, job) if job["window"] is not None else None
         if window is not None:
             observers.append(window)
@@ -470,7 +494,7 @@ def main() -> None:
             simulator=simulator,
             make_agent=parts.agent,
             box=box,
-            oracles=parts.oracles(),
+            oracles=oracles,
             crash_on=settings.crash_on,
             observers=observers,
         )

@@ -32,6 +32,7 @@ from crashhunt.requirements._robustness import (
     lasting,
     proposition_values,
     steps_of,
+    term_values,
 )
 
 if TYPE_CHECKING:
@@ -39,7 +40,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.requirements._formula import Formula, Window
+    from crashhunt.requirements._formula import Formula, Node, Window
+
+    Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +147,25 @@ class Requirement:
 
         ways = [replace(truths, leaf=partial(leaf, order=slice(None, None, way)), is_leaf=is_leaf) for way in (1, -1)]
         return tuple(sum(float(way.values(part)[0]) for way in ways) for part in conjuncts(self.formula))
+
+    def comparisons(self, signals: Mapping[str, object], step_length_s: float) -> dict[str, dict[str, Floats]]:
+        """Return the values of both sides of each comparison at each sample, by the texts of comparison and side."""
+        _require_step_length(step_length_s)
+        self.require_known(signals)
+        arrays, _ = checked_signals(signals, self.signals)
+        count = len(next(iter(arrays.values()))) if arrays else 1
+        found = {}
+        for node in nodes_of(self.formula):
+            if isinstance(node, Compare):
+                sides = {
+                    self._text_of(side): term_values(side, arrays, count, self.text) for side in (node.left, node.right)
+                }
+                found[self._text_of(node)] = sides
+        return found
+
+    def _text_of(self, node: Node) -> str:
+        begin, end = node.span
+        return " ".join(self.text[begin:end].split())
 
     def require_known(self, known: Collection[str]) -> None:
         """Check that all signals are known.

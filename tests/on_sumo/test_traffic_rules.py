@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import libsumo
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from conftest import mostly_nightly
 
+from crashhunt.agents import CarFollowing
 from crashhunt.episode import Episode, TrialSignals
 from crashhunt.oracles import Overlap, RequirementOracle
 from crashhunt.requirements import TRAFFIC_RULES, parse
@@ -146,3 +148,138 @@ def test_a_collision_with_an_actor_that_has_priority_violates_right_of_way(tmp_p
             assert result.robustness["right-of-way"] <= 0
             return
     raise AssertionError(hit)
+
+
+class Junction:
+    """The junction of the scenario ``intersection``, computed from its network file alone."""
+
+    def __init__(self, net):
+        self.length = {lane: float(m) for lane, m in re.findall(r'<lane id="([^"]+)".*?length="([^"]+)"', net)}
+        shapes = re.findall(r'<lane id="([^"]+)".*?shape="([^"]+)"', net)
+        self.shapes = {lane: [tuple(map(float, one.split(","))) for one in shape.split()] for lane, shape in shapes}
+        links = re.findall(r'<connection from="([^":]+)" to="([^"]+)" fromLane="(\d+)".*? via="([^"]+)"', net)
+        self.inside = {(f"{one}_{lane}", to): via for one, to, lane, via in links}
+        self.after = dict(re.findall(r'<connection from="(:[^"]+)" .*? via="([^"]+)"', net))
+        self.yields = [bits[::-1] for bits in re.findall(r'<request index="\d+"\s+response="(\d+)"', net)]
+
+    def path(self, vehicle):
+        """The link of a vehicle through the junction, its points, and the distance of its front from their start."""
+        lane, place = libsumo.vehicle.getLaneID(vehicle), libsumo.vehicle.getLanePosition(vehicle)
+        route, at = libsumo.vehicle.getRoute(vehicle), libsumo.vehicle.getRouteIndex(vehicle)
+        if lane.startswith(":"):  # the route index is still that of the edge before
+            first = next((via for via in self.inside.values() if lane in (via, self.after.get(f"{via}"[:-2]))), None)
+            driven = place + (self.length[first] if first != lane else 0.0)
+        else:
+            first = self.inside.get((lane, route[at + 1])) if at + 1 < len(route) else None
+            driven = place - self.length[lane]
+        if first is None:
+            return None
+        second = self.after.get(first[:-2])
+        points = self.shapes[first] + (self.shapes[second][1:] if second else [])
+        return int(first[:-2].rpartition("_")[2]) + int(first.rpartition("_")[2]), points, driven
+
+
+def crossing(one, other):
+    """The distances along two lines of points at which they first cross; None if they do not."""
+    along = 0.0
+    for (ax, ay), (bx, by) in pairwise(one):
+        whole = 0.0
+        for (cx, cy), (dx, dy) in pairwise(other):
+            turn = (bx - ax) * (dy - cy) - (by - ay) * (dx - cx)
+            if turn:
+                s = ((cx - ax) * (dy - cy) - (cy - ay) * (dx - cx)) / turn
+                u = ((cx - ax) * (by - ay) - (cy - ay) * (bx - ax)) / turn
+                if 0 <= s <= 1 and 0 <= u <= 1:
+                    return along + s * math.dist((ax, ay), (bx, by)), whole + u * math.dist((cx, cy), (dx, dy))
+            whole += math.dist((cx, cy), (dx, dy))
+        along += math.dist((ax, ay), (bx, by))
+    return None
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("route", ["north-south", "west-east", "south-west"])
+def test_priority_is_that_of_the_network_file_and_of_the_geometry_of_the_lanes(route, tmp_path):
+    shutil.copytree(ROOT / "scenarios" / "intersection", tmp_path / "own")
+    table = tmp_path / "own" / "scenario.toml"
+    table.write_text(table.read_text().replace('route = "west-east"', f'route = "{route}"'))
+    scenario = load_scenario(tmp_path / "own")
+    junction = Junction((tmp_path / "own" / "intersection.net.xml").read_text())
+    near, finite, arrivals = 0, 0, 0
+    for seed in range(1, 7):
+        simulator = SumoSimulator(scenario, tmp_path)
+        spec = TrialSpec(0, seed, {}, {**argument_values(scenario), "priority_demand": 600, "minor_demand": 100}, 260)
+        with Episode(spec, simulator=simulator, make_agent=lambda *_: CarFollowing(), crash_on=()) as episode:
+            result = episode.start()
+            read = TrialSignals(episode).reader(["priority_m", "priority_arrival_s"], "ego")
+            while result is None:
+                result = episode.step()
+                own = junction.path("ego") if "ego" in libsumo.vehicle.getIDList() else None
+                if own is None:
+                    continue
+                distance_m, arrival_s = read()
+                before = {}
+                for other in set(libsumo.vehicle.getIDList()) - {"ego"}:
+                    its = junction.path(other)
+                    if its is not None and junction.yields[own[0]][its[0]] == "1":
+                        meet = crossing(own[1], its[1])
+                        before[other] = (meet[0] - own[2], meet[1] - its[2]) if meet else (math.nan, math.nan)
+                if distance_m < math.inf:
+                    finite += 1
+                    assert before  # the network file gives somebody priority
+                    apart = [abs(max(0.0, mine) - distance_m) for mine, _ in before.values()]
+                    assert min(apart) < 8.0 or np.isnan(apart).any()  # lanes are wide, lines of points are not
+                if any(0 < mine < 30 and 0 < its < 30 for mine, its in before.values()):
+                    near += 1
+                    assert distance_m < math.inf
+                if arrival_s < math.inf:
+                    arrivals += 1
+                    speeds = {other: max(0.1, libsumo.vehicle.getSpeed(other)) for other in before}
+                    apart = [abs(max(0.0, its) - arrival_s * speeds[other]) for other, (_, its) in before.items()]
+                    assert min(apart) < 8.0
+        simulator.close()
+    assert (near > 0, finite > 0, arrivals > 0) == (route != "west-east",) * 3
+
+
+@pytest.mark.parametrize("lane", [0, 1])
+def test_red_light_is_that_of_the_program_in_the_network_file(lane, tmp_path):
+    net = (ROOT / "tests" / "on_sumo" / "signal.net.xml").read_text()
+    phases = [(float(s), state) for s, state in re.findall(r'<phase duration="([^"]+)"\s+state="([^"]+)"', net)]
+    link = int(re.search(rf'from="west" to="east" fromLane="{lane}" .*?linkIndex="(\d+)"', net)[1])
+    length_m = float(re.search(rf'<lane id="west_{lane}".*?length="([^"]+)"', net)[1])
+    (tmp_path / "n.net.xml").write_text(net)
+    (tmp_path / "r.rou.xml").write_text(
+        f'<routes><vehicle id="ego" depart="0" departPos="0" departLane="{lane}"><route edges="west east"/>'
+        "</vehicle></routes>"
+    )
+    (tmp_path / "scenario.toml").write_text(
+        'title = "t"\nschema = 1\nsimulator = "sumo"\nstep_length_s = 0.5\nwarmup_s = 0.0\n'
+        '[sumo]\nnet = "n.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nexisting = true\n'
+    )
+    simulator = SumoSimulator(load_scenario(tmp_path), tmp_path)
+    compared = {True: 0, False: 0}
+    with Episode(
+        TrialSpec(0, 1, {}, {}, 200), simulator=simulator, make_agent=lambda *_: Crawls(), crash_on=()
+    ) as episode:
+        result = episode.start()
+        read = TrialSignals(episode).reader(["red_light_m", "speed"], "ego")
+        while result is None:
+            if (row := read()) is None or not libsumo.vehicle.getLaneID("ego").startswith("west"):
+                break
+            passed_s = (libsumo.simulation.getTime() - 0.5) % sum(seconds for seconds, _ in phases)
+            state = next(
+                one for number, (_, one) in enumerate(phases) if passed_s < sum(s for s, _ in phases[: number + 1])
+            )
+            left_m = length_m - libsumo.vehicle.getLanePosition("ego")
+            expected = left_m - 1.0 if state[link] in "ru" and left_m <= max(60.0, 6.0 * row[1]) else math.inf
+            assert row[0] == pytest.approx(expected, abs=1e-6)
+            compared[expected < math.inf] += 1
+            result = episode.step()
+    simulator.close()
+    assert min(compared.values()) > 10
+
+
+class Crawls(Hectic):
+    """Drives at 1.2 m/s."""
+
+    def act(self, observation):
+        return 1.2, 0

@@ -17,6 +17,7 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.oracles import RequirementOracle
 from crashhunt.panels import Text
 from crashhunt.replays import Look, _debugger
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
@@ -147,7 +148,8 @@ def test_panels_are_those_of_agents_that_draw_from_the_first_step_on(monkeypatch
     monkeypatch.setattr(_debugger, "save_panels", lambda folder, step, panels: saved.append((folder, step, panels)))
     episode = SimpleNamespace(names=["a", "b", "c"], agents={"a": Draws(), "b": object(), "c": Fails()}, steps=0)
     space = SimpleNamespace(meanings=("LEFT", "RIGHT"))
-    episode.simulator = SimpleNamespace(actions={name: SimpleNamespace(space=space) for name in episode.names})
+    actions = {name: SimpleNamespace(space=space) for name in episode.names}
+    episode.simulator = SimpleNamespace(actions=actions, scene=lambda: SimpleNamespace(time_s=0.0))
     observer = _debugger._Panels(3, tmp_path)
     observer.begin(episode)
     for step in range(1, 5):
@@ -159,6 +161,30 @@ def test_panels_are_those_of_agents_that_draw_from_the_first_step_on(monkeypatch
     ]  # fmt: skip
     assert "no plan yet" in " ".join(saved[1][2][0][1].text.split())
     assert "LEFT" in (tmp_path / "meanings.jsonl").read_text()
+
+
+def test_film_shows_both_sides_of_the_comparisons_of_a_requirement(monkeypatch, tmp_path):
+    saved = []
+    monkeypatch.setattr(_debugger, "save_panels", lambda _, step, panels: saved.append((step, *panels)))
+    oracle = RequirementOracle("near", "always (reward > 0 -> speed * 2 < 8 - reward)")
+    values = iter([None, (1.0, 2.0), (3.0, 2.0), (1.0, 9.0)])
+    source = SimpleNamespace(step_length_s=0.5, reader=lambda names, agent: lambda: next(values))
+    oracle.read_signals(source, ["ego"])
+    for _ in range(4):
+        oracle.check(SimpleNamespace(roster=SimpleNamespace(index={}), agent_lanes={}), ["ego"])
+    observer = _debugger._Panels(2, tmp_path, [oracle])
+    simulator = SimpleNamespace(step_length_s=0.5, scene=lambda: SimpleNamespace(time_s=60.0))
+    observer.begin(SimpleNamespace(names=(), simulator=simulator))
+    observer.end("result")
+    assert [(step, label) for step, (label, _) in saved] == [
+        (2, "reward > 0"), (3, "reward > 0"), (2, "speed * 2 < 8 - reward"), (3, "speed * 2 < 8 - reward"),
+    ]  # fmt: skip
+    curve = saved[-1][1][1]
+    assert {name: list(values) for name, values in curve.series.items()} == {
+        "speed * 2": [4.0, 4.0, 18.0], "8 - reward": [7.0, 5.0, 7.0],
+    }  # fmt: skip
+    assert list(curve.x) == [60.5, 61.0, 61.5]
+    assert curve.draw().shape == (160, 240, 3)
 
 
 class Left(BaseException):
