@@ -37,7 +37,7 @@ SHOWN = {
         ),
         (
             {"fault": {"verdict": "nobody can tell", "findings": []}, "last_escape_step": 0},
-            "ego drove into b at step 9: no vehicle is certainly at fault, avoidable by full braking until step 0.",
+            "ego drove into b at step 9: fault not decided, avoidable by full braking until step 0.",
         ),
     ],
 )

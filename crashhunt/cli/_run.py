@@ -141,10 +141,12 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         except _OutputClosedError as error:
             raise BrokenPipeError from error
         watcher.tell_notes()  # where there was nothing to run
-    console.print(describe_hunt(report), markup=False, soft_wrap=True)
+    described = describe_hunt(report)
+    console.print(described, markup=False, soft_wrap=True)
     if console.is_terminal and report.crashes and has_dashboard():
+        label = "Look at it:  " if "Replay one:" in described else "Look at it: "  # below the labels before it
         console.print(
-            f"Look at it: {command_line('crashhunt', 'dashboard', options.directory)}", markup=False, soft_wrap=True
+            f"{label}{command_line('crashhunt', 'dashboard', options.directory)}", markup=False, soft_wrap=True
         )
     if options.json:
         print(json.dumps(report.to_json()))

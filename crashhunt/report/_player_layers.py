@@ -38,6 +38,7 @@ _COLOURS, _MIN_PICTURE_PIXELS = (1, 3), 16
 _ACTOR_SHADE, _LANE_SHADE = 40, 200  # of the cells of a grid, of 255
 _PLAN_SHAPE, _POSE_NAMES = 5, ("x", "y", "heading", "time")
 _PLAN_START_M, _MAX_ACCELERATION_MPS2 = 3.0, 10.0  # bounds of the place of the first planned pose
+_MAX_CURVES = 12  # of observed values
 _KM = 1000.0
 _STATES = ("green", "yellow", "red", "off or blinking")
 _LAYERS: Mapping[str, tuple[str, ...]] = {
@@ -88,6 +89,8 @@ def player_layers(
         found["vehicleLights"] = lights["vehicles"]
     plan = _plan(recording, channel, origin)
     pictures = _pictures(recording, channel)
+    if seen := _seen(recording, channel):
+        found["seen"] = seen
     more = {**({"plan": plan} if plan else {}), **({"pictures": pictures} if pictures else {})}
     return {**found, **more, **_observed(recording, channel, origin)}
 
@@ -233,6 +236,22 @@ def _pictures(recording: Recording, channel: AgentChannel) -> dict[str, object]:
             packed = base64.b64encode(zlib.compress(np.array(drawn).tobytes(), 6)).decode("ascii")
             found[name] = {"first": first, "size": list(drawn[0].shape), "bytes": packed}
     return found
+
+
+def _seen(recording: Recording, channel: AgentChannel) -> dict[str, object]:
+    """Return the observed values of an episode without a scene, for curves; empty if there are too many."""
+    size = math.prod(channel.observation_shape)
+    if recording.actors or channel.observation_parts or not 0 < size <= _MAX_CURVES or _is_picture(channel):
+        return {}
+    steps = recording.all_steps
+    values = np.full((recording.steps + 1, size), np.nan)
+    for number in range(min(recording.steps + 1, len(steps) - 1)):
+        observation = steps[number + 1].observations.get(channel.id)
+        if observation is not None:
+            values[number] = np.asarray(observation, float).ravel()
+    names = list(channel.observation_names)
+    names = names if len(names) == size else [f"observation[{place}]" for place in range(size)]
+    return {"names": names, "values": packed_floats(values)}
 
 
 def _is_picture(channel: AgentChannel) -> bool:

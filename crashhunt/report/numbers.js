@@ -7,6 +7,8 @@ function formatNumber(value) {
   const [digits, power] = value.toExponential(2).split("e");
   return `${Number(digits)}e${Number(power)}`;
 }
+/* Two decimals, as in texts and tables. */
+function formatCriticality(value) { return typeof value === "number" && Number.isFinite(value) ? value.toFixed(2) : "-"; }
 function formatPercent(share) { return `${formatNumber(100 * share)} %`; }
 
 /* The share that each argument explains, with its interval. */

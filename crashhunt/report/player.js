@@ -74,6 +74,7 @@ async function load(crash) {
   const [own, behind] = crash.danger ? await Promise.all([crash.danger, crash.behind].map(unpack)) : [null, null];
   Object.assign(crash, { values, ttcs: ttc, gaps: gap, acts: actions, dangers: own, behinds: behind });
   for (const layer of [crash.plan, ...Object.values(crash.observed?.layers ?? {})].filter(Boolean)) layer.array = await unpack(layer.values);
+  if (crash.seen) crash.seen.array = await unpack(crash.seen.values);
   for (const picture of Object.values(crash.pictures ?? {})) picture.array = await unpackBytes(picture.bytes);
   crash.bent = new Map((crash.bends || []).map(([step, actor, line]) => [step * crash.actors.length + actor, line]));
   crash.road = new Path2D();
@@ -126,6 +127,8 @@ function show(crash, rows) {
   view.picked = "";
   view.step = begin(crash);
   $("pictures").replaceChildren();
+  $("scene").style.height = crash.actors.length ? "" : "48px";
+  for (const id of ["in", "out", "follow", "fit", "ids", "key-scene"]) $(id).hidden = !crash.actors.length;
   $("observed").hidden = !crash.observed && !crash.pictures;
   crash.rows ??= rowsOf(crash);
   $("plot").style.height = `${HEAD + crash.rows.length * ROW + BELOW}px`;
@@ -603,7 +606,7 @@ function drawGhost(context) {
 }
 
 /* The curves: one above the other, each with its own axis. */
-const HEAD = 14, ROW = 66, TITLE = 16, BELOW = 22, LEFT = 46, RIGHT = 12, TTC_CUT_S = 10, GAP_CUT_M = 100, PULL_CUT_MPS2 = 12;
+const HEAD = 14, ROW = 66, TITLE = 16, BELOW = 22, LEFT = 56, RIGHT = 12, TTC_CUT_S = 10, GAP_CUT_M = 100, PULL_CUT_MPS2 = 12;
 const ROUND = [1, 2, 3, 5, 10, 15, 20, 30, 40, 50, 60, 80, 100, 150, 200];
 function rowsOf(crash) {
   const whole = (count, value) => Float32Array.from({ length: count }, (_, step) => value(step));
@@ -632,6 +635,12 @@ function rowsOf(crash) {
     if (!finite.length) return;
     const low = finite.reduce((a, b) => Math.min(a, b)), high = finite.reduce((a, b) => Math.max(a, b));
     rows.push({ title: `action: ${name}`, unit: "", low: low === high ? low - 1 : low, high: low === high ? high + 1 : high, isStep: true, series: [own(values, { name: "" })] });
+  });
+  crash.seen?.names.forEach((name, place) => {
+    const values = whole(crash.steps, (step) => crash.seen.array[step * crash.seen.names.length + place]), finite = values.filter(Number.isFinite);
+    if (!finite.length) return;
+    const low = finite.reduce((a, b) => Math.min(a, b)), high = finite.reduce((a, b) => Math.max(a, b));
+    rows.push({ title: `observed: ${name}`, unit: "", low: low === high ? low - 1 : low, high: low === high ? high + 1 : high, series: [{ name: "", color: "--observed", values }] });
   });
   return rows.filter((row) => row.series.some((one) => one.values.some(Number.isFinite)));
 }
@@ -766,11 +775,13 @@ function valuesAt(crash, step) {
   const parts = [["time", `${(crash.time0 + step * crash.dt).toFixed(Math.abs(10 * crash.dt - Math.round(10 * crash.dt)) < 1e-6 ? 1 : 2)} s`], ["speed", measured(crash.speeds[step], "m/s")], ...other, ["acceleration", measured(crash.pulls[step], "m/s²")]];
   if (crash.other) parts.push([`acceleration of ${crash.other}`, measured(crash.otherPulls[step], "m/s²")]);
   parts.push([`TTC${ttcWith && ` with ${ttcWith}`}`, measured(crash.ttcs[step], "s")], [`gap${gapTo && ` to ${gapTo}`}`, measured(crash.gaps[step], "m")]);
-  if (crash.dangers) parts.push(["criticality", formatNumber(crash.dangers[step])], ["rear criticality", formatNumber(crash.behinds[step])]);
+  if (!crash.actors.length) parts.splice(1);
+  if (crash.dangers) parts.push(["criticality", formatCriticality(crash.dangers[step])], ["rear criticality", formatCriticality(crash.behinds[step])]);
   crash.actionNames.forEach((name, place) => {
     const value = crash.acts[step * crash.actionNames.length + place];
     parts.push([name, formatNumber(value)]);
   });
+  crash.seen?.names.forEach((name, place) => parts.push([name, formatNumber(crash.seen.array[step * crash.seen.names.length + place])]));
   return parts;
 }
 

@@ -71,7 +71,7 @@ def describe(shown: dict[str, Any]) -> str:
     verdict = shown["fault"]["verdict"]
     rules = sorted({finding["rule"] for finding in shown["fault"]["findings"]})
     if verdict == "nobody can tell":
-        fault = "no vehicle is certainly at fault"
+        fault = "fault not decided"
     else:
         who = {"ego": shown["agent"], "the other": shown["other"], "both": "both"}[verdict]
         fault = f"the fault of {who} ({', '.join(rules)})"

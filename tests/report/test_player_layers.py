@@ -14,7 +14,17 @@ from conftest import add_toy
 from crashhunt.crashes import list_bundles
 from crashhunt.recording import AgentChannel, ObservedPart
 from crashhunt.report import player_data
-from crashhunt.report._player_layers import _checked, _in_words, _pictures, _plan, _present, _rows, _way, player_layers
+from crashhunt.report._player_layers import (
+    _checked,
+    _in_words,
+    _pictures,
+    _plan,
+    _present,
+    _rows,
+    _seen,
+    _way,
+    player_layers,
+)
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators import PARTS
 from crashhunt.world import Actor, Roster, Scene
@@ -160,6 +170,16 @@ def test_observed_picture_is_the_newest_one_of_its_step(shape):
     assert (shown == np.array([one[-1:].transpose(1, 2, 0) if shape[0] == 4 else one for one in seen])).all()
     vector = AgentChannel("car", "<f8", (5,), "<f8", (1,))
     assert _pictures(SimpleNamespace(all_steps=steps, steps=3), vector) == {}
+
+
+def test_observed_values_are_curves_where_there_is_no_scene():
+    channel = AgentChannel("cart", "<f4", (2,), "<i8", (), (), ("angle", "rate"))
+    steps = [SimpleNamespace(observations={})] + [SimpleNamespace(observations={"cart": [n, -n]}) for n in range(3)]
+    found = _seen(SimpleNamespace(all_steps=steps, steps=2, actors=[]), channel)
+    assert found["names"] == ["angle", "rate"]
+    values = np.frombuffer(zlib.decompress(base64.b64decode(found["values"])), "<f4").reshape(-1, 2)
+    assert values.tolist() == [[0, 0], [1, -1], [2, -2]]
+    assert _seen(SimpleNamespace(all_steps=steps, steps=2, actors=["ego"]), channel) == {}
 
 
 def test_stop_lines_are_at_the_ends_of_the_lanes_that_have_to_yield():

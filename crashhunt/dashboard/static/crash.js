@@ -5,7 +5,7 @@ const [, , ID, , CRASH] = location.pathname.split("/"), API = `/api/hunts/${ID}/
 $("hunt").href = `/hunts/${ID}`;
 
 function facts(crash) {
-  const lineage = crash.lineage.map(([number, origin, danger]) => `trial ${number} (${origin || "no strategy"}${danger === null ? "" : `, criticality ${formatNumber(danger)}`})`);
+  const lineage = crash.lineage.map(([number, origin, danger]) => `trial ${number} (${origin || "no strategy"}${danger === null ? "" : `, criticality ${formatCriticality(danger)}`})`);
   const fault = crash.fault?.findings?.map((one) => `${one.rule}: ${one.words} (${one.source})`) ?? [];
   return [["arguments", crash.arguments], ...(lineage.length ? [["made from", lineage.join(", ")]] : []), ...Object.entries(crash.facts), ...(fault.length ? [["rules", fault.join("\n")]] : []), ["folder", crash.path]];
 }

@@ -179,7 +179,7 @@ function chooseDots() {
   drawn = points.filter((one) => one.crash || isDrawn(one));
 }
 
-const about = (one) => spelled([`trial ${one.number}: ${one.outcome}`, one.danger === null ? "" : `criticality ${formatNumber(one.danger)}`, one.disturbances ? plural(one.disturbances, "disturbance", "disturbances") : "", one.origin && `from ${one.origin}`, ...Object.entries(one.values).map(([name, value]) => `${name} ${short(value)}${units[name] ? ` ${units[name]}` : ""}`)].filter((part) => part).join("\n")).replaceAll("\n", "<br>");
+const about = (one) => spelled([`trial ${one.number}: ${one.outcome}`, one.danger === null ? "" : `criticality ${formatCriticality(one.danger)}`, one.disturbances ? plural(one.disturbances, "disturbance", "disturbances") : "", one.origin && `from ${one.origin}`, ...Object.entries(one.values).map(([name, value]) => `${name} ${short(value)}${units[name] ? ` ${units[name]}` : ""}`)].filter((part) => part).join("\n")).replaceAll("\n", "<br>");
 function drawTrials() {
   chooseDots();
   const measured = drawn.filter((one) => one.danger !== null || one.crash), origins = [...new Set(points.map((one) => one.origin))].sort();
@@ -356,7 +356,7 @@ function pick(number) {
   const command = run.map(quoted).join(" "), box = make("div", undefined, "command");
   box.append(make("span", "run its arguments again, with other seeds"), make("code", command), copyButton(command, `the arguments of trial ${number}`));
   const facts = make("dl");
-  facts.append(...[["outcome", one.outcome], ["steps", one.steps], ["criticality", formatNumber(one.danger)], ["disturbances", one.disturbances], ["least time to collision with any actor", one.ttc === null ? "-" : `${one.ttc.toFixed(1)} s`], ["came from", [one.origin, one.parent === null ? "" : `trial ${one.parent}`].filter((part) => part).join(", ") || "-"], ...Object.entries(one.values).map(([name, value]) => [name, `${short(value)}${units[name] ? ` ${units[name]}` : ""}`])].flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
+  facts.append(...[["outcome", one.outcome], ["steps", one.steps], ["criticality", formatCriticality(one.danger)], ["disturbances", one.disturbances], ["least time to collision with any actor", one.ttc === null ? "-" : `${one.ttc.toFixed(1)} s`], ["came from", [one.origin, one.parent === null ? "" : `trial ${one.parent}`].filter((part) => part).join(", ") || "-"], ...Object.entries(one.values).map(([name, value]) => [name, `${short(value)}${units[name] ? ` ${units[name]}` : ""}`])].flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
   panel.replaceChildren(make("h3", `Trial ${number}`), facts, box);
   panel.scrollIntoView({ block: "nearest" });
 }
