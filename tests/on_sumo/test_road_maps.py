@@ -23,6 +23,8 @@ ALL = [
     pytest.param(path.name, marks=pytest.mark.nightly) if path.name.startswith(LARGE) else path.name
     for path in sorted(NETS.glob("*.net.xml*"))
 ]
+PUBLIC = Path(sumolib.__file__).parent / "scenario" / "scenarios" / "RealWorld"
+ALL += [pytest.param(str(path), marks=pytest.mark.nightly) for path in sorted(PUBLIC.glob("*/rilsa?.net.xml"))]
 CAR = "passenger"
 
 

@@ -22,17 +22,20 @@ from crashhunt.sumo._reader_protocol import Moment, Places, ReaderSetup  # noqa:
 from crashhunt.sumo.maps import read_network  # noqa: E402
 
 NETS = Path(__file__).parent / "nets"
+REAL = Path(sumolib.__file__).parent / "scenario" / "scenarios" / "RealWorld"
+PUBLIC = {f"rilsa{one}": REAL / f"RiLSA_example{one}" / f"rilsa{one}.net.xml" for one in (1, 2, 3, 4)}
+"""Networks that SUMO's package contains, of signalised junctions in a German guideline."""
 NIGHTLY = pytest.mark.nightly
 FURTHER = (
     "rand", "spider", "stops", "allway",
-    "grid-skew", "grid-walks", "rand-wide", "spider-lights",
+    "grid-skew", "grid-walks", "rand-wide", "spider-lights", *PUBLIC,
 )  # fmt: skip
 FOREIGN = (
     "grid-lights",
     "left-grid",
     *(pytest.param(name, marks=NIGHTLY) for name in FURTHER),
 )
-FEW_FOES = {"grid-skew", "spider-lights"}
+FEW_FOES = {"grid-skew", "spider-lights", *PUBLIC}
 STEP_S, LENGTH_M = 0.5, 4.5
 READERS = {
     "lanes": readers.LanesReader,
@@ -40,6 +43,8 @@ READERS = {
     "route_state": readers.RouteStateReader,
     "signals": readers.SignalsReader,
     "right_of_way": readers.RightOfWayReader,
+    "speed_limit": readers.SpeedLimitReader,
+    "stop_line": readers.StopLineReader,
 }
 
 
@@ -71,7 +76,7 @@ class Town:
 
     def __init__(self, name, folder, vehicles=30):
         self.name = name
-        path = NETS / f"{name}.net.xml.gz"
+        path = PUBLIC.get(name, NETS / f"{name}.net.xml.gz")
         self.net = sumolib.net.readNet(str(path), withInternal=True)
         self.graph = LaneGraph(read_network(path, with_junctions=True))
         self.conflicts = Conflicts(self.graph)
@@ -272,6 +277,33 @@ def test_route_points_behind_lead_to_the_points_ahead(town):
             assert behind == 7 or libsumo.vehicle.getDistance(vehicle) < 20.0
             checked += behind
     assert checked > 100
+
+
+def test_stop_line_is_that_of_the_next_link_and_the_rules_of_its_junction(town):
+    seen = dict.fromkeys(("yields", "signs", "lights", "none"), 0)
+    for number, vehicles in enumerate(town.steps(60)):
+        for vehicle in vehicles if number % 3 == 0 else ():
+            lane = libsumo.vehicle.getLaneID(vehicle)
+            assert town.read(vehicle, "speed_limit").tolist() == [town.net.getLane(lane).getSpeed()]
+            found = next_connection(town, vehicle)
+            if found is None:
+                continue
+            (own, line), node = found, found[0].getFrom().getToNode()
+            others = [one for edge in node.getIncoming() for to in edge.getOutgoing().values() for one in to]
+            yields = any(
+                node.getLinkIndex(own) in node._prohibits and node.forbids(other, own)
+                for other in others
+                if other.getFromLane() is not own.getFromLane() and crossing(path_of(town, own), path_of(town, other))
+            )
+            present, distance, must_yield, stop_sign, signal = town.read(vehicle, "stop_line").tolist()
+            assert (present, distance) == (1, pytest.approx(line))
+            assert (stop_sign, signal) == (own.getState() in "sw", bool(own.getTLSID()))
+            assert must_yield >= yields  # paths that are near each other without a common point also conflict
+            seen["yields"] += must_yield > 0
+            seen["signs"] += stop_sign > 0
+            seen["lights"] += signal > 0
+            seen["none"] += not (must_yield or stop_sign or signal)
+    assert sum(seen.values()) > 50
 
 
 def crossing(mine, theirs):
