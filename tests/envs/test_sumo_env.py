@@ -9,13 +9,17 @@ import subprocess
 import sys
 import time
 
+import gymnasium
 import numpy as np
 import pytest
 from conftest import mostly_nightly
+from gymnasium.utils.env_checker import check_env
 
 import crashhunt
 from crashhunt.envs import SumoEnv
 from crashhunt.errors import ActionError, InvalidEpisodeError, ScenarioError, SimulatorError, UsageError
+from crashhunt.scenario import ACTIONS
+from crashhunt.sumo._observing import READERS
 
 SEVERAL = """
 import json, warnings
@@ -62,6 +66,58 @@ def test_several_in_one_process_and_in_gymnasiums_vectors(tmp_path):
     assert found["again"] == "Episodes"  # the first has been closed
     assert found["same"] and found["equal"]  # noqa: PT018 - one fact
     assert found["vector"][0] == found["vector"][1] > 0
+
+
+def with_every_part(form, scenario="intersection", parts=tuple(READERS)):
+    return SumoEnv(scenario, action=form, observation=parts, max_steps=30, process=True)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("form", [name for name in ACTIONS if name not in ("trajectory", "target_pose")])
+@pytest.mark.filterwarnings("ignore::UserWarning")  # it recommends other ranges of actions
+def test_gymnasium_accepts_every_part_and_every_form_that_can_be_drawn_at_random(form):
+    env = with_every_part(form)
+    check_env(env, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(("form", "plan"), [
+    ("trajectory:frame=ego", lambda v: np.array([[t, v * t, 0.0, 0.0, v] for t in (0.5, 1.0)])),
+    ("target_pose:frame=ego", lambda v: np.array([v, 0.0, 0.0, 1.0])),
+])  # fmt: skip
+def test_plans_drive_the_environment_and_one_that_cannot_be_followed_is_an_error(form, plan):
+    env = with_every_part(form)
+    observation, _ = env.reset(seed=1)
+    for _ in range(10):
+        observation, reward, *_ = env.step(plan(float(observation["ego"][3])))
+        assert reward > 0.0
+        assert env.observation_space.contains(observation)
+    with pytest.raises(ActionError, match="moves the vehicle by"):
+        env.step(plan(90.0))
+    env.close()
+
+
+@pytest.mark.nightly
+def test_every_part_is_stacked_by_gymnasiums_vectors():
+    vector = gymnasium.vector.AsyncVectorEnv([lambda: with_every_part("acceleration_steering")] * 2)
+    shown, _ = vector.reset(seed=[1, 2])
+    assert all(shown[name].shape == (2, *space.shape) for name, space in vector.single_observation_space.items())
+    assert vector.step(vector.action_space.sample())[1].shape == (2,)
+    vector.close()
+
+
+@pytest.mark.nightly
+def test_stable_baselines3_trains_with_steering_on_a_dictionary_of_parts():
+    sb3 = pytest.importorskip("stable_baselines3")
+    parts = ("ego", "actors:rows=4", "route:points=10", "route_state", "signals", "right_of_way", "stop_line")
+    vector = sb3.common.vec_env.DummyVecEnv([lambda: with_every_part("acceleration_steering", "motorway", parts)] * 2)
+    model = sb3.PPO("MultiInputPolicy", vector, n_steps=32, batch_size=32, n_epochs=1, device="cpu", seed=1)
+    before = [one.detach().clone() for one in model.policy.parameters()]
+    model.learn(128)
+    assert model.num_timesteps == 128
+    assert any((one != two).any() for one, two in zip(before, model.policy.parameters(), strict=True))
+    vector.close()
 
 
 @pytest.fixture(scope="module")
