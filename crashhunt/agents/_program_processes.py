@@ -23,7 +23,7 @@ from crashhunt.base.processes import descendants_of, kill
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-_MAX_FILE_BYTES: Final = 64 << 20  # of each file that the program writes, such as its log
+MAX_FILE_BYTES: Final = 64 << 20  # of each file that the program writes, such as its log
 _LOOK_EVERY_S: Final = 0.002  # whether a process has ended of which this one is not the parent
 _CLOSING_S: Final = 1.0
 _CHUNK_BYTES: Final = 1 << 16
@@ -64,8 +64,8 @@ def launch(
     )
     with suppress(OSError, ValueError, AttributeError):  # it has ended already, or the system has no such call
         soft, hard = resource.prlimit(made.pid, resource.RLIMIT_FSIZE)
-        if soft == resource.RLIM_INFINITY or soft > _MAX_FILE_BYTES:
-            resource.prlimit(made.pid, resource.RLIMIT_FSIZE, (_MAX_FILE_BYTES, hard))
+        if soft == resource.RLIM_INFINITY or soft > MAX_FILE_BYTES:
+            resource.prlimit(made.pid, resource.RLIMIT_FSIZE, (MAX_FILE_BYTES, hard))
     return made
 
 

@@ -24,6 +24,7 @@ import numpy as np
 from pydantic_core import from_json, to_json
 
 from crashhunt.agents._program_processes import (
+    MAX_FILE_BYTES,
     AttachedProgram,
     ReusedProgram,
     launch,
@@ -34,7 +35,7 @@ from crashhunt.base import forks
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError, ProgramError
 from crashhunt.base.processes import descendants_of, kill
-from crashhunt.base.programs import command_of, library_path, words_of
+from crashhunt.base.programs import command_of, is_path, library_path, words_of
 from crashhunt.base.text import one_line
 from crashhunt.simulators import (
     FlattensObservations,
@@ -77,11 +78,13 @@ _REASONS: Final = tuple(
         r"^SUMMARY: (\w+Sanitizer: .+)$",
         r"^(.+: runtime error: .+)$",  # of the sanitizer for undefined behaviour
         r"^(.+: Assertion .+ failed\.)$",
-        r"^terminate called after throwing an instance of (.+\n {2}what\(\): .+)$",
+        r"^terminate called after throwing an instance of '(.+)'\n {2}what\(\): +(.+)$",
         r"^(terminate called .+)$",
+        r"^(\*\*\* .+ \*\*\*: terminated)$",  # of glibc, as the next one
+        r"^(double free or corruption.*|(?:free|malloc|realloc|munmap_chunk)\(\): .+|corrupted size vs\. .+)$",
     )
 )
-"""What the log of a program names as the reason of its end: sanitizers, assert, exceptions of C++."""
+"""What the log of a program names as the reason of its end: sanitizers, assert, exceptions of C++, a damaged heap."""
 _UNITS: Final = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "heading": "rad", "target_speed": "m/s"}
 _DECLARATION_KEYS: Final = ("range", "unit", "default")
 
@@ -496,10 +499,11 @@ class _Process:
 
     def _read(self, shown: str, deadline: float | None) -> bytes:
         """Return the next message of the program, without its frame."""
-        received = self._received
+        received, searched = self._received, 0
         while True:
             if self._packer is None:
-                begin, end = 0, received.find(b"\n")
+                begin, end = 0, received.find(b"\n", searched)
+                searched = len(received)
             else:
                 begin, end = _LENGTH_BYTES, _LENGTH_BYTES + int.from_bytes(received[:_LENGTH_BYTES], "little")
             if max(len(received), end) > _MAX_MESSAGE_BYTES:
@@ -528,6 +532,8 @@ class _Process:
         assert process is not None
         half = f", in the middle of a message: {_shown(self._received)}" if self._received else ""
         if not self._ends_within(process, _CLOSING_S):
+            for pid in (*descendants_of(process.pid), process.pid):  # it cannot receive `close`, or answer
+                kill(pid)
             return ProgramError(
                 f"the program has closed its end instead of answering {shown}{half}, and is still running"
             )
@@ -542,10 +548,12 @@ class _Process:
         source = self._log if self._attached is None else self._attached.log
         with suppress(OSError), open(f"/proc/self/fd/{source}", "rb") as log:
             size = log.seek(0, os.SEEK_END)
+            if size >= MAX_FILE_BYTES:
+                return f": its log has reached {MAX_FILE_BYTES >> 20} MB"
             log.seek(max(self._log_begin, size - _MAX_REPORT_BYTES))
             text = log.read(_MAX_REPORT_BYTES).decode("utf-8", "replace")
             found = next((match for pattern in _REASONS if (match := pattern.search(text))), None)
-            return f": {one_line(found[1])[:_MAX_REASON_CHARACTERS]}" if found else ""
+            return f": {one_line(': '.join(found.groups()))[:_MAX_REASON_CHARACTERS]}" if found else ""
         return ""
 
     @staticmethod
@@ -671,7 +679,8 @@ def _argument(name: str, facts: object) -> Argument:
 
 def _absolute(value: Value) -> Value:
     """Return a value; one that names a file of the current folder becomes its absolute path."""
-    return str(Path(value).absolute()) if isinstance(value, str) and os.path.isfile(value) else value  # noqa: PTH113
+    is_file = isinstance(value, str) and is_path(value) and os.path.isfile(value)  # noqa: PTH113
+    return str(Path(str(value)).absolute()) if is_file else value
 
 
 def _described_observation(space: Space[object], names: Sequence[str]) -> dict[str, SpaceDescription]:

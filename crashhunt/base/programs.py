@@ -106,7 +106,7 @@ def relative_to(folder: Path, words: Sequence[str]) -> str:
     found = [str(folder / first) if os.sep in first else first]
     for word in rest:
         name = _value_in(word)
-        is_there = _is_path(name) and os.path.exists(folder / name)  # noqa: PTH110
+        is_there = is_path(name) and os.path.exists(folder / name)  # noqa: PTH110
         found.append(f"{word[: len(word) - len(name)]}{folder / name}" if is_there else word)
     return f"{PREFIX}{shlex.join(found)}"
 
@@ -128,7 +128,7 @@ def files_of(locator: str) -> dict[str, Path]:
     found = {} if _is_of_system(program) else {first: program}
     for word in rest:
         name = _value_in(word)
-        if _is_path(name) and os.path.isfile(name):  # noqa: PTH113
+        if is_path(name) and os.path.isfile(name):  # noqa: PTH113
             found[name] = Path(name).absolute()
     return found
 
@@ -207,7 +207,7 @@ def _absolute(word: str, copies: Mapping[str, str]) -> str:
     if name in copies:
         return f"{word[: len(word) - len(name)]}{copies[name]}"
     # The program runs in a folder of its own, so a path relative to the current folder would lead nowhere.
-    is_there = _is_path(name) and os.path.exists(name)  # noqa: PTH110
+    is_there = is_path(name) and os.path.exists(name)  # noqa: PTH110
     return f"{word[: len(word) - len(name)]}{Path(name).absolute()}" if is_there else word
 
 
@@ -216,7 +216,7 @@ def _value_in(word: str) -> str:
     return word.partition("=")[2] if word.startswith("-") and "=" in word else word
 
 
-def _is_path(word: str) -> bool:
+def is_path(word: str) -> bool:
     """Return whether a word may name a file; a plain word such as ``test`` is a value, even if a file has this name."""
     return os.sep in word or "." in word
 

@@ -31,6 +31,7 @@ from typing import (
 )
 
 from crashhunt.analysis import Counts, Shrunk
+from crashhunt.base.binaries import BinaryFacts
 from crashhunt.base.codec import JsonObject, Serializable, names_of_tuple, written_keys
 from crashhunt.base.json_types import ErrorData, Plain
 from crashhunt.base.program_messages import ProgramAnswer, ProgramRequest, RoadMapData
@@ -286,6 +287,7 @@ _SHOW = {
     "moments": [_MOMENT],
     "signals?": dict[str, JsonObject],
     "notes?": list[Note],
+    "programs?": dict[str, BinaryFacts],
 }
 _BOTH = {"base": int, "head": int}
 _INVALID_PAIRS = {"invalid": int, "not_started": _BOTH, "killed": _BOTH, "unknown": _BOTH}

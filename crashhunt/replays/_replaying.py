@@ -20,6 +20,7 @@ from crashhunt.trial import Outcome, TrialResult
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from crashhunt.base.binaries import BinaryFacts
     from crashhunt.crashes import Bundle
     from crashhunt.recording import AgentChannel, Prologue
     from crashhunt.replays._prepare import Code, Look
@@ -62,12 +63,18 @@ class ReplayReport(Serializable):
         "digest_recorded=bundle.result.digest", "digest_replayed=replayed.digest", "divergence",
         "outcome_recorded=bundle.result.outcome", "outcome_replayed=replayed.outcome", "reason", "edits=rerun.edits",
         "code_differences=rerun.code_differences", "warnings=rerun.warnings", "times", "agreed", "verdicts",
+        "programs?",
     )  # fmt: skip
 
     @property
     def bundle(self) -> Bundle:
         """The bundle of the crash."""
         return self.rerun.bundle
+
+    @property
+    def programs(self) -> Mapping[str, BinaryFacts] | None:
+        """What identifies the recorded programs and libraries of agents, by the word that names each."""
+        return self.rerun.snapshot.environment().get("programs") or None
 
     @property
     def steps_replayed(self) -> int:

@@ -50,6 +50,7 @@ from crashhunt.simulators import TRAJECTORY_SHAPE
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from crashhunt.base.binaries import BinaryFacts
     from crashhunt.crashes import Bundle, Moment
     from crashhunt.recording import StepRecord
     from crashhunt.report._step_table import TableCell
@@ -135,6 +136,7 @@ class Story:
             ],
             **({"signals": {name: asdict(signal) for name, signal in signals.items()}} if signals else {}),
             **({"notes": [note.to_json() for note in self.notes]} if self.notes else {}),
+            **({"programs": programs} if (programs := programs_of(self.bundle)) else {}),
         }
 
     def words(self) -> list[str]:
@@ -445,14 +447,18 @@ def _words(action: Sequence[float] | None, names: Sequence[str]) -> str:
     return ", ".join(f"{name} {format_number(value)}" for name, value in zip(names, action, strict=False))
 
 
-def describe_programs(bundle: Bundle) -> list[str]:
-    """Return a line for each program or library of an agent: revision, architecture, build id and missing libraries."""
+def programs_of(bundle: Bundle) -> dict[str, BinaryFacts]:
+    """Return what identifies the programs and libraries of agents, by the word that names each."""
     try:
-        programs = snapshot_of(bundle).environment().get("programs", {})
+        return snapshot_of(bundle).environment().get("programs", {})
     except CrashhuntError:  # there is no snapshot, or it is damaged
-        return []
+        return {}
+
+
+def describe_programs(bundle: Bundle) -> list[str]:
+    """Return a line for each program or library of an agent: revision, architecture, build id."""
     lines = []
-    for word, facts in programs.items():
+    for word, facts in programs_of(bundle).items():
         known = [
             f"revision {facts['revision']}" if facts.get("revision") else "",
             facts["machine"],

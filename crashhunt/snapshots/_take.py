@@ -24,6 +24,7 @@ from crashhunt.base.opened_files import output_files
 from crashhunt.base.programs import (
     can_fork,
     files_of,
+    is_path,
     is_program,
     libraries_folder,
     libraries_of,
@@ -504,7 +505,9 @@ def _argument_files(settings: HuntSettings) -> dict[str, str]:
             elif isinstance(distribution, Choice):
                 values = distribution.options
             for value in values:
-                if isinstance(value, str) and value not in found and os.path.isfile(value):  # noqa: PTH113
+                if not isinstance(value, str) or value in found or (is_program(agent.agent) and not is_path(value)):
+                    continue
+                if os.path.isfile(value):  # noqa: PTH113
                     found[value] = f"{layout.FILES}/{len(found)}-{Path(value).name}"
     return found
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import platform
 import re
 import shutil
 import sqlite3
@@ -332,6 +333,10 @@ def test_a_replay_runs_the_saved_library_and_reports_that_the_current_one_differ
     hunted(toy, "fails")
     compile_library(toy.folder, source=IN_C.replace('kind, "fails"', 'kind, "never"'))
     assert "every observation, action and scene is bit-identical" in toy.crashhunt("replay", "h").out
+    facts = toy.crashhunt("show", "h", "--json").json["programs"]["./libplanner.so"]
+    assert facts["machine"] == platform.machine()
+    assert any(name.startswith("libm.so") for name in facts["system"])
+    assert toy.crashhunt("replay", "h", "--json").json["programs"] == {"./libplanner.so": facts}
     assert (
         "differs from the snapshot: ./libplanner.so has changed"
         in toy.crashhunt("replay", "h", "--code", "current", "--expect", "fixed").out

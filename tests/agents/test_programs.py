@@ -108,10 +108,15 @@ def test_harm_in_binary_messages_is_an_error_of_the_agent(tmp_path, kind, messag
         ),
         ("planner.cpp:9:3: runtime error: division by zero", "division by zero"),
         ("planner: a.cpp:7: int main(): Assertion `lanes > 0' failed.", "Assertion `lanes > 0' failed."),
-        ("terminate called after throwing an instance of 'std::out_of_range'\n  what():  lane 5", "what():  lane 5"),
+        (
+            "terminate called after throwing an instance of 'std::out_of_range'\n  what():  lane 5",
+            ": std::out_of_range: lane 5",
+        ),
+        ("ready\n*** stack smashing detected ***: terminated", ": *** stack smashing detected ***: terminated"),
+        ("ready\nfree(): invalid pointer", ": free(): invalid pointer"),
         ("goodbye", "answering hello"),
     ],
-    ids=["address", "undefined", "assert", "exception", "none"],
+    ids=["address", "undefined", "assert", "exception", "stack", "heap", "none"],
 )
 def test_the_reason_in_the_log_of_a_program_that_ends_is_part_of_the_error(tmp_path, capfd, log, reason):
     program = tmp_path / "ends"
@@ -206,7 +211,7 @@ HARMS = [
     ("without", "observe", "its answer to observe of step 3 has no action"),
     ("twice", "observe", "it has sent something before observe of step 4"),
     ("long", "observe", "its answer to observe of step 3 is longer than 16 MB"),
-    ("flood", "observe", "instead of answering observe of step 3"),
+    ("flood", "observe", "exited with 1 instead of answering observe of step 3: its log has reached 64 MB"),
 ]
 
 
@@ -546,4 +551,6 @@ def test_files_of_the_command_line_travel_and_programs_of_the_system_do_not(tmp_
     words = ("--mode", "test", "--config=/copy/config.yaml", "--rate", "0.5")
     assert command_of(locator, copies) == ("/copy/planner", *words)
     assert list(files_of("exec:python3 ./planner")) == ["./planner"]
+    given = agent_of("exec:./planner", tmp_path, mode="test", config="config.yaml")._hello["arguments"]
+    assert given == {"mode": "test", "config": str(tmp_path / "config.yaml")}
     assert command_of("exec:/bin/sh ./planner") == ("/bin/sh", str(planner))

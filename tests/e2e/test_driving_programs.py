@@ -35,12 +35,14 @@ def test_a_hunt_varies_what_a_program_declares_and_its_crash_replays_where_the_p
     assert all(8.0 <= speed <= 20.0 for speed in speeds)
     (shown,) = [toy.crashhunt("show", "h", "--json").json]
     assert shown["summary"].startswith("ego drove into")
+    assert shown["programs"]["./planner"]["revision"] == "1.4-3-gabc"
     assert "\n  program ./planner: revision 1.4-3-gabc\n" in toy.crashhunt("show", "h").out
     toy.crashhunt("report", "h")
     planner.write_text(planner.read_text().replace("else speed", "else speed / 2"))
     changed = toy.crashhunt("replay", "h", "--code", "current", "--json", expect=None).json
     assert changed["verdict"] != "reproduced"
     assert changed["code_differences"] == ["./planner has changed"]
+    assert changed["programs"] == shown["programs"]
     planner.unlink()
     shutil.move(toy.folder / "h", toy.folder / "elsewhere")
     assert toy.crashhunt("replay", "elsewhere", "--json").json["verdict"] == "reproduced"
@@ -56,6 +58,7 @@ def test_each_harm_costs_its_own_trial_with_a_message_that_names_the_vehicle_and
         "NaN": "the action [nan, 0] is not (target_speed, lane_change)",
     }
     kinds = "|".join([*harms, "none"])
+    (toy.folder / "garbage").write_text("a file with the name of a value")
     toy.crashhunt(
         "run", "h", "2", "5", "20", "--agent", "exec:./planner - observe", "--arg", f"kind={kinds}", "--arg",
         "speed=8.0", "--set", "gap_m=30.0", "--sampler", "grid", *RUN, "--keep-going", "--step-timeout", "4", "--json",
