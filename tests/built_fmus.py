@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import subprocess
 import zipfile
 from typing import TYPE_CHECKING
@@ -33,6 +34,7 @@ static int step(instance *c) {
     if (c->v[101] == 2) c->v[110] = NAN;
     if (c->v[101] == 3) *(volatile int *)8 = 1;
     if (c->v[101] == 4) usleep(60000);
+    if (c->v[101] == 5) c->v[110] = 12.0 - ++c->v[112] / 8;
     return 0;
 }
 
@@ -62,6 +64,11 @@ int fmi2GetInteger(void *c, const reference *r, size_t n, int *v) {
     return 0;
 }
 int fmi2DoStep(void *c, double t, double h, int n) { return step(c); }
+#ifdef STATE
+int fmi2GetFMUstate(void *c, void **s) { *s = malloc(sizeof(instance)); *(instance *)*s = *(instance *)c; return 0; }
+int fmi2SetFMUstate(void *c, void *s) { *(instance *)c = *(instance *)s; return 0; }
+int fmi2FreeFMUstate(void *c, void **s) { free(*s); *s = NULL; return 0; }
+#endif
 #else
 #include <stdbool.h>
 #include <stdint.h>
@@ -94,6 +101,11 @@ int fmi3DoStep(void *c, double t, double h, bool p, bool *e, bool *s, bool *a, d
     *l = t + h;
     return step(c);
 }
+#ifdef STATE
+int fmi3GetFMUState(void *c, void **s) { *s = malloc(sizeof(instance)); *(instance *)*s = *(instance *)c; return 0; }
+int fmi3SetFMUState(void *c, void *s) { *(instance *)c = *(instance *)s; return 0; }
+int fmi3FreeFMUState(void *c, void **s) { free(*s); *s = NULL; return 0; }
+#endif
 #endif
 """
 
@@ -155,20 +167,24 @@ DESCRIBED_BY_FMI_3 = """<?xml version="1.0" encoding="UTF-8"?>
 
 def build_fmu(
     folder: Path, version: int, *, place: str = "kinematics[{row}].{column}", speed: str = "target_speed",
-    description: str = "", machine: str = "",
+    description: str = "", machine: str = "", has_state: bool = False,
 ) -> Path:  # fmt: skip
-    """Compile the FMU into a folder, and return its path."""
+    """Compile the FMU into a folder, and return its path; it may offer its state (`fmi3GetFMUState`)."""
     import fmpy
     from fmpy import fmi2, fmi3
 
     slave = fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave
     # FMPy calls a few functions, and refuses an FMU that lacks another one.
     names = [name for name, _ in inspect.getmembers(slave) if name.startswith(f"fmi{version}")]
-    others = "".join(f"int {name}(void) {{ return 3; }}\n" for name in names if f"{name}(" not in IN_C)
-    (folder / "planner.c").write_text(IN_C + others, encoding="utf-8")
+    offered = IN_C if has_state else re.sub("#ifdef STATE.*?#endif", "", IN_C, flags=re.DOTALL)
+    others = "".join(f"int {name}(void) {{ return 3; }}\n" for name in names if f"{name}(" not in offered)
+    (folder / "planner.c").write_text(offered + others, encoding="utf-8")
     words = ["-shared", "-fPIC", "-o", "planner.so", "planner.c", "-lm"]
-    subprocess.run([str(COMPILER), "-w", f"-DFMI{version}", *words], cwd=folder, check=True)
+    subprocess.run([str(COMPILER), "-w", f"-DFMI{version}", "-DSTATE", *words], cwd=folder, check=True)
     made = described_by_fmi_2(place, speed) if version == 2 else DESCRIBED_BY_FMI_3
+    if has_state:
+        attribute = "canGetAndSetFMUstate" if version == 2 else "canGetAndSetFMUState"
+        made = made.replace('modelIdentifier="planner"', f'modelIdentifier="planner" {attribute}="true"')
     machine = machine or (fmpy.platform if version == 2 else fmpy.platform_tuple)
     with zipfile.ZipFile(folder / "planner.fmu", "w") as archive:
         archive.writestr("modelDescription.xml", description or made)

@@ -680,52 +680,81 @@ def child_agents(place: str) -> dict[str, float]:
 
 
 def child_library(place: str) -> dict[str, float]:
-    """CPU time of a step on `loop`: with an agent in Python that does nothing, and with such a library, in turns."""
-    from dataclasses import replace
+    """CPU time of a step on `loop`: a Python agent that does nothing and such a library drive in turns of 20 steps.
 
+    Both act in the same trial, and their actions are equal. Each turn is compared with the turn before it.
+    """
     import bench_agents
 
-    from crashhunt.episode import WorkerSettings
+    from crashhunt.agents import LibraryFactory
+    from crashhunt.episode import FastEpisode, Nearness, Recorder
+    from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
+    from crashhunt.recording import BlackBox
     from crashhunt.scenario import argument_values, load_scenario
+    from crashhunt.sumo import SumoSimulator
     from crashhunt.trial import TrialSpec
 
-    chosen, rounds, at_once, lengths = load_scenario("loop"), 10, 6, (100, 600)
-    (Path(place) / "nothing.py").write_text(
-        "class Nothing:\n    def reset(self, seed): ...\n\n    def act(self, observation):\n        return 8.0, 0\n"
-    )
-    sys.path.insert(0, place)
-    spent: dict[tuple[str, int], list[float]] = {}
-    with folder() as scratch:
-        slots: dict[str, Slot] = {}
-        for locator in ("nothing:Nothing", bench_agents.build_library(Path(place))):
-            (own := scratch / str(len(slots))).mkdir()
-            agents = {name: replace(setup, agent=locator, arguments={}) for name, setup in chosen.agents.items()}
-            oracles = ("reported-collision", "overlap", "off-road")
-            slots[locator] = Slot(
-                WorkerSettings(scenario=replace(chosen, agents=agents), oracles=oracles, crash_on=(), scratch=own)
+    class Nothing:
+        def reset(self, seed: int) -> None: ...
+
+        def act(self, observation: object) -> object:
+            return 8.0, 0
+
+    rounds, steps, turn, settling, clock = 10, 2000, 20, 2, time.thread_time_ns
+    chosen, factory = load_scenario("loop"), LibraryFactory(bench_agents.build_library(Path(place)))
+
+    class InTurns:
+        """Passes each turn to another agent, and measures the time from each call to the next one."""
+
+        def __init__(self, *agents: Any) -> None:
+            self.agents, self.began, self.step = agents, 0, 0
+            self.turns: list[list[int]] = []
+
+        def reset(self, seed: int) -> None:
+            for agent in self.agents:
+                agent.reset(seed)
+
+        def act(self, observation: object) -> object:
+            now, place = clock(), self.step % turn
+            if place > settling:
+                self.turns[-1].append(now - self.began)
+            elif place == 0:
+                self.turns.append([])
+            agent = self.agents[self.step // turn % 2]
+            self.step += 1
+            self.began = clock()
+            return agent.act(observation)
+
+    taken: tuple[list[float], list[float]] = [], []
+    with folder() as stage:
+        simulator, box = SumoSimulator(chosen, stage), BlackBox(stage / "blackbox.bin")
+        for seed in range(rounds + 1):
+            box.begin(pid=os.getpid(), trial=0, started=time.monotonic())
+            made: list[InTurns] = []
+
+            def make(name: str, simulator: Any, _: object, made: list[InTurns] = made) -> InTurns:
+                made.append(InTurns(Nothing(), factory.agent(name, simulator, {}, folder=stage, files={})))
+                return made[-1]
+
+            spec = TrialSpec(
+                number=0, seed=seed, arguments={}, scenario_arguments=argument_values(chosen), max_steps=steps
             )
-        for number in range(rounds + 1):
-            for steps in lengths:
-                for locator, slot in slots.items():
-                    began = slot.cpu_s()
-                    for again in range(at_once if number else 1):
-                        trial = number * at_once + again
-                        slot.run(
-                            TrialSpec(
-                                number=trial, seed=trial, arguments={"ego": {}}, max_steps=steps,
-                                scenario_arguments=argument_values(chosen),
-                            )
-                        )  # fmt: skip
-                    if number:  # the first warms everything up
-                        spent.setdefault((locator, steps), []).append((slot.cpu_s() - began) / at_once)
-    short, long = lengths
-    steps_s = [
-        [(whole - part) / (long - short) for whole, part in zip(spent[one, long], spent[one, short], strict=True)]
-        for one in slots
-    ]
-    ratios = [library_s / python_s for python_s, library_s in zip(*steps_s, strict=True)]
-    python_s, library_s = map(statistics.median, steps_s)
-    return {"python_s": python_s, "library_s": library_s, "ratio": statistics.median(ratios)}
+            with FastEpisode(
+                spec, simulator=simulator, make_agent=make, crash_on=(),
+                oracles=[ReportedCollision(), Overlap(), OffRoad()],
+                observers=[Recorder(box, simulator), Nearness(box.take_frames)],
+            ) as episode:  # fmt: skip
+                result = episode.start()
+                while result is None:
+                    result = episode.step()
+            whole = [statistics.median(one) for one in made[0].turns if len(one) == turn - settling - 1]
+            for python_ns, library_ns in zip(whole[::2], whole[1::2], strict=False):
+                if seed:  # the first warms everything up
+                    taken[0].append(python_ns / 1e9)
+                    taken[1].append(library_ns / 1e9)
+    python_s, library_s = map(statistics.median, taken)
+    more_s = statistics.median(library - python for python, library in zip(*taken, strict=True))
+    return {"python_s": python_s, "library_s": library_s, "more_s": more_s, "ratio": 1 + more_s / python_s}
 
 
 def bench_agents() -> Iterator[Figure]:
@@ -739,7 +768,10 @@ def bench_agents() -> Iterator[Figure]:
     start_ms = 1e3 * (found["start_s"] - found["step_s"])
     yield Figure("exec_start", start_ms, "ms", "lower", 3.0, "start, hello, reset and close of an echo in C")
     python_us, library_us = 1e6 * found["python_s"], 1e6 * found["library_s"]
-    note = f"CPU time of a step on loop: {library_us:.3g} µs with a library, {python_us:.3g} µs with Python"
+    note = (
+        f"CPU time of a step on loop: {library_us:.3g} µs with a library, {python_us:.3g} µs with Python, "
+        f"{1e6 * found['more_s']:.2g} µs more in pairs"
+    )
     yield Figure("lib_step", found["ratio"], "x", "lower", 1.05, note)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import zipfile
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -16,6 +17,7 @@ pytest.importorskip("fmpy", reason="FMPy is not installed", exc_type=ImportError
 from built_fmus import COLUMNS, build_fmu
 
 from crashhunt.agents import FmuFactory
+from crashhunt.base import forks
 from crashhunt.base.errors import ActionError, PluginError, ProgramError
 from crashhunt.simulators import SpeedAndLaneChange
 from crashhunt.trial import Range, signature_of
@@ -59,6 +61,20 @@ def test_an_fmu_acts_like_the_agent_in_python_in_each_of_its_instances(tmp_path,
     assert {speed for speed, _ in answers} == {0.0, 9.125}
     agent.close()
     agent.close()
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("has_state", [False, True])
+def test_a_fork_has_the_state_of_an_fmu_whether_or_not_the_fmu_offers_it(tmp_path, version, has_state):
+    agent = agent_of(build_fmu(tmp_path, version, has_state=has_state), harm=5)
+    seen, known = observations(12), replace(forks.held(), threads=forks.threads())
+    before = [agent.act(each) for each in seen[:4]]
+    copies = [forks.Copy(lambda: {"actions": [agent.act(each)[0] for each in seen[4:]]}, known) for _ in range(2)]
+    answers = [copy.answer(20)["actions"] for copy in copies]
+    after = [agent.act(each)[0] for each in seen[4:]]
+    agent.close()
+    assert answers == [after, after]
+    assert [*(action[0] for action in before), *after] == [12.0 - step / 8 for step in range(1, 13)]
 
 
 def test_a_table_names_the_sources_of_inputs_and_of_the_action(tmp_path):
