@@ -110,7 +110,7 @@ class Chromium:
 
     def driver(self) -> Any:
         """Return the driver of a browser that answers; one that a test has crashed is replaced."""
-        from selenium.common.exceptions import WebDriverException
+        from selenium.common.exceptions import SessionNotCreatedException, WebDriverException
         from urllib3.exceptions import HTTPError
 
         if self._driver is not None:
@@ -119,10 +119,16 @@ class Chromium:
                 return self._driver
             except (WebDriverException, HTTPError, OSError):
                 self.quit()
-        self._driver = self._start()
+        for number in range(3):  # on a loaded machine, a browser may begin later than its driver waits, a minute
+            try:
+                self._driver = self._start(f"{self._profile}-{number}")
+                break
+            except SessionNotCreatedException:
+                if number == 2:
+                    raise
         return self._driver
 
-    def _start(self) -> Any:
+    def _start(self, profile: str) -> Any:
         program, driver = needed("chromium", "chromium-browser", "google-chrome"), needed("chromedriver")
         webdriver = pytest.importorskip("selenium.webdriver")
         service = pytest.importorskip("selenium.webdriver.chrome.service")
@@ -131,7 +137,7 @@ class Chromium:
         for word in (
             "headless=new", "no-sandbox", "disable-gpu", "no-first-run", "disable-background-networking",
             "disable-component-update", "disable-sync", "window-size=1280,1000", "disable-dev-shm-usage",
-            f"user-data-dir={self._profile}",
+            f"user-data-dir={profile}",
         ):  # fmt: skip
             options.add_argument(f"--{word}")
         options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
