@@ -53,6 +53,7 @@ def test_an_invariant_is_violated_at_the_first_certain_step(seed):
 
 
 @pytest.mark.nightly
+@pytest.mark.timeout(3600)  # a minute on an idle machine
 def test_20_000_violations_are_found_at_the_first_certain_step():
     for seed in range(20_000):
         assert_at_the_certain_step(seed, 4, 14)

@@ -44,6 +44,7 @@ def test_every_formula_has_the_value_of_its_definition(seed, step_s):
 
 
 @pytest.mark.nightly
+@pytest.mark.timeout(3600)  # a minute on an idle machine
 def test_20_000_formulas_have_the_value_of_their_definition():
     for seed in range(20_000):
         assert_as_defined(seed, depth=4, count=25)
@@ -70,6 +71,7 @@ def _known_to_rtamt(*, past: bool):
 @pytest.mark.nightly
 @pytest.mark.skipif(importlib.util.find_spec("rtamt") is None, reason="pip install rtamt")
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.timeout(3600)  # a minute on an idle machine
 def test_20_000_formulas_have_the_value_that_rtamt_computes():
     import rtamt
 
