@@ -205,7 +205,7 @@ def test_conjuncts_and_disjuncts_are_those_that_a_minimum_would_mix(text, sizes)
     assert [len(row) for row in parse(text).parts(signals, 1.0)] == sizes
 
 
-def test_slack_is_the_time_that_whole_numbers_were_away_from_a_violation():
+def test_slack_is_the_time_by_which_a_requirement_on_whole_numbers_holds():
     """A stay of at least 2.5 s is required; the robustness of both sides is 0."""
     requirement = parse(
         "always ((gear != 2 and eventually[0.1:0.1] (gear == 2)) -> eventually[0.1:0.1] always[0:2.4] (gear == 2))"
