@@ -91,7 +91,9 @@ def test_signals_are_listed_with_units(toy):
     listed = toy.crashhunt("signals", "toy", "--json").json
     assert {"name": "speed", "unit": "m/s", "meaning": "speed along the heading"} in listed["signals"]
     assert listed["agents"] == ["ego"]
-    assert "m/s²" in toy.crashhunt("signals", "toy").out
+    path = toy.folder / "toy" / "scenario.toml"
+    path.write_text(f'requirement.late = "eventually[0:99] (speed > 1)"\n{path.read_text()}')
+    assert "m/s²" in toy.crashhunt("signals", "toy").out  # although the window is longer than the step that runs
 
 
 DRIVER = """
