@@ -546,7 +546,7 @@ class SumoSimulator:
     def _is_contact(self, contact: Contact) -> bool:
         """Return whether a reported collision is one; only outlines tell for a vehicle that moves freely.
 
-        SUMO examines collisions before it places the vehicle, and turns it as its lane.
+        SUMO examines collisions before it places such a vehicle.
         """
         scene, names = self._scene, (contact.collider, contact.victim)
         rows = [scene.roster.index[name] for name in names if name in scene.roster.index]
