@@ -13,11 +13,9 @@ from dataclasses import replace
 from heapq import heappop, heappush
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.disturbances import FIRST_STEP
 from crashhunt.episode import WorkerSettings
+from crashhunt.hunts._trial_seeds import propose_trial, spec_of
 from crashhunt.ledger import Turn
 from crashhunt.plans import reused_agents, with_settings
 from crashhunt.results import trials_of_running
@@ -34,10 +32,9 @@ if TYPE_CHECKING:
     from crashhunt.samplers import NamedSampler
     from crashhunt.snapshots import Snapshot
     from crashhunt.statistics import Forcings
-    from crashhunt.trial import Disturbance, Forcing, TrialResult, Value
+    from crashhunt.trial import TrialResult
 
 
-_TRAFFIC_STREAM = 0x74726166  # apart from what else is drawn of the hunt's seed
 GREATEST_LAG = 32
 """Greatest delay of results for a sampler in a deterministic hunt, in trials. It does not depend on the workers, so
 that 1 and 16 of them run the same trials."""
@@ -130,7 +127,7 @@ class Trials:
         self._unanswered = deque(unanswered)
         self._forcings = forcings
         self._running_again: set[int] = set()
-        self._proposed: dict[int, TrialSpec] = {}  # by a run before this one, and not ended
+        self.propose_trial: dict[int, TrialSpec] = {}  # by a run before this one, and not ended
         self._open: set[int] = set()
         self._has_origins = False
         self._told: tuple[int, ...] = ()  # reported since the last proposal
@@ -167,18 +164,18 @@ class Trials:
             self._running_again.add(found[-1].number)
         turns: list[Turn] = []
         while self._next is not None and len(found) < room:
-            spec = self._proposed.pop(self._next, None)
+            spec = self.propose_trial.pop(self._next, None)
             if spec is None and self._sampler.learns:
                 if self._must_wait(self._next):
                     break
                 self._refuse_other_version()
                 self._told += self._report_to_sampler(self._next - self._lag_of(self._next))
-                spec = _proposed(self._next, self._settings, self._sampler, self._disturber)
+                spec = propose_trial(self._next, self._settings, self._sampler, self._disturber)
                 if spec is None and self._open:
                     break
                 if spec is None:
                     self._told += self._report_to_sampler(self._next)
-                    spec = _proposed(self._next, self._settings, self._sampler, self._disturber)
+                    spec = propose_trial(self._next, self._settings, self._sampler, self._disturber)
                 if spec is None:
                     self._next = None
                     break
@@ -207,7 +204,7 @@ class Trials:
         Raises:
             HuntDirectoryError: the hunt began with another version.
         """
-        if self._sampler.learns and self._next is not None and self._next not in self._proposed:
+        if self._sampler.learns and self._next is not None and self._next not in self.propose_trial:
             self._refuse_other_version()
 
     def ended(self, result: TrialResult) -> None:
@@ -264,7 +261,7 @@ class Trials:
                     self._sampler.tell(result)
                     told.add(number)
             if turn.spec.number not in finished:
-                self._proposed[turn.spec.number] = turn.spec
+                self.propose_trial[turn.spec.number] = turn.spec
         self._untold = sorted(known - told)
 
 
@@ -298,76 +295,6 @@ class Pace:
         if not is_limited and now - self._looked >= _LOOK_EVERY_S:
             self._looked, self._finished = now, trials_of_running(self._other)
         return sys.maxsize if self._finished is None else max(0, self._finished + lead - upcoming)
-
-
-def spec_of(
-    number: int,
-    settings: HuntSettings,
-    sampler: NamedSampler,
-    disturber: DisturbanceSampler | None = None,
-    forcing: Forcing | None = None,
-) -> TrialSpec:
-    """Return the trial that a sampler proposes, with the disturbances that follow from the trial's seed.
-
-    With `--seeds`, trials use the given number of traffic seeds in turn. A traffic seed also determines the scenario's
-    arguments if the sampler is independent. Samplers that are not independent propose the scenario's arguments
-    themselves.
-
-    With a forcing, the trial is a root. In a root, no disturbance is drawn from the first step on in which a
-    disturbance may be forced.
-
-    Raises:
-        CrashhuntError: the sampler failed.
-    """
-    spec = _proposed(number, settings, sampler, disturber, forcing)
-    assert spec is not None  # only a sampler that learns may propose no trial, and not its first
-    return spec
-
-
-def _proposed(
-    number: int,
-    settings: HuntSettings,
-    sampler: NamedSampler,
-    disturber: DisturbanceSampler | None = None,
-    forcing: Forcing | None = None,
-) -> TrialSpec | None:
-    """Return the trial as `spec_of`; None if the sampler proposes none before it receives further results."""
-    rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
-    seed = int(rng.integers(2**31))
-    proposal = sampler.ask(number, rng)
-    if proposal is None:
-        return None
-    values = dict(proposal.arguments)
-    if settings.seeds:
-        turn = number % settings.seeds
-        rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(turn, _TRAFFIC_STREAM)))
-        seed = int(rng.integers(2**31))
-        if sampler.independent:
-            traffic = sampler.ask(turn, rng)
-            assert traffic is not None  # only a sampler that learns may propose no trial
-            values |= {key: value for key, value in traffic.arguments.items() if not key[0]}
-    arguments: dict[str, dict[str, Value]] = {agent: {} for agent in settings.agents}
-    scenario_arguments: dict[str, Value] = {}
-    for (agent, name), value in sorted(values.items()):
-        (arguments[agent] if agent else scenario_arguments)[name] = value
-    if proposal.seed is not None:
-        seed = proposal.seed
-    return TrialSpec(
-        number=number,
-        seed=seed,
-        arguments=arguments,
-        scenario_arguments=scenario_arguments,
-        max_steps=settings.max_steps,
-        parent=proposal.parent,
-        origin=proposal.origin,
-        disturbances=_drawn(disturber, seed, settings.max_steps, forcing) if disturber is not None else (),
-        forcing=forcing,
-    )
-
-
-def _drawn(disturber: DisturbanceSampler, seed: int, steps: int, forcing: Forcing | None) -> tuple[Disturbance, ...]:
-    """Return the disturbances of a trial; for a root, only those before the first step with a forced disturbance."""
-    return disturber.draw(seed, steps if forcing is None else min(steps, FIRST_STEP - 1))
 
 
 # What the workers of a hunt need to know.

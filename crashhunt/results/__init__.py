@@ -22,27 +22,21 @@ if TYPE_CHECKING:
         prune_bundles as prune_bundles,
         tally_crashes as tally_crashes,
     )
+    from ._hunt_directory import HuntDirectory as HuntDirectory
     from ._hunt_results import (
-        FACTS as FACTS,
-        Cell as Cell,
         HuntResults as HuntResults,
         IncompleteHuntWarning as IncompleteHuntWarning,
         SuiteResults as SuiteResults,
-        TrialRow as TrialRow,
-        columns_of as columns_of,
         load as load,
         write_parquet as write_parquet,
         write_text as write_text,
     )
-    from ._state import (
+    from ._hunt_state import (
         BRANCHES as BRANCHES,
         HEARTBEAT_S as HEARTBEAT_S,
         PROBES as PROBES,
         BranchSums as BranchSums,
-        HuntDirectory as HuntDirectory,
         HuntState as HuntState,
-        LogKind as LogKind,
-        LogReader as LogReader,
         ProbeSums as ProbeSums,
         copies_to_come as copies_to_come,
         draws_independently as draws_independently,
@@ -57,6 +51,13 @@ if TYPE_CHECKING:
         sums_of_probes as sums_of_probes,
         trials_of_running as trials_of_running,
         with_crash_counts as with_crash_counts,
+    )
+    from ._log_reader import LogKind as LogKind, LogReader as LogReader
+    from ._trial_table import (
+        FACTS as FACTS,
+        Cell as Cell,
+        TrialRow as TrialRow,
+        columns_of as columns_of,
     )
 
 offer_lazily(__name__)

@@ -5,6 +5,18 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
+    from ._argument_space import (
+        Argument as Argument,
+        Choice as Choice,
+        Constant as Constant,
+        Distribution as Distribution,
+        Kind as Kind,
+        Range as Range,
+        Value as Value,
+        kind_of as kind_of,
+        parse_spec as parse_spec,
+        without_folder as without_folder,
+    )
     from ._disturbance import (
         CELLS as CELLS,
         HOLD_KINDS as HOLD_KINDS,
@@ -53,23 +65,13 @@ if TYPE_CHECKING:
         check_parts as check_parts,
         in_effect as in_effect,
     )
-    from ._space import (
+    from ._signature import (
         FILLED_BY_NAME as FILLED_BY_NAME,
-        Argument as Argument,
-        Choice as Choice,
-        Constant as Constant,
         DeclaresArguments as DeclaresArguments,
-        Distribution as Distribution,
-        Kind as Kind,
         PrefersAction as PrefersAction,
-        Range as Range,
         ReturnsActions as ReturnsActions,
         Signature as Signature,
-        Value as Value,
-        kind_of as kind_of,
-        parse_spec as parse_spec,
         signature_of as signature_of,
-        without_folder as without_folder,
     )
     from ._specification import (
         ALL_AGENTS as ALL_AGENTS,

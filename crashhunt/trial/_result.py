@@ -17,10 +17,10 @@ from crashhunt.base.codec import (
     written_if,
 )
 from crashhunt.base.integrity import typed
-from crashhunt.base.text import count_of
 from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._evidence import KILLED, Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
+from crashhunt.trial._sentence import summarize
 from crashhunt.trial._specification import TrialSpec
 from crashhunt.world import ClosestApproach, Event
 
@@ -252,31 +252,6 @@ class Stress(Serializable):
         return f"asked {self.moments_asked} of {self.moments}"
 
 
-# The sentence about a result that all reports use, such as "ego drove into main.31 at step 47".
-
-
-def summarize(result: TrialResult) -> str:
-    """Return a sentence about the outcome of a trial, in one line."""
-    if result.collision is not None:
-        hit = result.collision
-        if hit.role == "alone":
-            what = "left the road" if result.outcome is Outcome.OFF_ROAD else f"crashed ({hit.kind})"
-            return f"{hit.agent} {what} at step {result.steps}"
-        verb = "drove into" if hit.role == "collider" else "was hit by"
-        return f"{hit.agent} {verb} {hit.other} at step {result.steps}"
-    if result.event is not None:
-        return f"{result.event.what}, at step {result.steps}"
-    if result.failure is not None:
-        failure = result.failure
-        if failure.traceback and failure.exit_code is None and failure.kind != "timeout":
-            whose = f"{failure.agent}: " if failure.agent else ""
-            if failure.party not in ("", "agent", "simulator"):
-                whose = f"{failure.party} ({failure.place}): "
-            return f"{whose}{failure.kind}: {failure.message}"
-        return failure.message
-    return f"{result.outcome} after {count_of(result.steps, 'step')}"
-
-
 @dataclass(frozen=True, slots=True)
 class TrialResult(Serializable):
     """The result of a trial.
@@ -416,7 +391,7 @@ class TrialResult(Serializable):
     @property
     def summary(self) -> str:
         """A sentence that describes the outcome, in one line."""
-        return summarize(self)
+        return summarize(self.outcome, self.steps, collision=self.collision, event=self.event, failure=self.failure)
 
 
 def in_effect(result: TrialResult, reported: Iterable[Disturbance]) -> TrialResult:

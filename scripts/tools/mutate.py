@@ -214,6 +214,7 @@ _TESTS_ELSEWHERE = {
         "hunts/test_verified_runs.py",
         "hunts/test_whole_hunts.py",
     ),
+    "hunts/_trial_seeds.py": ("hunts/test_next_trials.py", "hunts/test_whole_hunts.py"),
     "hunts/_preflight.py": (
         "hunts/test_hunt_parts.py",
         "hunts/test_preflight.py",
@@ -237,7 +238,10 @@ _TESTS_ELSEWHERE = {
         "hunts/test_whole_hunts.py",
     ),
     "results/_hunt_results.py": ("hunts/test_hunt_parts.py", "results/test_results.py", "results/test_trial_rows.py"),
-    "results/_state.py": (
+    "results/_trial_table.py": ("hunts/test_hunt_parts.py", "results/test_results.py", "results/test_trial_rows.py"),
+    "results/_hunt_directory.py": ("results/test_directory.py", "hunts/test_hunt_parts.py"),
+    "results/_log_reader.py": ("hunts/test_hunt_parts.py",),
+    "results/_hunt_state.py": (
         "results/test_directory.py",
         "hunts/test_hunt_parts.py",
         "hunts/test_phases.py",

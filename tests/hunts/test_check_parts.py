@@ -20,7 +20,7 @@ from crashhunt.errors import BundleError, CrashhuntError, HuntDirectoryError
 from crashhunt.hunts import check, salvage
 from crashhunt.hunts._disk_check import intact_snapshots
 from crashhunt.ledger import Ledger, Turn
-from crashhunt.results._state import ledger_owner
+from crashhunt.results._hunt_state import ledger_owner
 from crashhunt.trial import Outcome
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1" / "hunt"

@@ -18,7 +18,7 @@ from crashhunt.hunts import _hunt as hunt_module, _next_trials, _running_hunt, _
 from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace
 from crashhunt.ledger import Ledger
-from crashhunt.results._state import ledger_owner
+from crashhunt.results._hunt_state import ledger_owner
 from crashhunt.trial import UNUSABLE_VALUE, Branches, Failure, Outcome, TrialResult, TrialSpec
 
 TOY = """

@@ -39,8 +39,9 @@ from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReru
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
 from crashhunt.reruns import EndedRun, StoppedError
-from crashhunt.results import _hunt_results as _results, _state
-from crashhunt.results._state import HuntDirectory, LogReader
+from crashhunt.results import _hunt_results as _results, _log_reader
+from crashhunt.results._hunt_directory import HuntDirectory
+from crashhunt.results._log_reader import LogReader
 from crashhunt.statistics import TRIALS_PER_ROOT, RareEstimate, _rate_of_running_hunt, rate_of_bar
 from crashhunt.statistics._rare import Estimated
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
@@ -510,7 +511,7 @@ def test_hunt_that_ended_before_its_first_trial_does_not_block_its_directory(tmp
 
 
 def test_logs_are_read_from_their_ends_with_their_titles(tmp_path, monkeypatch):
-    monkeypatch.setattr(_state, "_MAX_LOG_BYTES", 10)
+    monkeypatch.setattr(_log_reader, "_MAX_LOG_BYTES", 10)
     for folder, text in (("", "x" * 20), ("crashes/000007-collision", "crash"), ("trials/000003", "trial"),
                          ("crashes/notes", "other")):  # fmt: skip
         (tmp_path / folder).mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ from crashhunt.hunts._progress import PhaseClock, RemainingTime
 from crashhunt.ledger import Ledger
 from crashhunt.report import describe_phase, format_pace
 from crashhunt.results import hunt_state
-from crashhunt.results._state import ledger_owner
+from crashhunt.results._hunt_state import ledger_owner
 from crashhunt.statistics import compare
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from crashhunt.hunts._verification import Audit
 from crashhunt.ledger import Ledger
 from crashhunt.plans import RunSettings
 from crashhunt.results import find_hunts, find_searches, hunt_state, is_hunt, load
-from crashhunt.results._state import draws_independently, ledger_owner, sums_of_branches, sums_of_probes
+from crashhunt.results._hunt_state import draws_independently, ledger_owner, sums_of_branches, sums_of_probes
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.statistics import CountingRule, RateWatch
 from crashhunt.trial import KILLED, Branches, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec

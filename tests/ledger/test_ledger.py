@@ -14,7 +14,7 @@ from crashhunt.errors import HuntDirectoryError
 from crashhunt.hunts._next_trials import find_unanswered
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.results import TrialRow
-from crashhunt.results._state import sums_of_branches, sums_of_probes
+from crashhunt.results._hunt_state import sums_of_branches, sums_of_probes
 from crashhunt.trial import KILLED, Branches, Failure, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 

@@ -11,7 +11,7 @@ import pytest
 
 from crashhunt.errors import BusyError, HuntDirectoryError
 from crashhunt.plans import HuntSettings
-from crashhunt.results import HuntDirectory, _state
+from crashhunt.results import HuntDirectory, _hunt_directory
 
 SETTINGS = HuntSettings(scenario="loop", scenario_digest="x", trials=1, max_steps=1, seed=1)
 
@@ -110,7 +110,7 @@ def test_directory_of_a_hunt_that_cannot_begin_is_removed_if_it_was_made_for_it(
 
 def test_directory_is_removed_even_if_no_folder_can_be_opened(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        _state, "shutil", SimpleNamespace(rmtree=lambda *_, **__: None)
+        _hunt_directory, "shutil", SimpleNamespace(rmtree=lambda *_, **__: None)
     )  # as with a low limit on open files
     with pytest.raises(ValueError, match="no snapshot"):
         _fail(HuntDirectory(tmp_path / "new"))

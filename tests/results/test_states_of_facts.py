@@ -17,8 +17,9 @@ from crashhunt.base.temporary import this_process
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings
-from crashhunt.results import _state, find_hunts, hunt_state, is_hunt
-from crashhunt.results._state import HuntDirectory, copies_to_come, ledger_owner, state_of_facts, sums_of_branches
+from crashhunt.results import _hunt_state, find_hunts, hunt_state, is_hunt
+from crashhunt.results._hunt_directory import HuntDirectory
+from crashhunt.results._hunt_state import copies_to_come, ledger_owner, state_of_facts, sums_of_branches
 from crashhunt.trial import Branch, Branches, Outcome, TrialResult, TrialSpec
 
 NOW = 1000.0
@@ -26,7 +27,7 @@ NOW = 1000.0
 
 @pytest.fixture(autouse=True)
 def _clock(monkeypatch):
-    monkeypatch.setattr(_state, "time", SimpleNamespace(time=lambda: NOW, strftime=time.strftime))
+    monkeypatch.setattr(_hunt_state, "time", SimpleNamespace(time=lambda: NOW, strftime=time.strftime))
 
 
 def running(**facts):
@@ -62,7 +63,7 @@ def test_clocks_stand_still_after_the_last_trial(said, monkeypatch):
     assert found.newest_kind_s == 20.0
     confirming = running(newest_kind=930.0, phase={"name": "confirming", "done": 0, "total": 1, "seconds_left": None})
     assert state(confirming).newest_kind_s == 20.0
-    monkeypatch.setattr(_state.time, "time", lambda: NOW + 3600)
+    monkeypatch.setattr(_hunt_state.time, "time", lambda: NOW + 3600)
     later = state(ended)
     assert (later.newest_kind_s, later.rate_per_s) == (found.newest_kind_s, found.rate_per_s)
     assert state(ended, last=None).newest_kind_s is None
@@ -123,24 +124,24 @@ def test_rate_of_a_hunt_that_has_ended_is_up_to_its_last_trial():
 
 def test_owner_on_another_machine_is_alive_for_a_minute_after_its_heartbeat():
     owner = {"host": "elsewhere", "pid": os.getpid(), "started": ledger_owner()["started"]}
-    assert _state._is_alive(owner, NOW - 59.0)
-    assert not _state._is_alive(owner, NOW - 60.0)
+    assert _hunt_state._is_alive(owner, NOW - 59.0)
+    assert not _hunt_state._is_alive(owner, NOW - 60.0)
     assert not state(running(owner=owner)).owner_alive  # without any heartbeat
 
 
 def test_owner_in_another_container_of_the_same_host_name_is_judged_by_its_heartbeat():
     here = ledger_owner()
-    assert _state._is_alive(here, 0.0)
+    assert _hunt_state._is_alive(here, 0.0)
     pid, started, boot, namespace = here["token"].split("-")
     other = {**here, "token": f"{pid}-{started}-{boot}-{int(namespace, 16) ^ 1:08x}"}
-    assert (_state._is_alive(other, NOW - 59.0), _state._is_alive(other, NOW - 60.0)) == (True, False)
+    assert (_hunt_state._is_alive(other, NOW - 59.0), _hunt_state._is_alive(other, NOW - 60.0)) == (True, False)
     gone = {**here, "pid": 2**22 + 5}
-    assert not _state._is_alive(gone, NOW)
+    assert not _hunt_state._is_alive(gone, NOW)
 
 
 def test_folders_of_runs_are_in_the_order_of_their_numbers():
     names = ["x/b3", "x/10", "x/a", "x/2", "x/1"]
-    assert sorted(map(Path, names), key=_state._ordered_states) == [
+    assert sorted(map(Path, names), key=_hunt_state._ordered_states) == [
         Path("x") / name for name in ("1", "2", "10", "a", "b3")
     ]
 

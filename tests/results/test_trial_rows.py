@@ -7,7 +7,7 @@ import json
 from dataclasses import replace
 
 from crashhunt.results import FACTS, TrialRow
-from crashhunt.results._hunt_results import BRANCHES, DISTURBANCES, ORIGINS, STRESS
+from crashhunt.results._trial_table import BRANCHES, DISTURBANCES, ORIGINS, STRESS
 from crashhunt.trial import (
     EVENTS,
     Branch,

@@ -2,45 +2,35 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
 import os
-import shutil
 import socket
 import time
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.codec import OMIT_DEFAULT, Serializable, written_if
-from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError
-from crashhunt.base.files import whole_file
-from crashhunt.base.integrity import changed_file
+from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.temporary import (
     owner_in,
-    remove_ended,
-    remove_scratch,
     start_time,
-    temporary_beside,
     this_process,
 )
 from crashhunt.base.text import command_line, near_path
-from crashhunt.crashes import Note, crash_folders, files_of, read_notes
+from crashhunt.crashes import Note, crash_folders, read_notes
 from crashhunt.ledger import KindData, Ledger, RunningRate, damaged, has_begun
-from crashhunt.plans import HuntSettings, read_settings, write_settings
 from crashhunt.results._code_versions import count_versions
 from crashhunt.results._found_crashes import outcomes_of_crashes, tally_crashes
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from crashhunt.base.codec import JsonObject
-    from crashhunt.base.integrity import FileEntry
     from crashhunt.ledger import Facts, HuntOwner
+    from crashhunt.plans import HuntSettings
 
 
 # What has come of the copies of a hunt's trials so far, as its ledger sums it up.
@@ -498,271 +488,3 @@ def _is_alive(owner: HuntOwner, heartbeat: float) -> bool:
 def _ordered_states(path: Path) -> tuple[tuple[int, int, str], ...]:
     """Return the sort key of folders of runs, which sorts by number: 2 before 10."""
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in path.parts)
-
-
-# The directory of a hunt: its owner, and the lock against a second hunt in it.
-
-_DIFFERENCES_SHOWN = 4
-# What a hunt writes, `hunt.toml` last: without it the folder is not a hunt's.
-_OWN_FILES = (
-    "snapshots",
-    "crashes",
-    *layout.BESIDE,
-    "trials",
-    layout.LEDGER,
-    "ledger.sqlite-wal",
-    "ledger.sqlite-shm",
-    layout.NOTES,
-    layout.HUNT,
-)
-_PERMITTED_FILES = (".lock", layout.SCRATCH, ".hunt.")  # what may be there before: of a hunt that could not begin
-
-
-class HuntDirectory:
-    """The directory of a hunt, with its lock and scratch folder.
-
-    Args:
-        path: path of the directory; the directory itself is created if it does not exist.
-
-    Attributes:
-        has_begun: whether the hunt has begun. Before that, an error deletes a directory that was created for the hunt,
-            and restores the settings of a hunt that was to resume.
-        settings_before: settings of a hunt that was to resume; None before `claim`, and for a new hunt.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._absolute = path.absolute()  # now, because the current folder may be deleted while the hunt runs
-        self.has_begun = False
-        self.settings_before: HuntSettings | None = None
-        self._file_before: bytes | None = None
-
-    @property
-    def scratch(self) -> Path:
-        """The folder into which running trials write.
-
-        A resumed hunt has another folder, because processes of a killed hunt may still write for a moment.
-        """
-        return self._absolute / f"{layout.SCRATCH}-{this_process().token}"
-
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Lock the directory against other hunts; the lock ends with this process.
-
-        Raises:
-            HuntDirectoryError: the directory is in use, belongs to something else, or cannot be written.
-        """
-        try:
-            is_new = self._make()
-            if not (self.path / ".lock").exists():  # leave no file in a foreign folder
-                self._refuse_foreign()
-            lock = (self.path / ".lock").open("a+")
-        except OSError as error:
-            raise self._unusable(error) from error
-        with lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                lock.seek(0)
-                raise BusyError(
-                    f"another hunt is running in this directory (process {lock.read().strip() or '?'})",
-                    fix="wait for it, stop it, or choose another directory",
-                    where=str(self.path),
-                ) from None
-            self._refuse_foreign()
-            lock.truncate(0)
-            lock.write(str(os.getpid()))
-            lock.flush()
-            try:
-                with temporary_beside(self.path / layout.LEDGER, name=self.scratch.name):
-                    yield
-            except BaseException:
-                if is_new and not self.has_begun:
-                    self._remove_own(".lock")
-                    with suppress(OSError):
-                        self.path.rmdir()
-                elif self._file_before is not None and not self.has_begun:
-                    with suppress(CrashhuntError, OSError), whole_file(self.path / layout.HUNT) as temporary:
-                        temporary.write_bytes(self._file_before)
-                raise
-
-    def _make(self) -> bool:
-        """Create the directory; return whether it is new."""
-        try:
-            self.path.mkdir()
-        except FileExistsError:
-            self.path.mkdir(exist_ok=True)  # raises for a file
-            return False
-        return True
-
-    def _remove_own(self, *more: str) -> None:
-        for name in (*_OWN_FILES, *more):
-            if (self.path / name).is_dir():
-                shutil.rmtree(self.path / name, ignore_errors=True)
-                with suppress(OSError):
-                    (self.path / name).rmdir()  # because rmtree opens the folder, which ``ulimit -n`` may refuse
-            else:
-                (self.path / name).unlink(missing_ok=True)
-
-    def claim(self, settings: HuntSettings, command: list[str], *, overwrite: bool, seed_given: bool) -> HuntSettings:
-        """Claim the directory for this hunt, or check that it already has this hunt; return the valid settings.
-
-        A hunt without the result of a trial is replaced.
-
-        Args:
-            settings: settings of the hunt.
-            command: the command line, which is written to ``hunt.toml`` as a comment.
-            overwrite: whether a new hunt replaces an existing one.
-            seed_given: whether the user chose the seed; if not, a resumed hunt keeps its own seed.
-
-        Raises:
-            HuntDirectoryError: the existing hunt has other trials, or the directory cannot be written.
-        """
-        if overwrite:
-            self._remove_own()
-        file = self.path / layout.HUNT
-        if file.exists():
-            before = read_settings(file)
-            resumed = settings if seed_given else replace(settings, seed=before.seed)
-            # The snapshots show which files of the scenario differ, if there are trials.
-            differences = before.differences(replace(resumed, scenario_digest=before.scenario_digest))
-            if not differences:
-                settings, self.settings_before = resumed, before
-            elif not self._has_results():  # the hunt ended before its first trial, often by a mistake in the scenario
-                self._remove_own()
-            else:
-                more = len(differences) - _DIFFERENCES_SHOWN
-                shown = "; ".join(differences[:_DIFFERENCES_SHOWN]) + (f"; and {more} more" if more > 0 else "")
-                raise HuntDirectoryError(
-                    f"the directory contains another hunt: {shown}",
-                    fix="give the same settings to resume it, another directory, or --overwrite to begin again",
-                    where=str(self.path),
-                )
-        for left in self.path.glob(f"{layout.SCRATCH}*"):  # with the lock of the hunt, no other hunt uses it
-            remove_scratch(left)
-        for folder in (self.path, *(self.path / name for name in (layout.CRASHES, *layout.BESIDE))):
-            remove_ended(folder)
-        try:
-            self._file_before = file.read_bytes() if file.exists() else None
-            self.scratch.mkdir()
-            write_settings(file, settings, command)
-        except OSError as error:
-            raise self._unusable(error) from error
-        return settings
-
-    def _has_results(self) -> bool:
-        """Return whether the hunt in the directory has the result of a trial; a damaged ledger counts as results."""
-        folders = (layout.CRASHES, layout.TRIALS, *layout.BESIDE)
-        if any(path for folder in folders for path in (self.path / folder).glob(layout.SHOWN)):
-            return True
-        if not has_begun(self.path / layout.LEDGER):
-            return any((self.path / layout.SNAPSHOTS).glob(layout.SHOWN))  # which is taken after the ledger exists
-        try:
-            with closing(Ledger(self.path / layout.LEDGER)) as ledger:
-                return bool(ledger.outcomes())
-        except HuntDirectoryError:
-            return True
-
-    def _refuse_foreign(self) -> None:
-        try:
-            foreign = sorted(path.name for path in self.path.iterdir() if not path.name.startswith(_PERMITTED_FILES))
-        except OSError as error:
-            raise self._unusable(error) from error
-        if foreign and not is_hunt(self.path):
-            raise HuntDirectoryError(
-                f"the folder is not empty and not a hunt: it has {foreign[0]!r}",
-                fix="give an empty or a new folder",
-                where=str(self.path),
-            )
-
-    def _unusable(self, error: OSError) -> HuntDirectoryError:
-        if isinstance(error, FileExistsError):
-            return HuntDirectoryError(f"{str(self.path)!r} is a file", fix="give a new or an empty folder")
-        return HuntDirectoryError(
-            f"the directory cannot be used: {error.strerror}",
-            fix="choose one below a folder that exists and is writable",
-            where=str(error.filename or self.path),
-        )
-
-
-# ``crashhunt logs``: finds and reads what hunts and trials have printed, wherever it was kept.
-
-LogKind = Literal["run", "error", "state"]
-
-_MAX_LOG_BYTES = 1_000_000  # bytes of one file, from its end
-
-
-class LogReader:
-    """Reads the new lines of the logs of a hunt and its trials.
-
-    Args:
-        hunt: directory of the hunt.
-        kinds: the kinds of logs to read: ``run``, ``error`` and ``state``.
-        trial: number of the only trial whose logs are read; None for all.
-    """
-
-    def __init__(self, hunt: Path, kinds: tuple[LogKind, ...], *, trial: int | None = None) -> None:
-        self._hunt = hunt
-        self._kinds = kinds
-        self._trial = trial
-        self._read: dict[Path, int] = {}
-        self._files: dict[Path, dict[str, FileEntry]] = {}
-        self._told = 0
-
-    def fresh(self) -> Iterator[tuple[str, str]]:
-        """Yield the title and the text of lines that are new since the previous call."""
-        if self._trial is None:
-            if "state" in self._kinds:
-                yield from self._states()
-            yield from self._texts(self._hunt, "")
-        places = (layout.CRASHES, *layout.BESIDE, layout.TRIALS)
-        folders = [folder for place in places for folder in (self._hunt / place).glob(layout.SHOWN)]
-        for folder in sorted(folders, key=lambda folder: folder.name):
-            number = folder.name.partition("-")[0]
-            if number.isdecimal() and self._trial in (None, int(number)):
-                yield from self._texts(folder, f"trial {int(number)}, ")
-
-    def _states(self) -> Iterator[tuple[str, str]]:
-        if not has_begun(self._hunt / layout.LEDGER):
-            if is_hunt(self._hunt) and (state := hunt_state(self._hunt)).damaged:
-                raise HuntDirectoryError(state.detail)
-            return
-        with closing(Ledger(self._hunt / layout.LEDGER)) as ledger:
-            events = ledger.events()[self._told :]
-        self._told += len(events)
-        lines = [
-            f"{time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at))}  {state}{f'  {why}' if why else ''}"
-            for at, state, why in events
-        ]
-        if lines:
-            yield "state", "\n".join(lines)
-
-    def _texts(self, folder: Path, title: str) -> Iterator[tuple[str, str]]:
-        for kind in ("run", "error"):
-            path = folder / f"{kind}.log"
-            if kind not in self._kinds:
-                continue
-            try:
-                with path.open("rb") as file:
-                    size = file.seek(0, os.SEEK_END)
-                    begin = self._read.get(path, max(0, size - _MAX_LOG_BYTES))
-                    if size <= begin:
-                        continue
-                    file.seek(begin)
-                    text = file.read(size - begin).decode("utf-8", "replace")
-            except OSError:
-                continue
-            self._read[path] = size
-            if text.strip():
-                changed = "" if self._as_written(path) else ", which has changed since it was written"
-                yield f"{title}{kind}{changed}", text
-
-    def _as_written(self, path: Path) -> bool:
-        """Return whether a file still has the digest that its crash recorded; files of hunts have no digest.
-
-        A crash records the digests of all its files, so another file was added later.
-        """
-        if path.parent not in self._files:
-            self._files[path.parent] = files_of(path.parent)
-        files = self._files[path.parent]
-        return not changed_file(path, files[path.name]) if path.name in files else not files
