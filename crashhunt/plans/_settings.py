@@ -20,7 +20,15 @@ from crashhunt.base.text import command_line, near_path
 from crashhunt.oracles import DEFAULT_ORACLES
 from crashhunt.plans._declaration import at_least
 from crashhunt.plans._durations_and_rates import seconds_of
-from crashhunt.plans._run_options import Driver, HuntOptions, RunOptions, Spec, TrialOptions
+from crashhunt.plans._run_options import (
+    Driver,
+    HuntOptions,
+    RunOptions,
+    Spec,
+    Subject,
+    TrialOptions,
+    hunt_options,
+)
 from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
 
 if TYPE_CHECKING:
@@ -364,7 +372,7 @@ class Request(HuntOptions):
         max_steps: maximum number of steps of a trial.
 
     Raises:
-        UsageError: the agent is not in a module that workers can import.
+        UsageError: the agent is not in a module that workers can import, or a table is no dictionary.
     """
 
     parallel: int = 1
@@ -374,6 +382,9 @@ class Request(HuntOptions):
     def __post_init__(self) -> None:
         """Write the only agent, and values that are not texts, in the form of the command line."""
         super().__post_init__()
+        for known in hunt_options(Subject):
+            if known.form == "table":
+                known.checked(getattr(self, known.name))
         drivers = {} if self.agent in (None, "") else {"": self.agent}
         locators = {name: _locator(who) for name, who in {**(self.agents or {}), **drivers}.items() if who is not None}
         words = {"arguments": spec_words(self.arguments), "scenario_arguments": spec_words(self.scenario_arguments)}

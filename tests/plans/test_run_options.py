@@ -213,6 +213,9 @@ def test_hunt_toml_is_what_it_was_to_the_byte(tmp_path):
         ({"crash_on": "collision"}, "--crash-on is 'collision'; give a list"),
         ({"snapshot_limit_mb": 0}, "--snapshot-limit is 0; give MB above 0, or --no-snapshot"),
         ({"sampler": 3}, "--sampler is 3; give a text"),
+        ({"arguments": "speed"}, "--arg is 'speed'; give a dictionary"),
+        ({"scenario_arguments": 3}, "--set is 3; give a dictionary"),
+        ({"agents": "a:B"}, "--agent is 'a:B'; give a dictionary"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_with_the_fix(given, message):
