@@ -21,6 +21,8 @@ MODULES = sorted(
 
 @pytest.mark.parametrize("name", MODULES)
 def test_what_a_module_offers_is_documented(name):
+    if name.startswith("crashhunt.agents.planners."):  # needs the planner, which no test environment has
+        pytest.importorskip(name, exc_type=ModuleNotFoundError)
     module = importlib.import_module(name)
     own = [attribute for attribute, value in vars(module).items() if getattr(value, "__module__", "") == name]
     for attribute in {*own, *getattr(module, "__all__", ())}:

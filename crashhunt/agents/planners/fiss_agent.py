@@ -56,5 +56,7 @@ class FissPlanner:
         return np.column_stack((np.maximum(plan.t, 0.0), plan.x, plan.y, plan.yaw, plan.v))[:64]
 
 
-class FopPlanner(FissPlanner):  # noqa: D101 - it evaluates all samples
+class FopPlanner(FissPlanner):
+    """Evaluates all samples."""
+
     planner_type = "fop_plus"
