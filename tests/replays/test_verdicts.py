@@ -120,6 +120,7 @@ def report(verdict, result=CRASH, divergence=None):
         edits=("speed was 5",),
         warnings=("numpy",),
         recorded=SimpleNamespace(steps=30),
+        snapshot=SimpleNamespace(environment=dict),
     )
     recording = SimpleNamespace(steps=29)
     return ReplayReport(rerun=rerun, verdict=verdict, replayed=result, recording=recording, divergence=divergence)
