@@ -127,7 +127,7 @@ class Trials:
         self._unanswered = deque(unanswered)
         self._forcings = forcings
         self._running_again: set[int] = set()
-        self.propose_trial: dict[int, TrialSpec] = {}  # by a run before this one, and not ended
+        self._proposed: dict[int, TrialSpec] = {}  # by a run before this one, and not ended
         self._open: set[int] = set()
         self._has_origins = False
         self._told: tuple[int, ...] = ()  # reported since the last proposal
@@ -164,7 +164,7 @@ class Trials:
             self._running_again.add(found[-1].number)
         turns: list[Turn] = []
         while self._next is not None and len(found) < room:
-            spec = self.propose_trial.pop(self._next, None)
+            spec = self._proposed.pop(self._next, None)
             if spec is None and self._sampler.learns:
                 if self._must_wait(self._next):
                     break
@@ -204,7 +204,7 @@ class Trials:
         Raises:
             HuntDirectoryError: the hunt began with another version.
         """
-        if self._sampler.learns and self._next is not None and self._next not in self.propose_trial:
+        if self._sampler.learns and self._next is not None and self._next not in self._proposed:
             self._refuse_other_version()
 
     def ended(self, result: TrialResult) -> None:
@@ -261,7 +261,7 @@ class Trials:
                     self._sampler.tell(result)
                     told.add(number)
             if turn.spec.number not in finished:
-                self.propose_trial[turn.spec.number] = turn.spec
+                self._proposed[turn.spec.number] = turn.spec
         self._untold = sorted(known - told)
 
 
