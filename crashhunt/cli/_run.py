@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import OWN_THREAD
 from crashhunt.base.resources import error_of_next_thread, limit_behind
-from crashhunt.base.text import command_line
 from crashhunt.cli._common import add_json, add_options, chosen_options, integer, make_console, unwritable_output
 from crashhunt.cli._exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_VALID_TRIAL, THE_ANSWER_IS_NO
 from crashhunt.cli._rate import exit_code_of
@@ -141,13 +140,8 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         except _OutputClosedError as error:
             raise BrokenPipeError from error
         watcher.tell_notes()  # where there was nothing to run
-    described = describe_hunt(report)
+    described = describe_hunt(report, has_dashboard=console.is_terminal and has_dashboard())
     console.print(described, markup=False, soft_wrap=True)
-    if console.is_terminal and report.crashes and has_dashboard():
-        label = "Look at it:  " if "Replay one:" in described else "Look at it: "  # below the labels before it
-        console.print(
-            f"{label}{command_line('crashhunt', 'dashboard', options.directory)}", markup=False, soft_wrap=True
-        )
     if options.json:
         print(json.dumps(report.to_json()))
     if report.stopped_because == "no_valid_trial":

@@ -130,11 +130,12 @@ _SOURCE_WORDS = {
 }
 
 
-def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
+def describe_hunt(report: HuntReport, program: str = "crashhunt", *, has_dashboard: bool = False) -> str:
     """Return the result of a hunt as text that fits a screen.
 
     A single crash is described with its cause, its directory and the command that replays it. Of several crashes, the
-    text has each crash type with its shortest crash, and the counts of the hunt follow.
+    text has each crash type with its shortest crash, and the counts of the hunt follow. With a dashboard, the last line
+    is the command that shows the crashes in it.
     """
     ran = sum(report.outcomes.values())
     outcomes = ", ".join(f"{name} {count}" for name, count in report.outcomes.items()) or "none"
@@ -202,6 +203,9 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
         lines += [f"Show one:    {command_line(program, 'show', report.directory, *chosen)}"] if has_types else []
     if has_types:
         lines.append(f"Show types:  {command_line(program, 'crashes', report.directory)}")
+    if has_dashboard and report.crashes:
+        space = " " * has_types  # the labels before it are longer then
+        lines.append(f"Look at it: {space}{command_line(program, 'dashboard', report.directory)}")
     return in_lines(lines)
 
 

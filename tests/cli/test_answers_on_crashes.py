@@ -838,7 +838,7 @@ def test_run_ends_with_the_code_of_its_report(monkeypatch, capsys, words, report
     hunt = SimpleNamespace(settings=setup, scenario=SimpleNamespace(name="toy", notes=()), run=lambda watcher: found)
     monkeypatch.setattr("signal.signal", lambda *_: None)
     monkeypatch.setattr("crashhunt.api.prepare", lambda *words, **options: hunt)
-    monkeypatch.setattr("crashhunt.report.describe_hunt", lambda report: "found")
+    monkeypatch.setattr("crashhunt.report.describe_hunt", lambda report, **_: "found")
     assert run("run", "h", "1", "5", "60", *words, "--json") == code
     assert capsys.readouterr() == ('"the report"\n', "found\n")
 
@@ -847,7 +847,7 @@ def test_ctrl_c_after_a_hunt_does_not_say_that_the_hunt_has_not_begun(monkeypatc
     setup = SimpleNamespace(agents={"ego": SimpleNamespace(agent="keep-lane")})
     hunt = SimpleNamespace(settings=setup, scenario=SimpleNamespace(name="toy", notes=()), run=lambda watcher: None)
     monkeypatch.setattr("crashhunt.api.prepare", lambda *words, **options: hunt)
-    monkeypatch.setattr("crashhunt.report.describe_hunt", lambda report: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("crashhunt.report.describe_hunt", lambda report, **_: signal.raise_signal(signal.SIGINT))
     monkeypatch.setattr(importlib.import_module("crashhunt.cli._run"), "_leave", lambda code: None)
     before = signal.getsignal(signal.SIGINT)
     try:

@@ -131,6 +131,8 @@ def test_end_of_a_hunt_fits_a_screen_with_the_counts_and_the_next_commands_last(
         "Show one:    crashhunt show 'my hunt' --crash 000000-collision",
         "Show types:  crashhunt crashes 'my hunt'",
     ]
+    with_page = describe_hunt(report, has_dashboard=True).splitlines()
+    assert with_page == [*found, "Look at it:  crashhunt dashboard 'my hunt'"]
 
 
 def test_crashes_that_are_flaky_or_not_confirmed_are_named_among_many():
