@@ -55,8 +55,8 @@ class WorkerSettings(Serializable):
         sealed: for an untrusted crash, the files that the process may read in addition to installed packages and its
             scratch folder. The process may write only in the scratch folder. With None, the process has no
             restrictions.
-        find_escapes: whether further runs of the trial find the last step at which braking avoids a collision; only in
-            a new process.
+        find_escapes: whether the trial confirms a crash: further runs find the last step at which braking avoids a
+            collision, and lights and routes are recorded for its picture. Only in a new process.
         audit: the share of trials without a crash whose scratch folder is kept, because they are run again.
         hunt_seed: seed of the hunt, which determines the audited trials.
         warm_copies: number of traffic seeds for which a worker keeps a suspended fork after the warm-up; 0 for none.

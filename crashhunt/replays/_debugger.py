@@ -58,9 +58,6 @@ if TYPE_CHECKING:
 # The debugger continues in a fork while the process waits for its end. If the fork ends in order to go back, the
 # process gets the terminal again. So the user finds the exact earlier state, without effects of later steps.
 
-_SHOWN_S = 10.0  # of the curves of a requirement, as of those that every film has
-_MOST_COMPARISONS = 6  # of requirements that a film shows
-
 _MAX_STEPS_BACK = 50  # steps; what has changed since is kept for each
 _BACK_EXIT_CODE = 78  # exit code
 _TARGET = "back"
@@ -315,6 +312,10 @@ class _Stopped:
         debugger = _Debugger()
         debugger.step, debugger.backwards = self._step, self._backwards
         return debugger.runcall(self.agent.act, observation)
+
+
+_SHOWN_S = 10.0  # of the curves of a requirement, as of those that every film has
+_MOST_COMPARISONS = 6  # of requirements that a film shows
 
 
 class _Panels(Observer):

@@ -228,9 +228,7 @@ def _argument_plot(
             if inside.any():
                 middle = (place + 0.5) / (len(edges) - 1)
                 lines[hunt].append((middle, float(crashed[inside].mean()), int(inside.sum())))
-    most = (
-        max((rate for line in lines.values() for _, rate, _ in line), default=0.0) or 1.0
-    )  # of an axis without crashes
+    most = max((rate for line in lines.values() for _, rate, _ in line), default=0.0) or 1.0  # without crashes
     parts = ['<path class="axis" d="M52 8V148H268"/>',
              f'<text x="160" y="180" text-anchor="middle">{html.escape(label)}</text>',
              '<text transform="translate(11 78) rotate(-90)" text-anchor="middle">crash rate</text>',

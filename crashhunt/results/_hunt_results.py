@@ -35,7 +35,6 @@ from crashhunt.plans import HuntSettings, read_settings, with_settings
 from crashhunt.results._code_versions import CodeVersions
 from crashhunt.results._hunt_state import HuntState, draws_independently, find_hunts, hunt_state
 from crashhunt.results._trial_table import (
-    _JUDGED,
     BRANCHES,
     CODE_VERSION,
     DISTURBANCES,
@@ -59,6 +58,8 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Facts
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult
+
+_JUDGED = b'"drivers"'  # the key of a judgement with answers of competent drivers
 
 
 class IncompleteHuntWarning(UserWarning):

@@ -38,8 +38,6 @@ BRANCHES = ("branches", "branch_crashes", "branches_asked")
 PREVENTABLE = tuple(f"preventable_by.{model}" for model in COMPETENT_DRIVERS)
 """Further columns of hunts with judged crashes: whether each model of a competent driver prevents the crash."""
 
-_JUDGED = b'"drivers"'
-
 CODE_VERSION = "code_version"
 """A further column of hunts whose code has changed: the number of the version with which a trial ran."""
 
@@ -172,6 +170,3 @@ def columns_of(settings: HuntSettings) -> tuple[str, ...]:
     """Return the columns of a table of trials: facts, then ``AGENT.ARGUMENT``, then ``scenario.ARGUMENT``."""
     arguments = [f"{agent}.{name}" for agent, chosen in settings.agents.items() for name in sorted(chosen.arguments)]
     return (*FACTS, *arguments, *(f"scenario.{name}" for name in sorted(settings.scenario_arguments)))
-
-
-# Trials as tables in files: CSV, JSON, JSON lines and Parquet, written row by row.

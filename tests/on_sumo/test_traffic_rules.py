@@ -225,7 +225,7 @@ def test_priority_is_that_of_the_network_file_and_of_the_geometry_of_the_lanes(r
                         before[other] = (meet[0] - own[2], meet[1] - its[2]) if meet else (math.nan, math.nan)
                 if distance_m < math.inf:
                     finite += 1
-                    assert before  # the network file gives somebody priority
+                    assert before  # as the network file says, another vehicle has priority
                     apart = [abs(max(0.0, mine) - distance_m) for mine, _ in before.values()]
                     assert min(apart) < 8.0 or np.isnan(apart).any()  # lanes are wide, lines of points are not
                 if any(0 < mine < 30 and 0 < its < 30 for mine, its in before.values()):
