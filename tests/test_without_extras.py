@@ -11,7 +11,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
-OTHER_NAMES = {"eclipse-sumo": "sumo", "stable-baselines3": "stable_baselines3"}  # imported under another name
+OTHER_NAMES = {"eclipse-sumo": "sumo"}  # imported under another name
 OF_AN_EXTRA = {"optuna", "ray", "cma-es"}  # entry points that need one
 
 LOAD = """
@@ -41,7 +41,7 @@ def test_entry_points_and_the_question_for_the_dashboard_need_no_package_of_an_e
         for word in words
         if extra != "dev"  # it lists what tests use of the dependencies of others, too
     }
-    blocked = sorted(OTHER_NAMES.get(name, name) for name in extras - core - {"crashhunt"})
+    blocked = sorted(OTHER_NAMES.get(name, name.replace("-", "_")) for name in extras - core - {"crashhunt"})
     assert {"optuna", "uvicorn", "ray"} <= {*blocked}
     done = subprocess.run([sys.executable, "-P", "-c", LOAD, json.dumps(blocked)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base.errors import PluginError
 from crashhunt.base.exceptions import in_words, place_of
+from crashhunt.base.extras import install_command
 from crashhunt.base.programs import factory_of, is_program
 from crashhunt.base.text import did_you_mean, one_of
 
@@ -253,6 +254,7 @@ def import_module(name: str, *, shown: str = "", installed: bool = False) -> typ
         raise _not_imported(name, shown or name, error) from error
 
 
+_EXTRAS = {"crashhunt.agents.planners": "planners"}  # of our modules for the packages of others
 _DESKTOP_LIBRARIES = ("libGL.so.1", "libX11.so.6", "libXext.so.6", "libXrender.so.1", "libatomic.so.1")
 """System libraries that simulators with a window link to, and that servers and containers often lack."""
 
@@ -344,6 +346,8 @@ def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
         fix = f"{hint} run from the folder that holds the module, install it, or correct the name".lstrip()
         return PluginError(f"{shown!r} cannot be imported: No module named {missing!r}", fix=fix)
     fix = f"install {missing.partition('.')[0]!r}, or correct the import" if missing else "correct the module"
+    if missing and (extra := _EXTRAS.get(name.rpartition(".")[0])):
+        fix = install_command(extra)
     if library := re.search(r"(\S+\.so[.\d]*): cannot open shared object file", said):
         on_debian = " (apt install libgl1 libxext6 libxrender1 libatomic1)" if library[1] in _DESKTOP_LIBRARIES else ""
         fix = f"install the system library {library[1]}{on_debian}"

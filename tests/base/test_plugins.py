@@ -223,3 +223,12 @@ def test_clone_in_the_current_folder_is_reported_where_the_installed_package_is_
         == describe_unused_clone(SimpleNamespace(__name__="highway_env", __file__=None))
         == ""
     )
+
+
+def test_an_adapter_of_a_planner_names_the_extra_that_it_needs(monkeypatch):
+    monkeypatch.setitem(sys.modules, "fiss_planner", None)  # the import fails, also where it is installed
+    monkeypatch.delitem(sys.modules, "crashhunt.agents.planners.fiss_agent", raising=False)
+    with pytest.raises(PluginError) as caught:
+        locate("agents", "crashhunt.agents.planners.fiss_agent:FissPlanner")
+    assert "install" in caught.value.fix
+    assert "[planners]" in caught.value.fix
