@@ -558,11 +558,11 @@ class _Axes:
     """Axes with labels, and the conversion of values to pixel positions."""
 
     def __init__(self, canvas: Canvas, left: float, right: float, low: float, high: float, top: int) -> None:
-        self._draw, self._top = canvas.draw, top
+        self._draw, self._bottom = canvas.draw, canvas.height - _BOTTOM
+        self._top = top = min(top, self._bottom - 1)  # the legend of a small panel is as high as the panel
         self._left, self._low = left, low
         self._scale_x = (canvas.width - _LEFT - _RIGHT) / span_of(left, right)
-        self._scale_y = (canvas.height - top - _BOTTOM) / span_of(low, high)
-        self._bottom = canvas.height - _BOTTOM
+        self._scale_y = (self._bottom - top) / span_of(low, high)
         for tick in ticks(low, high):
             at = self._bottom - (tick - low) * self._scale_y
             canvas.draw.line((_LEFT, at, canvas.width - _RIGHT, at), GRID)

@@ -44,6 +44,7 @@ def colors(picture: np.ndarray) -> dict[tuple[int, ...], int]:
 @settings(max_examples=examples(200))
 @given(panels, st.sampled_from([(240, 160), (64, 64), (500, 90)]))
 @example(Curve([5e-324, 0.0]), (240, 160))  # as near as floats get
+@example(ActionDistribution(mean=[0.0, 0.0, 0.0], std=[0.0, 0.0, 0.0]), (64, 64))  # a legend as high as the panel
 def test_whatever_an_agent_shows_becomes_a_picture_or_one_clear_error(panel, size):
     try:
         picture = panel.draw(*size, label="any")
