@@ -153,7 +153,7 @@ def replayed_shot(report: ReplayReport, chosen: ReplayOptions) -> Shot:
 
     folder = chosen.look.panels[1] if chosen.look is not None and chosen.look.panels is not None else None
     panels = load_panels(folder) if folder is not None else {}
-    meanings = load_meanings(folder).get(report.bundle.driver, ()) if folder is not None else ()
+    meanings = load_meanings(folder).get(report.bundle.driver) if folder is not None else None
     crashed = report.replayed.outcome in report.rerun.worker.crash_on
     return _shot(report.bundle, report.recording, report.replayed, panels, crashed=crashed, meanings=meanings)
 
@@ -186,9 +186,9 @@ def _shot(
     panels: Mapping[int, Mapping[str, NDArray[np.uint8]]],
     *,
     crashed: bool,
-    meanings: Sequence[str] = (),
+    meanings: Sequence[str] | None = None,
 ) -> Shot:
-    from crashhunt.crashes import most_dangerous
+    from crashhunt.crashes import most_dangerous, names_of_actions
     from crashhunt.recording import read_lanes
     from crashhunt.render import Shot
 
@@ -202,7 +202,7 @@ def _shot(
             other=near.other,
             crash_step=-1,
             panels=panels,
-            meanings=meanings,
+            meanings=meanings or names_of_actions(bundle, near.agent),
             nearest=near.step,
         )
     hit = result.collision
@@ -214,7 +214,7 @@ def _shot(
         other=other,
         crash_step=recording.steps if crashed else -1,
         panels=panels,
-        meanings=meanings,
+        meanings=meanings or names_of_actions(bundle, bundle.driver),
     )
 
 

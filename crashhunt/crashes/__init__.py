@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         is_bundle_made_here as is_bundle_made_here,
         list_bundles as list_bundles,
         list_near_misses as list_near_misses,
+        names_of_actions as names_of_actions,
         read_bundle as read_bundle,
         read_lights as read_lights,
         read_params as read_params,

@@ -34,6 +34,7 @@ from crashhunt.recording import (
 from crashhunt.simulators import (
     FlattensObservations,
     KnowsEncodedType,
+    NamesMetaActions,
     NamesObservations,
     ObservesParts,
     OfAnyLength,
@@ -380,18 +381,22 @@ _ROUTE_EVERY = 5  # steps; a route changes little in between
 
 
 class LightRecorder(Observer):
-    """Observer that keeps what a simulator reports of traffic lights, the lights of vehicles, and routes."""
+    """Observer that keeps what a simulator reports of traffic lights, the lights of vehicles, routes, and actions."""
 
     def __init__(self) -> None:
         self._simulator: ReportsLights | None = None
+        self._actions: dict[str, list[str]] = {}
         self._signals: dict[str, list[tuple[int, str]]] = {}
         self._vehicles: dict[str, list[tuple[int, int, int]]] = {}
         self._parts: dict[str, deque[tuple[int, object]]] = {}
         self._routes: dict[str, deque[tuple[int, list[float]]]] = {}
 
     def begin(self, episode: ObservedEpisode) -> None:
-        """Keep the simulator."""
+        """Keep the simulator, and the names of discrete actions, of which the recording has the numbers only."""
         self._simulator = episode.simulator if supports(episode.simulator, ReportsLights) else None
+        for agent, form in episode.simulator.actions.items():
+            if supports(form.space, NamesMetaActions):
+                self._actions[agent] = [str(name) for name in form.space.meanings]
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Read the lights and routes of a step."""
@@ -423,8 +428,9 @@ class LightRecorder(Observer):
     def data(self) -> dict[str, object] | None:
         """Return everything that was read, as JSON; None if the simulator reports nothing."""
         if self._simulator is None or not (self._signals or self._vehicles or self._parts):
-            return None
+            return {"actions": self._actions} if self._actions else None
         return {
+            **({"actions": self._actions} if self._actions else {}),
             "signals": self._signals,
             "vehicles": self._vehicles,
             "parts": {agent: list(steps) for agent, steps in self._parts.items()},

@@ -16,6 +16,7 @@ from crashhunt.crashes import (
     judgement_of,
     last_escape,
     most_dangerous,
+    names_of_actions,
     read_notes,
     snapshot_of,
     subject_of,
@@ -81,6 +82,7 @@ class Story:
         self.nearest = most_dangerous(self.recording) if bundle.is_near_miss else None
         near = self.nearest
         self.agent, self.other = (near.agent, near.other) if near else (bundle.driver, hit.other if hit else "")
+        self.action_words = names_of_actions(bundle, self.agent)
         compact = self.recording.compact
         self._is_whole = compact is None  # otherwise actors are missing that criticality and closest approach need
         self.danger = danger_course(self.recording, self.agent) if compact is None else None
@@ -158,7 +160,7 @@ class Story:
         if result.event is not None or (hit is not None and hit.role == "alone"):
             before = self._action(end)
             whose = "Its" if result.event is None else f"{self.agent}'s"
-            decision = self._opaque_action(end) or _words(before, self._names())
+            decision = self._opaque_action(end) or self._decided(before)
             sentences.append(f"{whose} last decision was {decision}.")
             sentences += self._about_fault() if self.fault.findings else []
         if self.danger is not None:
@@ -410,7 +412,20 @@ class Story:
         if opaque := self._opaque_action(step):
             return [opaque]
         action = self._action(step)
-        return ["-"] * len(self._names()) if action is None else [format_number(value) for value in action]
+        return ["-"] * len(self._names()) if action is None else self._formatted(action)
+
+    def _decided(self, action: Sequence[float] | None) -> str:
+        """Return an action with the name of each of its numbers."""
+        if action is None:
+            return "not recorded"
+        pairs = zip(self._names(), self._formatted(action), strict=False)
+        return ", ".join(f"{name} {value}" for name, value in pairs)
+
+    def _formatted(self, action: Sequence[float]) -> list[str]:
+        """Return the numbers of an action as text; the name of a discrete action, where it is known."""
+        if len(action) == 1 and action[0] in range(len(self.action_words)):
+            return [self.action_words[int(action[0])]]
+        return [format_number(value) for value in action]
 
 
 _GAP_M = 0.05  # shown as 0.1; a smaller one needs any deceleration, up to millions of m/s²
@@ -439,12 +454,6 @@ def _named(moment: Moment, nearest: Mapping[str, TableCell]) -> dict[str, object
         "time_to_other_s": moment.time_to_collision_s,
         **{name: nearest[name] for name in NEAREST},
     }
-
-
-def _words(action: Sequence[float] | None, names: Sequence[str]) -> str:
-    if action is None:
-        return "not recorded"
-    return ", ".join(f"{name} {format_number(value)}" for name, value in zip(names, action, strict=False))
 
 
 def programs_of(bundle: Bundle) -> dict[str, BinaryFacts]:

@@ -491,6 +491,7 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
         "agents": list(recording.agents),
         "dt": recording.prologue.step_length_s,
         **_scenes(recording, story.agent),
+        "actionWords": story.action_words,
         **(_to_closest(story) if story.encounter is None else _to_other(story.encounter, recording)),
         "lanes": _lanes(bundle, recording),
         **player_layers(bundle, recording, story.agent, story.contact, _origin(recording)),

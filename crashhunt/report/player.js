@@ -634,7 +634,8 @@ function rowsOf(crash) {
     const values = whole(crash.steps, (step) => crash.acts[step * size + place]), finite = values.filter(Number.isFinite);
     if (!finite.length) return;
     const low = finite.reduce((a, b) => Math.min(a, b)), high = finite.reduce((a, b) => Math.max(a, b));
-    rows.push({ title: `action: ${name}`, unit: "", low: low === high ? low - 1 : low, high: low === high ? high + 1 : high, isStep: true, series: [own(values, { name: "" })] });
+    const words = [...new Set(finite)].sort((a, b) => a - b).filter((value) => actionWord(crash, value)).map((value) => `${value} ${actionWord(crash, value)}`);
+    rows.push({ title: `action: ${words.join(", ") || name}`, unit: "", low: low === high ? low - 1 : low, high: low === high ? high + 1 : high, isStep: true, series: [own(values, { name: "" })] });
   });
   crash.seen?.names.forEach((name, place) => {
     const values = whole(crash.steps, (step) => crash.seen.array[step * crash.seen.names.length + place]), finite = values.filter(Number.isFinite);
@@ -761,13 +762,16 @@ function drawCursor(context, x, top, bottom) {
 }
 
 /* A measured value, with one decimal as in texts and tables. */
-const measured = (value, unit) => (Number.isFinite(value) ? `${value.toFixed(1)} ${unit}` : "-");
+const measured = (value, unit) => (Number.isFinite(value) ? `${value.toFixed(1).replace(/^-0\.0$/, "0.0")} ${unit}` : "-");
 
 /* The actors to which time to collision and gap of a step belong: the collision partner, or the closest ones. */
 function partners(crash, step) {
   if (crash.other) return [crash.other, crash.other];
   return crash.closest[step] ?? ["", ""];
 }
+
+/* The name of a discrete action; undefined for other actions, and where the names are not known. */
+const actionWord = (crash, value) => (crash.actionNames.length === 1 ? crash.actionWords[value] : undefined);
 
 /* What the rows of curves say at a step, and its actions: for the line below the scene and for the tip on the curves. */
 function valuesAt(crash, step) {
@@ -779,7 +783,7 @@ function valuesAt(crash, step) {
   if (crash.dangers) parts.push(["criticality", formatCriticality(crash.dangers[step])], ["rear criticality", formatCriticality(crash.behinds[step])]);
   crash.actionNames.forEach((name, place) => {
     const value = crash.acts[step * crash.actionNames.length + place];
-    parts.push([name, formatNumber(value)]);
+    parts.push([name, actionWord(crash, value) ?? formatNumber(value)]);
   });
   crash.seen?.names.forEach((name, place) => parts.push([name, formatNumber(crash.seen.array[step * crash.seen.names.length + place])]));
   return parts;

@@ -15,6 +15,8 @@ import pytest
 from conftest import mostly_nightly, rewritten
 
 import crashhunt
+from crashhunt.crashes import list_bundles, names_of_actions
+from crashhunt.report import player_data
 from crashhunt.scenario import shipped_scenarios
 
 SEEDS = {  # with which a crash comes soon
@@ -53,7 +55,17 @@ def test_a_crash_of_it_is_found_replayed_and_filmed(shell, scenario):
         return
     shell.crashhunt("export", "h", "crash.zip")
     assert shell.crashhunt("replay", "crash.zip", "--json").json["digest_replayed"] == crash["digest"]
-    assert f"step {crash['step']}" in shell.crashhunt("show", "h").out
+    shown = shell.crashhunt("show", "h").out
+    assert f"step {crash['step']}" in shown
+    if scenario == "highway":  # the log has the number of an action, and people read its name
+        from highway_env.envs.common.action import DiscreteMetaAction
+
+        (bundle,) = list_bundles(shell.folder / "h")
+        words = names_of_actions(bundle, "ego")
+        assert dict(enumerate(words)) == DiscreteMetaAction.ACTIONS_ALL
+        last = int(bundle.recording().all_steps[-1].actions["ego"].item())
+        assert shown[shown.rindex(f"\n{crash['step']:4} ") :].split()[3] == words[last]
+        assert player_data(bundle)["actionWords"] == words
     shell.crashhunt("report", "h")
     assert crash["id"] in (shell.folder / "h/report.html").read_text(encoding="utf-8")
 
