@@ -27,6 +27,7 @@ _EGO, _PARTNER, _AGENT, _OTHER = (255, 179, 26), (143, 15, 63), (46, 158, 91), (
 _CRASH = (198, 40, 40)
 _DISTURBANCE_COLOR = (128, 62, 158)
 _POINTS_PER_EDGE = 40  # of the outline of an actor
+_CLOSEST_M = 0.1  # pairs of these points that are as much farther apart belong to one contact, too
 _TRAIL_S = 4.0  # of where the agent has been
 _PERSON_PIXELS = 4  # radius at least; a person is 20 cm long
 _OVERSAMPLING = 2  # drawn so many times larger, for smooth edges
@@ -110,14 +111,15 @@ class SceneView:
         return as_array(smooth)
 
     def _contact(self, scene: Scene, row: int, step: int) -> NDArray[np.float64]:
-        """Return the position to mark: where the outlines of the two actors are closest, or the front of the agent."""
+        """Return the position to mark: the middle of where the outlines are closest, or the front of the agent."""
         other = scene.roster.index.get(self._other)
         if step != self._crash_step or other is None:
             return np.array(scene.points[row])
         first, second = (_along(corners(scene, one)) for one in (row, other))
         apart = np.linalg.norm(first[:, np.newaxis] - second[np.newaxis], axis=2)
-        one, two = np.unravel_index(apart.argmin(), apart.shape)
-        middle: NDArray[np.float64] = (first[one] + second[two]) / 2
+        # Along a whole edge, such as at a rear end, all pairs are as close: the first of them would be a corner.
+        one, two = np.nonzero(apart <= apart.min() + _CLOSEST_M)
+        middle: NDArray[np.float64] = (first[one] + second[two]).mean(axis=0) / 2
         return middle
 
     def _marked(self, step: int) -> str:

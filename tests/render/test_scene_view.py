@@ -224,19 +224,30 @@ def test_a_planned_trajectory_is_drawn_as_its_speed_over_time():
     assert np.array_equal(panel.x, [0.1, 0.2])
 
 
-def test_ring_of_a_crash_is_where_the_outlines_meet():
-    # ego, 5 m long and 2 m wide, drives east and touches with its left front corner a truck that crosses ahead.
-    step = {"ego": (2.5, 0.0, 0.0, 10.0), "other": (4.0, 0.9, -np.pi / 2, 5.0)}
-    found = recording(step, step, actors=[CAR, TRUCK])
+def ring_of(found):
+    """Return the middle of the ring of a crash in the last step, relative to ego, in m."""
     picture = view(found, width=400, height=400, crash_step=1, other="other").draw(1)
     apart = np.abs(picture.astype(int) - CRASH).max(axis=2)
     apart[:60] = 255  # the word above
     rows, columns = np.nonzero(apart < 40)
+    return np.array([(columns.min() + columns.max()) / 2 - 200, 200 - (rows.min() + rows.max()) / 2]) / 8.0
+
+
+def test_ring_of_a_crash_is_where_the_outlines_meet():
+    # ego, 5 m long and 2 m wide, drives east and touches with its left front corner a truck that crosses ahead.
+    step = {"ego": (2.5, 0.0, 0.0, 10.0), "other": (4.0, 0.9, -np.pi / 2, 5.0)}
+    found = recording(step, step, actors=[CAR, TRUCK])
     scene = found.scene(1)
     expected = _nearest_middle(*(np.array(corners(scene, scene.roster.index[name])) for name in ("ego", "other")))
-    offset = (expected - scene.centers[scene.roster.index["ego"]]) * 8.0
-    assert (columns.min() + columns.max()) / 2 == pytest.approx(200 + offset[0], abs=1.5)
-    assert (rows.min() + rows.max()) / 2 == pytest.approx(200 - offset[1], abs=1.5)
+    assert ring_of(found) == pytest.approx(expected - scene.centers[scene.roster.index["ego"]], abs=0.2)
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.8])
+def test_ring_of_a_rear_end_is_in_the_middle_of_what_touches(aside):
+    step = {"ego": (0.0, 0.0, 0.0, 10.0), "other": (TRUCK.length, aside, 0.0, 5.0)}  # the points are those of fronts
+    x, y = ring_of(recording(step, step, actors=[CAR, TRUCK]))
+    touching = max(-CAR.width / 2, aside - TRUCK.width / 2), min(CAR.width / 2, aside + TRUCK.width / 2)
+    assert (x, y) == pytest.approx((CAR.length / 2, sum(touching) / 2), abs=0.2)
 
 
 def _nearest_middle(first, second):

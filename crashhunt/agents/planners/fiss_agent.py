@@ -53,7 +53,10 @@ class FissPlanner:
                 place = int(number), *row[1:4], math.hypot(*row[4:6]), *row[7:9]
                 others.append(fp.predict_lane_following(self.roads, *place, 6.0, 0.1))
         plan = self.planner.step(time, state, others).trajectory
-        return np.column_stack((np.maximum(plan.t, 0.0), plan.x, plan.y, plan.yaw, plan.v))[:64]
+        # The planner derives headings from places, which turn at random where the vehicle stands: keep the last one.
+        moving = np.maximum.accumulate(np.where(np.array(plan.v) > 0.3, np.arange(len(plan.v)), -1))
+        yaw = np.where(moving < 0, heading, np.array(plan.yaw)[moving])
+        return np.column_stack((np.maximum(plan.t, 0.0), plan.x, plan.y, yaw, plan.v))[:64]
 
 
 class FopPlanner(FissPlanner):

@@ -39,7 +39,7 @@ PLANNERS = {
 def hunt(planner: str, scenario: str, trials: int, time: str) -> str:
     """Return a row of the table: planner, scenario, trials, steps per second of CPU, outcomes and first crash."""
     agent, action, arguments = PLANNERS[planner]
-    if scenario == "motorway":
+    if Path(scenario).stem.startswith("motorway"):
         arguments = [one.replace("=10:25", "=20:34") for one in arguments]
     out = Path("planners") / f"{planner}-{Path(scenario).stem}"
     out.parent.mkdir(exist_ok=True)
