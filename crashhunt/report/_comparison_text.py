@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import format_number, format_percent, in_lines
+from crashhunt.base.text import count_of, format_number, format_percent, in_lines
 from crashhunt.report._rate_text import count_training_trials
 from crashhunt.report._step_table import aligned, argument_units
 from crashhunt.results import FACTS, HuntResults, columns_of
@@ -82,7 +82,7 @@ def describe_comparison(found: Comparison) -> str:
         if other_code := hunt.exclusions.get("other_code"):
             lines.append(f"{hunt.dir}: only the newest code counts: {other_code} trials of earlier code are excluded")
         if hunt.excluded:
-            lines.append(f"{hunt.dir}: not counted: {hunt.excluded} trials after one that has not ended")
+            lines.append(f"{hunt.dir}: not counted: {count_of(hunt.excluded, 'trial')} after one that has not ended")
     for pair in found.pairs:
         lines += ["", pair.verdict]
         if pair.caution:

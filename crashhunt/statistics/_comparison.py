@@ -332,6 +332,8 @@ class _Side:
 
 # One hunt in numbers.
 
+_WITH_A_REASON = {"trained_on", "after_unfinished"}  # why no trial counts although there are some, as the rate says
+
 
 def _figures(side: _Side) -> HuntFigures:
     hunt, rate = side.hunt, side.rate()
@@ -350,7 +352,7 @@ def _figures(side: _Side) -> HuntFigures:
         crashes=rate.crashes,
         crash_rate=_share(hunt, rate),
         interval=None if rate.certain is None else (rate.certain.low, rate.certain.high),
-        why_not=rate.why_not if rate.trials or rate.excluded.get("trained_on") else "there is no valid trial",
+        why_not=rate.why_not if rate.trials or _WITH_A_REASON & rate.excluded.keys() else "there is no valid trial",
         median_steps_to_crash=float(np.median(crashed["steps"])) if len(crashed) else float("nan"),
         median_time_to_collision_s=float(np.median(fine["ttc"])) if len(fine) else float("nan"),
         outcomes=outcomes,

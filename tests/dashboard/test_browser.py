@@ -85,6 +85,7 @@ def test_texts_of_strangers_are_text_on_every_page(hunts, page):
     shutil.move(hunts / "one", one)
     settings = one / "hunt.toml"
     text = settings.read_text().replace("crashhunt.agents:KeepLaneWithSpeed", STRANGE)
+    text = text.replace("keep_going = true", "keep_going = false")
     settings.write_text(text.replace('scenario = "loop"', f'scenario = "{STRANGE}"'))
     (one / "run.log").write_text(STRANGE)
     with closing(sqlite3.connect(one / "ledger.sqlite")) as database, database:
@@ -113,6 +114,8 @@ def test_texts_of_strangers_are_text_on_every_page(hunts, page):
             assert page.run("return window.hacked") is None
             assert page.run("return document.querySelectorAll('img, main script').length") == 0
             assert page.run("return document.documentElement.scrollWidth") <= 360, url
+            if "/compare" in url:  # hunts that stop at their first crash have no estimate
+                assert page.run("return document.querySelectorAll('#table tbody td')[3].innerText") == "-"
             if url == dashboard.url:
                 assert page.serious() == []  # which takes seconds a page
             assert not page.run("return document.querySelector('.loading').checkVisibility()")

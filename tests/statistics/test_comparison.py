@@ -190,6 +190,17 @@ def test_hunts_that_were_killed_or_stopped_are_compared_up_to_the_first_trial_th
     assert pair.answer == "second"
 
 
+def test_hunt_whose_first_trial_has_not_ended_has_no_rate_for_that_reason(tmp_path):
+    stopped = hunt(tmp_path / "stopped", 3, keep_going=False, trials=3)
+    with closing(Ledger(stopped / "ledger.sqlite", writable=True)) as ledger:
+        ledger.replace([0, 1])
+    figures = (found := crashhunt.compare(stopped, hunt(tmp_path / "whole", 3))).hunts[0]
+    assert (figures.trials, figures.excluded) == (0, 1)
+    assert figures.why_not == "trial 0 has not ended, and trials count in the order of their numbers"
+    assert f"{stopped}: no crash rate: {figures.why_not}" in describe_comparison(found)
+    assert f"{stopped}: not counted: 1 trial after one that has not ended" in describe_comparison(found)
+
+
 def test_trials_that_are_invalid_for_both_agents_leave_both_sides(tmp_path):
     few, many = hunt(tmp_path / "few", 20, trials=100), hunt(tmp_path / "many", 2, trials=100)
     invalidate(few, 0)
