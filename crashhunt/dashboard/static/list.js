@@ -11,7 +11,7 @@ const COLUMNS = [
   { key: "crashes", label: "Crashes", number: true, value: (row) => row.crashed_trials },
   { key: "types", label: "Types", number: true, value: (row) => row.kinds_count ?? -1 },
   { key: "rate", label: "Crash rate per trial", number: true, value: (row) => row.rate?.certain?.high ?? -1 },
-  { key: "newest", label: "Last new type", number: true, value: (row) => -(sinceNewestKind(row) ?? Infinity) },
+  { key: "newest", label: "Since last new type", number: true, value: (row) => -(sinceNewestKind(row) ?? Infinity) },
   { key: "curve", label: "Discovery" },
   { key: "active", label: "Last active", number: true, value: (row) => row.active_at },
 ];
@@ -119,9 +119,15 @@ function fill(row) {
 function fillTimes() {
   for (const row of rows.values()) {
     const { cells } = nodeOf(row), age = sinceNewestKind(row);
-    setText(cells.newest, age === null ? "-" : ago(age));
+    setText(cells.newest, seconds(age));
     setText(cells.active, row.active_at ? ago(now() - row.active_at) : "-");
   }
+}
+
+/* A table with a column of dashes would be too wide for some screens. */
+function hideTimesLeft() {
+  const column = COLUMNS.find((one) => one.key === "left"), isHidden = ![...rows.values()].some((row) => row.seconds_left !== null);
+  for (const cell of [column.cell, ...[...nodes.values()].map((node) => node.cells.left)]) cell.hidden = isHidden;
 }
 
 function wanted(row) {
@@ -188,6 +194,7 @@ async function refresh() {
     setText($("places"), data.roots.join(", "));
     $("begin").hidden = rows.size > 0;
     $("hunts").hidden = rows.size === 0;
+    hideTimesLeft();
     fillTotals();
     arrange();
   }
