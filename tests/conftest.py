@@ -399,6 +399,12 @@ def mostly_nightly(cases: Iterable[Any], always: Container[Any]) -> list[Any]:
     ]  # fmt: skip
 
 
+def one_in(number: int, cases: Iterable[Any]) -> list[Any]:
+    """Cases of one contract, of which one in so many runs always, and the others at night."""
+    listed = [*cases]
+    return mostly_nightly(listed, listed[::number])
+
+
 @pytest.fixture
 def shell(tmp_path: Path) -> Iterator[Shell]:
     """An empty folder with a module `faulty` of agents that go wrong."""

@@ -124,6 +124,7 @@ def test_texts_of_strangers_are_text_on_every_page(hunts, page):
     assert [fault for fault in page.faults() if "404" not in fault] == []
 
 
+@pytest.mark.nightly  # by day, the report is driven by keyboard
 def test_the_table_of_hunts_is_reached_by_keyboard(hunts, page):
     shutil.copytree(hunts / "one", hunts / "two")
     with served(hunts) as dashboard:

@@ -12,7 +12,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from conftest import mostly_nightly, rewritten
+from conftest import mostly_nightly, one_in, rewritten
 
 import crashhunt
 from crashhunt.crashes import list_bundles, names_of_actions
@@ -136,15 +136,18 @@ def test_an_environment_of_ones_own_is_part_of_the_snapshot(shell):
 
 @pytest.mark.parametrize(
     ("table", "says"),
-    [
-        ('[highway]\nid = "highway-fast-v0"\nconfig = { vehicle_count = 3 }', "did you mean 'vehicles_count'"),
-        ('[highway]\nid = "higway-v0"', "higway"),
-        ('[highway]\nid = "highway-v0"\nconfig = { observation = { type = "Sonar" } }', "Unknown observation type"),
-        ('[highway]\nid = "highway-v0"\n[agents.ego]\nroute = "r"', "agents.ego.route = 'r' is for SUMO"),
-        ('warmup_s = 5.0\n[highway]\nid = "highway-v0"', "warmup_s = 5.0 is for SUMO"),
-        ('step_length_s = 0.5\n[highway]\nid = "highway-v0"', "policy_frequency"),
-        ('[sumo]\nnet = "x.net.xml"', "add a table [highway]"),
-    ],
+    one_in(
+        3,
+        [
+            ('[highway]\nid = "highway-fast-v0"\nconfig = { vehicle_count = 3 }', "did you mean 'vehicles_count'"),
+            ('[highway]\nid = "higway-v0"', "higway"),
+            ('[highway]\nid = "highway-v0"\nconfig = { observation = { type = "Sonar" } }', "Unknown observation type"),
+            ('[highway]\nid = "highway-v0"\n[agents.ego]\nroute = "r"', "agents.ego.route = 'r' is for SUMO"),
+            ('warmup_s = 5.0\n[highway]\nid = "highway-v0"', "warmup_s = 5.0 is for SUMO"),
+            ('step_length_s = 0.5\n[highway]\nid = "highway-v0"', "policy_frequency"),
+            ('[sumo]\nnet = "x.net.xml"', "add a table [highway]"),
+        ],
+    ),
 )
 def test_a_mistake_in_a_highway_scenario_is_one_line(shell, table, says):
     (shell.folder / "scenario.toml").write_text(f'schema = 1\nsimulator = "highway"\n{table}\n')
