@@ -383,7 +383,7 @@ def read_lights(bundle: Bundle) -> JsonObject:
 def names_of_actions(bundle: Bundle, agent: str) -> tuple[str, ...]:
     """Return the name of each discrete action of an agent, such as ``SLOWER``, by number; empty if unknown.
 
-    The replay that confirms a crash writes them beside the lights: the log has the numbers only.
+    The replay that confirms a crash writes them in the file of the lights: the log has the numbers only.
     """
     found = read_lights(bundle).get("actions")
     names = found.get(agent) if isinstance(found, dict) else None

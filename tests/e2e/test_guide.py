@@ -104,6 +104,9 @@ def test_a_word_that_is_no_topic_lists_the_pages_with_this_word():
         ("install the dashboard", "dashboard", ""),
         ("vehicle at fault", "fault", ""),
         ("notes and tags", "notes", ""),
+        ("too many trials slow", "troubleshooting", "My hunt is slow"),
+        ("is the seed reproducible", "troubleshooting", "My crash does not reproduce"),
+        ("crash does not reproduce on another computer", "troubleshooting", "My crash does not reproduce"),
     ],
 )
 def test_question_of_a_new_user_is_answered_by_one_of_the_first_pages(words, topic, heading):
