@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 12
+_INTERFACE = 13
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -320,15 +320,30 @@ class Core(Protocol):
         """Return an observation of this number of values, all of which are 0."""
 
     def LaneBlock(  # noqa: N802 - a class
-        self, arrays: tuple[object, ...], middle_x: float, middle_y: float, /,
+        self, paths: Sequence[tuple[object, int, int] | None], middle_x: float, middle_y: float, window: int, /,
     ) -> _LaneBlock:  # fmt: skip
-        """Return candidates of lanes: arrays in the order of `LanesReader`, and the middle of their square."""
+        """Return candidates of lanes.
 
-    def rows_on_lanes(self, columns: Columns, lanes: Mapping[str, object], /) -> list[tuple[int, str]] | None:
-        """Return the row and the lane of each vehicle on one of these lanes; None if the scene has other actors."""
+        Args:
+            paths: The rows of each path, and the first and the last row that can be the nearest; None without a lane.
+            middle_x: x of the middle of the square, in m.
+            middle_y: y of the middle of the square, in m.
+            window: Number of rows among which the nearest row is, wherever in the square the vehicle is.
+        """
 
-    def vehicle_states(self, vehicles: _Vehicles, /) -> list[tuple[str, float, float, int]] | None:
-        """Return the lane, lateral position, acceleration and signals of vehicles; None if libsumo fails."""
+    def rows_on_lanes(
+        self, columns: Columns, lanes: Mapping[str, object], /
+    ) -> list[tuple[int, str, int, float, str]] | None:
+        """Return the vehicles on these lanes: row, lane, index on the route, position on the lane (m), route.
+
+        The result is None if the scene has other actors.
+        """
+
+    def vehicle_states(self, vehicles: _Vehicles, /) -> list[tuple[str, float, float, int, int, float, str]] | None:
+        """Return the states of vehicles that are read for observations alone; None if libsumo fails.
+
+        A state is lane, lateral position, acceleration, signals, index on the route, position on the lane, route.
+        """
 
     def columns(
         self, vehicles: _Vehicles, points: Sequence[object], headings: Sequence[float], speeds: Sequence[float], /

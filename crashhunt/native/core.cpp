@@ -16,6 +16,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <deque>
 #include <exception>
 #include <string>
 #include <utility>
@@ -70,8 +71,8 @@ struct Sumo {
     PositionOf position;
     NumberOf angle, speed;
     NumberOf driven, aside, aside_speed, along, decel, acceleration, min_gap;
-    WholeOf lane_index, stop_state, signals;
-    NameOf road, lane;
+    WholeOf lane_index, stop_state, signals, route_index;
+    NameOf road, lane, route;
     NumberAt lane_angle;
     NeighborOf follower, leader;
     Command set_speed;
@@ -135,6 +136,8 @@ PyObject *bind(PyObject *, PyObject *path) {
                  find(library, "_ZN7libsumo7Vehicle15getAccelerationE" STRING, found.acceleration) &&
                  find(library, "_ZN7libsumo7Vehicle10getSignalsE" STRING, found.signals) &&
                  find(library, "_ZN7libsumo7Vehicle12getLaneIndexE" STRING, found.lane_index) &&
+                 find(library, "_ZN7libsumo7Vehicle13getRouteIndexE" STRING, found.route_index) &&
+                 find(library, "_ZN7libsumo7Vehicle10getRouteIDE" STRING, found.route) &&
                  find(library, "_ZN7libsumo7Vehicle12getStopStateE" STRING, found.stop_state) &&
                  find(library, "_ZN7libsumo7Vehicle9getRoadIDE" STRING, found.road) &&
                  find(library, "_ZN7libsumo7Vehicle9getLaneIDE" STRING, found.lane) &&

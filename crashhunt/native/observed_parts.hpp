@@ -33,22 +33,60 @@ struct Held {
     const int64_t *whole() const { return static_cast<const int64_t *>(buffer.buf); }
 };
 
-// The candidates of the lanes around a vehicle, as _Block of sumo/_road_readers.py.
+// The candidates of the lanes around a vehicle, as _Block of sumo/_road_readers.py, with the rows where they are.
+struct CandidateLane {
+    Held rows; // of a LanePath; not held where there is no lane
+    int64_t count = 0, begin = 0, last = 0;
+    std::vector<double> x, y, squared; // of the points among which the nearest is
+};
 struct Lanes {
-    Held rows, low, high, begin, x, y, squared;
+    std::deque<CandidateLane> lanes;
     double middle_x = 0, middle_y = 0;
-    size_t lanes = 0, window = 0, columns = 0;
 };
 struct LaneBlock {
     PyObject_HEAD Lanes *lanes;
 };
 PyTypeObject *lane_block_type = nullptr;
+const size_t LANE_COLUMNS = 6; // of a row of a LanePath, which has one more
 
-// LaneBlock((rows, low, high, begin, x, y, squared), middle_x, middle_y)
+// The points among which the nearest one is while the vehicle is in the square; as _block_of.
+bool set_window(CandidateLane &lane, PyObject *rows, int64_t start, int64_t last, const Lanes &lanes, int64_t window) {
+    if (!lane.rows.hold(rows)) {
+        return false;
+    }
+    lane.count = static_cast<int64_t>(lane.rows.length(0));
+    if (lane.rows.length(1) != LANE_COLUMNS + 1 || start < 0 || last < start || last >= lane.count || window < 1) {
+        PyErr_SetString(PyExc_ValueError, "these are not the points of a lane");
+        return false;
+    }
+    const double *numbers = lane.rows.numbers();
+    const auto x = [&](int64_t row) { return numbers[static_cast<size_t>(row) * (LANE_COLUMNS + 1) + 1]; };
+    const auto y = [&](int64_t row) { return numbers[static_cast<size_t>(row) * (LANE_COLUMNS + 1) + 2]; };
+    int64_t nearest = start;
+    double least = HUGE_VAL;
+    for (int64_t row = start; row <= last; row++) {
+        const double dx = x(row) - lanes.middle_x, dy = y(row) - lanes.middle_y, squared = dx * dx + dy * dy;
+        if (squared < least) {
+            least = squared;
+            nearest = row;
+        }
+    }
+    lane.begin = std::max(start, std::min(nearest - window / 2, last + 1 - window));
+    lane.last = last;
+    for (int64_t row = lane.begin; row <= std::min(lane.begin + window - 1, last); row++) {
+        lane.x.push_back(x(row) - lanes.middle_x);
+        lane.y.push_back(y(row) - lanes.middle_y);
+        lane.squared.push_back(lane.x.back() * lane.x.back() + lane.y.back() * lane.y.back());
+    }
+    return true;
+}
+
+// LaneBlock([(rows, start, last) | None], middle_x, middle_y, window)
 PyObject *lane_block_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
-    PyObject *rows, *low, *high, *begin, *x, *y, *squared;
+    PyObject *paths, *rows;
     double middle_x, middle_y;
-    if (!PyArg_ParseTuple(arguments, "(OOOOOOO)dd", &rows, &low, &high, &begin, &x, &y, &squared, &middle_x, &middle_y)) {
+    Py_ssize_t window, start, last;
+    if (!PyArg_ParseTuple(arguments, "O!ddn", &PyList_Type, &paths, &middle_x, &middle_y, &window)) {
         return nullptr;
     }
     LaneBlock *self = reinterpret_cast<LaneBlock *>(type->tp_alloc(type, 0));
@@ -58,28 +96,17 @@ PyObject *lane_block_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
     Lanes &lanes = *(self->lanes = new Lanes());
     lanes.middle_x = middle_x;
     lanes.middle_y = middle_y;
-    bool good = lanes.rows.hold(rows) && lanes.low.hold(low) && lanes.high.hold(high) && lanes.begin.hold(begin) &&
-                lanes.x.hold(x) && lanes.y.hold(y) && lanes.squared.hold(squared);
-    if (good) {
-        lanes.lanes = lanes.x.length(0);
-        lanes.window = lanes.x.length(1);
-        lanes.columns = lanes.rows.length(1);
-        const size_t points = lanes.lanes * lanes.window;
-        const int64_t total = static_cast<int64_t>(lanes.rows.length(0));
-        good = lanes.window && lanes.columns && lanes.low.count() == lanes.lanes && lanes.high.count() == lanes.lanes &&
-               lanes.begin.count() == lanes.lanes && lanes.x.count() == points && lanes.y.count() == points &&
-               lanes.squared.count() == points;
-        for (size_t lane = 0; good && lane < lanes.lanes; lane++) {
-            good = lanes.low.whole()[lane] >= 0 && lanes.low.whole()[lane] <= lanes.high.whole()[lane] &&
-                   lanes.high.whole()[lane] < total;
+    for (Py_ssize_t number = 0; number < PyList_GET_SIZE(paths); number++) {
+        PyObject *path = PyList_GET_ITEM(paths, number);
+        CandidateLane &lane = (lanes.lanes.emplace_back(), lanes.lanes.back());
+        if (path != Py_None && (!PyTuple_CheckExact(path) || !PyArg_ParseTuple(path, "Onn", &rows, &start, &last) ||
+                                !set_window(lane, rows, start, last, lanes, window))) {
+            if (!PyErr_Occurred()) {
+                PyErr_SetString(PyExc_TypeError, "a candidate is a tuple or None");
+            }
+            Py_DECREF(self);
+            return nullptr;
         }
-        if (!good) {
-            PyErr_SetString(PyExc_ValueError, "these are not the arrays of lanes");
-        }
-    }
-    if (!good) {
-        Py_DECREF(self);
-        return nullptr;
     }
     return reinterpret_cast<PyObject *>(self);
 }
@@ -203,10 +230,6 @@ bool see(const Scene &scene, size_t row, double radius, size_t limit) {
     return true;
 }
 
-PyObject *lane_text(const std::string &lane) {
-    return PyUnicode_DecodeUTF8(lane.data(), static_cast<Py_ssize_t>(lane.size()), "surrogateescape");
-}
-
 // Whether an actor on a lane is before or behind the vehicle on its path; -1 with an exception.
 int is_on_path(PyObject *lanes, PyObject *entered, PyObject *ask, PyObject *lane, bool is_behind) {
     int found = PySet_Contains(lanes, lane);
@@ -277,7 +300,7 @@ PyObject *draft_actors(PyObject *draft, PyObject *const *given, Py_ssize_t count
         int signals = 0;
         PyObject *last = PyDict_GetItemWithError(given[5], id); // borrowed
         try {
-            lane = lane_text(sumo.lane(name));
+            lane = text_of(sumo.lane(name));
             offset = known_value(sumo.aside(name));
             acceleration = last ? (speed - PyFloat_AsDouble(last)) / step_s : known_value(sumo.acceleration(name));
             signals = sumo.signals(name);
@@ -310,7 +333,9 @@ PyObject *draft_actors(PyObject *draft, PyObject *const *given, Py_ssize_t count
 }
 
 std::vector<double> distances; // used again
-std::vector<size_t> nearest_points, chosen_lanes;
+std::vector<std::ptrdiff_t> nearest_points;
+std::vector<size_t> chosen_lanes;
+std::vector<std::pair<double, size_t>> other_lanes;
 
 // lanes(place, block, x, y, limit, (number of lanes, points, before, stride)): the columns of the part `lanes`
 PyObject *draft_lanes(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
@@ -325,55 +350,59 @@ PyObject *draft_lanes(PyObject *draft, PyObject *const *given, Py_ssize_t count)
         return nullptr;
     }
     const Lanes &lanes = *reinterpret_cast<LaneBlock *>(given[1])->lanes;
-    const size_t width = lanes.columns;
-    double *out = wanted < 0 || points < 0 ? nullptr
-                                           : part_at(draft, place, static_cast<size_t>(wanted * points) * width);
+    double *out = wanted < 0 || points < 0
+                      ? nullptr
+                      : part_at(draft, place, static_cast<size_t>(wanted * points) * LANE_COLUMNS);
     if (!out) {
         return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_ValueError, "there are no such lanes");
     }
     const double to_x = -2.0 * (x - lanes.middle_x), to_y = -2.0 * (y - lanes.middle_y);
-    const double *px = lanes.x.numbers(), *py = lanes.y.numbers(), *ps = lanes.squared.numbers();
-    distances.resize(lanes.window);
     nearest_points.clear();
     chosen_lanes.clear();
-    std::vector<std::pair<double, size_t>> others;
-    for (size_t lane = 0; lane < lanes.lanes; lane++) {
-        const size_t first = lane * lanes.window;
+    other_lanes.clear();
+    for (size_t number = 0; number < lanes.lanes.size(); number++) {
+        const CandidateLane &lane = lanes.lanes[number];
+        const double *px = lane.x.data(), *py = lane.y.data(), *ps = lane.squared.data();
+        const size_t window = lane.x.size();
+        distances.resize(window);
         double *const away = distances.data();
-        for (size_t point = 0; point < lanes.window; point++) {
-            double squared = px[first + point] * to_x;
-            squared += py[first + point] * to_y;
-            squared += ps[first + point];
+        for (size_t point = 0; point < window; point++) {
+            double squared = px[point] * to_x;
+            squared += py[point] * to_y;
+            squared += ps[point];
             away[point] = squared;
         }
-        size_t nearest_point = 0;
-        for (size_t point = 1; point < lanes.window; point++) {
-            if (away[point] < away[nearest_point]) {
-                nearest_point = point;
-            }
+        double least = HUGE_VAL;
+        for (size_t point = 0; point < window; point++) {
+            least = std::min(least, away[point]);
         }
-        nearest_points.push_back(nearest_point);
-        if (lane < 3) {
-            if (lane < static_cast<size_t>(wanted)) {
-                chosen_lanes.push_back(lane);
+        if (number >= 3) {
+            nearest_points.push_back(0);
+            if (least <= limit) {
+                other_lanes.emplace_back(least, number);
             }
-        } else {
-            others.emplace_back(away[nearest_point], lane);
+        } else if (static_cast<Py_ssize_t>(number) < wanted) {
+            chosen_lanes.push_back(number);
+        }
+        if (number < 3 || least <= limit) {
+            const auto nearest = std::find(away, away + window, least);
+            nearest_points.resize(number + 1);
+            nearest_points[number] = nearest - away;
         }
     }
-    std::sort(others.begin(), others.end());
-    for (size_t number = 0; number < others.size() && static_cast<Py_ssize_t>(number) < wanted - 3; number++) {
-        if (others[number].first <= limit) {
-            chosen_lanes.push_back(others[number].second);
-        }
+    const size_t others = static_cast<size_t>(std::max<Py_ssize_t>(wanted - 3, 0));
+    std::sort(other_lanes.begin(), other_lanes.end());
+    for (size_t number = 0; number < std::min(others, other_lanes.size()); number++) {
+        chosen_lanes.push_back(other_lanes[number].second);
     }
-    for (size_t lane : chosen_lanes) {
-        const int64_t start = lanes.begin.whole()[lane] + static_cast<int64_t>(nearest_points[lane]);
-        for (int64_t point = 0; point < points; point++) {
-            int64_t row = start + (point - before) * stride;
-            row = std::min(std::max(row, lanes.low.whole()[lane]), lanes.high.whole()[lane]);
-            memcpy(out, lanes.rows.numbers() + static_cast<size_t>(row) * width, 8 * width);
-            out += width;
+    for (size_t number : chosen_lanes) {
+        const CandidateLane &lane = lanes.lanes[number];
+        const int64_t start = lane.begin + nearest_points[number];
+        for (int64_t point = 0; point < points; point++, out += LANE_COLUMNS) {
+            const int64_t row = start + (point - before) * stride;
+            if (row >= 0 && row < lane.count) { // before and behind a lane, and where there is none, are zeros
+                memcpy(out, lane.rows.numbers() + static_cast<size_t>(row) * (LANE_COLUMNS + 1), 8 * LANE_COLUMNS);
+            }
         }
     }
     Py_RETURN_NONE;
@@ -421,7 +450,8 @@ PyObject *draft_route(PyObject *draft, PyObject *const *given, Py_ssize_t count)
     Py_RETURN_NONE;
 }
 
-// rows_on_lanes(columns, mapping of lanes) -> list of (row, lane) | None: the vehicles on these lanes
+// rows_on_lanes(columns, mapping of lanes) -> list of (row, lane, index on its route, position on the lane, route) |
+//     None: the vehicles on these lanes
 PyObject *rows_on_lanes(PyObject *, PyObject *const *given, Py_ssize_t count) {
     Columns *columns = count == 2 ? columns_of(given[0]) : nullptr;
     if (!columns || !PyDict_CheckExact(given[1]) || unbound()) {
@@ -435,14 +465,17 @@ PyObject *rows_on_lanes(PyObject *, PyObject *const *given, Py_ssize_t count) {
     PyObject *found = PyList_New(0);
     try {
         for (size_t row = 0; found && row < names.size(); row++) {
-            PyObject *lane = lane_text(sumo.lane(names[row]));
+            PyObject *lane = text_of(sumo.lane(names[row]));
             const int known = lane ? PyDict_Contains(given[1], lane) : -1;
-            PyObject *pair = known > 0 ? Py_BuildValue("(nO)", static_cast<Py_ssize_t>(row), lane) : nullptr;
+            PyObject *state = known > 0 ? Py_BuildValue("(nOidN)", static_cast<Py_ssize_t>(row), lane,
+                                                        sumo.route_index(names[row]), sumo.along(names[row]),
+                                                        text_of(sumo.route(names[row])))
+                                        : nullptr;
             Py_XDECREF(lane);
-            if (known < 0 || (known && (!pair || PyList_Append(found, pair) < 0))) {
+            if (known < 0 || (known && (!state || PyList_Append(found, state) < 0))) {
                 Py_CLEAR(found);
             }
-            Py_XDECREF(pair);
+            Py_XDECREF(state);
         }
     } catch (...) {
         Py_XDECREF(found);
@@ -460,8 +493,9 @@ PyObject *vehicle_states(PyObject *, PyObject *given) {
     PyObject *found = PyList_New(0);
     try {
         for (const std::string &name : vehicles->roster->ids) {
-            PyObject *state = found ? Py_BuildValue("(Nddi)", lane_text(sumo.lane(name)), sumo.aside(name),
-                                                    sumo.acceleration(name), sumo.signals(name))
+            PyObject *state = found ? Py_BuildValue("(NddiidN)", text_of(sumo.lane(name)), sumo.aside(name),
+                                                    sumo.acceleration(name), sumo.signals(name),
+                                                    sumo.route_index(name), sumo.along(name), text_of(sumo.route(name)))
                                     : nullptr;
             if (!state || PyList_Append(found, state) < 0) {
                 Py_CLEAR(found);

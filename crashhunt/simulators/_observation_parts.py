@@ -672,7 +672,8 @@ class ObservationLayout:
     def restore(self, array: NDArray[np.generic]) -> dict[str, NDArray[np.generic]]:
         """Return the observation that the agent receives, from its recorded array."""
         return {
-            name: array[place].reshape(shape).astype(dtype, copy=False) for name, place, shape, dtype in self._places
+            name: array[place].reshape(shape) if dtype is array.dtype else array[place].reshape(shape).astype(dtype)
+            for name, place, shape, dtype in self._places
         }
 
     def with_errors(

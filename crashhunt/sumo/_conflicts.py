@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 _UPSTREAM_M = 150.0  # actors further away are out of sight
 _CLOSE_SHARE = 0.8  # of the mean width of two lanes, which lets neighbouring lanes pass
+_MAX_PREPARING_S = 0.3  # in large networks; it has no effect on results
 _STEP_M = 0.25  # resolution of conflict areas
 
 
@@ -71,6 +73,15 @@ class Conflicts:
         self._graph = graph
         self._rules = {lane: (one, index) for one in graph.rules.values() for index, lane in enumerate(one.inside)}
         self._found: dict[str, dict[str, list[Approach]]] = {}
+
+    def prepare(self) -> None:
+        """Find the conflicts of all paths, so that trials in forks of this process need not; in a limited time."""
+        end = time.process_time() + _MAX_PREPARING_S
+        for lane in self._graph.lanes.values():
+            for link in () if lane.is_internal else lane.links:
+                if time.process_time() > end:
+                    return
+                self.around(link)
 
     def around(self, link: LaneLink) -> dict[str, list[Approach]]:
         """Return the lanes from which actors come into conflict with a path, by id; the path begins at its stop line.

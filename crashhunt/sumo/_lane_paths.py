@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import time
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from crashhunt.sumo._lane_graph import TURNS
+from crashhunt.sumo._lane_graph import TURNS, is_open
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -16,11 +18,16 @@ if TYPE_CHECKING:
 
     from crashhunt.sumo._lane_graph import GraphLane, LaneGraph
 
+    NearLanesOf = dict[tuple["Sampling", str], "NearLanes"]
+
     Array = NDArray[np.float64]
 
+NEAR_M = 50.0  # lanes are shown within this distance
+SQUARE_M = 16.0  # within squares of this size, the same lanes are candidates
 _GRID_M = 0.5  # upper bound of the distance of two prepared points
 CENTER_BEHIND_M = 8.0  # the centre of a vehicle may be this far behind its front, which is on the lane
 _NONE = -1
+_MAX_PREPARING_S = 0.3
 
 
 class LanePath(NamedTuple):
@@ -126,6 +133,45 @@ class LanePaths:
         last = min(count - 1, first + math.ceil((end - start) / grid - 1e-9))
         begin = max(0, first - math.ceil(CENTER_BEHIND_M / grid))
         return LanePath(rows, begin, first, last)
+
+
+class NearLanes:
+    """The lanes near each square of a network for one class of vehicles, and the paths straight through them.
+
+    Args:
+        graph: the lanes of the network.
+        sampling: how points are sampled.
+        vehicle_class: the class of vehicles.
+    """
+
+    def __init__(self, graph: LaneGraph, sampling: Sampling, vehicle_class: str) -> None:
+        self._graph, self._class = graph, vehicle_class
+        ahead = partial(straight_ahead, graph, vehicle_class=vehicle_class)
+        behind = partial(straight_behind, graph, vehicle_class=vehicle_class)
+        self.paths = LanePaths(graph, sampling, ahead, behind)
+        self._squares: dict[tuple[int, int], list[tuple[float, str]]] = {}
+
+    def prepare(self) -> None:
+        """Find the lanes of all squares and their paths, so that trials in forks of this process need not.
+
+        The time limit is for large networks. It has no effect on results.
+        """
+        end = time.process_time() + _MAX_PREPARING_S
+        for lane in self._graph.lanes.values():
+            if time.process_time() > end:
+                return
+            if is_open(lane.data, self._class):
+                for square in {(int(x), int(y)) for x, y in np.floor(self._graph.lines(lane).center / SQUARE_M)}:
+                    self.lanes(square)
+                self.paths.path(lane)
+
+    def lanes(self, square: tuple[int, int]) -> list[tuple[float, str]]:
+        """Return the lanes near a square, the nearest first: distance from its middle in m, id."""
+        found = self._squares.get(square)
+        if found is None:
+            x, y = ((number + 0.5) * SQUARE_M for number in square)
+            found = self._squares[square] = self._graph.near(x, y, NEAR_M + SQUARE_M, self._class)
+        return found
 
 
 def _within(lanes: Iterable[GraphLane], graph: LaneGraph, reach_m: float) -> list[GraphLane]:

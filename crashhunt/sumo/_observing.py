@@ -12,7 +12,7 @@ import numpy as np
 from crashhunt.simulators import REACH_M, History, RayCaster, layouts_of, occluded, with_reference_point
 from crashhunt.sumo._conflicts import Conflicts
 from crashhunt.sumo._ego_and_actors import ActorsReader, EgoReader
-from crashhunt.sumo._lane_graph import lane_graph
+from crashhunt.sumo._lane_graph import USUAL_CLASS, lane_graph
 from crashhunt.sumo._reader_protocol import Places, ReaderSetup
 from crashhunt.sumo._road_readers import (
     CrossingsReader,
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from crashhunt.native import Core, Draft
     from crashhunt.scenario import Scenario
     from crashhunt.sumo._lane_graph import LaneGraph
+    from crashhunt.sumo._lane_paths import NearLanesOf
     from crashhunt.sumo._reader_protocol import Moment, Reader
 
 READERS: Mapping[str, type[Reader]] = {
@@ -84,12 +85,21 @@ class ObservedParts:
         self._step_length_s = scenario.step_length_s
         self._scenario = scenario
         self._places: dict[str, Places] = {}
-        if self.layouts:
-            self.graph  # noqa: B018 - the zygote makes the simulator, so the processes of all trials share the graph
+        self._near: NearLanesOf = {}
         self._readers: dict[str, dict[str, Reader]] = {}
         self._histories: dict[str, History] = {}
         self._casters: dict[str, RayCaster] = {}
         self._drafts: dict[str, tuple[Draft, list[tuple[int, Reader]]]] = {}
+
+    def prepare(self) -> None:
+        """Prepare the network, once for all trials in forks of this process."""
+        if self.layouts:
+            self.graph  # noqa: B018 - reads the network
+        requests = [request for layout in self.layouts.values() for request in layout.parts.values()]
+        for request in (one for one in requests if one.part.name == "lanes"):
+            LanesReader.prepare(self.graph, request, USUAL_CLASS, self._near)
+        if not {"right_of_way", "stop_line", "crossings"}.isdisjoint(one.part.name for one in requests):
+            self.conflicts.prepare()
 
     @cached_property
     def graph(self) -> LaneGraph:
@@ -136,6 +146,7 @@ class ObservedParts:
                         steering=known.get(agent),
                         core=self.core,
                         reference_share=layout.reference_share,
+                        near=self._near,
                     )
                 )
                 for name, request in layout.parts.items()

@@ -340,13 +340,16 @@ class Sight:
         return low is not None and high is not None and high - low > _FLAT_M
 
 
-def _state(vehicle: str) -> tuple[str, float, float, int]:
-    """Return the values that the core reads for the observation ``actors``."""
+def _state(vehicle: str) -> tuple[str, float, float, int, int, float, str]:
+    """Return the values that the core reads for the observations ``actors`` and ``right_of_way``."""
     return (
         sumo.vehicle_getLaneID(vehicle),
         sumo.vehicle_getLateralLanePosition(vehicle),
         sumo.vehicle_getAcceleration(vehicle),
         sumo.vehicle_getSignals(vehicle),
+        sumo.vehicle_getRouteIndex(vehicle),
+        sumo.vehicle_getLanePosition(vehicle),
+        sumo.vehicle_getRouteID(vehicle),
     )
 
 

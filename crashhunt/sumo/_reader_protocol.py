@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import cos, sin
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.simulators import RequestedPart
     from crashhunt.sumo._conflicts import Conflicts
     from crashhunt.sumo._lane_graph import GraphLane, LaneGraph, RouteGuide
+    from crashhunt.sumo._lane_paths import NearLanesOf
     from crashhunt.world import RoadMap, Scene
 
 
@@ -38,6 +39,7 @@ class ReaderSetup:
             vehicle's actions contain no steering angle. The angle then follows from the yaw rate.
         core: The compiled core; None if it is not used.
         reference_share: How far the reference point is ahead of the centre, as a share of a vehicle's length.
+        near: The lanes near each square, by sampling and vehicle class, shared like the lanes.
     """
 
     agent: str
@@ -51,6 +53,7 @@ class ReaderSetup:
     steering: Callable[[], float] | None = None
     core: Core | None = None
     reference_share: float = 0.0
+    near: NearLanesOf = field(default_factory=dict)
 
     @property
     def settings(self) -> Mapping[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from itertools import repeat
 from math import cos, sin
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,25 +13,35 @@ import numpy as np
 from libsumo import _libsumo as sumo
 
 from crashhunt.sumo._lane_graph import is_open
-from crashhunt.sumo._lane_paths import CENTER_BEHIND_M, LanePaths, Sampling, straight_ahead, straight_behind
+from crashhunt.sumo._lane_paths import (
+    CENTER_BEHIND_M,
+    NEAR_M,
+    SQUARE_M,
+    LanePaths,
+    NearLanes,
+    Sampling,
+    straight_ahead,
+    straight_behind,
+)
 from crashhunt.sumo._reader_protocol import Reader
 from crashhunt.world import PERSON, is_person
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from crashhunt.native import Draft, LaneBlock
+    from crashhunt.simulators import RequestedPart
     from crashhunt.sumo._conflicts import Approach, Conflict
-    from crashhunt.sumo._lane_graph import GraphLane, LaneLink, RouteGuide, Signal
-    from crashhunt.sumo._lane_paths import LanePath
+    from crashhunt.sumo._lane_graph import GraphLane, LaneGraph, LaneLink, RouteGuide, Signal
+    from crashhunt.sumo._lane_paths import LanePath, NearLanesOf
     from crashhunt.sumo._reader_protocol import Moment, Place, ReaderSetup
+    from crashhunt.world import Scene
 
     Array = NDArray[np.float64]
+    _OnLane = tuple[str, int, float, str]  # lane, index on the route, position on the lane in m, route
 
-_NEAR_M = 50.0  # lanes are shown within this distance
-_SQUARE_M = 16.0  # within squares of this size, the same lanes are candidates
 _WINDOW_M = 24.0  # within a square, the nearest point of a lane moves less along the lane
 _NO_PERSON_M = 1000.0  # the distance of the nearest person where there is none
 _STANDING_MPS, NEVER_S = 0.1, 1000.0  # an actor that stands arrives after this time
@@ -53,31 +64,35 @@ class LanesReader(Reader):
         super().__init__(setup)
         self._graph = setup.graph
         self._lanes, points, self._columns = setup.shape
-        spacing = setup.settings["spacing"]
-        self._sampling = Sampling(
-            spacing, points, min(points - 1, math.floor(setup.settings["behind"] / spacing + 1e-9))
-        )
+        self._sampling = _sampling_of(setup.request)
+        self._near = _near_lanes(setup.graph, self._sampling, setup.places.vehicle_class, setup.near)
         self._steps = (np.arange(points) - self._sampling.before) * self._sampling.stride
-        self._window = np.arange(2 * math.ceil(_WINDOW_M / self._sampling.grid_m) + 1)
+        self._window = 2 * math.ceil(_WINDOW_M / self._sampling.grid_m) + 1
         self._paths: dict[tuple[int, int], LanePaths] = {}
-        self._others: LanePaths | None = None
         self._key: tuple[object, ...] = ()
         self._block: _Block
-        self._in_core: tuple[_Block, LaneBlock] | None = None
+        self._in_core: LaneBlock
         self._size = self._lanes, points, self._sampling.before, self._sampling.stride
+
+    @staticmethod
+    def prepare(graph: LaneGraph, request: RequestedPart, vehicle_class: str, near: NearLanesOf) -> None:
+        """Prepare what vehicles of a class share; `near` receives it."""
+        _near_lanes(graph, _sampling_of(request), vehicle_class, near).prepare()
 
     def observe(self, moment: Moment) -> Array:
         """Return the columns of ``lanes``."""
         place = self._setup.places.find(moment)
         if place is None:
             return np.zeros(self._setup.shape)
-        block = self._block_at(place)
+        if self._moves_to(place):
+            self._block = _block_of(self._candidates(place), *self._middle, np.arange(self._window))
+        block = self._block
         # The squared distances, except for a term that all points have in common.
         squared = block.x * (-2.0 * (place.x - block.middle_x))
         squared += block.y * (-2.0 * (place.y - block.middle_y))
         squared += block.squared
         nearest = squared.argmin(axis=1)
-        limit = block.limit(place)
+        limit = self._limit(place)
         chosen = list(range(min(3, self._lanes)))
         if self._lanes > 3:
             best = squared[3:].min(axis=1).tolist()
@@ -95,20 +110,31 @@ class LanesReader(Reader):
         core, place = self._setup.core, self._setup.places.find(moment)
         if place is None or core is None:
             return
-        block = self._block_at(place)
-        if self._in_core is None or self._in_core[0] is not block:
-            arrays = tuple([np.ascontiguousarray(one) for one in block[:-2]])
-            self._in_core = block, core.LaneBlock(arrays, block.middle_x, block.middle_y)
-        draft.lanes(at, self._in_core[1], place.x, place.y, block.limit(place), self._size)
+        if self._moves_to(place):
+            paths = [
+                None if one is None else (one.rows, one.begin if number < 3 else one.first, one.last)
+                for number, one in enumerate(self._candidates(place))
+            ]
+            self._in_core = core.LaneBlock(paths, *self._middle, self._window)
+        draft.lanes(at, self._in_core, place.x, place.y, self._limit(place), self._size)
 
-    def _block_at(self, place: Place) -> _Block:
-        square = math.floor(place.x / _SQUARE_M), math.floor(place.y / _SQUARE_M)
+    def _moves_to(self, place: Place) -> bool:
+        """Set the square and the lane; return whether the candidates are not those of the last step."""
+        square = math.floor(place.x / SQUARE_M), math.floor(place.y / SQUARE_M)
         key = place.lane, id(place.guide), place.number, square
-        if key != self._key:
-            self._key, self._block = key, self._made(place, square)
-        return self._block
+        if key == self._key:
+            return False
+        self._key, self._square = key, square
+        self._middle = (square[0] + 0.5) * SQUARE_M, (square[1] + 0.5) * SQUARE_M
+        return True
 
-    def _made(self, place: Place, square: tuple[int, int]) -> _Block:
+    def _limit(self, place: Place) -> float:
+        """Return the largest squared distance of a lane, without the term that all points have in common, in m²."""
+        dx, dy = place.x - self._middle[0], place.y - self._middle[1]
+        return NEAR_M * NEAR_M - dx * dx - dy * dy
+
+    def _candidates(self, place: Place) -> list[LanePath | None]:
+        """Return the paths of the own lane, the left and the right lane, then of the lanes near the square."""
         graph, places, lane = self._graph, self._setup.places, place.lane
         own = self._own_paths(place)
         around: list[LanePath | None] = [own.path(lane)]
@@ -118,22 +144,12 @@ class LanesReader(Reader):
             is_usable = other is not None and is_open(other.data, places.vehicle_class)
             sides.append(other if is_usable else None)
             around.append(own.path(other) if other is not None and is_usable else None)
-        if self._others is None:
-            vehicle_class = places.vehicle_class
-            self._others = LanePaths(
-                graph,
-                self._sampling,
-                partial(straight_ahead, graph, vehicle_class=vehicle_class),
-                partial(straight_behind, graph, vehicle_class=vehicle_class),
-            )
-        x, y = ((number + 0.5) * _SQUARE_M for number in square)
-        reach = _NEAR_M + _SQUARE_M
-        near = graph.near(x, y, reach, places.vehicle_class) if self._lanes > 3 else []
+        near = self._near.lanes(self._square) if self._lanes > 3 else []
         taken = {one.id for one in (lane, *sides) if one is not None}
         near = [one for one in near if one[1] not in taken]
-        limit = near[min(len(near), self._lanes - 3) - 1][0] + 2 * _SQUARE_M if near else 0.0
-        around += [self._others.path(graph.lanes[name]) for distance, name in near if distance <= limit]
-        return _block_of(around, x, y, self._window)
+        limit = near[min(len(near), self._lanes - 3) - 1][0] + 2 * SQUARE_M if near else 0.0
+        around += [self._near.paths.path(graph.lanes[name]) for distance, name in near if distance <= limit]
+        return around
 
     def _own_paths(self, place: Place) -> LanePaths:
         """Return the paths of the lanes on the vehicle's own road, which follow its route if they can."""
@@ -150,6 +166,18 @@ class LanesReader(Reader):
                 partial(straight_behind, self._graph, vehicle_class=vehicle_class, preferred=before),
             )
         return found
+
+
+def _sampling_of(request: RequestedPart) -> Sampling:
+    spacing, points = request.settings["spacing"], request.shape[1]
+    return Sampling(spacing, points, min(points - 1, math.floor(request.settings["behind"] / spacing + 1e-9)))
+
+
+def _near_lanes(graph: LaneGraph, sampling: Sampling, vehicle_class: str, near: NearLanesOf) -> NearLanes:
+    found = near.get((sampling, vehicle_class))
+    if found is None:
+        found = near[sampling, vehicle_class] = NearLanes(graph, sampling, vehicle_class)
+    return found
 
 
 def _along_route(guide: RouteGuide, number: int, lane: GraphLane) -> Iterator[GraphLane]:
@@ -186,11 +214,6 @@ class _Block(NamedTuple):
     squared: Array
     middle_x: float
     middle_y: float
-
-    def limit(self, place: Place) -> float:
-        """Return the largest squared distance of a lane, without the term that all points have in common, in m²."""
-        dx, dy = place.x - self.middle_x, place.y - self.middle_y
-        return _NEAR_M * _NEAR_M - dx * dx - dy * dy
 
 
 _EMPTY = np.zeros((1, 6))
@@ -385,7 +408,7 @@ class RightOfWayReader(Reader):
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
         self._graph = setup.graph
-        self._routes: dict[str, tuple[str, tuple[str, ...]]] = {}
+        self._takes: dict[tuple[int, str, int, str], list[tuple[Conflict, float]]] = {}
 
     def observe(self, moment: Moment) -> Array:
         """Return the columns of ``right_of_way``."""
@@ -409,22 +432,25 @@ class RightOfWayReader(Reader):
             return []
         scene, row, core = moment.scene, moment.row, self._setup.core
         actors = scene.roster.actors
-        present: Iterable[tuple[int, str]] | None = None
+        present: Iterable[tuple[int, _OnLane | None]] | None = None
         if core is not None and scene.columns is not None:
-            present = core.rows_on_lanes(scene.columns, approaches)
+            read = core.rows_on_lanes(scene.columns, approaches)
+            present = None if read is None else [(one[0], one[1:]) for one in read]
         front = -line
         rear = front - actors[row].length
         stop_sign = float(link.state in _STOP_STATES)
-        rows = []
-        for other, lane in ((number, "") for number in range(len(actors))) if present is None else present:
+        rows, speeds = [], scene.speeds
+        for other, state in zip(range(len(actors)), repeat(None)) if present is None else present:
             actor = actors[other]
             if other == row or actor.id in moment.hidden:
                 continue
-            speed = max(0.0, scene.speeds[other])
+            taken, position = self._taken(actor.id, state, scene, other, approaches)
             best = None
-            for conflict, place_m in self._taken(actor.id, lane, scene.headings[other], approaches):
+            for conflict, offset in taken:
+                place_m = offset + position
                 if rear > conflict.end_m or place_m - actor.length > conflict.other_end_m:
                     continue  # one of them has passed
+                speed = max(0.0, speeds[other])
                 away = conflict.other_begin_m - place_m
                 arrival = max(0.0, away) / speed if speed > _STANDING_MPS else NEVER_S if away > 0.0 else 0.0
                 must_yield = conflict.must_yield and self._goes_first(link, line, actor.id, conflict, place_m, arrival)
@@ -448,37 +474,45 @@ class RightOfWayReader(Reader):
         return conflict._replace(other_begin_m=begin, other_end_m=end), length - position
 
     def _taken(
-        self, name: str, lane: str, heading: float, approaches: Mapping[str, list[Approach]]
-    ) -> Iterator[tuple[Conflict, float]]:
-        """Yield the conflicting paths that an actor takes, and its front's distance behind their stop lines, in m.
+        self, name: str, state: _OnLane | None, scene: Scene, row: int, approaches: Mapping[str, list[Approach]]
+    ) -> tuple[Sequence[tuple[Conflict, float]], float]:
+        """Return the conflicting paths that an actor takes, and the position of its front on its lane, in m.
+
+        Each path has the distance from its stop line to the start of the lane, in m.
 
         Args:
             name: identifier of the actor.
-            lane: lane of the actor; empty if it is not known yet.
-            heading: heading of the actor, in rad.
+            state: lane of the actor, and its place; None if they are not known yet.
+            scene: the scene.
+            row: row of the actor.
             approaches: the lanes from which actors come into conflict with the path of the vehicle.
         """
         try:
             if is_person(name):
                 person = name.removeprefix(PERSON)
-                lane = sumo.person_getLaneID(person)
-                for one in approaches.get(lane, ()):
-                    yield self._on_crossing(one.conflict, lane, sumo.person_getLanePosition(person), heading)
-                return
-            found = approaches.get(lane or sumo.vehicle_getLaneID(name))
+                lane, position = sumo.person_getLaneID(person), sumo.person_getLanePosition(person)
+                heading = scene.headings[row]
+                return [
+                    self._on_crossing(one.conflict, lane, position, heading) for one in approaches.get(lane, ())
+                ], 0.0
+            if state is None:
+                lane = sumo.vehicle_getLaneID(name)
+                state = (lane, *_on_route(name)) if lane in approaches else None
+            if state is None:
+                return (), 0.0
+            lane, number, position, route = state
+            key = id(approaches), lane, number, route
+            found = self._takes.get(key)
             if found is None:
-                return
-            number, position = sumo.vehicle_getRouteIndex(name), sumo.vehicle_getLanePosition(name)
-            route = sumo.vehicle_getRouteID(name)
-            known = self._routes.get(name)
-            if known is None or known[0] != route:
-                known = self._routes[name] = route, tuple(sumo.vehicle_getRoute(name))
+                edges = tuple(sumo.vehicle_getRoute(name))
+                found = self._takes[key] = [
+                    (one.conflict, one.offset_m)
+                    for one in approaches[lane]
+                    if one.back < 0 or edges[number + one.back : number + one.back + 2] == one.edges
+                ]
         except libsumo.TraCIException:  # an actor of a recording that is played back
-            return
-        for one in found:
-            first = number + one.back
-            if one.back < 0 or known[1][first : first + 2] == one.edges:
-                yield one.conflict, one.offset_m + position
+            return (), 0.0
+        return found, position
 
     def _goes_first(
         self, link: LaneLink, line: float, name: str, conflict: Conflict, place_m: float, arrival: float
@@ -496,6 +530,12 @@ class RightOfWayReader(Reader):
             own = -float(sumo.vehicle_getWaitingTime(agent)), max(0.0, line) / own_speed
             return (-float(sumo.vehicle_getWaitingTime(name)), arrival) < own
         return True
+
+
+def _on_route(vehicle: str) -> tuple[int, float, str]:
+    """Return a vehicle's index on its route, its position on its lane in m, and its route."""
+    number, position = sumo.vehicle_getRouteIndex(vehicle), sumo.vehicle_getLanePosition(vehicle)
+    return number, position, sumo.vehicle_getRouteID(vehicle)
 
 
 def path_across(place: Place) -> tuple[LaneLink, float] | None:

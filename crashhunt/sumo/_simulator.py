@@ -39,6 +39,7 @@ from crashhunt.sumo._ego_and_actors import vehicle_data_of
 from crashhunt.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.sumo._files import StagedFiles
 from crashhunt.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
+from crashhunt.sumo._lane_graph import USUAL_CLASS
 from crashhunt.sumo._lights import LightReader
 from crashhunt.sumo._loading import VERSION, Loading, keep_xml_ready
 from crashhunt.sumo._manoeuvres import manoeuvre_paths
@@ -66,7 +67,6 @@ if TYPE_CHECKING:
 
 guard_against_agents()
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
-_USUAL_CLASS = "passenger"  # of vehicles whose type names no class
 _WINDOW_WIDTH_M = 150.0  # width of the visible part of the network when the window follows a vehicle
 _FORMS: dict[str, Callable[[], ActionForm]] = {
     "speed_and_lane": SpeedAndLaneChange,
@@ -105,6 +105,7 @@ class SumoSimulator:
         native = scenario.table(SumoSetup).native is not False
         core = core_for(VERSION, sumo.__file__) if native else None
         self._parts = ObservedParts(scenario, core)
+        self._parts.prepare()
         self.observation_layouts = self._parts.layouts
         self.observation_spaces |= {agent: layout.flat_space for agent, layout in self.observation_layouts.items()}
         if self.observation_layouts:
@@ -330,7 +331,7 @@ class SumoSimulator:
 
     def prepare_road_maps(self) -> None:
         """Read the network."""
-        self._parts.graph.lanes_for(_USUAL_CLASS)
+        self._parts.graph.lanes_for(USUAL_CLASS)
 
     def road_map(self, agent: str) -> RoadMap:
         """Return the map of the roads, with the route of a vehicle that has entered."""

@@ -538,7 +538,7 @@ LIES = {
     "Vehicles, others than before": _Crowded,
     "is_coming_or_going": lambda: not core.is_coming_or_going(),
     "vehicle_states": lambda vehicles: [
-        (lane, aside, 1.0, bits) for lane, aside, _, bits in core.vehicle_states(vehicles)
+        (lane, aside, 1.0, *rest) for lane, aside, _, *rest in core.vehicle_states(vehicles)
     ],
 }
 
