@@ -1,0 +1,43 @@
+"""Adapters of planners from PyPI: they are short, and with the planner's package they drive and replay."""
+
+from __future__ import annotations
+
+import io
+import tokenize
+from pathlib import Path
+
+import pytest
+
+import crashhunt
+from crashhunt.agents import planners
+
+ADAPTERS = sorted(path for path in Path(planners.__file__).parent.glob("*.py") if path.name != "__init__.py")
+MAX_LINES = 60  # what a user can be asked to write
+PLANNERS = {  # the class of an adapter, the package that it needs, and its form of actions
+    "fiss_agent:FissPlanner": ("fiss_planner", "trajectory"),
+    "fiss_agent:FopPlanner": ("fiss_planner", "trajectory"),
+    "frenetix_agent:Frenetix": ("frenetix", "trajectory"),
+    "mpc_agent:Mpc": ("osqp", "acceleration_steering"),
+}
+
+
+@pytest.mark.parametrize("path", ADAPTERS, ids=lambda path: path.stem)
+def test_adapter_has_at_most_60_lines_of_code(path):
+    kinds = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+    tokens = tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline)
+    lines = {line for token in tokens if token.type not in kinds for line in range(token.start[0], token.end[0] + 1)}
+    assert len(lines) <= MAX_LINES
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("scenario", ["intersection", "motorway"])
+@pytest.mark.parametrize("name", PLANNERS)
+def test_planner_drives_and_replays_to_the_bit(name, scenario, tmp_path):
+    package, action = PLANNERS[name]
+    pytest.importorskip(package)
+    agent = f"crashhunt.agents.planners.{name}"
+    options = {"scenario": scenario, "agents": {"ego": agent}, "action": action, "seed": 1, "audit": 1.0}
+    report = crashhunt.run(tmp_path / "h", 1, 1, 40, **options)
+    assert (report.outcomes, report.trial_steps) == ({"survived": 1}, 40)
+    # The trial was run again in a new process, and compared bit by bit.
+    assert (report.audit.trials, report.audit.differences, report.audit.not_finished) == (1, (), 0)
