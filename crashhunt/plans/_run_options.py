@@ -152,7 +152,7 @@ class TrialOptions(_Options):
         help="the outcomes that count as a crash. By default: collision, off_road, agent_error, simulator_error, "
         "process_died, hang. Traffic events may also count: red_light, wrong_way, off_route, stop_missed, not_moving "
         "(no motion for 60 s, or for S seconds with not_moving:S), others_collided, hard_braking (or "
-        "hard_braking:M/S² for another limit), teleport",
+        "hard_braking:M/S² for another limit), teleport, stop_sign, kerb",
         flag="--crash-on", group="what", metavar="KIND,…", separator=",",
     )  # fmt: skip
     disturb: Sequence[str] = option(

@@ -32,11 +32,15 @@ _MAX_ACCELERATION_MPS2 = 10.0
 _MAX_BRAKING_MPS2 = 15.0
 _MAX_YAW_RATE_RADPS = 1.5
 _OVER_M = 1.0  # a vehicle so far over the side of its lane is in the way of the next lane
+_RECENT_LANES = 4  # looked at before SUMO is asked for the lane below a point
 _LOOK_S, _MIN_LOOK_M = 0.5, 4.0  # how far ahead a vehicle that keeps its lane looks
 _MAX_LANES_AHEAD = 10
 _MAX_GAP_M = 5.0  # distance of a pursued trajectory from the vehicle
 _OBSTACLES = ("building", "obstacle")  # types of polygons
 _STANDING_M = 0.01  # a vehicle that moves by less in a step does not turn
+_KERB_M = 0.1  # an outline that is less off the road drives over no kerb
+_CORNERS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))  # counter-clockwise, as shares of half the size
+_ALONG_OUTLINE = tuple((ahead, left) for ahead in (1.0, -1.0, 0.5, 0.0, -0.5) for left in (1.0, -1.0))
 _MAX_SLIDE_M, _MAX_TURN_RAD = 0.2, 0.05  # distance of a trajectory's start from the vehicle, as plans predict
 
 
@@ -81,12 +85,14 @@ class FreeMotion:
         self._route, self._goal, self._last = sumo.vehicle_getRouteID(vehicle), route[-1], len(route) - 1
         self.edges = frozenset(route)
         """The edges of the route; SUMO gives a vehicle that leaves its route another one."""
-        self.hit = ""
-        """Type and identifier of the obstacle that the vehicle has driven into; empty if there is none."""
+        self.events: list[tuple[str, str]] = []
+        """The events of the last step, each with its kind and what the vehicle did."""
+        self._is_over_kerb: bool | None = None  # not known yet
         sumo.vehicle_setSpeedMode(vehicle, 0)  # SUMO would otherwise report a speed within its own limits
 
     def apply(self, action: NDArray[np.generic]) -> bool:
         """Move the vehicle by an encoded action; return whether it stays on the road and hits no obstacle."""
+        self.events.clear()
         state = self._next(action.tolist())
         if self._arrives(state):
             sumo.vehicle_remove(self._vehicle, _ARRIVED)
@@ -100,19 +106,44 @@ class FreeMotion:
                 raise
             return False  # no lane is within 100 m
         sumo.vehicle_setSpeed(self._vehicle, state.speed)
-        self.hit = self._area.obstacle_at(self._corners())
-        return not self.hit and self._area.contains(state.x, state.y, self._kind)
+        if self._area.has_obstacles and (hit := self._area.obstacle_at(self._outline(_CORNERS))):
+            self.events.append(("off_road", f"drove into the {hit}"))
+            return False
+        return self._stays_on_road()
 
-    def _corners(self) -> list[tuple[float, float]]:
-        """Return the corners of the vehicle's outline, counter-clockwise."""
+    def _stays_on_road(self) -> bool:
+        """Return whether the centre is on the road; add an event if the vehicle begins to drive over a kerb.
+
+        At the start of a road, the rear of a vehicle that has just entered may be off the road.
+        """
+        half, half_width, over = self._half - _KERB_M, self._half_width - _KERB_M, ""
+        if not self._area.has_whole(self.state, half, half_width, self._kind):
+            if not self._area.contains(self.state.x, self.state.y, self._kind):
+                return False
+            points = zip(_ALONG_OUTLINE, self._outline(_ALONG_OUTLINE, _KERB_M), strict=True)
+            outside = (place for place, point in points if not self._area.contains(*point, self._kind))
+            over = next((_words_of(*place) for place in outside), "")
+        if over and self._is_over_kerb is False:
+            self.events.append(("kerb", f"drove over the kerb with {over}"))
+        self._is_over_kerb = bool(over)
+        return True
+
+    def _outline(self, places: Sequence[tuple[float, float]], inset_m: float = 0.0) -> list[tuple[float, float]]:
+        """Return points of the vehicle's outline.
+
+        Args:
+            places: how far the points are ahead and to the left of the centre, as shares of half the size.
+            inset_m: distance of the points from the outline, to its inside, in m.
+        """
         state, (cos, sin) = self.state, (math.cos(self.state.heading), math.sin(self.state.heading))
+        half, half_width = self._half - inset_m, self._half_width - inset_m
         return [
-            (state.x + ahead * cos - left * sin, state.y + ahead * sin + left * cos)
-            for ahead, left in (
-                (self._half, self._half_width), (-self._half, self._half_width),
-                (-self._half, -self._half_width), (self._half, -self._half_width),
+            (
+                state.x + ahead * half * cos - left * half_width * sin,
+                state.y + ahead * half * sin + left * half_width * cos,
             )
-        ]  # fmt: skip
+            for ahead, left in places
+        ]
 
     def steering(self) -> float:
         """Return the steering angle of the last step in rad, positive to the left."""
@@ -374,11 +405,13 @@ class DrivableArea:
         self._boxes = np.zeros((0, 4))  # least and largest x and y of each obstacle
         self._lanes: dict[str, tuple[Sequence[tuple[float, float]], float]] = {}
         self._junctions: dict[str, Sequence[tuple[float, float]]] = {}
-        self._nearest = ""
+        self._recent: dict[str, list[str]] = {}  # lanes by vehicle class, the last one first
+        self._open: dict[tuple[str, str], list[str]] = {}
 
     def read_obstacles(self) -> None:
         """Read the obstacles of the episode."""
         self._obstacles.clear()
+        self._recent.clear()
         for name in sorted(sumo.polygon_getIDList()):
             kind, shape = sumo.polygon_getType(name), [tuple(point[:2]) for point in sumo.polygon_getShape(name)]
             if kind.partition(".")[0] in _OBSTACLES and len(shape) > 2:
@@ -386,10 +419,13 @@ class DrivableArea:
         boxes = [(*np.min(shape, axis=0), *np.max(shape, axis=0)) for _, shape in self._obstacles]
         self._boxes = np.array(boxes).reshape(-1, 4)
 
+    @property
+    def has_obstacles(self) -> bool:
+        """Whether there are obstacles in this episode."""
+        return bool(self._obstacles)
+
     def obstacle_at(self, corners: Sequence[tuple[float, float]]) -> str:
         """Return type and identifier of the first obstacle that an outline touches; empty if there is none."""
-        if not self._obstacles:
-            return ""
         (low_x, low_y), (high_x, high_y) = np.min(corners, axis=0), np.max(corners, axis=0)
         x0, y0, x1, y1 = self._boxes.T
         near = np.flatnonzero((x0 <= high_x) & (x1 >= low_x) & (y0 <= high_y) & (y1 >= low_y))
@@ -404,35 +440,84 @@ class DrivableArea:
             y: position to the north, in m.
             kind: vehicle class.
         """
-        if self._nearest and self._is_on(self._nearest, x, y):
-            return True
+        recent = self._recent.get(kind, [])
+        for place, lane in enumerate(recent):
+            if self._is_on(lane, x, y):
+                if place:
+                    recent.insert(0, recent.pop(place))
+                return True
         try:
             edge, _, lane = sumo.simulation_convertRoad(x, y, False, kind)
         except libsumo.TraCIException:
             return False  # no lane of this class is near
-        self._nearest = f"{edge}_{lane}"
-        if self._is_on(self._nearest, x, y):
-            return True
+        for found in (f"{edge}_{lane}", *self._open_lanes(edge, kind)):
+            if self._is_on(found, x, y):
+                self._recent[kind] = [found, *(one for one in recent if one != found)][:_RECENT_LANES]
+                return True
         return any(
             _is_inside(x, y, self._shape(junction))
             for junction in {sumo.edge_getFromJunction(edge), sumo.edge_getToJunction(edge)}
         )
 
+    def has_whole(self, state: MotionState, half: float, half_width: float, kind: str) -> bool:
+        """Return whether a rectangle is on one straight part of the lane that was last found for a vehicle class.
+
+        Args:
+            state: the pose of its centre.
+            half: half its length, in m.
+            half_width: half its width, in m.
+            kind: vehicle class.
+        """
+        recent = self._recent.get(kind)
+        if not recent:
+            return False
+        shape, border = self._lane(recent[0])
+        x, y, cos, sin = state.x, state.y, math.cos(state.heading), math.sin(state.heading)
+        for (ax, ay), (bx, by) in pairwise(shape):
+            dx, dy = bx - ax, by - ay
+            length = math.sqrt(dx * dx + dy * dy)
+            along, across = abs(cos * dx + sin * dy), abs(cos * dy - sin * dx)
+            reach = half * along + half_width * across  # times the length, as all lengths here
+            if (
+                reach <= (x - ax) * dx + (y - ay) * dy <= length * length - reach
+                and abs((y - ay) * dx - (x - ax) * dy) + half * across + half_width * along <= border * length
+            ):
+                return True
+        return False
+
+    def _open_lanes(self, edge: str, kind: str) -> Sequence[str]:
+        """Return the lanes of an edge that a vehicle class may use; the nearest centre line may be of another lane."""
+        found = self._open.get((edge, kind))
+        if found is None:
+            lanes = [f"{edge}_{lane}" for lane in range(sumo.edge_getLaneNumber(edge))]
+            found = self._open[edge, kind] = [one for one in lanes if kind not in sumo.lane_getDisallowed(one)]
+        return found
+
     def _is_on(self, lane: str, x: float, y: float) -> bool:
+        shape, half = self._lane(lane)
+        return any(_distance_squared(x, y, *start, *end) <= half * half for start, end in pairwise(shape))
+
+    def _lane(self, lane: str) -> tuple[Sequence[tuple[float, float]], float]:
+        """Return the centre line of a lane, and half its width in m."""
         found = self._lanes.get(lane)
         if found is None:
             found = self._lanes[lane] = (
                 [tuple(point[:2]) for point in sumo.lane_getShape(lane)],
                 sumo.lane_getWidth(lane) / 2,
             )
-        shape, half = found
-        return any(_distance_squared(x, y, *start, *end) <= half * half for start, end in pairwise(shape))
+        return found
 
     def _shape(self, junction: str) -> Sequence[tuple[float, float]]:
         found = self._junctions.get(junction)
         if found is None:
             found = self._junctions[junction] = [tuple(point[:2]) for point in sumo.junction_getShape(junction)]
         return found
+
+
+def _words_of(ahead: float, left: float) -> str:
+    """Return a place of the outline in words."""
+    side = "left" if left > 0 else "right"
+    return f"its {'front' if ahead > 0 else 'rear'} {side} corner" if abs(ahead) == 1.0 else f"its {side} side"
 
 
 def _offset_from(path: Sequence[tuple[float, float]], x: float, y: float) -> tuple[float, float]:

@@ -292,9 +292,10 @@ class SumoSimulator:
             rewards[agent] = 0.0 if row is None else scene.speed(row) * self.step_length_s
             terminations[agent] = row is None
         scene.events = self._events.look(scene, tuple(actions))
-        for agent in self._off_road:
-            if (motion := self._driving.moving.get(agent)) and motion.hit:
-                scene.events += (self._events.hit(scene, agent, motion.hit),)
+        for agent, motion in self._driving.moving.items() if self._driving.moving else ():
+            scene.events += tuple(
+                self._events.of_agent(scene, agent, *one) for one in motion.events if agent in actions
+            )
         self._shown = observations
         if scene.contacts or self._off_road:
             hit = {name for contact in scene.contacts for name in (contact.collider, contact.victim)}
@@ -508,7 +509,8 @@ class SumoSimulator:
     def _apply_alone(self, agent: str, action: NDArray[np.generic]) -> bool:
         """Apply an action; return whether the vehicle stays on the road, so that the step can stay uneventful."""
         self._off_road = [] if self._driving.apply(agent, action) else [agent]
-        return not self._off_road
+        motion = self._driving.moving.get(agent)
+        return not self._off_road and (motion is None or not motion.events)
 
     def _is_core_wrong(self, observations: Observations, usual: UsualSteps | None) -> bool:
         """Return whether the compiled core returns other values than the Python code that it replaces."""

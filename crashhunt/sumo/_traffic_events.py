@@ -157,6 +157,8 @@ class HardBraking:
 
 
 _RED_STATES = ("r", "u")  # red, and red with yellow; vehicles may pass "s" after a stop
+_STOP_STATES = ("s", "w")  # of links behind a stop sign: of one road, or of all roads of the junction
+_STOP_M = 5.0  # a vehicle that stands within this distance before the line has stopped there
 _MAX_LINKS_PER_STEP = 6  # most links that a vehicle can cross in one long step
 _DIRECTION_INTERVAL_STEPS = 10  # steps between two checks of the driving direction on the same lane
 _WRONG_WAY_COSINE = -0.5  # cosine of the angle between course and lane below which a vehicle drives the wrong way
@@ -200,6 +202,9 @@ class SumoEvents:
         self._braking.begin(agents, controlled)
         self._wrong: set[str] = set()
         self._stuck: set[tuple[str, str]] = set()
+        self._stops: dict[str, bool] = {}  # agents before a stop sign, and whether they have stopped there
+        for agent, lane in self._lanes.items():
+            self._watch_stop(agent, "", lane)
         self._standstill.begin()
 
     @property
@@ -219,7 +224,7 @@ class SumoEvents:
 
     def is_quiet(self, agent: str) -> bool:
         """Whether no event of the agent is in progress, so that the core may run the next step."""
-        return self._braking.is_quiet and agent not in self._wrong
+        return self._braking.is_quiet and agent not in self._wrong and agent not in self._stops
 
     def resume(self, scene: Scene, steps: int, followers: dict[str, str]) -> None:
         """Resume after uneventful steps: set the scene, the number of steps, and the agents' followers."""
@@ -243,10 +248,13 @@ class SumoEvents:
             if lane != before:
                 self._lanes[agent] = lane
                 self._entered(agent, before, lane, scene, found)
+                self._watch_stop(agent, before, lane)
             if lane != before or self._steps % _DIRECTION_INTERVAL_STEPS == 0:
                 self._ask_direction(agent, lane, last, scene, found)
             row = scene.roster.index[agent]
             speed = scene.speed(row)
+            if speed < Standstill.SPEED and self._stops.get(agent) is False:
+                self._stops[agent] = sumo.lane_getLength(lane) - sumo.vehicle_getLanePosition(agent) <= _STOP_M
             if speed < Standstill.SPEED and sumo.vehicle_getStopState(agent) & 1:
                 self._standstill.move(agent)  # at a planned stop
             elif stood := self._standstill.look(agent, speed):
@@ -262,9 +270,9 @@ class SumoEvents:
         self._last = scene
         return tuple(found)
 
-    def hit(self, scene: Scene, agent: str, obstacle: str) -> Event:
-        """Return the event that names the obstacle into which an agent has driven."""
-        return self._of(scene, agent, "off_road", f"{agent} drove into the {obstacle}")
+    def of_agent(self, scene: Scene, agent: str, kind: str, what: str) -> Event:
+        """Return an event of an agent that moves freely, such as ``drove into the building 'b'``."""
+        return self._of(scene, agent, kind, f"{agent} {what}")
 
     def _of(self, scene: Scene, agent: str, kind: str, what: str, others: tuple[str, ...] = ()) -> Event:
         row = scene.roster.index.get(agent)
@@ -283,7 +291,7 @@ class SumoEvents:
         )
 
     def _entered(self, agent: str, before: str, lane: str, scene: Scene, found: list[Event]) -> None:
-        """Add an event if a controlled vehicle that entered a new lane ran a red light."""
+        """Add an event if a controlled vehicle that entered a new lane ran a red light or a stop sign."""
         left, edge = before.rpartition("_")[0], lane.rpartition("_")[0]
         if left == edge:
             return  # the vehicle has changed lanes
@@ -294,6 +302,16 @@ class SumoEvents:
             speed = scene.speeds[scene.roster.index[agent]]
             what = f"{agent} ran a red light at {speed:.1f} m/s, coming from lane {before}"
             found.append(self._of(scene, agent, "red_light", what))
+        elif self._stops.get(agent) is False and ways and all(states[0] in _STOP_STATES for states in ways):
+            speed = scene.speeds[scene.roster.index[agent]]
+            what = f"{agent} ran a stop sign at {speed:.1f} m/s, coming from lane {before}"
+            found.append(self._of(scene, agent, "stop_sign", what))
+
+    def _watch_stop(self, agent: str, before: str, lane: str) -> None:
+        """Note whether a stop sign stands at the end of an agent's new lane."""
+        stopped = self._stops.pop(agent, False) and before.rpartition("_")[0] == lane.rpartition("_")[0]
+        if not lane.startswith(":") and any(link[5] in _STOP_STATES for link in sumo.lane_getLinks(lane)):
+            self._stops[agent] = stopped
 
     def _ask_direction(self, agent: str, lane: str, last: Scene, scene: Scene, found: list[Event]) -> None:
         """Add an event if the agent drives against the direction of its lane."""

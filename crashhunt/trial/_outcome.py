@@ -35,6 +35,8 @@ class Outcome(StrEnum):
     OTHERS_COLLIDED = "others_collided"
     HARD_BRAKING = "hard_braking"
     TELEPORT = "teleport"
+    STOP_SIGN = "stop_sign"
+    KERB = "kerb"
     AGENT_ERROR = "agent_error"
     SIMULATOR_ERROR = "simulator_error"
     PROCESS_DIED = "process_died"

@@ -21,6 +21,8 @@ EVENT_WORDS = {
     "others_collided": ("collision of others", "collisions of others"),
     "hard_braking": ("hard braking of another", "hard brakings of others"),
     "teleport": ("teleport", "teleports"),
+    "stop_sign": ("stop sign run", "stop signs run"),
+    "kerb": ("drive over a kerb", "drives over a kerb"),
 }
 """Each kind, in words: of one and of several."""
 

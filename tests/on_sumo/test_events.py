@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections import Counter
 from itertools import pairwise
@@ -351,3 +352,30 @@ def test_on_highway_env_a_standstill_and_driving_backwards(tmp_path):
     assert [(step, event.kind) for step, event in told] == [(39, "not_moving"), (61, "wrong_way")]
     assert told[1][1].what == "ego drove backwards on lane 0_1_1"
     simulator.close()
+
+
+STOP_ROUTE = {"stops": ("-103", "105"), "allway": ("A0A1", "A1B1")}
+
+
+@pytest.mark.parametrize("name", STOP_ROUTE)
+def test_stop_sign_is_run_by_a_vehicle_that_does_not_stand_before_the_line(drive, name, tmp_path):
+    """TraCI's own positions and speeds say where the vehicle stood; SUMO's driver stops at each sign."""
+    net, edges = NET.parent / "nets" / f"{name}.net.xml.gz", " ".join(STOP_ROUTE[name])
+    routes = f'<routes><vType id="car" sigma="0"/><route id="on" edges="{edges}"/>{{traffic}}</routes>'
+    for halts_m, expected in ((None, ["stop_sign"]), (3.0, []), (20.0, ["stop_sign"])):
+        stood = []
+
+        def act(step, halts_m=halts_m, stood=stood):
+            lane = libsumo.vehicle.getLaneID("ego")
+            rest = libsumo.lane.getLength(lane) - libsumo.vehicle.getLanePosition("ego")
+            if halts_m is None or stood.count(True) > 5 or not lane.startswith(STOP_ROUTE[name][0]):
+                return 8.0, 0
+            stood.append(libsumo.vehicle.getSpeed("ego") < 0.1)
+            return math.sqrt(max(0.0, 3.0 * (rest - halts_m))), 0
+
+        result, told = drive(act, net=net, routes=routes, route="on", dt=0.1, steps=600, depart_speed="5", speed_mode=0)
+        assert kinds(told) == expected, halts_m
+        assert result.outcome in (Outcome.FINISHED, Outcome.SURVIVED)
+        assert not expected or told[0][1].what.startswith("ego ran a stop sign at ")
+    result, told = drive(lambda _: None, net=net, routes=routes, route="on", dt=0.1, steps=900, action="sumo")
+    assert (result.outcome, kinds(told)) == (Outcome.FINISHED, [])

@@ -8,6 +8,7 @@ import shutil
 import libsumo
 import numpy as np
 import pytest
+import sumolib
 
 from crashhunt.base.errors import ActionError
 from crashhunt.oracles import Overlap
@@ -500,3 +501,37 @@ def test_vehicle_does_not_drive_backwards(start):
     drive_to(motion, x, y, heading, 2.0)
     with pytest.raises(ActionError, match="the target pose moves the vehicle backwards"):
         simulator.actions["ego"].encode((x - 0.21, y, heading, 0.1))
+
+
+def drivable(net):
+    """Return a function that says by sumolib's geometry whether a point is on a lane for cars or in a junction."""
+    edges = [edge for edge in net.getEdges(withInternal=True) if edge.allows("passenger")]
+    lanes = [(lane.getShape(), lane.getWidth() / 2) for edge in edges for lane in edge.getLanes()]
+    junctions = [node.getShape() for node in net.getNodes() if len(node.getShape()) > 2]
+    away = sumolib.geomhelper.distancePointToPolygon
+    return lambda place: (
+        any(away(place, shape) <= half for shape, half in lanes)
+        or any(sumolib.geomhelper.isWithin(place, shape) for shape in junctions)
+    )
+
+
+def test_kerb_is_driven_over_where_a_side_leaves_the_road_while_the_centre_stays_on_it(start):
+    simulator, step = start("target_pose", **EMPTY)
+    is_drivable = drivable(sumolib.net.readNet(libsumo.simulation.getOption("net-file"), withInternal=True))
+    _, y0, _ = centre()
+    said, over, before = [], [], False
+    for number in range(45):
+        x, _, _ = centre()
+        step((x + 1.2, y0 - 1.2 * math.sin(number / 8) ** 2, 0.0, 0.1))
+        x, y, heading = centre()
+        c, s = math.cos(heading), math.sin(heading)
+        half, half_width = 2.5 - 0.1, 0.9 - 0.1
+        dense = [(half * share, side * half_width) for share in np.linspace(-1, 1, 9) for side in (1, -1)]
+        now = not all(is_drivable((x + a * c - b * s, y + a * s + b * c)) for a, b in dense)
+        over += [number] if now and not before else []
+        before = now
+        said += [(number, event.what) for event in simulator.scene().events if event.kind == "kerb"]
+    assert [number for number, _ in said] == over
+    assert len(over) >= 2
+    assert all("drove over the kerb with its" in what and "right" in what for _, what in said)
+    assert simulator.agents == ["ego"]

@@ -35,10 +35,10 @@ def test_counts_in_words():
     assert [event_counts({kind: 1}) for kind in EVENT_WORDS] == [
         "1 red light run", "1 wrong-way drive", "1 route missed", "1 scheduled stop missed", "1 long standstill",
         "1 collision of others",
-        "1 hard braking of another", "1 teleport",
+        "1 hard braking of another", "1 teleport", "1 stop sign run", "1 drive over a kerb",
     ]  # fmt: skip
     assert [event_counts({kind: 2}) for kind in EVENT_WORDS] == [
         "2 red lights run", "2 wrong-way drives", "2 routes missed", "2 scheduled stops missed", "2 long standstills",
         "2 collisions of others",
-        "2 hard brakings of others", "2 teleports",
+        "2 hard brakings of others", "2 teleports", "2 stop signs run", "2 drives over a kerb",
     ]  # fmt: skip
