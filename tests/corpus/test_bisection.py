@@ -69,7 +69,7 @@ def repository(tmp_path, monkeypatch):
     return bisect
 
 
-@pytest.mark.parametrize("first", [1, 3])
+@pytest.mark.parametrize("first", [pytest.param(1, marks=pytest.mark.nightly), 3])
 def test_first_commit_with_the_crash_is_found(repository, first):
     seen = []
     found, commits, runs = repository(

@@ -10,6 +10,7 @@ from importlib.util import find_spec
 
 import pytest
 
+CHANGED = ("--code", "current", "--set", "initial_spacing=2")
 GYM = """
 schema = 1
 simulator = "gym"
@@ -118,10 +119,15 @@ def strange_folder(shell):
     return shell.folder
 
 
-def test_no_command_imports_from_the_current_folder_what_the_user_has_not_named(strange_folder, shell):
+@pytest.mark.parametrize(
+    "more",  # a confirmation begins as a replay does
+    [(), pytest.param((["agents"], ["replay", "out", *CHANGED]), marks=pytest.mark.nightly)],
+    ids=["", "more"],
+)
+def test_no_command_imports_from_the_current_folder_what_the_user_has_not_named(strange_folder, shell, more):
     for words in (
-        ["agents"], ["run", "out", "1", "2", "100", "--scenario", "highway", "--seed", "3"],
-        ["replay", "out", "--code", "current", "--set", "initial_spacing=2"], ["report", "out"],
+        ["run", "out", "1", "2", "100", "--scenario", "highway", "--seed", "3"],
+        *more, ["report", "out"],
     ):  # fmt: skip
         shell.process(*words, expect=None)
         assert not list(strange_folder.glob("*.ran")), words

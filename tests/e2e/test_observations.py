@@ -31,7 +31,7 @@ class Writes(Follows):
     def act(self, observation):
         observation["ego"][0] = 7.0
 '''
-WORDS = ("4", "60", "--scenario", "intersection", "--seed", "5", "--keep-going")
+WORDS = ("4", "60", "--scenario", "intersection", "--seed", "5", "--keep-going", "--keep", "1")
 
 
 def digests(shell, folder):

@@ -19,6 +19,7 @@ def hunt(shell, *words, name="h", trials="12", expect=0):
 def collect(shell):
     """Collect the violations of two requirements, in ``h``; for `made_once`."""
     words = ["--require", CALM, "--require", "apart=always (clearance_m > 6)", "--oracle", "none", "--keep-going"]
+    words += ["--keep", "1"]
     hunt(shell, *words)
 
 

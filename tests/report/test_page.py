@@ -6,7 +6,7 @@ import json
 import shlex
 import time
 from contextlib import closing
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -31,11 +31,12 @@ def hunted(shell):
     shell.crashhunt("run", "<b>bold&", "2", "3", "800", *words)
     with closing(Ledger(shell.folder / "<b>bold&" / layout.LEDGER, writable=True)) as ledger:
         ledger.note(notices=["SUMO omits <b>"])
+    (shell.folder / "report.json").write_text(shell.crashhunt("report", "<b>bold&", "--json").out)
 
 
 @pytest.fixture
 def hunt(shell, made_once):
-    """Three real crashes, in a directory whose name would be markup."""
+    """Three real crashes and their report, in a directory whose name would be markup."""
     return made_once(hunted, shell)
 
 
@@ -51,6 +52,13 @@ def opened(browser, path: Path) -> None:
     wait_until(lambda: browser.execute_script("return crashhuntView.crash !== null"))
 
 
+def report_of(hunt, browser) -> dict[str, Any]:
+    """Open the report of the hunt, and return what its command said."""
+    done: dict[str, Any] = json.loads((hunt.folder / "report.json").read_text())
+    opened(browser, hunt.folder / done["file"])
+    return done
+
+
 def step(browser) -> int:
     return browser.execute_script("return crashhuntView.step")
 
@@ -60,8 +68,7 @@ def text(browser, name: str) -> str:
 
 
 def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
-    done = hunt.crashhunt("report", "<b>bold&", "--json").json
-    opened(browser, hunt.folder / done["file"])
+    done = report_of(hunt, browser)
     bundles = list_bundles(hunt.folder / "<b>bold&")
     assert text(browser, "title") == "<b>bold&"  # as text, not as markup
     assert text(browser, "notices") == "SUMO omits <b>"
@@ -73,6 +80,13 @@ def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
     listed = browser.find_elements(By.CSS_SELECTOR, "#list button")
     assert sorted(button.text.split("\n")[0] for button in listed) == [bundle.id for bundle in bundles]
     assert [bundle["id"] for bundle in page_data(browser)["crashes"]] == done["crashes"]
+
+    # It opens with the animation.
+    box = browser.execute_script("return document.getElementById('scene').getBoundingClientRect()")
+    assert box["top"] < 400
+    assert text(browser, "subtitle").startswith("2 crashes in 3 trials; scenario loop")
+    order = browser.execute_script("return [...document.querySelectorAll('h2')].map((one) => one.textContent)")
+    assert [order.index(one) for one in ("Crashes", "Crash types", "The hunt in numbers", "Crash rate")] == [0, 1, 2, 4]
 
     # The scene on the canvas is the one of the log.
     for number, crash in enumerate(done["crashes"][:2]):
@@ -100,18 +114,8 @@ def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
 
 
-def test_report_opens_with_the_animation(hunt, browser):
-    opened(browser, hunt.folder / hunt.crashhunt("report", "<b>bold&", "--json").json["file"])
-    box = browser.execute_script("return document.getElementById('scene').getBoundingClientRect()")
-    assert box["top"] < 400
-    assert text(browser, "subtitle").startswith("2 crashes in 3 trials; scenario loop")
-    order = browser.execute_script("return [...document.querySelectorAll('h2')].map((one) => one.textContent)")
-    assert [order.index(one) for one in ("Crashes", "Crash types", "The hunt in numbers", "Crash rate")] == [0, 1, 2, 4]
-
-
 def test_curves_are_those_of_the_recording_for_both_vehicles(hunt, browser):
-    done = hunt.crashhunt("report", "<b>bold&", "--json").json
-    opened(browser, hunt.folder / done["file"])
+    done = report_of(hunt, browser)
     (bundle,) = (one for one in list_bundles(hunt.folder / "<b>bold&") if one.id == done["crashes"][0])
     recording, other = bundle.recording(), bundle.result.collision.other
     dt = recording.prologue.step_length_s
@@ -148,8 +152,7 @@ def test_curves_are_those_of_the_recording_for_both_vehicles(hunt, browser):
 
 
 def test_last_avoidable_step_is_one_click_away_and_shows_where_braking_leads(hunt, browser):
-    done = hunt.crashhunt("report", "<b>bold&", "--json").json
-    opened(browser, hunt.folder / done["file"])
+    report_of(hunt, browser)
     avoidable = next((number for number, crash in enumerate(page_data(browser)["crashes"]) if crash["avoidable"]), None)
     assert avoidable is not None
     browser.find_elements(By.CSS_SELECTOR, "#list button")[avoidable].click()
@@ -179,8 +182,7 @@ def test_last_avoidable_step_is_one_click_away_and_shows_where_braking_leads(hun
 
 @pytest.mark.nightly  # by day, clicks do
 def test_keys_lead_to_the_next_crash_and_show_all_names(hunt, browser):
-    done = hunt.crashhunt("report", "<b>bold&", "--json").json
-    opened(browser, hunt.folder / done["file"])
+    done = report_of(hunt, browser)
     for key, number in (("]", 1), ("]", 0), ("[", 1)):
         browser.find_element(By.TAG_NAME, "body").send_keys(key)
         wait_until(lambda number=number: text(browser, "summary") == done["crashes"][number])
@@ -194,8 +196,7 @@ def page_data(browser):
 
 
 def test_it_is_driven_by_keyboard_and_plays(hunt, browser):
-    hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
-    opened(browser, hunt.folder / "report.html")
+    report_of(hunt, browser)
     body = browser.find_element(By.TAG_NAME, "body")
     last = browser.execute_script("return crashhuntView.crash.steps") - 1
     body.send_keys(Keys.HOME)
@@ -348,7 +349,7 @@ def shortest(hunt) -> str:
 
 
 def test_click_on_vehicle_shows_its_facts_and_click_on_road_hides_them(hunt, browser):
-    opened(browser, hunt.folder / hunt.crashhunt("report", "<b>bold&", "--json").json["file"])
+    report_of(hunt, browser)
     click = (
         "const box = document.getElementById('scene').getBoundingClientRect();"
         "for (const kind of ['pointerdown', 'pointerup'])"
@@ -374,7 +375,7 @@ def test_route_and_lights_of_vehicles_are_shown_without_observations(hunt, brows
     lights = json.loads((bundle.path / "lights.json").read_text())
     lit = next(vehicle for vehicle, changes in lights["vehicles"].items() if any(brake for _, brake, _ in changes))
     step, *_ = next(change for change in lights["vehicles"][lit] if change[1])
-    opened(browser, hunt.folder / hunt.crashhunt("report", "<b>bold&", "--json").json["file"])
+    report_of(hunt, browser)
     assert browser.find_element(By.ID, "key-route").is_displayed()
     browser.execute_script("view.picked = arguments[0]; go(arguments[1])", lit, step)
     words = text(browser, "vehicle-facts").split("\n")

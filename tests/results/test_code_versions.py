@@ -116,61 +116,61 @@ def test_hunt_without_results_may_change_its_code(agent, tmp_path):
 @pytest.mark.long
 def test_versions_are_kept_apart_in_every_figure(agent, tmp_path, capsys):
     hunt = tmp_path / "h"
-    first = run(8, keep=1)
+    first = run(4, keep=1)
     failed = first.outcomes["agent_error"]
     agent(0, 1, 2, 3)
     with pytest.raises(
-        HuntDirectoryError, match="TRIALS is 8, but the first 8 trials belong to earlier code"
+        HuntDirectoryError, match="TRIALS is 4, but the first 4 trials belong to earlier code"
     ) as caught:
-        run(8, continue_with_new_code=True)
-    assert caught.value.fix.startswith("give more than 8 TRIALS")
-    report = run(14, keep=1, continue_with_new_code=True)
+        run(4, continue_with_new_code=True)
+    assert caught.value.fix.startswith("give more than 4 TRIALS")
+    report = run(7, keep=1, continue_with_new_code=True)
     newest, earlier = sorted(report.code_versions, key=lambda one: not one.is_newest)
-    assert (newest.version, newest.first, newest.trials, newest.crashes) == (2, 8, 6, 6)
-    assert (earlier.version, earlier.first, earlier.trials, earlier.crashes) == (1, None, 8, failed)
-    assert report.tally.found == sum(group.count for group in report.kinds) == 6
-    assert "newest version 2: 6 of 6 trials crashed; version 1:" in describe_hunt(report)
-    assert report.to_json()["code_versions"][1]["crashes"] == 6
+    assert (newest.version, newest.first, newest.trials, newest.crashes) == (2, 4, 3, 3)
+    assert (earlier.version, earlier.first, earlier.trials, earlier.crashes) == (1, None, 4, failed)
+    assert report.tally.found == sum(group.count for group in report.kinds) == 3
+    assert "newest version 2: 3 of 3 trials crashed; version 1:" in describe_hunt(report)
+    assert report.to_json()["code_versions"][1]["crashes"] == 3
 
     (rate,) = measure_rates(hunt, per="trial")
-    assert (rate.trials, rate.crashes, rate.estimate, rate.excluded) == (6, 6, 1.0, {"other_code": 8})
-    assert "not counted: 8 of earlier code" in describe_rates([rate])
+    assert (rate.trials, rate.crashes, rate.estimate, rate.excluded) == (3, 3, 1.0, {"other_code": 4})
+    assert "not counted: 4 of earlier code" in describe_rates([rate])
     state = hunt_state(hunt)
-    assert (state.rate["trials"], state.rate["crashes"], state.rate["certain"]["low"]) == (6, 6, rate.certain.low)
-    assert (state.crashes, [one["crashes"] for one in state.code_versions]) == (failed + 6, [failed, 6])
-    assert state.kinds[0]["count"] == 6
+    assert (state.rate["trials"], state.rate["crashes"], state.rate["certain"]["low"]) == (3, 3, rate.certain.low)
+    assert (state.crashes, [one["crashes"] for one in state.code_versions]) == (failed + 3, [failed, 3])
+    assert state.kinds[0]["count"] == 3
     results = HuntResults(hunt)
-    assert [row["code_version"] for row in results.rows()] == [1] * 8 + [2] * 6
-    assert results.trials()["code_version"].tolist() == [1] * 8 + [2] * 6
-    run(14, "other", keep=1)
+    assert [row["code_version"] for row in results.rows()] == [1] * 4 + [2] * 3
+    assert results.trials()["code_version"].tolist() == [1] * 4 + [2] * 3
+    run(7, "other", keep=1)
     comparison = compare(hunt, "other")
     figures = comparison.hunts[0]
-    assert (figures.trials, figures.crashes, figures.crash_rate, figures.outcomes) == (6, 6, 1.0, {"agent_error": 6})
+    assert (figures.trials, figures.crashes, figures.crash_rate, figures.outcomes) == (3, 3, 1.0, {"agent_error": 3})
     (pair,) = comparison.pairs
-    assert (pair.trials, pair.both) == (6, 6)
+    assert (pair.trials, pair.both) == (3, 3)
     groups = group_crashes(list_bundles(hunt), faults=False).groups
-    assert [*crashes_by_version([hunt], groups)[str(hunt)].values()] == [{1: failed, 2: 6}]
+    assert [*crashes_by_version([hunt], groups)[str(hunt)].values()] == [{1: failed, 2: 3}]
     found = find_crashes(hunt, 9)
-    assert (list(found.types.values()), found.untyped, found.tally.found) == ([6], 0, failed + 6)
+    assert (list(found.types.values()), found.untyped, found.tally.found) == ([3], 0, failed + 3)
     assert check(hunt)[0].fine
     for command in ("status", "crashes", "rate"):
         with pytest.raises(SystemExit) as ended:
             main([command, str(hunt)])
         assert ended.value.code == 0
-        assert "version 1" in (text := capsys.readouterr().out) or "8 of earlier code" in text
+        assert "version 1" in (text := capsys.readouterr().out) or "4 of earlier code" in text
 
     # A raise after results of the newest version forbids its estimate; the next version begins without it.
     assert measure_rates(hunt, per="trial")[0].estimate == 1.0
-    run(16, keep=1)
+    run(8, keep=1)
     assert measure_rates(hunt, per="trial")[0].why_not.startswith("TRIALS was changed")
     agent(0)  # the first version again
-    with pytest.raises(HuntDirectoryError, match=f"{REFUSED} 8 trials"):
-        run(20)
-    report = run(20, keep=1, continue_with_new_code=True)
+    with pytest.raises(HuntDirectoryError, match=f"{REFUSED} 4 trials"):
+        run(11)
+    report = run(11, keep=1, continue_with_new_code=True)
     newest = next(one for one in report.code_versions if one.is_newest)
-    assert (newest.version, newest.first, newest.trials, len(report.code_versions)) == (1, 16, 12, 2)
+    assert (newest.version, newest.first, newest.trials, len(report.code_versions)) == (1, 8, 7, 2)
     (rate,) = measure_rates(hunt, per="trial")
-    assert (rate.trials, rate.excluded, rate.estimate) == (4, {"other_code": 16}, rate.crashes / 4)
+    assert (rate.trials, rate.excluded, rate.estimate) == (3, {"other_code": 8}, rate.crashes / 4)
     assert HuntResults(hunt)._snapshot().digest in CodeVersions.of(HuntResults(hunt).facts).newest
 
 
