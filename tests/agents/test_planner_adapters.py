@@ -32,7 +32,7 @@ def test_adapter_has_at_most_60_lines_of_code(path):
 @pytest.mark.nightly
 @pytest.mark.parametrize("scenario", ["intersection", "motorway"])
 @pytest.mark.parametrize("name", PLANNERS)
-def test_planner_drives_and_replays_to_the_bit(name, scenario, tmp_path):
+def test_trial_of_a_planner_is_bit_identical_in_a_new_process(name, scenario, tmp_path):
     package, action = PLANNERS[name]
     pytest.importorskip(package)
     agent = f"crashhunt.agents.planners.{name}"
