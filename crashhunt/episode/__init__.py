@@ -47,7 +47,7 @@ if TYPE_CHECKING:
         set_generators as set_generators,
         stage_of as stage_of,
     )
-    from ._trial_signals import SIGNALS as SIGNALS, TrialSignals as TrialSignals
+    from ._trial_signals import INFO_KEY as INFO_KEY, SIGNALS as SIGNALS, TrialSignals as TrialSignals
     from ._worker_settings import WorkerSettings as WorkerSettings, answer_file as answer_file, scratch_of as scratch_of
 
 offer_lazily(__name__)

@@ -78,6 +78,7 @@ SIGNALS: Mapping[str, KnownSignal] = {
 _OBSERVATION = re.compile(r"observation\[(\d+)\]")
 _TRAILING_NUMBER = re.compile(r"\d+$")
 _INFO, _REWARD = "info.", "reward"
+INFO_KEY = "key of info"
 
 
 class SignalledEpisode(Protocol):
@@ -167,7 +168,7 @@ class TrialSignals:
             return self._column(int(element[1]))
         if name in self._events():
             return f"true in the steps with this event: {EVENT_WORDS[name][0]}"
-        return "reward of the step" if name == _REWARD else "key of info"
+        return "reward of the step" if name == _REWARD else INFO_KEY
 
     def _column(self, number: int) -> str:
         """Return the meaning of an element of the observation."""

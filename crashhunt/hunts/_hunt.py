@@ -19,6 +19,7 @@ from crashhunt.episode import internal_error
 from crashhunt.executors import HostConditions
 from crashhunt.hunts._next_trials import Pace, settings_of_workers
 from crashhunt.hunts._running_hunt import QUIET_WAIT_S, HuntSetup, RunningHunt, refuse_long_wait
+from crashhunt.hunts._signal_list import require_known_signals
 from crashhunt.hunts._trial_loop import run_trials
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.results import CodeVersions, HuntDirectory, resumed_versions
@@ -97,8 +98,10 @@ class Hunt:
         Raises:
             HuntDirectoryError: the directory is in use, belongs to another hunt, or cannot be written, or the disk is
                 full.
+            FormulaError: a requirement names an unknown signal.
             CrashhuntError: a process or a file failed; `InternalError` if crashhunt has a defect.
         """
+        require_known_signals(self.scenario, self.settings)
         with self._place.locked(), stop_requests() as self._stops:
             self.settings = self._place.claim(
                 self.settings, self._command, overwrite=self._overwrite, seed_given=self._seed_given

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypedDict, cast
+from typing import TYPE_CHECKING, TypedDict, cast
 
-from crashhunt.base.errors import ScenarioError
+from crashhunt.base.errors import CrashhuntError, FormulaError, ScenarioError
 from crashhunt.base.isolation import work_apart
 from crashhunt.base.temporary import temporary_folder
-from crashhunt.episode import Episode, Parts, TrialSignals, WorkerSettings
+from crashhunt.episode import INFO_KEY, SIGNALS, Episode, Parts, TrialSignals, WorkerSettings
 from crashhunt.hunts._trial_seeds import spec_of
+from crashhunt.oracles import REQUIREMENT
 from crashhunt.plans import sampler_of
+from crashhunt.requirements import parse
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from crashhunt.base.json_types import Plain
     from crashhunt.plans import HuntSettings
     from crashhunt.scenario import Scenario
@@ -46,9 +50,72 @@ def list_signals(scenario: Scenario, settings: HuntSettings) -> SignalList:
     Raises:
         ScenarioError: the trial cannot be set up.
     """
+
+    def look(episode: Episode) -> Plain:
+        episode.step()
+        signals = TrialSignals(episode)
+        found: list[SignalEntry] = [
+            {"name": name, "unit": unit, "meaning": signals.meaning(name)}
+            for name, unit in signals.known(episode.names[0]).items()
+        ]
+        return {
+            "scenario": scenario.name, "step_length_s": signals.step_length_s, "agents": list(episode.names),
+            "signals": found,
+        }  # fmt: skip
+
+    return cast("SignalList", _in_first_trial(look, scenario, settings))
+
+
+def require_known_signals(scenario: Scenario, settings: HuntSettings) -> None:
+    """Check before the first trial that the requirements of a hunt name known signals.
+
+    Without traffic events, only the environment's code knows the signals, and the first trial checks them. A step runs
+    only if a name is not one that scenes have.
+
+    Args:
+        scenario: the scenario.
+        settings: the settings of a hunt in the scenario.
+
+    Raises:
+        FormulaError: a signal is unknown; the error names the most similar one.
+    """
+    texts = [
+        oracle.partition(":")[2].partition("=") for oracle in settings.oracles if oracle.startswith(f"{REQUIREMENT}:")
+    ]
+    if not texts or not scenario.backend.reported_events:
+        return
+    usual = {*SIGNALS, *scenario.backend.reported_events} - {"speed_limit"}
+    requirements = {title: parse(formula) for title, _, formula in texts}
+    named = {name for requirement in requirements.values() for name in requirement.signals}
+    rest = {name for name in named if name not in usual and not name.startswith("observation[")}
+    if not rest:
+        return
+
+    def look(episode: Episode) -> Plain:
+        signals = TrialSignals(episode)
+        plain = {name for agent in episode.names for name in signals.known(agent)}
+        episode.step()
+        plain |= {name for agent in episode.names for name in signals.known(agent)}
+        plain |= {f"info.{name}" for name in plain if signals.meaning(name) == INFO_KEY}
+        return dict.fromkeys([*plain, *(f"{agent}.{name}" for agent in episode.names for name in plain)])
+
+    try:
+        known = {*_in_first_trial(look, scenario, settings), *(named - rest)}
+    except CrashhuntError:
+        return  # the first trial reports it
+    for title, requirement in requirements.items():
+        try:
+            requirement.require_known(known)
+        except FormulaError as error:
+            error.where = f"requirement {title}" if title != REQUIREMENT else title
+            raise
+
+
+def _in_first_trial(look: Callable[[Episode], Plain], scenario: Scenario, settings: HuntSettings) -> Plain:
+    """Return what a function reads, in a process of its own, in the first trial of a hunt before its first step."""
     spec = spec_of(0, settings, sampler_of(settings))
 
-    def look(_: object) -> Plain:
+    def work(_: object) -> Plain:
         with temporary_folder("signals") as scratch:
             parts = Parts(WorkerSettings(scenario=scenario, oracles=(), crash_on=(), scratch=scratch))
             parts.load()
@@ -57,19 +124,9 @@ def list_signals(scenario: Scenario, settings: HuntSettings) -> SignalList:
                 result = episode.start()
                 if result is not None:
                     raise ScenarioError(f"the trial cannot be set up: {result.summary}", where=scenario.origin)
-                episode.step()
-                signals = TrialSignals(episode)
-                found: list[SignalEntry] = [
-                    {"name": name, "unit": unit, "meaning": signals.meaning(name)}
-                    for name, unit in signals.known(episode.names[0]).items()
-                ]
-                agents = list(episode.names)
+                found = look(episode)
             simulator.close()
-            return {
-                "scenario": scenario.name, "step_length_s": simulator.step_length_s, "agents": agents,
-                "signals": found,
-            }  # fmt: skip
+            return found
 
     task = "the signals cannot be read"
-    read: Any = work_apart(look, task=task, timeout_s=_MAX_IMPORT_S + settings.run.timeout_s)
-    return cast("SignalList", read)
+    return work_apart(work, task=task, timeout_s=_MAX_IMPORT_S + settings.run.timeout_s)

@@ -8,12 +8,14 @@ from types import SimpleNamespace
 
 import pytest
 
+from crashhunt import run
 from crashhunt.base import layout
 from crashhunt.base.text import ABSENT_WORDS, PRESENT_WORDS
-from crashhunt.errors import ArgumentError, ScenarioError, UsageError
+from crashhunt.errors import ArgumentError, FormulaError, ScenarioError, UsageError
 from crashhunt.executors import EXCLUDED_WORDS
 from crashhunt.hunts import Preflight
 from crashhunt.hunts._preflight import WorkerNotices, _describe_end, unusable_value, why_invalid
+from crashhunt.hunts._signal_list import require_known_signals
 from crashhunt.plans import Request, plan
 from crashhunt.trial import UNUSABLE_VALUE, Failure, Outcome, TrialResult, TrialSpec
 
@@ -50,6 +52,16 @@ def test_value_that_cannot_be_compared_in_the_first_trial_is_refused_at_once():
     survived = result(0, outcome=Outcome.SURVIVED)
     assert [preflight.filter_setup_failures(one) for one in (survived, failed)] == [[survived], [failed]]
     assert unusable_value(survived) is None
+
+
+def test_unknown_signal_is_refused_before_the_first_trial(tmp_path):
+    asked = {"scenario": "intersection-two-agents", "trials": 1, "max_steps": 20, "seed": 1}
+    with pytest.raises(
+        FormulaError, match=r"requirement far: the signal 'west.gapp_m' is unknown; .* 'west.gap_m'"
+    ):
+        run(tmp_path / "h", 1, requirements=["far=always (west.gapp_m > 1 and info.speed > 0)"], **asked)
+    assert not (tmp_path / "h").exists()
+    require_known_signals(*plan(Request(requirements=("always (west.gap_m > 0 or info.speed > 0)",), **asked)))
 
 
 def test_constructor_that_needs_more_than_it_is_given_is_not_blamed_on_a_line_of_crashhunt():
