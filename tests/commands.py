@@ -44,12 +44,14 @@ CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 IMPORTED = ("cli", "api", "crashes", "executors", "hunts", "plans", "recording", "replays", "report", "snapshots")
 # What these import while they run, and whoever writes, reads and packs hunts; and what one command does that is rare.
 _WHILE_RUNNING = (
-    "crashhunt.agents._protocol", "crashhunt.corpus._cases", "crashhunt.corpus._case_runs",
-    "crashhunt.dashboard._server",
-    "crashhunt.samplers._space_filling", "crashhunt.sumo._setup_check",
-    "crashhunt.sumo._files", "crashhunt.suites._gate_runs", "crashhunt.suites._suite_file",
-    "crashhunt.analysis._whatif_runs", "encodings.ascii", "encodings.cp437", "gzip", "numpy.ma", "numpy.random",
-    "pydantic.dataclasses", "rich._emoji_codes", "rich.progress", "tomli_w", "urllib.request",
+    "crashhunt.agents._protocol", "crashhunt.analysis._shrink_runs", "crashhunt.analysis._whatif_runs",
+    "crashhunt.corpus._cases", "crashhunt.corpus._case_runs", "crashhunt.dashboard._server",
+    "crashhunt.gym._descriptor", "crashhunt.highway._descriptor", "crashhunt.results._log_reader",
+    "crashhunt.samplers._space_filling", "crashhunt.samplers._strategies", "crashhunt.simulators._toy_descriptor",
+    "crashhunt.suites._gate_runs", "crashhunt.suites._suite_file", "crashhunt.sumo._descriptor",
+    "crashhunt.sumo._files", "crashhunt.sumo._setup_check", "encodings.ascii", "encodings.cp437", "gzip",
+    "importlib.readers", "numpy.ma", "numpy.random", "pydantic.dataclasses", "rich._emoji_codes", "rich.progress",
+    "rich.status", "tomli_w", "urllib.request",
     "xml.etree.ElementTree", "xml.sax",
 )  # fmt: skip
 _FOR_COMMAND = {"compare": ("crashhunt.statistics", "scipy.stats")}  # the latter takes 0.8 s

@@ -95,10 +95,13 @@ def test_revisions_without_a_clear_status_leave_candidates(repository):
 @pytest.mark.parametrize(
     ("statuses", "good", "message"),
     [
-        (("fixed", "cannot_run"), "", "--bad HEAD: there, the crash is cannot run, and not still"),
+        pytest.param(
+            ("fixed", "cannot_run"), "", "--bad HEAD: there, the crash is cannot run, and not still",
+            marks=pytest.mark.nightly,
+        ),
         (("still", "still"), "main~1", "--good main~1: there, the crash is still, and not fixed"),
     ],
-)
+)  # fmt: skip
 def test_ends_without_the_expected_status_are_refused(repository, statuses, good, message):
     with pytest.raises(UsageError) as caught:
         repository(*statuses, good=good)

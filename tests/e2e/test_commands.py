@@ -80,7 +80,15 @@ def test_its_snapshot_output_and_digests_are_the_same(toy):
     assert said.startswith("Not here. ")
 
 
-@pytest.mark.parametrize("words", [("--help",), ("run", "h"), ("status", "nowhere", "--json"), ("--version",)])
+@pytest.mark.parametrize(
+    "words",
+    [
+        pytest.param(("--help",), marks=pytest.mark.nightly),
+        ("run", "h"),
+        pytest.param(("--version",), marks=pytest.mark.nightly),
+        pytest.param(("status", "nowhere", "--json"), marks=pytest.mark.nightly),
+    ],
+)
 def test_its_exit_code_and_output_are_the_same(shell, words):
     assert shell.crashhunt(*words, expect=None) == shell.process(*words, expect=None)
 

@@ -53,8 +53,9 @@ def test_a_crash_of_it_is_found_replayed_and_filmed(shell, scenario):
         assert shell.crashhunt("replay", "h", *who, "--json").json["verdict"] == "reproduced"
     if scenario not in ("loop", "highway"):
         return
-    shell.crashhunt("export", "h", "crash.zip")
-    assert shell.crashhunt("replay", "crash.zip", "--json").json["digest_replayed"] == crash["digest"]
+    if scenario == "loop":  # by day, tests/e2e/test_export.py
+        shell.crashhunt("export", "h", "crash.zip")
+        assert shell.crashhunt("replay", "crash.zip", "--json").json["digest_replayed"] == crash["digest"]
     shown = shell.crashhunt("show", "h").out
     assert f"step {crash['step']}" in shown
     if scenario == "highway":  # the log has the number of an action, and people read its name

@@ -86,8 +86,8 @@ def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, whom):
         pytest.param(("trials", "h"), marks=pytest.mark.nightly),
         ("scenarios",),
         ("--help",),
-        ("run", "-h"),
-        ("--version",),
+        pytest.param(("run", "-h"), marks=pytest.mark.nightly),
+        pytest.param(("--version",), marks=pytest.mark.nightly),
     ],
 )
 def test_output_that_cannot_be_written_is_one_line(toy, words):
