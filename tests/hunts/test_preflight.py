@@ -56,9 +56,7 @@ def test_value_that_cannot_be_compared_in_the_first_trial_is_refused_at_once():
 
 def test_unknown_signal_is_refused_before_the_first_trial(tmp_path):
     asked = {"scenario": "intersection-two-agents", "trials": 1, "max_steps": 20, "seed": 1}
-    with pytest.raises(
-        FormulaError, match=r"requirement far: the signal 'west.gapp_m' is unknown; .* 'west.gap_m'"
-    ):
+    with pytest.raises(FormulaError, match=r"requirement far: the signal 'west.gapp_m' is unknown; .* 'west.gap_m'"):
         run(tmp_path / "h", 1, requirements=["far=always (west.gapp_m > 1 and info.speed > 0)"], **asked)
     assert not (tmp_path / "h").exists()
     require_known_signals(*plan(Request(requirements=("always (west.gap_m > 0 or info.speed > 0)",), **asked)))
