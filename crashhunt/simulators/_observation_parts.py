@@ -379,7 +379,8 @@ PARTS: Mapping[str, Part] = {
         ),
         Part(
             name="predictions",
-            meaning="predicted positions of the actors in the rows of ``actors``, at constant velocity",
+            meaning="predicted positions of the actors in the rows of ``actors``, at constant speed: straight on, or, "
+            "where the simulator can, along the actor's lane and the lanes that follow it with the smallest turns",
             axes=("rows", "steps"),
             columns=(
                 _position("x", "x of the centre of the rectangle"),
@@ -392,6 +393,7 @@ PARTS: Mapping[str, Part] = {
                 Setting("steps", 30, 1, 1000, "", "number of times, the first one interval from now"),
                 Setting("radius", 100.0, 1.0, REACH_M, "m", "largest distance of the centres"),
                 Setting("interval", 0.1, 0.01, 10.0, "s", "time between two positions"),
+                Setting("along", 0, 0, 1, "", "what the actor drives along", ("heading", "lanes")),
             ),
             measured=("x", "y", "speed"),
         ),

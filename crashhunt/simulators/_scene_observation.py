@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt.base.errors import UsageError
 from crashhunt.simulators._bicycle_model import WHEELBASE_SHARE
 from crashhunt.simulators._kinematics_observation import kind_number
 from crashhunt.simulators._observation_parts import REACH_M, History, layouts_of
@@ -67,6 +68,10 @@ class SceneObserver:
 
     def __init__(self, setups: Mapping[str, AgentSetup]) -> None:
         self.layouts = layouts_of(setups, SCENE_PARTS)
+        for agent, layout in self.layouts.items():
+            if "predictions" in layout.parts and layout.parts["predictions"].settings["along"]:
+                where = f"agents.{agent}.observation: predictions:along is 'lanes'"
+                raise UsageError(f"{where}, which this simulator does not have", fix="leave it out")
         self.hidden: set[tuple[str, str]] = set()
         self._step_length_s = self._start_s = 0.0
         self._histories: dict[str, History] = {}

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from math import cos, sin
 from typing import TYPE_CHECKING
 
+import libsumo
 import numpy as np
 from libsumo import _libsumo as sumo
 
@@ -17,22 +20,36 @@ from crashhunt.simulators import (
     picture,
     predictions_of,
 )
+from crashhunt.sumo._lane_paths import NearLanes, Sampling
 from crashhunt.sumo._reader_protocol import Reader
+from crashhunt.world import is_person
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from crashhunt.sumo._lane_paths import LanePath
     from crashhunt.sumo._reader_protocol import Moment, ReaderSetup
 
+_MAX_SPEED_MPS, _MAX_PREDICTED_M = 60.0, 1000.0  # longer paths along lanes are straight at their end
+_SPACING_M = 1.0  # of the points of these paths
+_ALONG_COSINE = 0.5  # of the angle between an actor and its lane, below which it does not follow the lane
 _MAX_HALF_WIDTH_M = 10.0  # of a lane, and half the distance of two points of its centre line
 
 
 class PredictionsReader(Reader):
-    """Predicts the actors at constant velocity.
+    """Predicts the actors at constant speed, straight on or along lanes.
 
     Args:
         setup: The part.
     """
+
+    def __init__(self, setup: ReaderSetup) -> None:
+        super().__init__(setup)
+        horizon_s = setup.settings["interval"] * setup.shape[1]
+        reach_m = min(_MAX_PREDICTED_M, _MAX_SPEED_MPS * horizon_s)
+        self._sampling = Sampling(_SPACING_M, math.ceil(reach_m / _SPACING_M) + 1, 0)
+        self._times = setup.settings["interval"] * np.arange(1.0, setup.shape[1] + 1.0)
+        self._lanes: dict[str, NearLanes] = {}
 
     def observe(self, moment: Moment) -> NDArray[np.float64]:
         """Return the columns of ``predictions``."""
@@ -40,8 +57,70 @@ class PredictionsReader(Reader):
         near = nearest_actors(
             moment.scene, moment.row, hidden=moment.hidden, radius=settings["radius"], limit=self._setup.limit
         )
-        share, interval = self._setup.reference_share, settings["interval"]
-        return predictions_of(moment.scene, near, shape=self._setup.shape, interval=interval, reference_share=share)
+        share, interval, scene = self._setup.reference_share, settings["interval"], moment.scene
+        found = predictions_of(scene, near, shape=self._setup.shape, interval=interval, reference_share=share)
+        for place, one in enumerate(near if settings["along"] else ()):
+            actor, heading = scene.roster.actors[one.row], scene.headings[one.row]
+            path = self._path(actor.id, actor.kind)
+            if path is None:
+                continue
+            ahead, speed = share * actor.length, scene.speeds[one.row]
+            along = _along(path, one.x, one.y, heading, ahead=ahead, distances=speed * self._times)
+            if along is not None:
+                found[place, :, :3] = along
+        return found
+
+    def _path(self, actor: str, kind: str) -> LanePath | None:
+        """Return the path from an actor's lane on; None for a person, or off the lanes of the network file."""
+        try:
+            lane = None if is_person(actor) else self._setup.graph.lanes.get(sumo.vehicle_getLaneID(actor))
+        except libsumo.TraCIException:  # an actor of a recording that is played back
+            return None
+        if lane is None:
+            return None
+        lanes = self._lanes.get(kind)
+        if lanes is None:
+            lanes = self._lanes[kind] = NearLanes(self._setup.graph, self._sampling, kind)
+        return lanes.paths.path(lane)
+
+
+def _along(
+    path: LanePath, x: float, y: float, heading: float, *, ahead: float, distances: NDArray[np.floating]
+) -> NDArray[np.float64] | None:
+    """Return the positions and the heading of an actor that drives some distances along a path, shape (N, 3).
+
+    The result is None for an actor that drives across the path or against it. Behind its end, the path is straight.
+
+    Args:
+        path: the path from the actor's lane on.
+        x: x of the actor's centre, in m.
+        y: y of the actor's centre, in m.
+        heading: heading of the actor, in rad.
+        ahead: how far the reference point is ahead of the centre, in m.
+        distances: the distances, in m.
+    """
+    points = path.rows[path.begin :, 1:3]
+    if len(points) < 2:
+        return None
+    steps = np.diff(points, axis=0)
+    lengths = np.sqrt((steps * steps).sum(axis=1))
+    known = path.last + 1 - path.begin
+    nearest = min(int(((points[:known] - (x, y)) ** 2).sum(axis=1).argmin()), len(steps) - 1)
+    units = steps / np.maximum(lengths, 1e-9)[:, None]
+    if nearest and (units[nearest] @ (x - points[nearest, 0], y - points[nearest, 1])) < 0.0:
+        nearest -= 1
+    dx, dy = x - points[nearest, 0], y - points[nearest, 1]
+    ux, uy = units[nearest]
+    if ux * cos(heading) + uy * sin(heading) < _ALONG_COSINE:
+        return None
+    starts = np.append(0.0, np.cumsum(lengths))
+    at = starts[nearest] + dx * ux + dy * uy + distances
+    segment = np.clip(np.searchsorted(starts, at, side="right") - 1, 0, len(steps) - 1)
+    left = dy * ux - dx * uy
+    rest = at - starts[segment] + ahead
+    ux, uy = units[segment].T
+    place = points[segment] + np.stack((rest * ux - left * uy, rest * uy + left * ux), axis=1)
+    return np.column_stack((place, path.rows[path.begin + segment, 3]))
 
 
 class CovarianceReader(Reader):

@@ -294,6 +294,31 @@ def test_positions_are_those_of_the_reference_point(point, share, tmp_path):
             assert shown["ego"][:2] == pytest.approx(libsumo.vehicle.getPosition("ego"), abs=1e-9)
 
 
+def test_predictions_along_lanes_lead_where_actors_then_drive_that_stay_in_their_lane(tmp_path):
+    """The way that SUMO's vehicles drive in the next seconds is the independent source."""
+    parts = ("actors:rows=20", "predictions:rows=20:steps=20")
+    errors = []
+    for number, setting in enumerate(("", ":along=lanes")):
+        with closing(simulator_of("loop", tmp_path / str(number), parts[0], parts[1] + setting)) as simulator:
+            driven, seen = {}, []
+            for shown in episode(simulator, 3, 36):
+                seen.append(dict(zip(simulator.identifiers("ego"), shown["predictions"][:, -1], strict=False)))
+                for who in libsumo.vehicle.getIDList():
+                    place = (len(seen), libsumo.vehicle.getLaneIndex(who), *center(who))
+                    driven.setdefault(who, []).append(place)
+        found = []
+        for step in (1, 5, 9):
+            for who, (x, y, *_) in seen[step - 1].items():
+                way = np.array([place for place in driven[who] if place[0] >= step])
+                if np.ptp(way[:, 1]) == 0:
+                    found.append(np.hypot(way[:, 2] - x, way[:, 3] - y).min())
+        errors.append(np.array(found))
+    straight, along = errors
+    assert len(along) > 20
+    assert straight.max() > 2.0
+    assert along.max() < 1.6  # the way is known at steps of 0.1 s only
+
+
 def test_occlusion_hides_the_same_actors_in_every_part(tmp_path):
     parts = ("actors:radius=120:rows=99", "actor_ids:radius=120:rows=99", "predictions:radius=120:rows=99", "lidar2d")
     with (

@@ -8,8 +8,10 @@ from gymnasium import spaces
 from hypothesis import given, strategies as st
 
 from crashhunt.base.errors import UsageError
+from crashhunt.scenario import AgentSetup
 from crashhunt.simulators import PARTS, History, ObservationForm, ObservationLayout, parse_parts
 from crashhunt.simulators._observation_parts import modifiers_of
+from crashhunt.simulators._scene_observation import SceneObserver
 
 
 def layout_of(*words):
@@ -28,7 +30,8 @@ def test_every_part_has_a_space_of_its_shape_and_type():
         assert set(part.measured) <= {column.name for column in part.values_of_last_axis}
         for setting in part.settings:
             assert setting.low <= setting.default <= setting.high
-            (other,) = parse_parts([f"{name}:{setting.name}={setting.low:g}"], where="")
+            least = setting.choices[0] if setting.choices else f"{setting.low:g}"
+            (other,) = parse_parts([f"{name}:{setting.name}={least}"], where="")
             assert other.settings == {**one.settings, setting.name: setting.low}
 
 
@@ -163,3 +166,12 @@ def test_history_stacks_the_last_observations_with_the_present_one_last():
     ):
         with pytest.raises(UsageError, match=message):
             parse_parts(wrong, where="--observe")
+
+
+def test_predictions_along_lanes_are_refused_where_there_are_no_lanes():
+    words = ("predictions:along=lanes",)
+    with pytest.raises(
+        UsageError, match=r"agents\.ego\.observation: predictions:along is 'lanes', which this simulator does not have"
+    ):
+        SceneObserver({"ego": AgentSetup(observation=words)})
+    SceneObserver({"ego": AgentSetup(observation=("predictions:along=heading",))})
