@@ -80,6 +80,15 @@ def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
     listed = browser.find_elements(By.CSS_SELECTOR, "#list button")
     assert sorted(button.text.split("\n")[0] for button in listed) == [bundle.id for bundle in bundles]
     assert [bundle["id"] for bundle in page_data(browser)["crashes"]] == done["crashes"]
+    browser.find_element(By.XPATH, "//summary[.='The trial']").click()
+    facts = browser.find_element(By.XPATH, "//details[summary='The trial']").text
+    for words in (
+        "crash type\n",
+        " in this hunt)",
+        f"--code current --crash {done['crashes'][0]}",
+        "crashhunt export DIR ",
+    ):
+        assert words in facts
 
     # It opens with the animation.
     box = browser.execute_script("return document.getElementById('scene').getBoundingClientRect()")
