@@ -161,26 +161,26 @@ def test_a_phase_in_words():
 def test_confirmation_is_seen_while_it_runs_and_resumed_after_an_interrupt(toy):
     """Screen, status and JSON have the phase; Ctrl-C leaves the rest for the next start."""
     (toy.folder / "driver.py").write_text(SLOW)
-    words = ("run", "h", "2", "4", "99", "--scenario", "toy", "--agent", "driver:Driver", "--arg", "speed=14:20",
+    words = ("run", "h", "2", "5", "99", "--scenario", "toy", "--agent", "driver:Driver", "--arg", "speed=14:20",
              "--seed", "1", "--keep-going", "--json")  # fmt: skip
     process, states = toy.begin(*words), []
     deadline = time.monotonic() + 200
-    while not any(state.phase and state.phase["done"] >= 1 for state in states):
+    while not any(state.phase and state.phase["done"] >= 2 for state in states):
         assert time.monotonic() < deadline
         assert process.poll() is None, process.communicate()
         if (toy.folder / "h" / "ledger.sqlite").exists():
             states.append(hunt_state(toy.folder / "h"))
         time.sleep(0.2)
     state = states[-1]
-    assert (state.state, state.trials_run, state.phase["name"], state.phase["total"]) == ("running", 4, "confirming", 4)
+    assert (state.state, state.trials_run, state.phase["name"], state.phase["total"]) == ("running", 5, "confirming", 5)
     assert "confirming" in toy.crashhunt("status", "h").out
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=200)
     assert process.returncode == 130, err
     report = json.loads(out)
     confirmed = {crash["id"] for crash in report["crashes"] if crash["confirmed"]}
-    assert 1 <= len(confirmed) == 4 - report["unconfirmed"] < 4
-    assert f"Interrupted: {4 - len(confirmed)} of 4 crashes are not confirmed." in err
+    assert 2 <= len(confirmed) == 5 - report["unconfirmed"] < 5
+    assert f"Interrupted: {5 - len(confirmed)} of 5 crashes are not confirmed." in err
     assert "confirming " in err.split("Interrupted")[0]  # the log
     state = hunt_state(toy.folder / "h")
     assert (state.state, state.phase) == ("interrupted", None)
@@ -188,7 +188,7 @@ def test_confirmation_is_seen_while_it_runs_and_resumed_after_an_interrupt(toy):
     done = toy.crashhunt(*words)
     assert (done.json["unconfirmed"], done.json["stopped_because"]) == (0, "all_trials")
     assert all(crash["confirmed"] for crash in done.json["crashes"])
-    assert f"confirming {len(confirmed)} of 4" in done.err
+    assert f"confirming {len(confirmed)} of 5" in done.err
     with closing(Ledger(toy.folder / "h" / "ledger.sqlite")) as ledger:
         assert ledger.facts().get("phase") is None
 
