@@ -43,10 +43,10 @@ class Paced(Generic[T]):
 
     def __init__(self, make: Callable[[], T]) -> None:
         self._make = make
-        self._made: tuple[int, T] | None = None
+        self._made: tuple[object, T] | None = None
         self._due = 0.0
 
-    def __call__(self, version: int, *, now: bool = False) -> T:
+    def __call__(self, version: object, *, now: bool = False) -> T:
         """Return the value, which may be out of date.
 
         Args:
@@ -105,7 +105,9 @@ class RateWatch:
                 rate takes too long.
         """
         sequence = self.sequence
-        version = sequence.valid + sequence.invalid + sequence.not_random + sequence.trained_on
+        # A trial that waits for one of a lower number changes no count, but the reason why there is no rate.
+        counted = sequence.valid + sequence.invalid + sequence.not_random + sequence.trained_on
+        version = counted, sequence.excluded > 0
         return self._paced(version, now=now)
 
     def _running(self) -> RunningRate:

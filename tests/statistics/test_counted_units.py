@@ -293,6 +293,15 @@ def test_running_rate_is_that_of_the_trials_in_a_row_and_no_bar_ends_it(kinds, r
     json.dumps(found, allow_nan=False)
 
 
+def test_running_rate_names_the_trial_that_others_wait_for():
+    watch = RateWatch(RULE, "trial", ["collision"])
+    assert watch.running(now=True)["why_not"] == "no valid trial has finished"
+    watch.add_facts(trial(1, crashed=True))
+    assert watch.running(now=True)["why_not"].startswith("trial 0 has not ended")
+    watch.add_facts(trial(0))
+    assert watch.running(now=True)["crashes"] == 1
+
+
 def test_running_rate_is_made_again_only_where_something_has_changed():
     made = []
     paced = Paced(lambda: made.append(1) or len(made))
