@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import io
+import sys
 import tokenize
 from pathlib import Path
 
@@ -19,6 +21,20 @@ PLANNERS = {  # the class of an adapter, the package that it needs, and its form
     "frenetix_agent:Frenetix": ("frenetix", "trajectory"),
     "mpc_agent:Mpc": ("osqp", "acceleration_steering"),
 }
+PACKAGES = {  # what an adapter may import beside NumPy and the standard library; SciPy comes with OSQP
+    "commonroad_program": {"commonroad", "commonroad_clcs", "commonroad_dc", "commonroad_rp"},
+    "fiss_agent": {"fiss_planner"},
+    "frenetix_agent": {"frenetix"},
+    "mpc_agent": {"osqp", "scipy"},
+}
+
+
+@pytest.mark.parametrize("path", ADAPTERS, ids=lambda path: path.stem)
+def test_adapter_imports_only_its_planner(path):
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
+    assert {name.split(".")[0] for name in names} - sys.stdlib_module_names <= PACKAGES[path.stem] | {"numpy"}
 
 
 @pytest.mark.parametrize("path", ADAPTERS, ids=lambda path: path.stem)

@@ -34,6 +34,7 @@ class FissPlanner:
         size.rear_axle_to_center, size.max_speed = vehicle.rear_axle_offset, vehicle.max_speed
         size.max_accel, size.max_decel = vehicle.max_acceleration, vehicle.emergency_deceleration
         config.planner, config.desired_speed = fp.make_config(self.planner_type), desired_speed
+        self.curvature = math.tan(vehicle.max_steering) / vehicle.wheelbase
         self.planner = fp.LocalPlanner(config, size)
 
     def reset(self, seed):
@@ -53,10 +54,12 @@ class FissPlanner:
                 place = int(number), *row[1:4], math.hypot(*row[4:6]), *row[7:9]
                 others.append(fp.predict_lane_following(self.roads, *place, 6.0, 0.1))
         plan = self.planner.step(time, state, others).trajectory
-        # The planner derives headings from places, which turn at random where the vehicle stands: keep the last one.
-        moving = np.maximum.accumulate(np.where(np.array(plan.v) > 0.3, np.arange(len(plan.v)), -1))
-        yaw = np.where(moving < 0, heading, np.array(plan.yaw)[moving])
-        return np.column_stack((np.maximum(plan.t, 0.0), plan.x, plan.y, yaw, plan.v))[:64]
+        # The planner derives headings from places, which turn at random where the vehicle is slow: turn as wheels can.
+        yaw = [heading]
+        for angle, v in zip(plan.yaw, plan.v, strict=True):
+            most = max(v, 0.0) * 0.1 * self.curvature
+            yaw.append(yaw[-1] + min(max(math.remainder(angle - yaw[-1], math.tau), -most), most))
+        return np.column_stack((np.maximum(plan.t, 0.0), plan.x, plan.y, yaw[1:], plan.v))[:64]
 
 
 class FopPlanner(FissPlanner):
