@@ -522,7 +522,7 @@ def test_kerb_is_driven_over_where_a_side_leaves_the_road_while_the_centre_stays
     said, over, before = [], [], False
     for number in range(45):
         x, _, _ = centre()
-        step((x + 1.2, y0 - 1.2 * math.sin(number / 8) ** 2, 0.0, 0.1))
+        step((x + 1.2, y0 - 0.9 * math.sin(number / 8) ** 2, 0.2 * math.sin(number / 5), 0.1))
         x, y, heading = centre()
         c, s = math.cos(heading), math.sin(heading)
         half, half_width = 2.5 - 0.1, 0.9 - 0.1
