@@ -38,6 +38,7 @@ _COLOURS, _MIN_PICTURE_PIXELS = (1, 3), 16
 _ACTOR_SHADE, _LANE_SHADE = 40, 200  # of the cells of a grid, of 255
 _PLAN_SHAPE, _POSE_NAMES = 5, ("x", "y", "heading", "time")
 _PLAN_START_M, _MAX_ACCELERATION_MPS2 = 3.0, 10.0  # bounds of the place of the first planned pose
+_MAX_TABLE_ROWS, _MAX_TABLE_STEPS = 64, 100  # of an observed matrix
 _MAX_CURVES = 12  # of observed values
 _KM = 1000.0
 _STATES = ("green", "yellow", "red", "off or blinking")
@@ -91,6 +92,8 @@ def player_layers(
     pictures = _pictures(recording, channel)
     if seen := _seen(recording, channel):
         found["seen"] = seen
+    if table := _seen_table(recording, channel):
+        found["seenTable"] = table
     more = {**({"plan": plan} if plan else {}), **({"pictures": pictures} if pictures else {})}
     return {**found, **more, **_observed(recording, channel, origin)}
 
@@ -252,6 +255,19 @@ def _seen(recording: Recording, channel: AgentChannel) -> dict[str, object]:
     names = list(channel.observation_names)
     names = names if len(names) == size else [f"observation[{place}]" for place in range(size)]
     return {"names": names, "values": packed_floats(values)}
+
+
+def _seen_table(recording: Recording, channel: AgentChannel) -> dict[str, object]:
+    """Return an observed matrix with named columns, such as highway-env's Kinematics, at each of the last steps."""
+    shape, names = channel.observation_shape, channel.observation_names
+    if channel.observation_parts or len(shape) != 2 or len(names) != shape[1] or shape[0] > _MAX_TABLE_ROWS:
+        return {}
+    first = max(0, recording.steps - _MAX_TABLE_STEPS)
+    steps = recording.all_steps[first + 1 : recording.steps + 1]  # a step has the observation of the scene before it
+    nothing = np.full(shape, np.nan)
+    values = [np.asarray(step.observations.get(channel.id, nothing), float) for step in steps]
+    packed = packed_floats(np.array(values).reshape(-1))
+    return {"first": first, "names": list(names), "rows": shape[0], "values": packed} if values else {}
 
 
 def _is_picture(channel: AgentChannel) -> bool:

@@ -74,7 +74,7 @@ async function load(crash) {
   const [own, behind] = crash.danger ? await Promise.all([crash.danger, crash.behind].map(unpack)) : [null, null];
   Object.assign(crash, { values, ttcs: ttc, gaps: gap, acts: actions, dangers: own, behinds: behind });
   for (const layer of [crash.plan, ...Object.values(crash.observed?.layers ?? {})].filter(Boolean)) layer.array = await unpack(layer.values);
-  if (crash.seen) crash.seen.array = await unpack(crash.seen.values);
+  for (const seen of [crash.seen, crash.seenTable].filter(Boolean)) seen.array = await unpack(seen.values);
   for (const picture of Object.values(crash.pictures ?? {})) picture.array = await unpackBytes(picture.bytes);
   crash.bent = new Map((crash.bends || []).map(([step, actor, line]) => [step * crash.actors.length + actor, line]));
   crash.road = new Path2D();
@@ -89,6 +89,21 @@ async function load(crash) {
     crash.road.closePath();
   }
 }
+
+/* The observed matrix of a step, such as highway-env's Kinematics; rows of zeros have no actor. */
+function showSeen() {
+  const table = view.crash.seenTable;
+  $("seen-box").hidden = !table;
+  if (!table || !$("seen-box").open) return;
+  const width = table.names.length, begin = (view.step - table.first) * table.rows * width;
+  const rows = Array.from({ length: table.rows }, (_, row) => [row, ...table.array.slice(begin + row * width, begin + (row + 1) * width)]);
+  const shown = begin < 0 ? [] : rows.filter((row) => row.length > 1 && row.slice(1).some(Boolean));
+  const lines = [["row", ...table.names], ...shown.map((row) => row.map((value) => formatNumber(value + 0)))]; // -0 is 0
+  const widths = lines[0].map((_, column) => Math.max(...lines.map((line) => line[column].length)));
+  const text = lines.map((line) => line.map((cell, column) => cell.padStart(widths[column])).join("  ")).join("\n");
+  $("seen").textContent = shown.length ? text : `no observation is shown at this step; those of steps ${table.first} to ${table.first + table.array.length / table.rows / width - 1} are`;
+}
+$("seen-box").addEventListener("toggle", () => { if (view.crash) showSeen(); });
 
 /* The last steps are those that matter. */
 $("steps").closest("details").addEventListener("toggle", () => { $("steps").scrollTop = $("steps").scrollHeight; });
@@ -806,7 +821,7 @@ function go(step) {
   $("scrub").setAttribute("aria-valuetext", `step ${view.step}`);
   draw();
 }
-function draw() { if (view.crash) { drawScene(); drawPictures(); drawPlot(); showNow(); showPicked(); $("observed").setAttribute("aria-pressed", String(view.observed)); $("ids").setAttribute("aria-pressed", String(view.ids)); $("whole").setAttribute("aria-pressed", String(view.whole)); $("follow").setAttribute("aria-pressed", String(view.follow)); } }
+function draw() { if (view.crash) { drawScene(); drawPictures(); drawPlot(); showNow(); showSeen(); showPicked(); $("observed").setAttribute("aria-pressed", String(view.observed)); $("ids").setAttribute("aria-pressed", String(view.ids)); $("whole").setAttribute("aria-pressed", String(view.whole)); $("follow").setAttribute("aria-pressed", String(view.follow)); } }
 function pause() { view.playing = false; $("play").textContent = "Play"; }
 function play() {
   if (view.step >= view.crash.steps - 1) go(view.crash.nearest === null ? 0 : begin(view.crash));

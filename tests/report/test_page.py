@@ -204,6 +204,22 @@ def page_data(browser):
     return json.loads(browser.execute_script("return document.getElementById('data').textContent"))
 
 
+def test_observed_matrix_of_a_step_is_that_of_the_recording(hunt, browser):
+    report_of(hunt, browser)
+    shown = browser.execute_script("return crashhuntView.crash.id")
+    recording = next(one for one in list_bundles(hunt.folder / "<b>bold&") if one.id == shown).recording()
+    browser.execute_script("document.getElementById('seen-box').open = true; go(crashhuntView.crash.steps - 4)")
+    wait_until(lambda: text(browser, "seen"))
+    names, *rows = (line.split() for line in text(browser, "seen").splitlines())
+    seen = recording.all_steps[step(browser) + 1].observations["ego"]  # with which the next step was decided
+    assert names == ["row", "presence", "x", "y", "vx", "vy", "cos_h", "sin_h"]
+    values = np.array([[float(cell.replace(",", "")) for cell in row[1:]] for row in rows])
+    assert len(values) >= 2
+    assert values == pytest.approx(seen[[int(row[0]) for row in rows]], rel=6e-3, abs=1e-4)
+    browser.execute_script("go(crashhuntView.crash.steps - 1)")
+    assert text(browser, "seen").startswith("no observation is shown at this step; those of steps ")
+
+
 def test_it_is_driven_by_keyboard_and_plays(hunt, browser):
     report_of(hunt, browser)
     body = browser.find_element(By.TAG_NAME, "body")
