@@ -215,7 +215,17 @@ def _shot(
         crash_step=recording.steps if crashed else -1,
         panels=panels,
         meanings=meanings or names_of_actions(bundle, bundle.driver),
+        crash_words=_crash_words(result.outcome),
     )
+
+
+def _crash_words(outcome: Outcome) -> str:
+    """Return the text that a film shows at the end: only a traffic crash is called a crash."""
+    from crashhunt.oracles import REQUIREMENT
+
+    if outcome.category == "traffic crash":
+        return "CRASH"
+    return "VIOLATION" if outcome == REQUIREMENT else str(outcome).replace("_", " ").upper()
 
 
 def add_replay(commands: Commands) -> None:

@@ -79,6 +79,7 @@ class Shot:
         panels: pictures of the agent's own panels, by step and label.
         meanings: names of the agent's discrete actions, if they are known.
         nearest: for a near miss, the step around which the film is made; -1 for a crash, with which the film ends.
+        crash_words: text above the step of the crash.
     """
 
     recording: Recording
@@ -89,6 +90,7 @@ class Shot:
     panels: Mapping[int, Mapping[str, NDArray[np.uint8]]]
     meanings: Sequence[str] = ()
     nearest: int = -1
+    crash_words: str = "CRASH"
 
 
 class Layout:
@@ -181,6 +183,7 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
             scale=options.scale,
             crash_step=shot.crash_step,
             nearest_step=shot.nearest,
+            crash_words=shot.crash_words,
         )
         builtin = None
         if options.panels:

@@ -52,6 +52,7 @@ class SceneView:
         scale: scale of the picture, in pixels per metre.
         crash_step: step at which to mark the crash; -1 for none.
         nearest_step: step at which to mark the nearest moment of a near miss, for a second; -1 for none.
+        crash_words: text above the marked crash.
     """
 
     def __init__(
@@ -66,6 +67,7 @@ class SceneView:
         scale: float = 8.0,
         crash_step: int = -1,
         nearest_step: int = -1,
+        crash_words: str = "CRASH",
     ) -> None:
         self.width, self.height = width, height
         self._recording = recording
@@ -76,7 +78,7 @@ class SceneView:
         shrink = min(1.0, width / _FULL_SIZE_PIXELS[0], height / _FULL_SIZE_PIXELS[1])
         self._shrink = max(_MIN_SHRINK, shrink)
         self._has_legend = width >= _MIN_LEGEND_PIXELS[0] and height >= _MIN_LEGEND_PIXELS[1]
-        self._crash_step, self._nearest_step = crash_step, nearest_step
+        self._crash_step, self._crash_words, self._nearest_step = crash_step, crash_words, nearest_step
         self._second = round(1.0 / recording.prologue.step_length_s)
         self._center = np.zeros(2)
         self._trail = round(_TRAIL_S / recording.prologue.step_length_s)
@@ -125,7 +127,7 @@ class SceneView:
     def _marked(self, step: int) -> str:
         """Return the text above a marked step; empty if the step is not marked."""
         if step == self._crash_step:
-            return "CRASH"
+            return self._crash_words
         # One picture alone would be gone before anybody has seen it.
         since = step - self._nearest_step
         return "NEAREST" if self._nearest_step >= 0 and 0 <= since <= self._second else ""

@@ -233,6 +233,14 @@ def ring_of(found):
     return np.array([(columns.min() + columns.max()) / 2 - 200, 200 - (rows.min() + rows.max()) / 2]) / 8.0
 
 
+def test_words_above_a_crash_are_those_that_are_given():
+    step = {"ego": (2.5, 0.0, 0.0, 10.0)}
+    found = recording(step, step, actors=[CAR])
+    drawn = [view(found, width=400, height=400, crash_step=1, crash_words=words).draw(1) for words in ("", "CRASH")]
+    red = [(np.abs(picture[:60].astype(int) - CRASH).max(axis=2) < 40).sum() for picture in drawn]
+    assert red[0] == 0 < 100 < red[1]
+
+
 def test_ring_of_a_crash_is_where_the_outlines_meet():
     # ego, 5 m long and 2 m wide, drives east and touches with its left front corner a truck that crosses ahead.
     step = {"ego": (2.5, 0.0, 0.0, 10.0), "other": (4.0, 0.9, -np.pi / 2, 5.0)}
