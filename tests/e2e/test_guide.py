@@ -195,7 +195,7 @@ def test_every_module_is_listed_with_what_it_is_about():
 def test_every_file_that_the_architecture_names_is_there():
     text = find_page("architecture").file.read_text()
     top = Path(crashhunt.__file__).parent
-    for name in re.findall(r"`((?:\w+/)+\w+\.(?:py|html))`", text):
+    for name in re.findall(r"`((?:\w+/)+\w+\.(?:py|cpp|hpp|html|js))`", text):
         if "NAME" not in name:
             assert (top / name).is_file() or (top.parent / name).is_file(), name
 
