@@ -108,7 +108,6 @@ if TYPE_CHECKING:
         read_notes as read_notes,
         remove_note as remove_note,
         subject_of as subject_of,
-        tags_of as tags_of,
         unreadable_notes as unreadable_notes,
     )
     from ._types import (

@@ -81,11 +81,6 @@ def unreadable_notes(hunt: Path) -> list[int]:
     return _read_lines(hunt)[2]
 
 
-def tags_of(notes: Iterable[Note]) -> list[str]:
-    """Return the tags of notes without repetitions, in the order in which they were added."""
-    return list(dict.fromkeys(tag for note in notes for tag in note.tags))
-
-
 def add_note(hunt: Path, crash: str, text: str, tags: Sequence[str] = ()) -> Note:
     """Add a note to a hunt or a crash.
 

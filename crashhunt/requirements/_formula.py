@@ -31,11 +31,6 @@ class Window:
     end_s: float | None = None
     span: Span = (0, 0)
 
-    @property
-    def is_unbounded(self) -> bool:
-        """Whether the window has no farther bound."""
-        return self.end_s is None
-
 
 @dataclass(frozen=True, slots=True)
 class Number:

@@ -22,7 +22,6 @@ from crashhunt.crashes import (
     read_notes,
     remove_note,
     subject_of,
-    tags_of,
     unreadable_notes,
 )
 from crashhunt.errors import BundleError, HuntDirectoryError, UsageError
@@ -52,7 +51,7 @@ def test_notes_are_found_by_crash_and_by_words(tmp_path):
     assert [note.text for note in read_notes(tmp_path, "000001-collision")] == ["brakes late"]
     assert [note.text for note in read_notes(tmp_path, "")] == ["the whole hunt"]
     found = read_notes(tmp_path)
-    assert tags_of(found) == ["Nightly", "to-fix", "late"]
+    assert [note.tags for note in found] == [("Nightly",), ("to-fix", "late"), ()]
     assert [note.number for note in found if note.matches(["LATE", "to-fix"])] == [2]
     assert [note.number for note in found if note.matches(["nightly"])] == [1]
     assert [note.number for note in found if note.matches(["000001"])] == [2, 3]
