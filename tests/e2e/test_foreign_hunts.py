@@ -108,8 +108,10 @@ def test_commands_that_only_read_still_do(theirs):
         ("trials", "h"),
         ("crashes", "h"),
         ("check", "h"),
+        ("export", "h", "again.zip"),
         ("export", "their.zip", "again.zip"),
         ("corpus", "list", "corpus"),
+        ("replay", "h", "--from-log"),
         ("replay", "their.zip", "--from-log"),
         ("trust", "h"),
     ):

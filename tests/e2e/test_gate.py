@@ -142,8 +142,8 @@ def test_crash_that_comes_back_in_the_corpus_of_head_is_worse_without_any_trial(
             (("drivers:Calm", "HEAD"), "'drivers:Calm' is an agent and 'HEAD' is a commit; give two commits, or two"),
             (("HEAD", "HEAD", "--agent", "crashhunt.agents:RandomAgent"), "'crashhunt.agents' is imported from"),
             (
-                ("drivers:Calm", "drivers:Nobody"),
-                "HEAD (drivers:Nobody): the hunt cannot run: 'drivers:Nobody': drivers has",
+                ("drivers:Calm", "drivers:Missing"),
+                "HEAD (drivers:Missing): the hunt cannot run: 'drivers:Missing': drivers has",
             ),
             (("drivers:Calm", "drivers:Wild", "--most", "0"), "--most is 0; give at least 1"),
             (

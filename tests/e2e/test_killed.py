@@ -312,7 +312,7 @@ def test_what_is_written_is_whole_or_not_there(toy, made_once, monkeypatch, word
     count = killed(command, NEVER)
     made = {*toy.folder.iterdir()} - before
     whole = {path: described(path) for path in made}
-    for step in spread(count, 2, seed=len(words)):
+    for step in spread(count, 4, seed=len(words)):
         for path in {*toy.folder.iterdir()} - before:
             remove_tree(path)
         assert killed(command, step) == 0

@@ -151,7 +151,7 @@ def test_futures_on_highway_env_exist_where_it_draws_random_numbers(shell, made_
             (("--overrule", "brake"), "--overrule brake needs a step"),
             (("--overrule", "fly", "--before", "1"), "fly"),
             (("--arg", "speed=1"), "--arg speed has no effect without --agent"),
-            (("--agent", "nowhere:Nobody"), "nowhere"),
+            (("--agent", "nowhere:Missing"), "nowhere"),
             (("--agent", "bus=crashhunt.agents:CarFollowing"), "there is no agent 'bus'"),
             (("--agent", "a:B", "--set", "speed=1"), "--set and --agent contradict each other"),
             (("--set", "sped=1"), "'sped'"),

@@ -599,7 +599,7 @@ class _StopsAndGoes:
 )
 def test_parts_of_observations_are_the_same_bit_by_bit(run, scenario, parts):
     (ours, simulator), (theirs, _) = (
-        run(scenario, native=native, steps=80, parts=parts, agent=_StopsAndGoes()) for native in (None, False)
+        run(scenario, native=native, steps=160, parts=parts, agent=_StopsAndGoes()) for native in (None, False)
     )
     assert simulator._sight.core is core
     assert not simulator.notices

@@ -113,9 +113,9 @@ def kinds(told):
     ),
 )
 def test_red_lights_are_those_that_another_way_of_counting_finds(drive, route, dt):
-    """Every four seconds of a cycle of 40: the signal's own state, and the lane before and after each step."""
+    """Every two seconds of a cycle of 40: the signal's own state, and the lane before and after each step."""
     total = 0
-    for departs in range(0, 40, 4):
+    for departs in range(0, 40, 2):
         seen = []
 
         def act(step, seen=seen):
@@ -137,7 +137,7 @@ def test_red_lights_are_those_that_another_way_of_counting_finds(drive, route, d
         assert kinds(told) == ["red_light"] * expected
         assert result.outcome in (Outcome.FINISHED, Outcome.SURVIVED)
         total += expected
-    assert 3 <= total <= 7
+    assert 6 <= total <= 14
 
 
 def test_red_light_of_the_second_junction_in_a_step_is_seen(drive):

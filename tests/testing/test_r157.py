@@ -142,7 +142,7 @@ def test_vehicles_in_sumo_give_the_same_answers(kind, tmp_path):
     rng = np.random.default_rng(7)
     ranges = {name: (low + (high - low) * 0.02, high * 0.3) for name, (low, high) in r157._KINDS[kind].columns.items()}
     names = [*ranges]
-    rows = [[f"{rng.uniform(*ranges[name]):.3f}" for name in names] for _ in range(15)]
+    rows = [[f"{rng.uniform(*ranges[name]):.3f}" for name in names] for _ in range(40)]
     (tmp_path / "cases.csv").write_text("\n".join([",".join(names), *(",".join(row) for row in rows)]))
     for simulator in ("kinematic", "sumo"):
         words = [kind, str(tmp_path / "cases.csv"), str(tmp_path / f"{simulator}.csv"), "--simulator", simulator]
