@@ -153,7 +153,7 @@ def replayed_shot(report: ReplayReport, chosen: ReplayOptions) -> Shot:
 
     folder = chosen.look.panels[1] if chosen.look is not None and chosen.look.panels is not None else None
     panels = load_panels(folder) if folder is not None else {}
-    meanings = load_meanings(folder).get(report.bundle.driver) if folder is not None else None
+    meanings = load_meanings(folder).get(report.bundle.driver, ()) if folder is not None else ()
     crashed = report.replayed.outcome in report.rerun.worker.crash_on
     return _shot(report.bundle, report.recording, report.replayed, panels, crashed=crashed, meanings=meanings)
 
@@ -186,7 +186,7 @@ def _shot(
     panels: Mapping[int, Mapping[str, NDArray[np.uint8]]],
     *,
     crashed: bool,
-    meanings: Sequence[str] | None = None,
+    meanings: Sequence[str] = (),
 ) -> Shot:
     from crashhunt.crashes import most_dangerous, names_of_actions
     from crashhunt.recording import read_lanes

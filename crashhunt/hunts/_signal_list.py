@@ -84,6 +84,7 @@ def require_known_signals(scenario: Scenario, settings: HuntSettings) -> None:
     ]
     if not texts or not scenario.backend.reported_events:
         return
+    # Only some simulators know the speed limit, so the episode has to be asked for it.
     usual = {*SIGNALS, *scenario.backend.reported_events} - {"speed_limit"}
     requirements = {title: parse(formula) for title, _, formula in texts}
     named = {name for requirement in requirements.values() for name in requirement.signals}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
@@ -82,7 +83,6 @@ class Story:
         self.nearest = most_dangerous(self.recording) if bundle.is_near_miss else None
         near = self.nearest
         self.agent, self.other = (near.agent, near.other) if near else (bundle.driver, hit.other if hit else "")
-        self.action_words = names_of_actions(bundle, self.agent)
         compact = self.recording.compact
         self._is_whole = compact is None  # otherwise actors are missing that criticality and closest approach need
         self.danger = danger_course(self.recording, self.agent) if compact is None else None
@@ -97,6 +97,11 @@ class Story:
         if braking is not None:
             drove_into = hit is not None and hit.role == "collider"
             self.escape = last_escape(self.recording, self.agent, self.other, braking=braking) if drove_into else None
+
+    @cached_property
+    def action_words(self) -> tuple[str, ...]:
+        """The name of each discrete action of the agent, by number; empty if unknown."""
+        return names_of_actions(self.bundle, self.agent)
 
     def to_json(self) -> dict[str, object]:
         """Return the story in the form that ``show --json`` prints."""
