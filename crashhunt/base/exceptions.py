@@ -71,6 +71,8 @@ _CRASHHUNT_FOLDER = str(PACKAGE)
 _IMPORT_SYSTEM_FILES = ("<", importlib.__file__)  # of importing itself
 # Users look for their mistakes neither in the standard library nor in installed packages.
 _LIBRARY_FOLDERS = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
+INSTALLED_FOLDERS = frozenset(("site-packages", "dist-packages"))
+"""Names of folders with installed packages, also outside of Python's own folders; a version identifies a package."""
 
 
 def in_words(error: BaseException) -> str:
@@ -80,7 +82,8 @@ def in_words(error: BaseException) -> str:
 
 def is_users(filename: str) -> bool:
     """Return whether a source file belongs to the user, and not to crashhunt, an installed package or Python."""
-    return not filename.startswith((_CRASHHUNT_FOLDER, *_LIBRARY_FOLDERS, *_IMPORT_SYSTEM_FILES))
+    ours_or_pythons = (_CRASHHUNT_FOLDER, *_LIBRARY_FOLDERS, *_IMPORT_SYSTEM_FILES)
+    return not filename.startswith(ours_or_pythons) and INSTALLED_FOLDERS.isdisjoint(Path(filename).parts)
 
 
 def blamed(what: str, error: BaseException, *, fix: str = "correct the code") -> PluginError:
@@ -108,7 +111,7 @@ def place_of(error: BaseException) -> str:
         if not frame.filename.startswith(_IMPORT_SYSTEM_FILES)
     ]
     found = [frame for frame in frames if not frame.filename.startswith(_CRASHHUNT_FOLDER)]
-    own = [frame for frame in found if not frame.filename.startswith(_LIBRARY_FOLDERS)]
+    own = [frame for frame in found if is_users(frame.filename)]
     last = (own or found)[-1:]
     return f"{shown_path(last[0].filename)}, line {last[0].lineno}" if last else ""
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base.errors import PluginError
-from crashhunt.base.exceptions import in_words, place_of
+from crashhunt.base.exceptions import INSTALLED_FOLDERS, in_words, place_of
 from crashhunt.base.extras import install_command
 from crashhunt.base.programs import factory_of, is_program
 from crashhunt.base.text import did_you_mean, one_of
@@ -274,9 +274,6 @@ def add_current_folder(*, always_last: bool | None = None) -> CurrentFolder:
     return made
 
 
-_INSTALLED = frozenset(("site-packages", "dist-packages"))
-
-
 class CurrentFolder:
     """Finds modules in the current folder that neither Python nor crashhunt's dependencies have, installed or not."""
 
@@ -318,7 +315,7 @@ def describe_unused_clone(module: types.ModuleType) -> str:
     """Return that a package of the current folder is not used, because the installed one is; empty if there is none."""
     name, used = module.__name__, Path(module.__file__ or "")
     clone = Path.cwd() / name / "__init__.py"
-    if _INSTALLED.isdisjoint(used.parts) or not clone.is_file() or clone.resolve() == used.resolve():
+    if INSTALLED_FOLDERS.isdisjoint(used.parts) or not clone.is_file() or clone.resolve() == used.resolve():
         return ""
     fix = "install your clone with pip install -e, or rename its folder"
     return f"the package ./{name} in the current folder is not used: {name} is imported from {used.parent}. Fix: {fix}"

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NoReturn, TypedDict
 from crashhunt.base import layout
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
-from crashhunt.base.exceptions import is_users
+from crashhunt.base.exceptions import INSTALLED_FOLDERS, is_users
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.opened_files import OpenedFiles
 from crashhunt.base.programs import is_native
@@ -73,7 +73,6 @@ if TYPE_CHECKING:
 EXCLUDED_WORDS = " are left out: "
 """Text of a notice between "probes" or "branches" and the reason why they are disabled."""
 _EXCLUDED_FROM_HERE_WORDS = " are left out from here on: "
-_INSTALLED = frozenset(("site-packages", "dist-packages"))  # names of folders; a version identifies what they contain
 
 # Bound here, before any agent is imported that could replace them.
 _dumps, _leave, _open, _dup2, _close = json.dumps, os._exit, os.open, os.dup2, os.close
@@ -375,7 +374,7 @@ def notices_of_late_imports(before: frozenset[str], code: Sequence[str]) -> list
             if "." in name or not isinstance(file, str) or not is_users(file):
                 continue
             path = Path(file).resolve()
-            if _INSTALLED.isdisjoint(path.parts) and not any(path.is_relative_to(folder) for folder in code):
+            if INSTALLED_FOLDERS.isdisjoint(path.parts) and not any(path.is_relative_to(folder) for folder in code):
                 folder = path.parent.parent if path.stem == "__init__" else path.parent
                 found.append(
                     f"the module {name!r} is not in the snapshot, because it is imported only during a trial: replays "

@@ -17,6 +17,7 @@ from crashhunt.base import layout
 from crashhunt.base.binaries import describe_binary
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import BundleError, SnapshotError, UsageError, remedy
+from crashhunt.base.exceptions import INSTALLED_FOLDERS
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree
 from crashhunt.base.git import query
 from crashhunt.base.integrity import describe_files, digest_of_content, digest_of_data, digest_of_file
@@ -127,7 +128,7 @@ def _not_installed(places: Mapping[str, Path | None]) -> set[str]:
 
 def _is_installed(place: Path | None) -> bool:
     """Return whether a module is installed, so that its version identifies it."""
-    if place is None or not {"site-packages", "dist-packages"}.isdisjoint(place.parts):
+    if place is None or not INSTALLED_FOLDERS.isdisjoint(place.parts):
         return True
     return f"{place}{os.sep}".startswith(_installed_places())
 

@@ -51,10 +51,14 @@ def test_other_errors_are_not_explained(project, name):
 def test_files_of_the_user_are_named_and_those_of_others_are_not(project):
     outside = project.folder / "elsewhere.bin"
     outside.write_text("")
+    installed = project.folder / "lib" / "site-packages" / "torch.so"  # pip install --target, and PYTHONPATH
+    installed.parent.mkdir(parents=True)
+    installed.write_text("")
     opened = [
         project.copy / "build" / "libplanner.so", project.tree / "build" / "libplanner.so", outside,
         project.copy / "agent.py", project.tree / "agent.py", project.copy / "nothing", project.folder / "nothing",
         sys.executable, os.__file__, pytest.__file__, "/etc/passwd", "/proc/self/maps", project.tree / ".git" / "HEAD",
+        installed,
     ]  # fmt: skip
     said = describe_unsaved(map(str, opened), project.snapshot, since=time.time() + 9)
     assert [line.partition(",")[0] for line in said] == [
