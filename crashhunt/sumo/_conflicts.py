@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from crashhunt.sumo._lane_graph import MAX_PREPARING_S
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -18,7 +20,6 @@ if TYPE_CHECKING:
 
 _UPSTREAM_M = 150.0  # actors further away are out of sight
 _CLOSE_SHARE = 0.8  # of the mean width of two lanes, which lets neighbouring lanes pass
-_MAX_PREPARING_S = 0.3  # in large networks; it has no effect on results
 _STEP_M = 0.25  # resolution of conflict areas
 
 
@@ -76,7 +77,7 @@ class Conflicts:
 
     def prepare(self) -> None:
         """Find the conflicts of all paths, so that trials in forks of this process need not; in a limited time."""
-        end = time.process_time() + _MAX_PREPARING_S
+        end = time.process_time() + MAX_PREPARING_S
         for lane in self._graph.lanes.values():
             for link in () if lane.is_internal else lane.links:
                 if time.process_time() > end:

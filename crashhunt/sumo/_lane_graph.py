@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     Line = NDArray[np.float64]
 
 USUAL_CLASS = "passenger"  # of vehicles whose type names no class
+MAX_PREPARING_S = 0.3  # of lanes, and of conflicts, of a large network; it has no effect on results
 _BUCKET_M = 32.0  # edge length of the squares that points of lanes are sorted into
 _BLEND_M = 50.0  # length of a lane change of a reference path
 _MAX_TURN_PATH = 20  # lanes inside a junction that follow each other; more are a faulty network

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from crashhunt.sumo._lane_graph import TURNS, is_open
+from crashhunt.sumo._lane_graph import MAX_PREPARING_S, TURNS, is_open
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -27,7 +27,6 @@ SQUARE_M = 16.0  # within squares of this size, the same lanes are candidates
 _GRID_M = 0.5  # upper bound of the distance of two prepared points
 CENTER_BEHIND_M = 8.0  # the centre of a vehicle may be this far behind its front, which is on the lane
 _NONE = -1
-_MAX_PREPARING_S = 0.3
 
 
 class LanePath(NamedTuple):
@@ -152,11 +151,8 @@ class NearLanes:
         self._squares: dict[tuple[int, int], list[tuple[float, str]]] = {}
 
     def prepare(self) -> None:
-        """Find the lanes of all squares and their paths, so that trials in forks of this process need not.
-
-        The time limit is for large networks. It has no effect on results.
-        """
-        end = time.process_time() + _MAX_PREPARING_S
+        """Find the lanes of all squares and their paths, so that trials in forks of this process need not."""
+        end = time.process_time() + MAX_PREPARING_S
         for lane in self._graph.lanes.values():
             if time.process_time() > end:
                 return
