@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import struct
-import subprocess
 import sys
 import tempfile
 from functools import cache
@@ -87,6 +86,8 @@ def _names_of(path: str) -> set[str]:
 
 def _lines(*command: str) -> list[str]:
     """Return the output of a command as lines; empty if it fails or takes too long."""
+    import subprocess
+
     try:
         done = subprocess.run(
             command, capture_output=True, stdin=subprocess.DEVNULL, check=False, timeout=_PACKAGES_TIMEOUT_S,
@@ -131,6 +132,8 @@ def own_libraries(file: Path) -> tuple[dict[str, Path], list[str]]:
 
 def _loaded_by(file: Path, variables: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
     """Return the path of each library that the dynamic linker would load, and the names of the missing libraries."""
+    import subprocess
+
     try:
         done = subprocess.run(
             ["ldd", str(file)], capture_output=True, stdin=subprocess.DEVNULL, check=False, timeout=_LDD_TIMEOUT_S,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import platform
-import subprocess
 import sys
 from dataclasses import dataclass
 from functools import cache
@@ -119,6 +118,8 @@ def _probed(path: Path, *_version: int) -> Library:
     Raises:
         PluginError: the library cannot be used.
     """
+    import subprocess
+
     command = [sys.executable, "-P", "-I", "-S", library_probe.__file__, str(path)]
     try:
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_PROBE_S, check=False)
