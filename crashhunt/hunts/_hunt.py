@@ -20,7 +20,6 @@ from crashhunt.executors import HostConditions
 from crashhunt.hunts._next_trials import Pace, settings_of_workers
 from crashhunt.hunts._running_hunt import QUIET_WAIT_S, HuntSetup, RunningHunt, refuse_long_wait
 from crashhunt.hunts._signal_list import require_known_signals
-from crashhunt.hunts._trial_loop import run_trials
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.results import CodeVersions, HuntDirectory, resumed_versions
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
@@ -223,4 +222,4 @@ class Hunt:
             notes=self._notes,
         )
         self._running = RunningHunt(setup, ledger, watch)
-        return self._running.run(run_trials)
+        return self._running.run()

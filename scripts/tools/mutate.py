@@ -202,11 +202,6 @@ _TESTS_ELSEWHERE = {
         "hunts/test_rare_hunts.py",
         "hunts/test_states_and_reports.py",
         "hunts/test_whole_hunts.py",
-    ),
-    "hunts/_trial_loop.py": (
-        "hunts/test_hunt_loop.py",
-        "hunts/test_hunt_parts.py",
-        "hunts/test_whole_hunts.py",
         "e2e/test_hunt.py",
     ),
     "hunts/_next_trials.py": (

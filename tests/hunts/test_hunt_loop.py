@@ -14,7 +14,7 @@ import pytest
 
 import crashhunt
 from crashhunt.errors import CrashhuntError, HuntDirectoryError, ScenarioError
-from crashhunt.hunts import _hunt as hunt_module, _next_trials, _running_hunt, _trial_loop
+from crashhunt.hunts import _hunt as hunt_module, _next_trials, _running_hunt
 from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace
 from crashhunt.ledger import Ledger
@@ -58,7 +58,7 @@ class Inline:
         self.most = max(self.most, len(self.waiting))
 
     def completed(self, timeout_s):
-        assert timeout_s == _trial_loop._TICK_S
+        assert timeout_s == _running_hunt._TICK_S
         if self.waiting:
             yield self.ends(self.waiting.pop(self.first))
 
@@ -89,7 +89,7 @@ def run(tmp_path, monkeypatch):
             return found.executor
 
         found = SimpleNamespace(seen=[], path=tmp_path / "h", executor=None)
-        monkeypatch.setattr(_trial_loop, "make_executor", make)
+        monkeypatch.setattr(_running_hunt, "make_executor", make)
         given = {"scenario": "toy.toml", "seed": 4, "snapshot_code": False, "watch": found.seen.append} | options
         found.report = crashhunt.run(found.path, parallel, trials, 60, **given)
         with closing(Ledger(found.path / "ledger.sqlite")) as ledger:
@@ -161,7 +161,7 @@ def test_hunt_waits_while_it_is_far_ahead_of_its_partner(run, tmp_path, monkeypa
     monkeypatch.setattr("crashhunt.hunts.Hunt", begin)
     monkeypatch.setattr(_next_trials, "trials_of_running", finished)
     monkeypatch.setattr(_next_trials, "_LOOK_EVERY_S", 0.0)
-    monkeypatch.setattr(_trial_loop, "_MAX_LEAD_S", 0.0)
+    monkeypatch.setattr(_running_hunt, "_MAX_LEAD_S", 0.0)
     found = run(99, ends)
     assert found.numbers == list(range(99))
     assert found.report.stopped_because == "all_trials"
@@ -390,7 +390,7 @@ def bundles(monkeypatch):
         written.append(result.spec.number)
         return SimpleNamespace(result=result, id=f"{result.spec.number:06d}", confirmed=True, path=folder)
 
-    monkeypatch.setattr(_trial_loop, "write_bundle", write)
+    monkeypatch.setattr(_running_hunt, "write_bundle", write)
     monkeypatch.setattr(_running_hunt.TrialReruns, "confirm", lambda again, crashes: list(crashes))
     return written
 
@@ -503,11 +503,11 @@ def test_parts_of_a_hunt_are_closed_at_its_end(run, monkeypatch):
 
         monkeypatch.setattr(kind, "close", close)
 
-    for kind in (_trial_loop.Audit, _trial_loop.Confirmation, _running_hunt.SharedReruns):
+    for kind in (_running_hunt.Audit, _running_hunt.Confirmation, _running_hunt.SharedReruns):
         note(kind, kind.__name__)
     released = []
     monkeypatch.setattr(
-        _trial_loop, "release_shared_memory", lambda scratch, *, of_ended: released.append((scratch, of_ended))
+        _running_hunt, "release_shared_memory", lambda scratch, *, of_ended: released.append((scratch, of_ended))
     )
     found = run(3)
     assert closed == ["Audit", "Confirmation", "SharedReruns"]

@@ -26,15 +26,13 @@ from crashhunt.hunts import (
     _preflight,
     _progress,
     _running_hunt,
-    _trial_loop,
     _verification,
 )
 from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._next_trials import result_lag
 from crashhunt.hunts._progress import PhaseClock, Progress
 from crashhunt.hunts._reports import BranchReport, Difference, ProbeReport, RareReport, kind_data
-from crashhunt.hunts._running_hunt import RunningHunt
-from crashhunt.hunts._trial_loop import TrialLoop
+from crashhunt.hunts._running_hunt import RunningHunt, TrialLoop
 from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReruns, is_settled
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
@@ -204,7 +202,7 @@ def test_rest_of_an_audit_is_a_phase_of_its_own(running, loop):
     )  # fmt: skip
 
     def receive(*, wait_s):
-        assert wait_s == _trial_loop._TICK_S
+        assert wait_s == _running_hunt._TICK_S
         audit.waiting -= 2 if audit.waiting == 3 else 1
 
     found._receive_notices = receive
@@ -332,14 +330,14 @@ def test_trial_is_written_recorded_and_counted(running, loop, monkeypatch):
         save=lambda bundle: calls.append(("saved", bundle)),
     )  # fmt: skip
     found = loop()
-    monkeypatch.setattr(_trial_loop, "write_trial", lambda _, given, scratch: calls.append(("files", scratch.name)))
-    monkeypatch.setattr(_trial_loop, "read_map", lambda scratch, trial: "lanes")
+    monkeypatch.setattr(_running_hunt, "write_trial", lambda _, given, scratch: calls.append(("files", scratch.name)))
+    monkeypatch.setattr(_running_hunt, "read_map", lambda scratch, trial: "lanes")
 
     def write(folder, given, trial, **more):
         calls.append(("bundle", folder == running.setup.place.path, trial.name, more))
         return "bundle"
 
-    monkeypatch.setattr(_trial_loop, "write_bundle", write)
+    monkeypatch.setattr(_running_hunt, "write_bundle", write)
 
     def record(given):
         calls.clear()
