@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import faulthandler
+import hashlib
 import io
 import json
 import logging
@@ -14,7 +15,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, TypedDict
+from typing import TYPE_CHECKING, NoReturn, NotRequired, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.capabilities import supports
@@ -47,7 +48,6 @@ from crashhunt.episode import (
     run_episode,
 )
 from crashhunt.executors._native_stack import record_native_stack
-from crashhunt.executors._postmortem import encode_report
 from crashhunt.recording import BlackBox
 from crashhunt.simulators import (
     HasMap,
@@ -65,8 +65,8 @@ if TYPE_CHECKING:
 
     from crashhunt.agents import Agent
     from crashhunt.base.codec import JsonObject
+    from crashhunt.base.json_types import ErrorData
     from crashhunt.episode import ForkRunner, Reset, WorkerSettings
-    from crashhunt.executors._postmortem import FaultReport, Report
     from crashhunt.simulators import Simulator
     from crashhunt.trial import TrialResult, Value
 
@@ -90,6 +90,46 @@ class Job(TypedDict):
     reserved: int
     wants_map: bool
     tries_copy: bool
+
+
+CHECKSUM_BYTES = 16  # in front of a report
+
+
+class Report(TypedDict):
+    """The report that the process of a trial writes at its end.
+
+    ``result`` does not contain the specification, which the supervisor knows. ``notices`` are texts for the user.
+    """
+
+    result: Mapping[str, object]
+    notices: list[str]
+    map: NotRequired[str]
+    entered: NotRequired[list[str]]
+    responses: NotRequired[list[JsonObject]]
+    braking: NotRequired[Mapping[str, object] | None]
+    lights: NotRequired[Mapping[str, object]]
+
+
+class FaultReport(TypedDict):
+    """The report that the process of a trial writes if crashhunt itself failed in this process."""
+
+    fault: ErrorData
+
+
+def encode_report(report: Report | FaultReport, *, dumps: Callable[[object], str] = json.dumps) -> bytes:
+    """Return a report as bytes, after its checksum.
+
+    Args:
+        report: the report to encode.
+        dumps: function that converts data to JSON text.
+    """
+    text = dumps(report).encode()
+    return checksum_of(text) + text
+
+
+def checksum_of(text: bytes) -> bytes:
+    """Return the checksum in front of a report."""
+    return hashlib.blake2b(text, digest_size=CHECKSUM_BYTES).digest()
 
 
 class TrialProcess:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         Phase as Phase,
         Record as Record,
         digest_of as digest_of,
+        is_evidence as is_evidence,
         read_black_box as read_black_box,
         read_header as read_header,
     )

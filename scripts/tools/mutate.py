@@ -159,6 +159,7 @@ _TESTS_ELSEWHERE = {
     ),
     "executors/_supervisor.py": (
         "executors/test_escapes_of_trials.py",
+        "executors/test_evidence.py",
         "executors/test_killed_trials.py",
         "executors/test_maps_of_trials.py",
         "executors/test_supervisors.py",
