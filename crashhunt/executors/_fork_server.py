@@ -31,7 +31,7 @@ from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import WorkerSettings, require_origin, seal
 from crashhunt.executors._host_conditions import HostConditions
 from crashhunt.executors._supervisor import be_supervisor
-from crashhunt.executors._time_limits import ImportWatch, await_imports, import_died
+from crashhunt.executors._time_limits import ImportWatch, import_died
 from crashhunt.executors._zygote import be_zygote, import_nothing, import_parts
 from crashhunt.trial import TrialResult
 
@@ -262,59 +262,6 @@ def _parse_request(data: bytes) -> FromForkServer:
         elif "importing" in message:
             said["importing"] = str(message["importing"])
     return said
-
-
-def fork_zygote(settings: WorkerSettings, *, late: bool = False, rehearses: bool = False) -> socket.socket:
-    """Fork a zygote that imports the modules that trials need; return a socket to it. The zygote ends with the socket.
-
-    Args:
-        settings: settings of the hunt.
-        late: whether each trial imports its agents itself.
-        rehearses: whether to rehearse a trial, as for `import_parts`.
-
-    Raises:
-        ImportKilledError: the zygote was killed during its imports, by a signal that may come from outside.
-        CrashhuntError: an import takes too long, or has ended the zygote.
-    """
-    ours, theirs = socket.socketpair()
-    reports, reported = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    prepare(TrialResult)
-    gc.freeze()
-    parent, pid = os.getpid(), os.fork()
-    if pid == 0:
-        try:
-            ours.close()
-            reports.close()
-            die_with(parent)
-            _import_for_zygote(theirs, reported, settings, late=late, rehearses=rehearses)
-        finally:
-            os._exit(1)
-    theirs.close()
-    reported.close()
-    with reports:
-        await_imports(reports, pid, settings.timeout_s)
-    return ours
-
-
-def _import_for_zygote(
-    control: socket.socket, reported: socket.socket, settings: WorkerSettings, *, late: bool, rehearses: bool
-) -> None:
-    def report(importing: str) -> None:
-        with suppress(OSError):  # the parent listens until everything has been imported, and no longer
-            reported.send(json.dumps(importing).encode())
-
-    try:
-        imported = import_nothing(settings) if late else import_parts(settings, report, rehearses=rehearses)
-    except CrashhuntError as error:
-        control.sendall(json.dumps(error.to_json()).encode() + b"\n")
-        imported = None
-    else:
-        if imported is None:
-            control.sendall(json.dumps({"unfit": True}).encode() + b"\n")
-    report("")
-    reported.close()
-    if imported is not None:
-        be_zygote(control, settings, imported)
 
 
 def _ignore_signals() -> None:

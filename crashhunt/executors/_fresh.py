@@ -2,31 +2,42 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.codec import prepare
 from crashhunt.base.errors import CrashhuntError, WorkerError
-from crashhunt.base.processes import children_of
+from crashhunt.base.processes import children_of, die_with
 from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
-from crashhunt.executors._fork_server import fork_zygote
 from crashhunt.executors._host_conditions import HostConditions
 from crashhunt.executors._postmortem import TrialAttempt, hung, result_of_death, where_it_is
 from crashhunt.executors._protocol import Notes, snapshot_environment
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError, with_escape
-from crashhunt.executors._time_limits import START_UP_S, ImportKilledError, PauseMeter, has_hung, import_died
+from crashhunt.executors._time_limits import (
+    START_UP_S,
+    ImportKilledError,
+    PauseMeter,
+    await_imports,
+    has_hung,
+    import_died,
+)
+from crashhunt.executors._zygote import be_zygote, import_nothing, import_parts
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
@@ -247,6 +258,59 @@ def _run(job: FreshJob, answer: Callable[[Answer], None]) -> int:
     except CrashhuntError as error:
         answer(error.to_json())
     return 0
+
+
+def fork_zygote(settings: WorkerSettings, *, late: bool = False, rehearses: bool = False) -> socket.socket:
+    """Fork a zygote that imports the modules that trials need; return a socket to it. The zygote ends with the socket.
+
+    Args:
+        settings: settings of the hunt.
+        late: whether each trial imports its agents itself.
+        rehearses: whether to rehearse a trial, as for `import_parts`.
+
+    Raises:
+        ImportKilledError: the zygote was killed during its imports, by a signal that may come from outside.
+        CrashhuntError: an import takes too long, or has ended the zygote.
+    """
+    ours, theirs = socket.socketpair()
+    reports, reported = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    prepare(TrialResult)
+    gc.freeze()
+    parent, pid = os.getpid(), os.fork()
+    if pid == 0:
+        try:
+            ours.close()
+            reports.close()
+            die_with(parent)
+            _import_for_zygote(theirs, reported, settings, late=late, rehearses=rehearses)
+        finally:
+            os._exit(1)
+    theirs.close()
+    reported.close()
+    with reports:
+        await_imports(reports, pid, settings.timeout_s)
+    return ours
+
+
+def _import_for_zygote(
+    control: socket.socket, reported: socket.socket, settings: WorkerSettings, *, late: bool, rehearses: bool
+) -> None:
+    def report(importing: str) -> None:
+        with suppress(OSError):  # the parent listens until everything has been imported, and no longer
+            reported.send(json.dumps(importing).encode())
+
+    try:
+        imported = import_nothing(settings) if late else import_parts(settings, report, rehearses=rehearses)
+    except CrashhuntError as error:
+        control.sendall(json.dumps(error.to_json()).encode() + b"\n")
+        imported = None
+    else:
+        if imported is None:
+            control.sendall(json.dumps({"unfit": True}).encode() + b"\n")
+    report("")
+    reported.close()
+    if imported is not None:
+        be_zygote(control, settings, imported)
 
 
 def _not_started(number: int, log: Path, exit_code: int) -> WorkerError:

@@ -174,7 +174,8 @@ class TrialProcess:
             CrashhuntError: the simulator cannot be created.
         """
         if self._parts is None:
-            self._parts = loaded(self._settings)
+            self._parts = Parts(self._settings)
+            self._parts.load()
         if self._simulator is None:
             self._simulator = self._parts.simulator()
             if supports(self._simulator, RestoresState):
@@ -421,18 +422,3 @@ def notices_of_late_imports(before: frozenset[str], code: Sequence[str]) -> list
                     f"run its code of today; add {command_line('--snapshot-root', folder)}"
                 )
     return found
-
-
-def loaded(settings: WorkerSettings, report: Callable[[str], None] = lambda _: None) -> Parts:
-    """Import the modules that trials need, and return them.
-
-    Args:
-        settings: settings of the hunt.
-        report: function called before each import, as in `Parts.load`.
-
-    Raises:
-        CrashhuntError: a module cannot be imported.
-    """
-    parts = Parts(settings)
-    parts.load(report)
-    return parts

@@ -13,30 +13,26 @@ import shutil
 import signal
 import sys
 import time
-from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NoReturn, TypedDict, cast
+from typing import TYPE_CHECKING, Final, NoReturn, cast
 
 from crashhunt.agents import ProgramFactory, offer_reused
-from crashhunt.base import forks, layout
-from crashhunt.base.capabilities import supports
+from crashhunt.base import layout
 from crashhunt.base.errors import DISK, CrashhuntError
 from crashhunt.base.exceptions import message_of
 from crashhunt.base.forks import ended
 from crashhunt.base.plugins import locate, registered
-from crashhunt.base.processes import adopt_orphans, children_of, die_with, end_descendants, kill
+from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill
 from crashhunt.base.programs import is_native
-from crashhunt.base.resources import FREE, free_memory, limit_behind
+from crashhunt.base.resources import limit_behind
 from crashhunt.base.temporary import SharedMemoryWatch
-from crashhunt.base.text import format_percent
-from crashhunt.episode import Parts, generators, options_of, seed_everything, set_generators, stage_of
+from crashhunt.episode import Parts, stage_of
 from crashhunt.executors._rehearsal import rehearse_trial
 from crashhunt.executors._trial_process import TrialProcess
-from crashhunt.simulators import CountsSetUp
-from crashhunt.trial import TrialSpec
+from crashhunt.executors._warm_traffics import WarmTraffics
 
 if TYPE_CHECKING:
     import socket
@@ -46,249 +42,9 @@ if TYPE_CHECKING:
     from crashhunt.episode import WorkerSettings
     from crashhunt.executors._protocol import FromZygote, KillTrial
     from crashhunt.executors._trial_process import Job
-    from crashhunt.simulators import Info, Observations, Simulator
 
-    Wait = Callable[[int | None, Callable[[], None]], None]
-
-
-# Warming up once: forks of a zygote that have reset the simulator, for trials that begin in the same traffic.
-#
-# The zygote of a slot keeps some such processes suspended. A trial with the same seed and scenario arguments runs in a
-# fork of one of them, with the random generators as the reset left them: nothing in its digest shows the difference.
 
 _CHUNK_BYTES = 1 << 16  # bytes at a time
-_MIN_WARM_UP_S = 0.02  # a fork of a fork costs some ten milliseconds, half of them for its end
-_TRIALS_UNTIL_STALE = 8  # a copy makes room after this many trials per copy without one in its traffic
-
-# Bound here, before any agent is imported that could replace them.
-_dumps, _loads, _write = json.dumps, json.loads, os.write
-
-
-class _Answer(TypedDict, total=False):
-    """A report of a suspended process: the duration of its reset, its failure, or how the process of a trial ended."""
-
-    took_s: float
-    unfit: str
-    pid: int
-    ended: int
-
-
-class WarmTraffics:
-    """The suspended processes of a zygote: one for each traffic, in which the simulator has been reset.
-
-    Args:
-        limit: maximum number of suspended processes.
-        notify: function called with texts for the user.
-        worth_s: a suspended process is kept only if its warm-up took at least this wall time, in s.
-    """
-
-    def __init__(self, limit: int, notify: Callable[[str], None], *, worth_s: float = _MIN_WARM_UP_S) -> None:
-        self._worth_s = worth_s
-        self._limit = limit
-        self._notify = notify
-        self._suspended: OrderedDict[str, _Suspended] = OrderedDict()  # the most recently used is the last
-        self._trials = 0
-        self._trial: TrialProcess | None = None
-        self._simulator: Simulator | None = None
-
-    def prepare(self, trial: TrialProcess, simulator: Simulator) -> None:
-        """Store the objects with which trials run."""
-        self._trial, self._simulator = trial, simulator
-
-    @property
-    def processes(self) -> frozenset[int]:
-        """The suspended processes, by traffic."""
-        return frozenset(one.pid for one in self._suspended.values())
-
-    def forget(self) -> None:
-        """Close the pipes to the suspended processes in the present process, which runs a trial."""
-        for one in self._suspended.values():
-            one.close()
-        self._suspended.clear()
-
-    def run(self, job: Job, wait: Wait) -> tuple[int, int] | None:
-        """Run a trial in a fork of the suspended process for its traffic; create that process if it is missing.
-
-        Args:
-            job: the job of the trial.
-            wait: function that waits until a descriptor can be read; its second argument is a function that kills the
-                process.
-
-        Returns:
-            The process that ran the trial and its exit code; None if the trial has to run in a fork of the zygote.
-        """
-        if self._trial is None or self._limit == 0:
-            return None
-        self._trials += 1
-        spec = TrialSpec.from_json(job["spec"])
-        key = _traffic_key(spec)
-        found = self._suspended.get(key) or self._make(key, spec, wait)
-        if found is None:
-            return None
-        self._suspended.move_to_end(key)
-        found.used = self._trials
-        said = found.ask(_dumps(job).encode() + b"\n", wait)
-        if said is None:  # it was killed, and the trial with it
-            code = self._drop(key)
-            return found.pid, code or -9
-        if "unfit" in said:
-            self._stop(said["unfit"])
-            self._drop(key)
-            return None
-        return said["pid"], said["ended"]
-
-    def _make(self, key: str, spec: TrialSpec, wait: Wait) -> _Suspended | None:
-        if not self._make_room():
-            return None
-        wakes, ours = os.pipe()
-        theirs, says = os.pipe()
-        assert self._trial is not None
-        assert self._simulator is not None
-        be_suspended = partial(_be_suspended, wakes, says, self._trial, self._simulator, spec)
-        try:
-            pid = forks.fork(be_suspended, forks.held(), keeps=(wakes, says))
-        except forks.CannotForkError as error:
-            self._stop(error.message)
-            os.close(ours)
-            os.close(theirs)
-            return None
-        finally:
-            os.close(wakes)
-            os.close(says)
-        made = self._suspended[key] = _Suspended(pid=pid, asks=ours, says=theirs, used=self._trials)
-        said = made.ask(b"", wait)
-        if said is not None and said.get("took_s", 0.0) >= self._worth_s:
-            return made
-        self._drop(key)
-        if said is not None and "took_s" in said:
-            self._limit = 0  # no warm-up here is worth it
-        return None
-
-    def _drop(self, key: str) -> int:
-        return self._suspended.pop(key).end()
-
-    def _stop(self, why: str) -> None:
-        self._limit = 0
-        self._notify(f"trials in the same traffic do not share its warm-up: {why}")
-
-    def _make_room(self) -> bool:
-        if free_memory() < FREE:
-            self._notify(
-                f"less than {format_percent(FREE)} of the memory is free: "
-                "fewer warmed-up copies are kept than there might be"
-            )
-            return False
-        if len(self._suspended) < self._limit:
-            return True
-        key, oldest = next(iter(self._suspended.items()))
-        # Where trials take turns in more traffics than there are copies, the oldest one is the next to be used.
-        if self._trials - oldest.used < _TRIALS_UNTIL_STALE * self._limit:
-            return False
-        self._drop(key)
-        return True
-
-
-@dataclass(slots=True, eq=False)
-class _Suspended:
-    """A suspended process and the pipes to it, as the zygote stores them.
-
-    Args:
-        pid: process id of the suspended process.
-        asks: the pipe for requests to the process.
-        says: the pipe for answers from the process.
-        used: number of the last trial that used the process.
-    """
-
-    pid: int
-    asks: int
-    says: int
-    used: int
-
-    def ask(self, text: bytes, wait: Wait) -> _Answer | None:
-        """Send a request to the process, and return its answer; None if the process has ended."""
-        try:
-            while text:
-                text = text[_write(self.asks, text) :]
-        except BrokenPipeError:
-            return None
-        received = bytearray()
-        while not received.endswith(b"\n"):
-            wait(self.says, self._kill)
-            data = os.read(self.says, _CHUNK_BYTES)
-            if not data:
-                return None
-            received += data
-        said: _Answer = _loads(received)
-        return said
-
-    def _kill(self) -> None:
-        """Kill the trial, or the process itself if it is still resetting the simulator."""
-        for pid in children_of(self.pid) or [self.pid]:
-            kill(pid)
-
-    def close(self) -> None:
-        """Close the pipes to the process."""
-        os.close(self.asks)
-        os.close(self.says)
-
-    def end(self) -> int:
-        """Kill the process, and return its exit code."""
-        for child in children_of(self.pid):
-            kill(child)
-        kill(self.pid)
-        code = forks.ended(self.pid)
-        self.close()
-        return code
-
-
-def _be_suspended(wakes: int, says: int, trial: TrialProcess, simulator: Simulator, spec: TrialSpec) -> None:
-    """Reset the simulator, and then run each requested trial in a fork."""
-    adopt_orphans()
-    began = time.monotonic()
-    try:
-        seed_everything(spec.seed)
-        begun = simulator.reset(seed=spec.seed, options=options_of(spec, simulator))
-    except BaseException:  # the trial itself will report it
-        _report(says, {})
-        return
-    _report(says, {"took_s": time.monotonic() - began})
-    drawn = generators()
-
-    def again(**_given: object) -> tuple[Observations, Info]:
-        set_generators(drawn)
-        return begun
-
-    with os.fdopen(wakes, "rb", closefd=False) as jobs:
-        for line in jobs:
-            try:
-                pid = forks.fork(partial(_run, trial, line, again), forks.held())
-            except forks.CannotForkError as error:
-                _report(says, {"unfit": error.message})
-                continue
-            code = forks.ended(pid)
-            end_descendants()
-            if supports(simulator, CountsSetUp):
-                simulator.setup_steps = 0  # they have been counted, with the first trial
-            _report(says, {"pid": pid, "ended": code})
-
-
-def _run(trial: TrialProcess, line: bytes, again: Callable[..., tuple[Observations, Info]]) -> None:
-    trial.run(_loads(line), again)
-
-
-def _report(says: int, said: _Answer) -> None:
-    text = _dumps(said).encode() + b"\n"
-    with suppress(BrokenPipeError):
-        while text:
-            text = text[_write(says, text) :]
-
-
-def _traffic_key(spec: TrialSpec) -> str:
-    """Return the key of a trial's traffic: its seed and the scenario's arguments."""
-    script = None if spec.script is None else spec.script.to_json()
-    return json.dumps([spec.seed, dict(spec.scenario_arguments), spec.only, script], sort_keys=True)
-
-
 _SEGMENTS_EVERY_S = 0.1  # whether the trial uses new shared memory, which its death would hide
 _NATIVE_STACK_S = 2.0  # in which a process that hangs writes its native stack
 _LOOK_EVERY_S = 0.005  # where the kernel does not report when a process ends

@@ -145,6 +145,7 @@ _TESTS_ELSEWHERE = {
         "executors/test_harm.py",
         "executors/test_last_words.py",
         "executors/test_new_processes.py",
+        "executors/test_zygotes.py",
     ),
     "executors/_pool.py": (
         "executors/test_lost_processes.py",
@@ -175,6 +176,7 @@ _TESTS_ELSEWHERE = {
         "executors/test_trial_processes.py",
         "executors/test_warm_traffics.py",
     ),
+    "executors/_warm_traffics.py": ("executors/test_warm_traffics.py", "executors/test_zygotes.py"),
     "executors/_zygote.py": (
         "executors/test_harm.py",
         "executors/test_warm_traffics.py",

@@ -368,10 +368,11 @@ def test_simulator_of_a_zygote_is_made_ready_once(process, monkeypatch):
     simulator = Simulator()
     simulator.can = ("RestoresState", "PreparesProcess")
     simulator.ready_process = lambda: simulator.called.append("ready")
-    monkeypatch.setattr(_trial_process, "loaded", lambda settings: SimpleNamespace(simulator=lambda: simulator))
+    parts = SimpleNamespace(load=lambda: simulator.called.append("load"), simulator=lambda: simulator)
+    monkeypatch.setattr(_trial_process, "Parts", lambda settings: parts)
     monkeypatch.setattr(_trial_process, "ready_recorder", ready.append)
     assert found.make_simulator() is found.make_simulator() is simulator
-    assert simulator.called == ["tidy", "ready"]
+    assert simulator.called == ["load", "tidy", "ready"]
     assert ready == [simulator]
 
 

@@ -15,9 +15,10 @@ import pytest
 from crashhunt.base import forks
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import stage_of
-from crashhunt.executors import _fork_server, _rehearsal, _time_limits, _zygote
+from crashhunt.executors import _fork_server, _fresh, _rehearsal, _time_limits, _warm_traffics, _zygote
 from crashhunt.executors._time_limits import ImportKilledError
-from crashhunt.executors._zygote import Imported, WarmTraffics
+from crashhunt.executors._warm_traffics import WarmTraffics
+from crashhunt.executors._zygote import Imported
 from crashhunt.trial import TrialSpec
 
 PID = 4321  # of each fork
@@ -89,9 +90,9 @@ def copies(monkeypatch):
     monkeypatch.setattr(forks, "fork", fork)
     monkeypatch.setattr(forks, "ended", ended)
     monkeypatch.setattr(forks, "held", lambda: "held")
-    monkeypatch.setattr(_zygote, "free_memory", lambda: 1.0)
-    monkeypatch.setattr(_zygote, "children_of", lambda pid: [pid + 1000] if pid in found.says else [])
-    monkeypatch.setattr(_zygote, "kill", found.killed.append)
+    monkeypatch.setattr(_warm_traffics, "free_memory", lambda: 1.0)
+    monkeypatch.setattr(_warm_traffics, "children_of", lambda pid: [pid + 1000] if pid in found.says else [])
+    monkeypatch.setattr(_warm_traffics, "kill", found.killed.append)
     found.wait = wait
     yield found
     for pair in found.says.values():
@@ -156,7 +157,7 @@ def test_copy_that_is_not_used_makes_room(warm, copies):
 
 
 def test_without_free_memory_no_copy_is_made(warm, copies, monkeypatch):
-    monkeypatch.setattr(_zygote, "free_memory", lambda: 0.0)
+    monkeypatch.setattr(_warm_traffics, "free_memory", lambda: 0.0)
     assert warm(2).run(job(0), copies.wait) is None
     assert "of the memory is free: fewer warmed-up copies are kept" in copies.notes[0]
     assert copies.made == []
@@ -569,15 +570,16 @@ def template(monkeypatch):
         found.called.append(("zygote", control.fileno() >= 0, settings, imported))
         leave("zygote")
 
-    monkeypatch.setattr(_fork_server, "import_parts", imports)
-    monkeypatch.setattr(_fork_server, "import_nothing", lambda settings: imports(settings))
-    monkeypatch.setattr(_fork_server, "be_zygote", zygote)
+    for module in (_fork_server, _fresh):
+        monkeypatch.setattr(module, "import_parts", imports)
+        monkeypatch.setattr(module, "import_nothing", lambda settings: imports(settings))
+        monkeypatch.setattr(module, "be_zygote", zygote)
+        monkeypatch.setattr(module, "die_with", lambda pid: found.called.append(("dies with", pid)))
+        monkeypatch.setattr(module, "prepare", lambda what: found.called.append("prepared"))
+        monkeypatch.setattr(module, "gc", SimpleNamespace(freeze=lambda: None, collect=lambda: None))
     monkeypatch.setattr(_fork_server, "adopt_orphans", lambda: found.called.append("adopts"))
-    monkeypatch.setattr(_fork_server, "die_with", lambda pid: found.called.append(("dies with", pid)))
-    monkeypatch.setattr(_fork_server, "prepare", lambda what: found.called.append("prepared"))
     monkeypatch.setattr(_fork_server, "end_descendants", found.orphans.append)
     monkeypatch.setattr(_fork_server, "_ORPHANS_EVERY_S", 0.01)
-    monkeypatch.setattr(_fork_server, "gc", SimpleNamespace(freeze=lambda: None, collect=lambda: None))
     monkeypatch.setattr(_fork_server.signal, "signal", lambda *given: found.signals.append(given))
     monkeypatch.setattr(os, "setsid", lambda: found.called.append("own session"))
     monkeypatch.setattr(os, "_exit", leave)
@@ -645,8 +647,8 @@ def test_zygote_of_a_new_process_is_awaited(template, monkeypatch, late):
 
     settings = SimpleNamespace(timeout_s=9.0)
     template.forked = PID
-    monkeypatch.setattr(_fork_server, "await_imports", wait)
-    with _fork_server.fork_zygote(settings) as control:
+    monkeypatch.setattr(_fresh, "await_imports", wait)
+    with _fresh.fork_zygote(settings) as control:
         assert awaited == [(PID, 9.0)]
         assert control.recv(10) == b""
     template.forked = 0
@@ -656,9 +658,9 @@ def test_zygote_of_a_new_process_is_awaited(template, monkeypatch, late):
         heard.append((given, imported))
         leave("zygote")
 
-    monkeypatch.setattr(_fork_server, "be_zygote", zygote)
+    monkeypatch.setattr(_fresh, "be_zygote", zygote)
     with pytest.raises(Left, match="1"):
-        _fork_server.fork_zygote(settings, late=late)
+        _fresh.fork_zygote(settings, late=late)
     assert heard == [(settings, "imported")]
     assert ("dies with", os.getpid()) in template.called
     assert template.late == [late]
@@ -666,7 +668,7 @@ def test_zygote_of_a_new_process_is_awaited(template, monkeypatch, late):
 
 def test_fork_zygote_imports_early_by_default(template):
     with pytest.raises(Left):
-        _fork_server.fork_zygote(SimpleNamespace(timeout_s=9.0))
+        _fresh.fork_zygote(SimpleNamespace(timeout_s=9.0))
     assert template.late == [False]
     assert template.rehearsed == 0  # a replay runs one trial, and would wait for ten
 
@@ -678,7 +680,7 @@ def test_imports_of_a_new_process_are_reported_with_their_error(template):
             reports, reported = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with reports, reported:
                 template.imported = imported
-                _fork_server._import_for_zygote(theirs, reported, "settings", late=False, rehearses=False)
+                _fresh._import_for_zygote(theirs, reported, "settings", late=False, rehearses=False)
                 assert sent(control) == [said or imported.to_json()]
                 assert sent(reports) == ["a module", ""]
                 assert reported.fileno() == -1
@@ -766,13 +768,13 @@ def test_suspended_process_resets_once_and_runs_each_trial_in_a_fork(monkeypatch
         return "observations"
 
     simulator.reset = reset
-    monkeypatch.setattr(_zygote, "adopt_orphans", lambda: None)
-    monkeypatch.setattr(_zygote, "seed_everything", drawn.append)
-    monkeypatch.setattr(_zygote, "options_of", lambda given, made: (given.number, made is simulator))
-    monkeypatch.setattr(_zygote, "generators", lambda: "drawn")
-    monkeypatch.setattr(_zygote, "set_generators", drawn.append)
-    monkeypatch.setattr(_zygote, "supports", lambda made, what: True)
-    monkeypatch.setattr(_zygote, "end_descendants", lambda: drawn.append("ended"))
+    monkeypatch.setattr(_warm_traffics, "adopt_orphans", lambda: None)
+    monkeypatch.setattr(_warm_traffics, "seed_everything", drawn.append)
+    monkeypatch.setattr(_warm_traffics, "options_of", lambda given, made: (given.number, made is simulator))
+    monkeypatch.setattr(_warm_traffics, "generators", lambda: "drawn")
+    monkeypatch.setattr(_warm_traffics, "set_generators", drawn.append)
+    monkeypatch.setattr(_warm_traffics, "supports", lambda made, what: True)
+    monkeypatch.setattr(_warm_traffics, "end_descendants", lambda: drawn.append("ended"))
     monkeypatch.setattr(forks, "fork", fork)
     monkeypatch.setattr(forks, "held", lambda: "held")
     monkeypatch.setattr(forks, "ended", lambda pid: 3 if pid == PID else None)
@@ -780,7 +782,7 @@ def test_suspended_process_resets_once_and_runs_each_trial_in_a_fork(monkeypatch
     for number in range(2):
         os.write(asks, json.dumps(job(number)).encode() + b"\n")
     os.close(asks)
-    _zygote._be_suspended(wakes, says, trial, simulator, spec(7, seed=5))
+    _warm_traffics._be_suspended(wakes, says, trial, simulator, spec(7, seed=5))
     first, *answers = map(json.loads, os.read(told, 1 << 16).splitlines())
     assert 0 <= first["took_s"] < 5
     assert answers == [{"pid": PID, "ended": 3}, {"unfit": "it has threads"}]
@@ -794,18 +796,18 @@ def test_suspended_process_resets_once_and_runs_each_trial_in_a_fork(monkeypatch
         raise KeyboardInterrupt
 
     simulator.reset = fails
-    _zygote._be_suspended(wakes, says, trial, simulator, spec(7))
+    _warm_traffics._be_suspended(wakes, says, trial, simulator, spec(7))
     assert json.loads(os.read(told, 100)) == {}
     for descriptor in (wakes, told, says):
         os.close(descriptor)
 
 
 def test_traffic_is_that_of_seed_and_arguments_of_the_scenario():
-    plain = _zygote._traffic_key(spec(1))
-    assert _zygote._traffic_key(spec(2)) == plain
+    plain = _warm_traffics._traffic_key(spec(1))
+    assert _warm_traffics._traffic_key(spec(2)) == plain
     for other in (spec(1, seed=2), spec(1, density=0.5)):
-        assert _zygote._traffic_key(other) != plain
-    assert _zygote._traffic_key(spec(1, a=1, b=2)) == _zygote._traffic_key(spec(1, b=2, a=1))
+        assert _warm_traffics._traffic_key(other) != plain
+    assert _warm_traffics._traffic_key(spec(1, a=1, b=2)) == _warm_traffics._traffic_key(spec(1, b=2, a=1))
 
 
 @pytest.mark.parametrize("fails", [False, True])
