@@ -29,10 +29,10 @@ from crashhunt.crashes import (
     partner,
     visible_from,
 )
-from crashhunt.plans import with_recorded_load_order
 from crashhunt.recording import has_same_scenes
 from crashhunt.replays import is_current_code, reruns_of
 from crashhunt.reruns import StoppedError
+from crashhunt.scenario import with_recorded_load_order
 from crashhunt.trial import Outcome, Overruled
 
 if TYPE_CHECKING:

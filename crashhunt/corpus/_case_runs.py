@@ -16,14 +16,9 @@ from crashhunt.base.text import command_line, in_lines, one_line
 from crashhunt.corpus._cases import Case, Expectation, cases_of_type, read_case, signature_today
 from crashhunt.crashes import Bundle, is_bundle_trusted, refuse_untrusted, signature_of, snapshot_of, write_bundle
 from crashhunt.episode import WorkerSettings
-from crashhunt.plans import (
-    load_order_change,
-    read_settings,
-    with_recorded_load_order,
-    with_settings,
-    write_settings,
-)
+from crashhunt.plans import read_settings, with_settings, write_settings
 from crashhunt.reruns import StoppedError, call_in_threads, run_alone
+from crashhunt.scenario import load_order_change, with_recorded_load_order
 from crashhunt.snapshots import Snapshot, environment_changes, take_snapshot
 from crashhunt.trial import Outcome
 

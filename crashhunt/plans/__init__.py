@@ -6,6 +6,7 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._argument_owners import Owners as Owners, Takes as Takes, agent_of as agent_of, takes_of as takes_of
+    from ._choices import parse_crash_on as parse_crash_on
     from ._code import (
         CodeFacts as CodeFacts,
         describe_code as describe_code,
@@ -23,17 +24,12 @@ if TYPE_CHECKING:
         share_of as share_of,
     )
     from ._plan import (
-        FIXED as FIXED,
         core_of as core_of,
         disturber as disturber,
         disturber_apart as disturber_apart,
-        load_order_change as load_order_change,
-        load_order_of as load_order_of,
-        parse_crash_on as parse_crash_on,
         plan as plan,
         plan_with_code as plan_with_code,
         sampler_of as sampler_of,
-        with_recorded_load_order as with_recorded_load_order,
         with_settings as with_settings,
     )
     from ._run_options import (

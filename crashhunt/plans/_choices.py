@@ -1,22 +1,26 @@
-"""Chooses the form of actions, the observed parts and the requirements: from options, scenario and agent's class."""
+"""Chooses actions, observed parts, requirements and crash outcomes, from options, scenario and agent's class."""
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError, UsageError
+from crashhunt.base.text import one_of
 from crashhunt.oracles import REQUIREMENT, check_requirement, requirement_oracles
 from crashhunt.scenario import action_settings, canonical_action, check_action
 from crashhunt.simulators import parse_parts
+from crashhunt.trial import CRASHES, EVENTS
+from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from crashhunt.plans._settings import Request
     from crashhunt.scenario import Scenario
-    from crashhunt.trial import Signature
+    from crashhunt.trial import Outcome, Signature
 
 
 def chosen_actions(
@@ -151,3 +155,50 @@ def without_refuted_notes(scenario: Scenario, requirements: list[str]) -> Scenar
         {note for backend in one.backends.values() for note in backend.notes(one)} for one in (scenario, with_one)
     )
     return replace(scenario, notes=tuple(note for note in scenario.notes if note in apply or note not in made))
+
+
+def parse_crash_on(
+    words: Sequence[str], brought: Sequence[Outcome] = ()
+) -> tuple[tuple[Outcome, ...], dict[str, float]]:
+    """Return the outcomes that ``--crash-on`` names, and the limits that it gives.
+
+    Args:
+        words: the values of ``--crash-on``.
+        brought: the outcomes of the chosen oracles, which ``--crash-on`` may name as well.
+
+    Raises:
+        UsageError: an outcome does not exist, or a limit is invalid.
+    """
+    known = tuple(dict.fromkeys((*CRASHES, *EVENTS, *brought)))
+    crashes = [str(outcome) for outcome in known]
+    names, limits = [], {}
+    for word in words:
+        name, colon, limit = str(word).partition(":")
+        if name not in crashes:
+            raise UsageError(
+                f"--crash-on {name!r} is not an outcome that can count as a crash",
+                fix=one_of(name, crashes, give="give some of"),
+            )
+        if colon:
+            limits[name] = _limit(name, limit)
+        names.append(name)
+    if not names:
+        raise UsageError("--crash-on names no outcome", fix=f"give some of {','.join(crashes)}")
+    return tuple(outcome for outcome in known if outcome in names), limits
+
+
+def _limit(name: str, text: str) -> float:
+    if name not in LIMITS:
+        raise UsageError(
+            f"--crash-on {name}:{text}: {name} has no limit",
+            fix=f"write {name} alone; only {' and '.join(LIMITS)} have a limit",
+        )
+    unit = LIMITS[name][1]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        fix = f"give {unit} above 0, such as {name}:{'30' if unit == 's' else '6'}"
+        raise UsageError(f"--crash-on {name}:{text}: {text!r} is not a limit", fix=fix)
+    return value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import secrets
 import sys
 from contextlib import contextmanager
@@ -32,6 +31,7 @@ from crashhunt.plans._choices import (
     chosen_observations,
     chosen_requirements,
     notes_on_actions,
+    parse_crash_on,
     refuse_late_plans,
     without_refuted_notes,
 )
@@ -48,8 +48,10 @@ from crashhunt.plans._settings import (
 )
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
 from crashhunt.scenario import (
+    FIXED_LOAD_ORDER,
     Scenario,
     backend_of,
+    load_order_of,
     load_scenario,
     scenario_digest,
     titles,
@@ -67,7 +69,6 @@ from crashhunt.trial import (
     is_signal,
     parse_spec,
 )
-from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -77,51 +78,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Category
 
     Surveyor = Callable[[Scenario, Request, HuntSettings], Scenario]
-
-
-# The order in which a simulator processes a scenario at load: whether it is fixed, and as it was for a recorded crash.
-#
-# ``environment.json`` of a snapshot holds it (``load_order``). Where it is missing, the order was not fixed.
-
-FIXED = "fixed"
-
-
-def load_order_of(scenario: Scenario) -> str | None:
-    """Return ``fixed`` or ``not fixed: REASON`` for the load order; None if the results do not depend on an order."""
-    order = scenario.backend.load_order
-    if order is None:
-        return None
-    why_not = order.why_not(scenario)
-    return f"not fixed: {why_not}" if why_not else FIXED
-
-
-def with_recorded_load_order(scenario: Scenario, recorded: str | None) -> Scenario:
-    """Return the scenario with the load order that a recorded crash had: the fixed order, or the simulator's own order.
-
-    The load order is the order in which the simulator processes objects when it loads the scenario.
-
-    Args:
-        scenario: the scenario to run again.
-        recorded: the value of ``load_order`` in the snapshot; None if the snapshot has none.
-    """
-    order = scenario.backend.load_order
-    return scenario if order is None or recorded == FIXED else order.keep(scenario)
-
-
-def load_order_change(scenario: Scenario, recorded: str | None) -> str:
-    """Return how the load order here differs from the recorded order, as a clause; empty if both are equal.
-
-    An order that was not fixed is kept by `with_recorded_load_order`. A difference therefore arises only if the
-    recorded order was fixed, and cannot be fixed here.
-
-    Args:
-        scenario: the scenario to run again.
-        recorded: the value of ``load_order`` in the snapshot; None if the snapshot has none.
-    """
-    order, now = scenario.backend.load_order, load_order_of(scenario)
-    if order is None or recorded != FIXED or now == FIXED:
-        return ""
-    return f"the order of {order.what} was fixed and is {now}"
 
 
 def plan(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario, HuntSettings]:
@@ -222,7 +178,7 @@ def _with_notes(scenario: Scenario, run: RunSettings) -> Scenario:
     notes = [accelerator.note(scenario) if accelerator is not None and run.accelerate else ""]
     notes.append(f"the compiled core is {core}" if core is not None else "")
     load_order = scenario.backend.load_order
-    if load_order is not None and (order := load_order_of(scenario)) != FIXED:
+    if load_order is not None and (order := load_order_of(scenario)) != FIXED_LOAD_ORDER:
         notes.append(f"the order of {load_order.what} is {order}; a trial may differ between processes")
     if outdated := outdated_modules():
         notes.append(f"compiled from other sources than those installed: {listed(outdated)}. Fix: {HOW_TO_REBUILD}")
@@ -465,53 +421,6 @@ def _with_notes_on_crashes(
 def _is_built_in(oracle: str) -> bool:
     point = registered("oracles").get(oracle_name(oracle))
     return point is not None and point.value.startswith(f"{layout.PACKAGE.name}.")
-
-
-def parse_crash_on(
-    words: Sequence[str], brought: Sequence[Outcome] = ()
-) -> tuple[tuple[Outcome, ...], dict[str, float]]:
-    """Return the outcomes that ``--crash-on`` names, and the limits that it gives.
-
-    Args:
-        words: the values of ``--crash-on``.
-        brought: the outcomes of the chosen oracles, which ``--crash-on`` may name as well.
-
-    Raises:
-        UsageError: an outcome does not exist, or a limit is invalid.
-    """
-    known = tuple(dict.fromkeys((*CRASHES, *EVENTS, *brought)))
-    crashes = [str(outcome) for outcome in known]
-    names, limits = [], {}
-    for word in words:
-        name, colon, limit = str(word).partition(":")
-        if name not in crashes:
-            raise UsageError(
-                f"--crash-on {name!r} is not an outcome that can count as a crash",
-                fix=one_of(name, crashes, give="give some of"),
-            )
-        if colon:
-            limits[name] = _limit(name, limit)
-        names.append(name)
-    if not names:
-        raise UsageError("--crash-on names no outcome", fix=f"give some of {','.join(crashes)}")
-    return tuple(outcome for outcome in known if outcome in names), limits
-
-
-def _limit(name: str, text: str) -> float:
-    if name not in LIMITS:
-        raise UsageError(
-            f"--crash-on {name}:{text}: {name} has no limit",
-            fix=f"write {name} alone; only {' and '.join(LIMITS)} have a limit",
-        )
-    unit = LIMITS[name][1]
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        fix = f"give {unit} above 0, such as {name}:{'30' if unit == 's' else '6'}"
-        raise UsageError(f"--crash-on {name}:{text}: {text!r} is not a limit", fix=fix)
-    return value
 
 
 def _locators(request: Request, scenario: Scenario) -> dict[str, str]:

@@ -13,10 +13,10 @@ from crashhunt.base.errors import UsageError
 from crashhunt.base.sandbox import landlock_version
 from crashhunt.crashes import is_bundle_trusted, refuse_side_effects, refuse_untrusted
 from crashhunt.episode import WorkerSettings
-from crashhunt.plans import load_order_change, read_settings, with_recorded_load_order, with_settings
+from crashhunt.plans import read_settings, with_settings
 from crashhunt.replays._edits import edited_spec
 from crashhunt.reruns import Reruns
-from crashhunt.scenario import argument_values, load_scenario
+from crashhunt.scenario import argument_values, load_order_change, load_scenario, with_recorded_load_order
 from crashhunt.snapshots import Snapshot, code_differences, environment_changes, processor, program_warnings
 from crashhunt.trial import SENSOR_KINDS
 

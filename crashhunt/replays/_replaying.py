@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Literal
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError, UntrustedError, UsageError
 from crashhunt.crashes import with_lights
-from crashhunt.plans import load_order_change
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, values_around
 from crashhunt.replays._prepare import ReplayOptions, Rerun, prepare
 from crashhunt.reruns import StoppedError, run_alone
+from crashhunt.scenario import load_order_change
 from crashhunt.snapshots import environment_changes
 from crashhunt.trial import Outcome, TrialResult
 

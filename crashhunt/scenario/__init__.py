@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         shipped_scenarios as shipped_scenarios,
     )
     from ._scenario import (
+        FIXED_LOAD_ORDER as FIXED_LOAD_ORDER,
         SIMULATOR_PACKAGES as SIMULATOR_PACKAGES,
         STEP_LENGTH_S as STEP_LENGTH_S,
         Accelerator as Accelerator,
@@ -46,10 +47,13 @@ if TYPE_CHECKING:
         configurations as configurations,
         digest_of_described as digest_of_described,
         installed_backends as installed_backends,
+        load_order_change as load_order_change,
+        load_order_of as load_order_of,
         scenario_digest as scenario_digest,
         titles as titles,
         with_action as with_action,
         with_observations as with_observations,
+        with_recorded_load_order as with_recorded_load_order,
     )
 
 offer_lazily(__name__)

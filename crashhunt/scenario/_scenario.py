@@ -688,3 +688,48 @@ class TrafficSurvey:
     module: str
     refine: Callable[[Scenario, Json], Scenario]
     restore: Callable[[Scenario, Scenario], Scenario | None]
+
+
+# The order in which a simulator processes a scenario at load: whether it is fixed, and as it was for a recorded crash.
+#
+# ``environment.json`` of a snapshot holds it (``load_order``). Where it is missing, the order was not fixed.
+
+FIXED_LOAD_ORDER = "fixed"
+
+
+def load_order_of(scenario: Scenario) -> str | None:
+    """Return ``fixed`` or ``not fixed: REASON`` for the load order; None if the results do not depend on an order."""
+    order = scenario.backend.load_order
+    if order is None:
+        return None
+    why_not = order.why_not(scenario)
+    return f"not fixed: {why_not}" if why_not else FIXED_LOAD_ORDER
+
+
+def with_recorded_load_order(scenario: Scenario, recorded: str | None) -> Scenario:
+    """Return the scenario with the load order that a recorded crash had: the fixed order, or the simulator's own order.
+
+    The load order is the order in which the simulator processes objects when it loads the scenario.
+
+    Args:
+        scenario: the scenario to run again.
+        recorded: the value of ``load_order`` in the snapshot; None if the snapshot has none.
+    """
+    order = scenario.backend.load_order
+    return scenario if order is None or recorded == FIXED_LOAD_ORDER else order.keep(scenario)
+
+
+def load_order_change(scenario: Scenario, recorded: str | None) -> str:
+    """Return how the load order here differs from the recorded order, as a clause; empty if both are equal.
+
+    An order that was not fixed is kept by `with_recorded_load_order`. A difference therefore arises only if the
+    recorded order was fixed, and cannot be fixed here.
+
+    Args:
+        scenario: the scenario to run again.
+        recorded: the value of ``load_order`` in the snapshot; None if the snapshot has none.
+    """
+    order, now = scenario.backend.load_order, load_order_of(scenario)
+    if order is None or recorded != FIXED_LOAD_ORDER or now == FIXED_LOAD_ORDER:
+        return ""
+    return f"the order of {order.what} was fixed and is {now}"

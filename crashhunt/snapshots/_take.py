@@ -33,8 +33,8 @@ from crashhunt.base.programs import (
     words_of,
 )
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
-from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, load_order_of, write_settings
-from crashhunt.scenario import Scenario, as_plain_data
+from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, write_settings
+from crashhunt.scenario import Scenario, as_plain_data, load_order_of
 from crashhunt.snapshots._environment import differing_versions, environment
 from crashhunt.snapshots._snapshot import (
     SCHEMA,

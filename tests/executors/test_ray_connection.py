@@ -472,7 +472,7 @@ def test_bridge_that_does_not_read_is_listened_to_meanwhile(executor, monkeypatc
 
 def test_machine_whose_links_are_fixed_wants_nodes_that_fix_them(executor, monkeypatch):
     found, _ = executor()
-    for order, wanted in ((_executor.FIXED, {"_crashhunt_link_order": "installed"}), ("as it comes", {})):
+    for order, wanted in ((_executor.FIXED_LOAD_ORDER, {"_crashhunt_link_order": "installed"}), ("as it comes", {})):
         monkeypatch.setattr(_executor, "load_order_of", lambda scenario, given=order: given)
         assert found._load_order() == wanted
 

@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 from crashhunt.native import LinkOrder, _link_order, link_order, why_no_link_order
-from crashhunt.plans import RunSettings, load_order_change, load_order_of, with_recorded_load_order
+from crashhunt.plans import RunSettings
 from crashhunt.plans._plan import _with_notes
-from crashhunt.scenario import load_scenario
+from crashhunt.scenario import load_order_change, load_order_of, load_scenario, with_recorded_load_order
 from crashhunt.sumo import SumoSetup
 
 ROOT = Path(__file__).parents[2]

@@ -20,8 +20,8 @@ from crashhunt.executors._protocol import NodeFigures, Notes
 from crashhunt.executors.ray._cluster import cluster_of, require_ray, silent
 from crashhunt.executors.ray._code_archive import CodeArchive, Folder
 from crashhunt.executors.ray._node_actor import code_digest
-from crashhunt.plans import FIXED, load_order_of
 from crashhunt.recording import BlackBoxHeader, Phase
+from crashhunt.scenario import FIXED_LOAD_ORDER, load_order_of
 from crashhunt.snapshots import versions
 from crashhunt.trial import TrialResult
 
@@ -142,7 +142,7 @@ class RayExecutor:
 
     def _load_order(self) -> dict[str, str]:
         """Return the library that fixes the link order; a node must have the same library."""
-        if load_order_of(self._settings.scenario) != FIXED:
+        if load_order_of(self._settings.scenario) != FIXED_LOAD_ORDER:
             return {}
         return {"_crashhunt_link_order": "installed"}
 
