@@ -487,6 +487,11 @@ class ContactRecord:
             return float(self.times[-1])
         return None if left is None else self.time_s - self.before[left].time_s
 
+    def reached_in_s(self, jumper: str) -> float:
+        """Return for how long before the contact the other actor had reached into the lane that an actor jumped to."""
+        since = self.lanes.reached_since(self.before, self.partner(jumper), self._at_contact(jumper))
+        return 0.0 if since is None else self.time_s - self.before[since].time_s
+
     def is_against_its_lane(self, actor: str, back: int | None = None) -> bool | None:
         """Return whether an actor moved against the direction of all lanes at its centre; None if that is not known.
 

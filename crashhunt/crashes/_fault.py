@@ -188,12 +188,16 @@ def _lane_change(case: ContactRecord) -> FaultFinding | None:
 
 
 def _into_changed_vehicle(case: ContactRecord, changer: str, source: str) -> FaultFinding | None:
-    """Blame an actor that moved sideways into a vehicle which had completed its lane change long enough before."""
+    """Blame an actor that jumped into a vehicle which had been in this lane, wholly or in part, for long enough."""
     other = case.partner(changer)
-    since = case.changed_s(other)
-    if since is None or since < _RESPONSE_S - 1e-6 or case.turned(since) > SAME_WAY:
+    since, reached = case.changed_s(other), case.reached_in_s(changer)
+    if since is not None and since >= _RESPONSE_S - 1e-6 and case.turned(since) <= SAME_WAY:
+        words = f"which had changed to the lane next to it {case.ago(since)}"
+    elif reached >= _RESPONSE_S - 1e-6 and case.turned(reached) <= SAME_WAY:
+        words = f"a part of which had been in this lane for at least {reached:.1f} s"
+    else:
         return None  # the other may have been about to change as well, or came there in a bend
-    words = f"{changer} moved sideways into {other}, which had changed to the lane next to it {case.ago(since)}"
+    words = f"{changer} moved sideways into {other}, {words}"
     return FaultFinding(rule="lane change", blames=_name_of(case, changer), words=words, source=source)
 
 

@@ -204,6 +204,27 @@ class LaneMap:
             return self._is_in_parallel_lane(lane, edge, end.heading)
         return False
 
+    def reached_since(self, scenes: Sequence[Scene], actor: str, pose: tuple[NDArray[np.float64], float]) -> int | None:
+        """Return the index of the scene since which the outline of an actor has always reached into a lane.
+
+        Args:
+            scenes: scenes up to the present.
+            actor: identifier of the actor.
+            pose: a point, in m, and a heading, in rad, on this lane.
+        """
+        lane, found = self._driven(pose), None
+        for index in range(len(scenes) - 1, -1, -1):
+            row = scenes[index].roster.index.get(actor)
+            if lane is None or row is None:
+                break
+            known, place = scenes[index].roster.actors[row], lane.place(scenes[index].centers[row])
+            angle = scenes[index].headings[row] - place.heading
+            reach = (known.length * abs(math.sin(angle)) + known.width * abs(math.cos(angle))) / 2
+            if not place.inside or abs(place.aside_m) - reach > lane.half_width - _OVER_M:
+                break
+            found = index
+        return found
+
     def _driven(self, pose: tuple[NDArray[np.float64], float]) -> _Lane | None:
         """Return the lane on which an actor drives; of overlapping lanes, the lane with the nearest centre line.
 

@@ -171,6 +171,25 @@ def test_completed_lane_change_is_no_part_of_both_moved_sideways(angle, before_s
 
 
 @settings(max_examples=examples(10), deadline=None)
+@given(angle=ANGLES, speed=st.sampled_from((0.3, 0.9, 1.0, 2.0)), leaves=st.booleans())
+def test_jump_into_a_part_of_a_vehicle_that_was_long_in_this_lane_is_the_fault_of_the_jumper(angle, speed, leaves):
+    """SUMO's vehicles do not see the part of a freely driven vehicle that is in another lane, and jump into it."""
+
+    def drifts(t):  # over the border at y = 2, which its outline reaches at y = 2.9
+        return 1.0 + 10.0 * t, 1.95 + (speed if leaves else -speed) * min(0.0, max(t, -2.0)), 0.0, 10.0
+
+    case = record(drives(10.0, y=-4.0, changes_s=0.0), drifts, step_s=0.05)
+    found = same_in_every_view(case, angle)
+    assert case.reached_in_s("ego") == pytest.approx(4.0 if leaves or speed < 0.45 else 0.9 / speed, abs=0.06)
+    words = [finding.words for finding in found[5]]
+    if leaves or speed < 0.91:
+        assert (found[4], len(words)) == ("ego", 1)
+        assert re.search(r"other, (a part of )?which had (been in|changed to)", words[0])
+    else:
+        assert (found[4], words) == ("nobody can tell", [])
+
+
+@settings(max_examples=examples(10), deadline=None)
 @given(phase=st.floats(0.1, 0.9), angle=ANGLES)
 def test_lane_change_after_the_contact_has_no_part_in_it(phase, angle):
     """In a step of 1 s the vehicle drives into the one ahead, and then SUMO changes its lane."""
