@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle
     from crashhunt.hunts._next_trials import Trials
-    from crashhunt.hunts._progress import Progress
     from crashhunt.hunts._verification import TrialReruns, VerificationRuns
     from crashhunt.trial import Branch, Disturbance, ForcedCopy, TrialResult
 
@@ -44,7 +43,7 @@ def verify_branches(copies: VerificationRuns) -> BranchReport | None:
         The report; None for a hunt without branches.
     """
     ledger = copies.again.ledger
-    if not copies.again.settings.branch:
+    if not copies.again.setup.settings.branch:
         return None
     sums: Counter[str] = Counter()
     why_unanswered = ""
@@ -121,7 +120,7 @@ def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
         The report; None for a hunt without probes.
     """
     ledger = copies.again.ledger
-    if not copies.again.settings.probe:
+    if not copies.again.setup.settings.probe:
         return None
     margins: list[float] = []
     sums: Counter[str] = Counter()
@@ -193,14 +192,13 @@ class ForkCrashes:
 
     Args:
         copies: object that runs crashes of forks from the start.
-        progress: progress of the hunt, to which these crashes are added.
         trials: trials of the hunt that are still to run.
     """
 
-    def __init__(self, copies: VerificationRuns, progress: Progress, trials: Trials) -> None:
+    def __init__(self, copies: VerificationRuns, trials: Trials) -> None:
         self._copies, self._trials = copies, trials
-        self._progress = progress
-        run, disturber = copies.again.settings.run, copies.disturber
+        self._progress = copies.again.progress
+        run, disturber = copies.again.setup.settings.run, copies.disturber
         self._ends = not run.keep_going and not run.only_at_fault and disturber is not None and bool(disturber.models)
         self._deterministic = run.deterministic
         self._waiting: list[TrialResult] = []
@@ -295,7 +293,7 @@ def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport
         The report; None if the hunt is not in rare mode.
     """
     again = copies.again
-    rule = rare_watch(again.settings, again.ledger, copies.disturber)
+    rule = rare_watch(again.setup.settings, again.ledger, copies.disturber)
     if rule is None:
         return None
     rule.read()
@@ -331,16 +329,16 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
     """Save bundles of the most critical trials of a hunt, and delete other bundles; return them in this order.
 
     Args:
-        again: object that runs trials of the hunt again. The settings of this object contain the number of bundles to
+        again: object that runs trials of the hunt again. The settings of the hunt contain the number of bundles to
             keep; if this is 0, existing bundles are not changed. For each trial that could not be kept, a line with the
-            reason is added to the notes of this object.
+            reason is added to the notes of the hunt.
     """
-    directory, ledger, keep = again.place.path, again.ledger, again.settings.run.near_misses
-    if not keep or len(again.stops):
+    directory, ledger, keep = again.setup.place.path, again.ledger, again.setup.settings.run.near_misses
+    if not keep or again.is_stopped:
         return ()
-    numbers = ledger.most_dangerous(keep, again.newest)
+    numbers = ledger.most_dangerous(keep, again.setup.code.newest)
     if not numbers and ledger.numbers_of(("survived", "finished")):
-        again.notes.append(
+        again.progress.notes.append(
             "no near miss is kept, because no trial without a crash has a criticality above 0, or because the scenario "
             "defines no criticality"
         )
@@ -359,13 +357,13 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
             now, was = one.result, wanted[one.result.spec.number]
             if now.was_killed_from_outside:
                 what = f"trial {now.spec.number}, a near miss, was {now.summary}"
-                again.notes.append(f"{what}: it has no bundle until the same command is run again")
+                again.progress.notes.append(f"{what}: it has no bundle until the same command is run again")
             elif was.is_identical_run(now):
                 one.write(was, confirmed=True)
             else:
-                again.failed.append(now)
+                again.progress.failed.append(now)
                 what = f"trial {now.spec.number}, a near miss, is another one in a fresh process"
-                again.notes.append(f"{what}: it has no bundle")
+                again.progress.notes.append(f"{what}: it has no bundle")
     except CrashhuntError as error:
-        again.notes.append(f"near misses could not be run again: {error}")
+        again.progress.notes.append(f"near misses could not be run again: {error}")
     return tuple(list_near_misses(directory))

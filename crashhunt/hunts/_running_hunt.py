@@ -176,21 +176,15 @@ class RunningHunt:
         self._begin()
         self.ledger.wait_while_locked(self._wait_for_ledger)
         self.reruns = TrialReruns(
-            place=setup.place,
+            setup=setup,
             ledger=self.ledger,
-            settings=setup.settings,
-            parallel=setup.parallel_here,
-            notes=progress.notes,
-            failed=progress.failed,
-            stops=setup.stops,
+            progress=progress,
             executors=SharedReruns(setup.place.scratch / "confirmations", parallel=setup.parallel_here),
             phases=PhaseClock(self._phase_display(), setup.parallel_here),
-            taken=setup.snapshot.digest,
-            newest=setup.code.newest,
         )
         try:
             copies = VerificationRuns(self.reruns, self.disturber)
-            self.fork_crashes = ForkCrashes(copies, progress, self.trials)
+            self.fork_crashes = ForkCrashes(copies, self.trials)
             self.fork_crashes.resume()
             stopped: StoppedBecause = progress.why_stopped(keep_going=setup.settings.run.keep_going)
             if not progress.is_done:
@@ -341,14 +335,14 @@ class RunningHunt:
         """Verify the results of the trials, and return the report of the hunt."""
         setup, ledger, progress, reruns = self.setup, self.ledger, self.progress, self.reruns
         run = setup.settings.run
-        reruns.judge(progress)
+        reruns.judge()
         if stopped in ("all_trials", "time") and progress.last_wanted is not None:
             stopped = progress.why_stopped(keep_going=run.keep_going)
         progress.crashes = prune_bundles(ledger, progress.kinds, progress.crashes, run.keep, final=not setup.stops)
         progress.replace(reruns.confirm(progress.crashes))
         reruns.confirm(progress.earlier)
         if self.audits_left.numbers:
-            self.audits_left.finish(reruns, progress)
+            self.audits_left.finish(reruns)
         near, (probes, branches) = keep_near_misses(reruns), verify_fork_results(copies)
         rare = verify_rare(copies, differences=len(progress.audit.differences) if progress.audit else 0)
         progress.phase = progress.ends_at = None

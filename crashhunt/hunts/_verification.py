@@ -27,17 +27,16 @@ from crashhunt.results import Judged
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from crashhunt.crashes import Bundle
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.executors import Executor
     from crashhunt.hunts._progress import PhaseClock, PhaseName, Progress
+    from crashhunt.hunts._running_hunt import HuntSetup
     from crashhunt.ledger import Facts, Ledger
-    from crashhunt.plans import HuntSettings
     from crashhunt.reruns import EndedRun, SharedReruns
-    from crashhunt.results import HuntDirectory
     from crashhunt.trial import TrialResult, TrialSpec
 
 
@@ -140,30 +139,24 @@ class TrialReruns:
     """Runs trials of a hunt again.
 
     Args:
-        place: directory of the hunt.
+        setup: the parts of the hunt that do not change.
         ledger: ledger of the hunt, which records the snapshot of each trial.
-        settings: settings of the hunt.
-        parallel: number of runs at a time.
-        notes: list to which a line is added for each problem.
-        failed: list to which runs are added that should have confirmed a crash, but ended differently.
-        stops: collection that becomes non-empty as soon as a stop is requested.
+        progress: progress of the hunt: a line is added to its notes for each problem, and to its failed runs those that
+            should have confirmed a crash, but ended differently.
         executors: the executors that run crashes again.
         phases: object to which the progress of these runs is reported.
-        taken: digest of the snapshot that this process has taken; if empty, each snapshot has to be trusted.
-        newest: digests of the snapshots of the newest version of the code; empty if there is only one version.
     """
 
-    place: HuntDirectory
+    setup: HuntSetup
     ledger: Ledger
-    settings: HuntSettings
-    parallel: int
-    notes: list[str]
-    failed: list[TrialResult]
-    stops: Sized
+    progress: Progress
     executors: SharedReruns
     phases: PhaseClock
-    taken: str = ""
-    newest: tuple[str, ...] = ()
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether a stop is requested."""
+        return bool(self.setup.stops)
 
     def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
         """Yield each trial as it ends, until a stop is requested.
@@ -178,20 +171,20 @@ class TrialReruns:
         by_snapshot: dict[str, list[TrialSpec]] = {}
         for spec in specs:
             by_snapshot.setdefault(self.ledger.snapshot_of(spec.number), []).append(spec)
-        scratch = self.place.scratch / folder
+        scratch = self.setup.place.scratch / folder
         for digest, group in by_snapshot.items():
-            snapshot = Snapshot(self.place.path / layout.SNAPSHOTS / digest)
-            if digest != self.taken and not is_snapshot_trusted(snapshot):
-                trust = command_line("crashhunt", "trust", self.place.path)
-                self.notes.append(
+            snapshot = Snapshot(self.setup.place.path / layout.SNAPSHOTS / digest)
+            if digest != self.setup.snapshot.digest and not is_snapshot_trusted(snapshot):
+                trust = command_line("crashhunt", "trust", self.setup.place.path)
+                self.progress.notes.append(
                     f"{len(group)} trials for {folder} did not run again: nothing proves that you took the snapshot "
                     f"{digest} on this machine; if you trust its code, run {trust}, and then the same command again"
                 )
                 continue
             scratch.mkdir(exist_ok=True)
             try:
-                again = settings_again(self.settings, snapshot, scratch)
-                runs = Reruns(again, "snapshot", parallel=self.parallel, stopped=self._show_progress)
+                again = settings_again(self.setup.settings, snapshot, scratch)
+                runs = Reruns(again, "snapshot", parallel=self.setup.parallel_here, stopped=self._show_progress)
                 with closing(runs), suppress(StoppedError):
                     for ended in runs.run(group, recorded=False):
                         yield Again(ended=ended, runs=self, snapshot=digest, folder=folder)
@@ -210,7 +203,7 @@ class TrialReruns:
     def _show_progress(self) -> bool:
         """Show the progress; return whether a stop is requested."""
         self.phases.tick()
-        return bool(len(self.stops))
+        return self.is_stopped
 
     def confirm_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Bundle:
         """Run a crash again that is not fully confirmed; return the updated crash.
@@ -219,20 +212,20 @@ class TrialReruns:
             bundle: the crash to confirm.
             stopped: function that returns whether to cancel; called regularly.
         """
-        if is_settled(bundle) or len(self.stops) or stopped():
+        if is_settled(bundle) or self.is_stopped or stopped():
             return bundle
         try:
             found = confirm(
                 bundle,
-                lambda: bool(len(self.stops)) or stopped(),
-                failed=self.failed,
+                lambda: self.is_stopped or stopped(),
+                failed=self.progress.failed,
                 executors=self.executors,
                 trusted=self._is_made_now(bundle),
             )
         except UntrustedError as refusal:
             note = f"{bundle.id} was not confirmed: {refusal.message}; {refusal.fix}"
-            if note not in self.notes:  # the end of the hunt asks again
-                self.notes.append(note)
+            if note not in self.progress.notes:  # the end of the hunt asks again
+                self.progress.notes.append(note)
             return bundle
         return bundle if found is None or not _write_if_kept(found, bundle.path) else found
 
@@ -245,15 +238,15 @@ class TrialReruns:
         """
 
         def is_stopped() -> bool:
-            return bool(len(self.stops)) or stopped()
+            return self.is_stopped or stopped()
 
         options = ReplayOptions(force=True, trusted=self._is_made_now(bundle))
         try:
             cause, found = find_cause(bundle, options, stopped=is_stopped)
         except CrashhuntError as error:
             note = f"{bundle.id} was not judged: {error.message}"
-            if note not in self.notes:
-                self.notes.append(note)
+            if note not in self.progress.notes:
+                self.progress.notes.append(note)
             return Judged(bundle)
         if is_stopped():
             return Judged(bundle, is_stopped=True)
@@ -261,19 +254,20 @@ class TrialReruns:
             _write_if_kept(found, bundle.path)
         return Judged(found, cause)
 
-    def judge(self, progress: Progress) -> None:
+    def judge(self) -> None:
         """Find the causes of the crashes that are still to be judged, one after another."""
+        progress = self.progress
         if progress.kinds is None or (total := progress.kinds.count_to_judge()) == 0:
             return
         self.phases.begin("causes", total)
-        while not len(self.stops) and (bundle := progress.kinds.next_to_judge()) is not None:
+        while not self.is_stopped and (bundle := progress.kinds.next_to_judge()) is not None:
             (judged,) = self.phases.run(self.judge_one, [bundle], counts=lambda one: not one.is_stopped)
             progress.kinds.settle(judged)
             progress.replace([judged.bundle if judged.bundle.id == one.id else one for one in progress.crashes])
 
     def _is_made_now(self, bundle: Bundle) -> bool | None:
         """Return whether a bundle has the snapshot that this process has just taken, whose files need no check."""
-        return True if bundle.snapshot == self.taken and is_bundle_made_here(bundle) else None
+        return True if bundle.snapshot == self.setup.snapshot.digest and is_bundle_made_here(bundle) else None
 
 
 def _write_if_kept(found: Bundle, folder: Path) -> bool:
@@ -320,8 +314,9 @@ class Again:
 
     def write(self, result: TrialResult, *, confirmed: bool | None = None) -> Bundle:
         """Write the bundle of the trial with a result; return the bundle."""
+        setup = self.runs.setup
         return write_bundle(
-            self.runs.place.path, result, self.ended.folder, hunt_seed=self.runs.settings.seed, snapshot=self.snapshot,
+            setup.place.path, result, self.ended.folder, hunt_seed=setup.settings.seed, snapshot=self.snapshot,
             lanes=self.ended.lanes, place=self.folder, confirmed=confirmed,
         )  # fmt: skip
 
@@ -361,7 +356,7 @@ class VerificationRuns:
     @property
     def is_stopped(self) -> bool:
         """Whether a stop is requested; some crashes of forks may then not have been run from the start."""
-        return bool(len(self.again.stops))
+        return self.again.is_stopped
 
     def crashes(self, found: Sequence[Found], folder: str, name: PhaseName) -> tuple[tuple[Bundle, ...], int]:
         """Return the crashes that reproduce at the same step, and are then confirmed bit-identically, in their order.
@@ -376,7 +371,7 @@ class VerificationRuns:
         """
         if self.is_stopped:
             return (), 0
-        place, kept = self.again.place.path / folder, self.kept.get(folder, {})
+        place, kept = self.again.setup.place.path / folder, self.kept.get(folder, {})
         stay = {bundle.path.name for bundle in kept.values()}
         for path in [one for one in place.iterdir() if one.name not in stay] if kept else [place]:
             remove_at_once(path)
@@ -416,23 +411,23 @@ class VerificationRuns:
                     continue
                 unanswered.discard(result.spec.number)
                 if (str(result.outcome), result.steps) != (copy.outcome, copy.step):
-                    self.again.failed.append(result)
+                    self.again.progress.failed.append(result)
                     continue
                 if self.disturber is not None:
                     result = replace(result, log_likelihood=self.disturber.log_likelihood_of(result))
                 bundles[result.spec.number] = one.write(result)
         except CrashhuntError as error:
-            self.again.notes.append(f"what copies have found could not be run from the start: {error}")
+            self.again.progress.notes.append(f"what copies have found could not be run from the start: {error}")
         confirmed = self.again.phases.run(lambda bundle: self._confirmed(bundle, unanswered), list(bundles.values()))
         return {bundle.result.spec.number: bundle for bundle in confirmed if bundle is not None}, unanswered
 
     def _confirmed(self, bundle: Bundle, unanswered: set[int]) -> Bundle | None:
         # It has just run here, so its code is trusted.
-        found = confirm(bundle, lambda: self.is_stopped, failed=self.again.failed, trusted=True)
+        found = confirm(bundle, lambda: self.is_stopped, failed=self.again.progress.failed, trusted=True)
         if found is None or found.confirmed is None:
             unanswered.add(bundle.result.spec.number)
         if found is None or not found.confirmed:
-            self.again.failed.append(bundle.result)  # nothing has come of this run either
+            self.again.progress.failed.append(bundle.result)  # nothing has come of this run either
             remove_at_once(bundle.path)
             return None
         found.write()
@@ -593,8 +588,9 @@ class PendingAudits:
         progress.audit = audit.report
         progress.audits_left = sorted({*audit.left, *self.numbers})
 
-    def finish(self, again: TrialReruns, progress: Progress) -> None:
+    def finish(self, again: TrialReruns) -> None:
         """Run the pending trials again, and add the results to the progress of the hunt."""
+        progress = again.progress
         left_now = set(progress.audits_left) - set(self.numbers)
         now, (late, left) = progress.audit or AuditReport(), _finish(again, self.numbers)
         progress.audit = AuditReport(
@@ -633,7 +629,7 @@ def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, li
                 )
                 ledger.remark(f"audit: {difference}")
                 differences.append(difference)
-                again.failed.append(now)
+                again.progress.failed.append(now)
     except CrashhuntError as error:
-        again.notes.append(f"trials could not be run again for the audit: {error}")
+        again.progress.notes.append(f"trials could not be run again for the audit: {error}")
     return AuditReport(len(wanted) - len(left), tuple(differences), len(left)), sorted(left)

@@ -42,8 +42,8 @@ FOUND = Found(TrialSpec(3, 1, {"ego": {}}, {}, 9), "collision", 5)
 
 def runs(tmp_path, stops, run):
     (tmp_path / "probes" / "000001-collision").mkdir(parents=True)
-    return SimpleNamespace(place=SimpleNamespace(path=tmp_path), stops=stops, notes=[], failed=[], parallel=2, run=run,
-                           phases=PhaseClock(lambda _: None, 2))  # fmt: skip
+    return SimpleNamespace(setup=SimpleNamespace(place=SimpleNamespace(path=tmp_path)), is_stopped=bool(stops), run=run,
+                           progress=Progress(), phases=PhaseClock(lambda _: None, 2))  # fmt: skip
 
 
 def test_the_one_that_stops_keeps_what_there_was(tmp_path):
@@ -60,7 +60,7 @@ def test_what_cannot_be_run_is_reported_and_the_hunt_has_ended_well(tmp_path):
 
     again = runs(tmp_path, [], fails)
     assert VerificationRuns(again, None).crashes([FOUND], "probes", "probes") == ((), 1)
-    assert again.notes == ["what copies have found could not be run from the start: no room"]
+    assert again.progress.notes == ["what copies have found could not be run from the start: no room"]
     assert not (tmp_path / "probes").exists()
 
 
@@ -72,7 +72,7 @@ def test_another_end_is_no_crash_of_it(tmp_path, outcome, step):
 
     again = runs(tmp_path, [], another)
     assert VerificationRuns(again, None).crashes([FOUND], "probes", "probes") == ((), 0)
-    assert [result.steps for result in again.failed] == [step]
+    assert [result.steps for result in again.progress.failed] == [step]
 
 
 class Copies:
@@ -80,7 +80,7 @@ class Copies:
 
     def __init__(self, *, words="brake=0.02", flaky=(), **run):
         settings = SimpleNamespace(run=SimpleNamespace(**{"keep_going": False, "only_at_fault": False} | run))
-        self.again = SimpleNamespace(settings=settings)
+        self.again = SimpleNamespace(setup=SimpleNamespace(settings=settings), progress=Progress())
         self.disturber = disturber_of(parse_rates([words] if words else []), agents=("ego",), step_length_s=0.1)
         self.flaky, self.ran = flaky, []
 
@@ -103,9 +103,9 @@ def ended(number, *, branch=None, probe=None):
 
 def looked(copies, *results, deterministic=False):
     """Which trial ends a hunt by a copy, and what was run from the start."""
-    copies.again.settings.run.deterministic = deterministic
-    progress = Progress()
-    at = ForkCrashes(copies, progress, SimpleNamespace(upcoming=None))
+    copies.again.setup.settings.run.deterministic = deterministic
+    copies.again.progress = progress = Progress()
+    at = ForkCrashes(copies, SimpleNamespace(upcoming=None))
     for result in results:
         at.add(result)
     told = []
@@ -152,8 +152,8 @@ def test_every_disturbance_of_a_crash_must_be_of_the_hunt():
 
 def test_a_copy_of_an_earlier_trial_comes_before_a_crash_where_that_is_asked_for():
     for deterministic, wanted in ((False, 4), (True, 2)):
-        copies, progress = Copies(deterministic=deterministic), Progress()
-        at = ForkCrashes(copies, progress, SimpleNamespace(upcoming=None))
+        copies = Copies(deterministic=deterministic)
+        progress, at = copies.again.progress, ForkCrashes(copies, SimpleNamespace(upcoming=None))
         crashed = replace(ended(4), outcome=Outcome.COLLISION)
         progress.found[4] = crashed
         for number in (2, 6):
@@ -167,9 +167,10 @@ def test_a_copy_of_an_earlier_trial_comes_before_a_crash_where_that_is_asked_for
 
 def test_a_deterministic_hunt_that_is_resumed_runs_trials_of_lower_numbers_first():
     for deterministic, waits in ((False, False), (True, True)):
-        copies, progress = Copies(deterministic=deterministic), Progress()
+        copies = Copies(deterministic=deterministic)
+        progress = copies.again.progress
         trials = SimpleNamespace(upcoming=1)
-        at = ForkCrashes(copies, progress, trials)
+        at = ForkCrashes(copies, trials)
         copies.again.ledger = SimpleNamespace(
             plain_results=lambda: [ended(3, branch=3.0).to_json(), ended(0).to_json()],
             result={3: ended(3, branch=3.0)}.get,
@@ -200,7 +201,7 @@ class Ends:
 
     def __init__(self, ledger, *, kept=None, stopped=False, unfinished=0, fails=(), disturber=None, **settings):
         self.kept, self.is_stopped, self.unfinished, self.fails = kept or {}, stopped, unfinished, fails
-        self.again = SimpleNamespace(ledger=ledger, settings=SimpleNamespace(**settings))
+        self.again = SimpleNamespace(ledger=ledger, setup=SimpleNamespace(settings=SimpleNamespace(**settings)))
         self.asked, self.disturber = [], disturber
 
     def crashes(self, found, folder, name):
@@ -432,10 +433,13 @@ def near(tmp_path, monkeypatch):
     def make(run, keep=3, stops=()):
         phases = []
         clock = SimpleNamespace(begin=lambda *given: phases.append(given), advance=lambda: phases.append("one"))
+        setup = SimpleNamespace(
+            place=SimpleNamespace(path=tmp_path), settings=SimpleNamespace(run=SimpleNamespace(near_misses=keep)),
+            code=SimpleNamespace(newest=()),
+        )  # fmt: skip
         again = SimpleNamespace(
-            place=SimpleNamespace(path=tmp_path), ledger=Rows(*map(trial, range(6))), notes=[], failed=[],
-            settings=SimpleNamespace(run=SimpleNamespace(near_misses=keep)), stops=stops, run=run, phases=clock,
-            newest=(),
+            setup=setup, ledger=Rows(*map(trial, range(6))), progress=Progress(), is_stopped=bool(stops), run=run,
+            phases=clock,
         )  # fmt: skip
         return SimpleNamespace(again=again, phases=phases, removed=removed, written=written, kept=kept)
 
@@ -457,8 +461,8 @@ def test_most_critical_trials_run_again_and_are_kept(near, tmp_path):
     assert found.removed == [tmp_path / "9"]
     assert found.written == [(0, True)]
     assert found.phases == [("near misses", 3), "one", "one", "one"]
-    assert [one.spec.number for one in found.again.failed] == [2]
-    assert found.again.notes == [
+    assert [one.spec.number for one in found.again.progress.failed] == [2]
+    assert found.again.progress.notes == [
         "trial 2, a near miss, is another one in a fresh process: it has no bundle",
         "trial 3, a near miss, was killed 3 times: it has no bundle until the same command is run again",
     ]
@@ -477,11 +481,11 @@ def test_near_misses_stay_where_none_are_asked_for_or_the_hunt_is_stopped(near):
 def test_trials_without_a_criticality_leave_no_near_misses_and_a_note(near, monkeypatch):
     found = near(lambda specs, folder: iter(()))
     for finished, count in (([0], 1), ([], 0)):
-        found.again.notes.clear()
+        found.again.progress.notes.clear()
         monkeypatch.setattr(found.again.ledger, "most_dangerous", lambda keep, snapshots: [])
         monkeypatch.setattr(found.again.ledger, "numbers_of", lambda outcomes, found=finished: found, raising=False)
         keep_near_misses(found.again)
-        assert [note.partition(",")[0] for note in found.again.notes] == ["no near miss is kept"] * count
+        assert [note.partition(",")[0] for note in found.again.progress.notes] == ["no near miss is kept"] * count
 
 
 def test_near_misses_that_are_there_do_not_run_again(near):
@@ -499,4 +503,4 @@ def test_near_misses_that_are_there_do_not_run_again(near):
     found.again.run = fails
     keep_near_misses(found.again)
     assert found.removed == [0]
-    assert found.again.notes == ["near misses could not be run again: no room"]
+    assert found.again.progress.notes == ["near misses could not be run again: no room"]

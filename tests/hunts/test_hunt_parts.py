@@ -558,9 +558,11 @@ class Bundle:
 
 
 def reruns(tmp_path, stops=(), **more):
-    given = {"place": SimpleNamespace(path=tmp_path, scratch=tmp_path / "scratch"), "ledger": None,
-             "settings": SETTINGS, "parallel": 2, "notes": [], "failed": [], "stops": stops,
-             "executors": "executors", "phases": None, "taken": "0f"}  # fmt: skip
+    setup = SimpleNamespace(
+        place=SimpleNamespace(path=tmp_path, scratch=tmp_path / "scratch"), settings=SETTINGS, parallel_here=2,
+        stops=stops, snapshot=SimpleNamespace(digest="0f"),
+    )  # fmt: skip
+    given = {"setup": setup, "ledger": None, "progress": Progress(), "executors": "executors", "phases": None}
     return TrialReruns(**given | more)
 
 
@@ -577,7 +579,7 @@ def test_crash_is_confirmed_once_and_written_if_it_is_still_there(tmp_path, monk
     again, found = reruns(tmp_path), replace(bundle, confirmed=True)
     assert again.confirm_one(bundle) is found
     assert written == [found]
-    assert asked == [(bundle, False, again.failed, "executors", True)]
+    assert asked == [(bundle, False, again.progress.failed, "executors", True)]
     assert again.confirm_one(replace(bundle, snapshot="other")) is found
     assert asked[-1][-1] is None
     for unchanged in (
@@ -604,7 +606,7 @@ def test_crash_is_confirmed_once_and_written_if_it_is_still_there(tmp_path, monk
     monkeypatch.setattr(_verification, "confirm", refuses)
     for _ in range(2):
         assert again.confirm_one(bundle) is bundle
-    assert again.notes == ["a was not confirmed: it is not yours; trust it"]
+    assert again.progress.notes == ["a was not confirmed: it is not yours; trust it"]
 
 
 def test_crash_that_is_deleted_while_it_is_written_stays_unconfirmed(tmp_path, monkeypatch):
@@ -675,7 +677,7 @@ def test_cause_of_a_crash_is_written_unless_it_was_stopped(tmp_path, monkeypatch
     assert reruns(tmp_path, stops=(2,)).judge_one(bundle) == Judged(bundle, is_stopped=True)
     answer[0] = CrashhuntError("no map", fix="x")
     assert again.judge_one(bundle) == again.judge_one(bundle) == Judged(bundle)
-    assert again.notes == ["a was not judged: no map"]
+    assert again.progress.notes == ["a was not judged: no map"]
     assert written == [other]
 
 
@@ -685,7 +687,7 @@ def test_trials_run_again_with_the_code_that_they_ran_with(tmp_path, monkeypatch
         tmp_path, ledger=SimpleNamespace(snapshot_of=lambda number: "0f" if number < 5 else "99"),
         phases=SimpleNamespace(tick=lambda: None),
     )  # fmt: skip
-    again.place.scratch.mkdir()
+    again.setup.place.scratch.mkdir()
     monkeypatch.setattr(_verification, "Snapshot", lambda path: path)
     monkeypatch.setattr(_verification, "is_snapshot_trusted", lambda snapshot: snapshot.name == "trusted")
     monkeypatch.setattr(_verification, "settings_again", lambda *given: given)
@@ -719,7 +721,7 @@ def test_trials_run_again_with_the_code_that_they_ran_with(tmp_path, monkeypatch
     ]
     assert made == [(((SETTINGS, tmp_path / layout.SNAPSHOTS / "0f", scratch), "snapshot"), 2)]
     assert (removed, Runs.closed) == ([scratch], 1)
-    (note,) = again.notes
+    (note,) = again.progress.notes
     assert note.startswith("1 trials for near did not run again: nothing proves that you took the snapshot 99 ")
     written = []
     monkeypatch.setattr("crashhunt.reruns.read_map", lambda folder, trial: (folder, trial.name))

@@ -75,10 +75,11 @@ class Again:
 
     place: object
     ends: list
-    stops: tuple = ()
+    is_stopped: bool = False
 
     def __post_init__(self):
-        self.phases, self.failed, self.notes, self.asked, self.written = Phases(), [], [], [], []
+        self.phases, self.progress, self.asked, self.written = Phases(), Progress(), [], []
+        self.setup = SimpleNamespace(place=self.place)
 
     def run(self, specs, folder):
         self.asked.append(([one.number for one in specs], folder))
@@ -149,7 +150,7 @@ def test_crashes_of_forks_count_where_they_come_again_from_the_start(again, conf
     assert [(one.id, one.confirmed, one.result.log_likelihood) for one in crashes] == [("000001", True, -2.0)]
     assert unanswered == 4  # 4, 6, 7 and 8
     assert runs.asked == [([1, 2, 3, 4, 5, 6, 7, 8], "near")]
-    assert [one.spec.number for one in runs.failed] == [2, 3, 5, 6, 7]
+    assert [one.spec.number for one in runs.progress.failed] == [2, 3, 5, 6, 7]
     assert [path.name for path in (tmp_path / "near").iterdir()] == ["000001"]
     assert (tmp_path / "near/000001/written").exists()
     assert runs.phases.calls[0] == ("probes", 16)
@@ -175,7 +176,7 @@ def test_verified_crash_of_a_fork_is_kept_and_not_run_again(again, confirms, tmp
     runs.ends.clear()
     assert [one.id for one in verified.crashes([found(1)], "near", "probes")[0]] == ["000001"]
     assert runs.phases.calls == calls  # nothing has begun
-    runs.stops = (2,)
+    runs.is_stopped = True
     assert verified.is_stopped
     assert verified.crashes([found(1)], "near", "probes") == ((), 0)
     assert verified.crash(found(1), "near") is None
@@ -186,7 +187,7 @@ def test_fork_whose_trial_cannot_run_is_noted(again, confirms):
     runs = again(crash(1), CrashhuntError("no map", fix="draw one"))
     crashes, unanswered = VerificationRuns(runs, None).crashes([found(1), found(2)], "near", "probes")
     assert ([one.id for one in crashes], unanswered) == (["000001"], 1)
-    assert runs.notes == ["what copies have found could not be run from the start: no map; draw one"]
+    assert runs.progress.notes == ["what copies have found could not be run from the start: no map; draw one"]
 
 
 def test_causes_are_searched_one_after_another(tmp_path):
@@ -198,27 +199,27 @@ def test_causes_are_searched_one_after_another(tmp_path):
     )  # fmt: skip
     progress = SimpleNamespace(kinds=kinds, crashes=[Bundle(crash(2)), Bundle(crash(9))])
     progress.replace = lambda crashes: setattr(progress, "crashes", crashes)
-    given = {"place": None, "ledger": None, "settings": None, "parallel": 2, "notes": [], "failed": [], "stops": [],
-             "executors": None, "phases": phases}  # fmt: skip
+    setup = SimpleNamespace(stops=[])
 
     class Runs(TrialReruns):
         def judge_one(self, bundle, stopped=lambda: False):
             asked.append(bundle.id)
             return Judged(replace(bundle, confirmed=True), "cause", is_stopped=bundle.id == "000001")
 
-    runs = Runs(**given)
-    runs.judge(progress)
+    runs = Runs(setup, None, progress, None, phases)
+    runs.judge()
     assert asked == ["000001", "000002"]
     assert [one.is_stopped for one in settled] == [True, False]
     assert phases.calls == [("causes", 2), "counted"]
     assert [one.confirmed for one in progress.crashes] == [True, None]
-    runs.judge(progress)  # nothing is left
+    runs.judge()  # nothing is left
     progress.kinds = None
-    runs.judge(progress)
+    runs.judge()
     assert len(phases.calls) == 2
     wanted[:] = [Bundle(crash(3))]
     progress.kinds = kinds
-    Runs(**given | {"stops": [2]}).judge(progress)
+    setup.stops.append(2)
+    runs.judge()
     assert len(asked) == 2
 
 
@@ -333,18 +334,17 @@ def test_audits_of_an_earlier_run_are_made_up_for(audit, again):
     assert PendingAudits(ledger, before, replace(audit.settings, audit=0.0)).numbers == []
     pending = PendingAudits(ledger, {"audits_left": [9, 2, 3, 8, 4]}, audit.settings)
     report = SimpleNamespace(trials=5, differences=(), not_finished=1)
-    progress = Progress()
+    runs = again(result(2), result(3, digest="f" * 32), killed(4))
+    progress, runs.ledger = runs.progress, ledger
     pending.note(SimpleNamespace(report=report, left=[7, 3]), progress)
     assert (progress.audit, progress.audits_left) == (report, [2, 3, 4, 7, 8, 9])
-    runs = again(result(2), result(3, digest="f" * 32), killed(4))
-    runs.ledger = ledger
-    pending.finish(runs, progress)
+    pending.finish(runs)
     assert runs.asked == [([2, 3, 4], "audits")]
     assert (progress.audit.trials, progress.audit.not_finished) == (7, 2)
     ((trial, step, field),) = [(one.trial, one.step, one.field) for one in progress.audit.differences]
     assert (trial, step, field) == (3, None, "the digest")
     assert ledger.remarks[0].startswith("audit: ")
-    assert [one.spec.number for one in runs.failed] == [3]
+    assert [one.spec.number for one in progress.failed] == [3]
     assert progress.audits_left == [4, 7]
     assert runs.phases.calls == [("auditing", 3), "one", "one"]
     nothing = again()
