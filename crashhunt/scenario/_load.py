@@ -227,7 +227,14 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
     if not kept:
         for backend in scenario.backends.values():
             backend.check_names(scenario, ego)
+        if str(name) in shipped_scenarios() and _has_scenario(Path(name)) and not Path(name).samefile(path.parent):
+            note = f"the scenario {name} is the one that comes with crashhunt; --scenario ./{name} is the folder here"
+            scenario = replace(scenario, notes=(*scenario.notes, note))
     return scenario
+
+
+def _has_scenario(folder: Path) -> bool:
+    return any(any(folder.glob(f"*{ending}")) for ending in (SCENARIO, *_endings()[1:]))
 
 
 def endings() -> tuple[str, ...]:

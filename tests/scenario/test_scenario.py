@@ -63,6 +63,20 @@ def test_every_shipped_scenario_is_valid_and_complete(name):
             assert argument.distribution.contains(argument.default), argument
 
 
+@pytest.mark.parametrize("file", ["scenario.toml", "own.sumocfg", "hunt.toml", ""])
+def test_shipped_scenario_is_noted_next_to_a_folder_of_its_name_with_a_scenario(tmp_path, monkeypatch, file):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "merge").mkdir()
+    if file:
+        (tmp_path / "merge" / file).touch()
+    scenario = load_scenario("merge")
+    assert scenario.folder == shipped_folder() / "merge"
+    said = [note for note in scenario.notes if note.endswith("--scenario ./merge is the folder here")]
+    assert len(said) == (file in ("scenario.toml", "own.sumocfg"))
+    monkeypatch.chdir(shipped_folder())
+    assert load_scenario("merge").notes == ()
+
+
 @pytest.mark.parametrize(
     ("keys", "value", "says"),
     [
