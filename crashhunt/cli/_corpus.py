@@ -185,6 +185,14 @@ def _trust_cases(cases: list[Path], options: argparse.Namespace) -> None:
             run_trusted(partial(check_trust, bundle), bundle, None, options, path=path)
 
 
+_COUNT_WORDS = {
+    "still": ("still crashes", "still crash"),
+    "fixed": ("fixed", "fixed"),
+    "changed": ("crashes in another way", "crash in another way"),
+    "cannot_run": ("cannot run", "cannot run"),
+}
+
+
 def _summary_of(reports: list[CaseReport], count: int) -> str:
     lines = [report.describe() for report in reports if not report.ok]
     lines += [f"{report.path.name}: {report.line}" for report in reports if report.ok and report.got == "still"]
@@ -195,8 +203,8 @@ def _summary_of(reports: list[CaseReport], count: int) -> str:
         for report in tighter
     ]
     counts = ", ".join(
-        f"{number} {got.replace('_', ' ')}"
-        for got in ("still", "fixed", "changed", "cannot_run")
+        f"{number} {words[number > 1]}"
+        for got, words in _COUNT_WORDS.items()
         if (number := sum(report.got == got for report in reports))
     )
     wrong = sum(not report.ok for report in reports)

@@ -95,7 +95,7 @@ class CaseReport(Serializable):
 
 
 _RESULT_WORDS = {
-    "still": "crashes still",
+    "still": "still crashes",
     "fixed": "fixed",
     "changed": "crashes in another way",
     "cannot_run": "cannot run",

@@ -120,7 +120,7 @@ def test_corpus_summary_counts_what_is_not_as_expected():
         report("d", "fixed", "fixed"), report("e", "still", "cannot_run"),
     ]  # fmt: skip
     lines = _corpus._summary_of(reports, 6).splitlines()
-    assert lines[-1].startswith("6 cases: 2 still, 2 fixed, 1 cannot run; interrupted after 5")
+    assert lines[-1].startswith("6 cases: 2 still crash, 2 fixed, 1 cannot run; interrupted after 5")
     wrong = sum(not one.ok for one in reports)
     assert lines[-1].endswith(f"; {wrong} not as expected")
     assert any(line.startswith("b: ") for line in lines)

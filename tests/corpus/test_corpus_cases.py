@@ -326,7 +326,7 @@ def test_report_states_whether_the_status_is_as_expected(expected, got, is_ok, m
 def test_report_describes_the_crash_and_how_to_look_at_it():
     found = report(was="it hit", now="it hits", note="too\nfast", warnings=("a", "b"), kept=Path("out/case"))
     assert found.describe().splitlines() == [
-        "case: crashes still",
+        "case: still crashes",
         "  it was: it hit",
         "  now:    it hits",
         "  note: too fast",

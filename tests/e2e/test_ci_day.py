@@ -157,8 +157,8 @@ def test_every_command_of_the_corpus_page_and_the_workflows_of_the_ci_page(proje
         case = case or next((project.folder / "crashes").iterdir()).name
     added, run, kept, show, tested, bisected = results
     assert f"crashes/{case} is new (" in added
-    assert "1 case: 1 still" in run
-    assert "1 case: 1 still" in kept
+    assert "1 case: 1 still crashes" in run
+    assert "1 case: 1 still crashes" in kept
     assert "drove into" in show
     assert "1 xfailed" in tested
     assert "is the first in which it crashes: Release v1.3" in bisected
@@ -194,4 +194,4 @@ def test_every_command_of_the_corpus_page_and_the_workflows_of_the_ci_page(proje
     git(project.folder, "commit", "-qam", "Break it again")
     broken = Job(job, project.folder, tmp_path / "broken").run()
     assert broken.failed
-    assert "crashes still, and fixed was expected" in broken.said
+    assert "still crashes, and fixed was expected" in broken.said
