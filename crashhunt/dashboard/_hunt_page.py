@@ -20,6 +20,7 @@ from crashhunt.plans import read_settings
 from crashhunt.results import (
     HuntState,
     count_versions,
+    first_trials,
     hunt_state,
     state_of_facts,
     sums_of_branches,
@@ -248,15 +249,9 @@ class HuntView:
 
     def kind_firsts(self) -> list[int]:
         """Return in order the numbers of the trials in which a crash type occurred for the first time."""
-        dropped = self.facts.get("dropped") or {}
-        found = []
-        for kind in self.kinds() or []:
-            numbers = list(dropped.get(kind.get("words", ""), ()))  # `--keep` may have deleted the first bundle
-            number = str(kind.get("first", "")).partition("-")[0]
-            if number.isascii() and number.isdecimal():
-                numbers.append(int(number))
-            found += [min(numbers)] if numbers else []
-        return sorted(found)
+        first = {kind.get("words", ""): kind.get("first", "") for kind in self.kinds() or []}
+        numbers = first_trials(first, self.facts.get("dropped") or {})
+        return sorted(number for words, number in numbers.items() if words in first)
 
     def active_at(self) -> float:
         """Return the time of the hunt's last activity, in s since the epoch; 0 if it is unknown."""

@@ -341,6 +341,7 @@ def _crashes(bundles: Sequence[Bundle], found: FoundCrashes, watch: Watch | None
             "words": words,
             "category": _category(found.shortest.get(words, "")),
             "count": count,
+            "first": found.first.get(words),
             "members": members.pop(words, []),
         }
         for words, count in found.types.items()

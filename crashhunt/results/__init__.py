@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         crashes_by_version as crashes_by_version,
         dropped_crashes as dropped_crashes,
         find_crashes as find_crashes,
+        first_trials as first_trials,
         prune_bundles as prune_bundles,
         tally_crashes as tally_crashes,
     )

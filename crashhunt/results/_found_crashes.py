@@ -117,6 +117,7 @@ class FoundCrashes:
         saved: number of crashes that have a bundle.
         types: number of crashes of each crash type (as text) over all trials, the most frequent type first.
         shortest: identifier of the shortest saved crash of each crash type.
+        first: number of the trial in which each crash type occurred for the first time.
         untyped: number of crashes whose type is unknown, because a log is missing or has not been read yet.
         shown: the crashes to show: the shortest crash of each type, then the shortest of all other crashes.
     """
@@ -125,6 +126,7 @@ class FoundCrashes:
     saved: int
     types: Mapping[str, int]
     shortest: Mapping[str, str]
+    first: Mapping[str, int]
     untyped: int
     shown: tuple[Bundle, ...]
 
@@ -143,42 +145,46 @@ def find_crashes(directory: Path, limit: int) -> FoundCrashes:
     folders = {folder.name: folder for folder in crash_folders(directory)}
     if not has_begun(directory / layout.LEDGER):
         bundles = list_bundles(directory)
-        types, shortest = _types_of(bundles, {})
+        types, shortest, first = _types_of(bundles, {})
         tally = CrashTally(len(bundles))
         return FoundCrashes(
             tally=tally,
             saved=len(bundles),
             types=types,
             shortest=shortest,
+            first=first,
             untyped=len(bundles) - sum(types.values()),
             shown=_listed_crashes(folders, _by_steps(bundles), shortest, limit),
         )
     with closing(Ledger(directory / layout.LEDGER)) as ledger:
         facts = ledger.facts()
-        dropped = {words: len(numbers) for words, numbers in (facts.get("dropped") or {}).items()}
+        dropped = facts.get("dropped") or {}
         crash_on = outcomes_of_crashes(directory, facts) or ()
         tally = tally_crashes(ledger, crash_on, disturbed=bool(facts.get("disturb")))
-        tally.found = max(tally.found, len(folders) + sum(dropped.values()))  # a bundle is written before its row
+        tally.found = max(
+            tally.found, len(folders) + sum(map(len, dropped.values()))
+        )  # a bundle is written before its row
         steps = {number: steps for number, _, name, steps, _ in ledger.table() if name in crash_on}
         versions = CodeVersions.of(facts)
         apart = ledger.numbers_from(versions.earlier)
     noted = _noted_types(facts)
     if apart:  # types are those of the newest code
-        dropped = {words: len(set(numbers) - apart) for words, numbers in (facts.get("dropped") or {}).items()}
-        dropped = {words: count for words, count in dropped.items() if count}
+        dropped = {words: rest for words, numbers in dropped.items() if (rest := sorted(set(numbers) - apart))}
         bundles = [bundle for bundle in list_bundles(directory) if bundle.snapshot not in versions.earlier]
-        types, shortest = _types_of(bundles, dropped)
+        types, shortest, first = _types_of(bundles, dropped)
     elif noted is None or (sum(kind["count"] for kind in noted) != tally.found and len(folders) <= _MAX_READ_LOGS):
-        types, shortest = _types_of(list_bundles(directory), dropped)
+        types, shortest, first = _types_of(list_bundles(directory), dropped)
     else:
         types = {kind["words"]: kind["count"] for kind in noted}
         shortest = {kind["words"]: kind["shortest"] for kind in noted}
+        first = first_trials({kind["words"]: kind["first"] for kind in noted}, dropped)
     names = sorted(folders, key=lambda name: (steps.get(_number(name), math.inf), _number(name)))
     return FoundCrashes(
         tally=tally,
         saved=len(folders),
         types=types,
         shortest=shortest,
+        first=first,
         untyped=max(0, tally.found - sum(number in apart for number in steps) - sum(types.values())),
         shown=_listed_crashes(folders, names, shortest, limit),
     )
@@ -189,12 +195,28 @@ def _noted_types(facts: Facts) -> Sequence[KindData] | None:
     return facts.get("kinds") if facts.get("kinds_version") == SIGNATURE_VERSION else None
 
 
-def _types_of(bundles: Sequence[Bundle], dropped: Mapping[str, int]) -> tuple[dict[str, int], dict[str, str]]:
-    """Return the crash types of bundles, from their logs, and of crashes without a bundle."""
-    groups = group_crashes(bundles, dropped, faults=False).groups
-    types = {**dropped, **{str(group.signature): group.count for group in groups}}
-    ranked = sorted(types.items(), key=lambda entry: -entry[1])
-    return dict(ranked), {str(group.signature): group.shortest.id for group in groups}
+def _types_of(
+    bundles: Sequence[Bundle], dropped: Mapping[str, Sequence[int]]
+) -> tuple[dict[str, int], dict[str, str], dict[str, int]]:
+    """Return the crash types of bundles, from their logs, and of crashes without a bundle: counts, shortest, first."""
+    counts = {words: len(numbers) for words, numbers in dropped.items()}
+    groups = {str(group.signature): group for group in group_crashes(bundles, counts, faults=False).groups}
+    counts |= {words: group.count for words, group in groups.items()}
+    ranked = sorted(counts.items(), key=lambda entry: -entry[1])
+    first = first_trials({words: group.first.id for words, group in groups.items()}, dropped)
+    return dict(ranked), {words: group.shortest.id for words, group in groups.items()}, first
+
+
+def first_trials(first: Mapping[str, str], dropped: Mapping[str, Sequence[int]]) -> dict[str, int]:
+    """Return the number of the trial in which each crash type occurred for the first time.
+
+    Args:
+        first: identifier of the first saved crash of each type.
+        dropped: numbers of the trials of each type whose bundles were deleted; the first crash may be one of them.
+    """
+    saved = {words: [number] for words, crash in first.items() if (number := _number(crash)) >= 0}
+    numbers = {words: [*dropped.get(words, ()), *saved.get(words, ())] for words in {**first, **dropped}}
+    return {words: min(each) for words, each in numbers.items() if each}
 
 
 def _by_steps(bundles: Sequence[Bundle]) -> list[str]:
@@ -204,7 +226,7 @@ def _by_steps(bundles: Sequence[Bundle]) -> list[str]:
 
 def _number(name: str) -> int:
     digits = name.partition("-")[0]
-    return int(digits) if digits.isdecimal() else -1
+    return int(digits) if digits.isascii() and digits.isdecimal() else -1
 
 
 def _listed_crashes(

@@ -69,6 +69,13 @@ def counted(folder):
         return Counter(one.failure.kind for one in ledger.results() if one.outcome is Outcome.AGENT_ERROR)
 
 
+def first_of(folder):
+    """Return the first trial of each exception, from the rows of the ledger alone."""
+    with closing(Ledger(folder / "ledger.sqlite")) as ledger:
+        crashes = [one for one in ledger.results() if one.outcome is Outcome.AGENT_ERROR]
+    return {one.failure.kind: one.spec.number for one in sorted(crashes, key=lambda one: -one.spec.number)}
+
+
 def page_of(shell, hunt, *words):
     done = shell.crashhunt("report", hunt, "--json", *words).json
     page = (shell.folder / done["file"]).read_text()
@@ -108,6 +115,9 @@ def test_every_count_of_crashes_is_that_of_the_ledger(hunts, name):
         assert (done["crashes_found"], done["crashes_saved"], len(done["crashes"])) == (count, saved, shown)
         assert (page["found"], page["saved"], len(page["crashes"])) == (count, saved, shown)
         assert {kind["words"].partition(" ")[0]: kind["count"] for kind in page["kinds"]} == truth
+        assert {kind["words"].partition(" ")[0]: kind["first"] for kind in page["kinds"]} == first_of(
+            hunts.folder / name
+        )
         assert sorted(place for kind in page["kinds"] for place in kind["members"]) == list(range(shown))
         if limit == 5:
             assert all(kind["members"] for kind in page["kinds"])  # each type has an example
@@ -123,6 +133,7 @@ def test_types_of_another_version_are_determined_again(hunts, monkeypatch):
     assert find_crashes(hunt, 0).types == {"of another version": sum(truth.values())}
     monkeypatch.setattr(tally_module, "SIGNATURE_VERSION", 99)
     assert {words.partition(" ")[0]: count for words, count in find_crashes(hunt, 0).types.items()} == truth
+    assert {words.partition(" ")[0]: number for words, number in find_crashes(hunt, 0).first.items()} == first_of(hunt)
 
 
 def test_a_report_reads_only_the_bundles_that_it_shows(hunts, monkeypatch):
