@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import count_of, format_number, format_percent, in_lines
+from crashhunt.base.text import count_of, format_number, in_lines
 from crashhunt.report._rate_text import count_training_trials
 from crashhunt.report._step_table import aligned, argument_units
 from crashhunt.results import FACTS, HuntResults, columns_of
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.results import Cell
-    from crashhunt.statistics import Comparison, HuntFigures, Per
+    from crashhunt.statistics import Comparison, HuntFigures
     from crashhunt.training import HeldOutTraffics
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5a5a5a")
@@ -53,15 +53,22 @@ svg .axis { stroke: var(--line); fill: none; }
 
 def describe_comparison(found: Comparison) -> str:
     """Return a comparison of hunts as text."""
-    per = _unit(found.per)
-    header = ("hunt", "trials", "crashes", f"crash rate{per}", "95 % interval", "median step", "median TTC")
+    header = (
+        "hunt",
+        "trials",
+        "crashes",
+        f"crash rate {PER_WORDS[found.per]}",
+        "95 % interval",
+        "median step",
+        "median TTC",
+    )
     rows = [
         (
             hunt.dir,
             str(hunt.trials),
             f"{hunt.crashes} ({hunt.disturbed} disturbed)" if hunt.disturbed is not None else str(hunt.crashes),
-            _number(hunt, hunt.crash_rate) if np.isfinite(hunt.crash_rate) else "-",
-            f"{_number(hunt, hunt.interval[0])} to {_number(hunt, hunt.interval[1])}" if hunt.interval else "-",
+            format_number(hunt.crash_rate) if np.isfinite(hunt.crash_rate) else "-",
+            f"{format_number(hunt.interval[0])} to {format_number(hunt.interval[1])}" if hunt.interval else "-",
             f"{hunt.median_steps_to_crash:g}" if np.isfinite(hunt.median_steps_to_crash) else "-",
             f"{hunt.median_time_to_collision_s:.2f} s" if np.isfinite(hunt.median_time_to_collision_s) else "-",
         )
@@ -88,16 +95,6 @@ def describe_comparison(found: Comparison) -> str:
         if pair.caution:
             lines.append(f"  but {pair.caution}")
     return in_lines(lines)
-
-
-def _number(hunt: HuntFigures, rate: float) -> str:
-    """Return a crash rate as text: in percent if it is per trial."""
-    return format_percent(rate) if hunt.per == "trial" else format_number(rate)
-
-
-def _unit(per: Per) -> str:
-    """Return the unit of a rate as text; empty for rates per trial, which are shown in percent."""
-    return "" if per == "trial" else f" {PER_WORDS[per]}"
 
 
 def comparison_page(found: Comparison, path: Path) -> None:
@@ -135,7 +132,7 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
     scale, parts = 100 / max(most, 1e-9), []
     for hunt in hunts:
         rate = _drawn_rate(hunt)
-        share = f"{_number(hunt, rate)}{_unit(hunt.per)} ({hunt.crashes} of {hunt.trials})"
+        share = f"{format_number(rate)} {PER_WORDS[hunt.per]} ({hunt.crashes} of {hunt.trials})"
         said = share if np.isfinite(hunt.crash_rate) else f"{hunt.crashes} of {hunt.trials}"
         if hunt.disturbed is not None:
             said += f", {hunt.disturbed} of them disturbed"
@@ -148,7 +145,7 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
             said += f", only trials of origin {html.escape(hunt.counted)} count, because the search guided all others"
         if hunt.interval:
             low, high = hunt.interval
-            said += f", 95 % interval {_number(hunt, low)} to {_number(hunt, high)}"
+            said += f", 95 % interval {format_number(low)} to {format_number(high)}"
             high = min(high, most)
             bar += f'<span class="interval" style="left:{low * scale:.2f}%;width:{(high - low) * scale:.2f}%"></span>'
         name = f'<span class="name">{html.escape(hunt.dir)}</span>'
@@ -231,8 +228,8 @@ def _argument_plot(
     most = max((rate for line in lines.values() for _, rate, _ in line), default=0.0) or 1.0  # without crashes
     parts = ['<path class="axis" d="M52 8V148H268"/>',
              f'<text x="160" y="180" text-anchor="middle">{html.escape(label)}</text>',
-             '<text transform="translate(11 78) rotate(-90)" text-anchor="middle">crash rate</text>',
-             f'<text x="48" y="16" text-anchor="end">{format_percent(most)}</text>',
+             '<text transform="translate(11 78) rotate(-90)" text-anchor="middle">crash rate per trial</text>',
+             f'<text x="48" y="16" text-anchor="end">{format_number(most)}</text>',
              '<text x="48" y="150" text-anchor="end">0</text>']  # fmt: skip
     for place, end in enumerate(labels):
         x = 52 + 216 * (place / (len(labels) - 1) if numeric else (place + 0.5) / len(labels))
@@ -244,7 +241,7 @@ def _argument_plot(
         parts.append(f'<path d="M{path}" fill="none" stroke="{colors[hunt]}" stroke-width="2"/>')
         parts += [
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colors[hunt]}">'
-            f"<title>{format_percent(rate)} of {count} trials</title></circle>"
+            f"<title>{format_number(rate)} per trial, {count} trials</title></circle>"
             for x, y, count, rate in at
         ]
     return (

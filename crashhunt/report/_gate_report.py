@@ -90,9 +90,7 @@ def _evidence(found: GateReport) -> list[str]:
         f"evidence: {format_number(found.evidence)}; {format_number(needed)} decides ({confidence})",
     ]
     if found.difference is not None:
-        lines.append(
-            f"difference: {found.difference.as_difference()} {_events(found)} per 100 trials (HEAD minus BASE)"
-        )
+        lines.append(f"difference: {found.difference.as_difference()} {_events(found)} per trial (HEAD minus BASE)")
     return lines
 
 
@@ -198,7 +196,7 @@ def gate_summary(found: GateReport) -> str:
         lines += [row_of([*(f"{count:,}" for count in counts), format_number(found.evidence)]), ""]
     if found.difference is not None:
         confidence = f"{found.confidence:g} %, valid whenever you look"
-        difference = f"**{found.difference.as_difference()}** {_events(found)} per 100 trials"
+        difference = f"**{found.difference.as_difference()}** {_events(found)} per trial"
         lines += [f"Difference: {difference} (HEAD minus BASE, {confidence}).", ""]
     if other := [*found.cautions, *_invalid_pairs(found), *_new_types(found)]:
         lines += [*(f"- {escaped(line)}" for line in other), ""]

@@ -77,15 +77,15 @@ class Interval(NamedTuple):
     low: float
     high: float
 
-    def as_difference(self, *, per_hundred: bool = True) -> str:
-        """Return the interval of a difference as text; per 100 units unless ``per_hundred`` is False.
+    def as_difference(self) -> str:
+        """Return the interval of a difference as text.
 
         >>> Interval(-0.0174, 0.1942).as_difference()
-        '-1.74 to +19.4'
-        >>> Interval(0.0000042, 3.25).as_difference(per_hundred=False)
+        '-0.0174 to +0.194'
+        >>> Interval(0.0000042, 3.25).as_difference()
         '+4.2e-6 to +3.25'
         """
-        ends = [format_number(100 * end if per_hundred else end) for end in self]
+        ends = [format_number(end) for end in self]
         signed = [f"+{text}" if 0 < end < math.inf else text for end, text in zip(self, ends, strict=True)]
         return " to ".join(signed)
 

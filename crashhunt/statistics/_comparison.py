@@ -207,10 +207,8 @@ class Pair(Serializable):
     def _difference(self) -> str:
         if self.difference is None:
             return ""
-        is_trial = self.per == "trial"
-        found = self.difference.as_difference(per_hundred=is_trial)
-        per = "per 100 trials" if is_trial else PER_WORDS[self.per]
-        return f"; difference: {found} crashes {per} ({self.second} minus {self.first}, 95 %)"
+        found = f"{self.difference.as_difference()} crashes {PER_WORDS[self.per]}"
+        return f"; difference: {found} ({self.second} minus {self.first}, 95 %)"
 
     def _unpaired(self) -> str:
         reason = f"{self.first} and {self.second}{self.why_unpaired.removeprefix('they')}"

@@ -30,9 +30,9 @@ def lines_of(*hunts, pairs=()):
 def test_row_has_the_rate_with_its_interval():
     header, row = lines_of(figures())
     assert re.split(r"  +", header) == [
-        "hunt", "trials", "crashes", "crash rate", "95 % interval", "median step", "median TTC"
+        "hunt", "trials", "crashes", "crash rate per trial", "95 % interval", "median step", "median TTC"
     ]  # fmt: skip
-    assert re.split(r"  +", row.strip()) == ["a", "40", "10", "25 %", "12.5 % to 50 %", "12", "1.23 s"]
+    assert re.split(r"  +", row.strip()) == ["a", "40", "10", "0.25", "0.125 to 0.5", "12", "1.23 s"]
 
 
 def test_rates_in_another_unit_are_numbers():
@@ -68,7 +68,7 @@ def test_bars_are_drawn_to_one_scale():
     text = _rates([figures(), figures("b", crash_rate=0.05, interval=(0.0, 0.1), crashes=2)], COLORS)
     places = re.findall(r"left:([\d.]+)%?;width:([\d.]+)%", text)
     assert [tuple(map(float, place)) for place in places] == [(0, 50), (25, 75), (0, 10), (0, 20)]
-    assert "25 % (10 of 40), 95 % interval 12.5 % to 50 %" in text
+    assert "0.25 per trial (10 of 40), 95 % interval 0.125 to 0.5" in text
     unknown = _rates([figures(crash_rate=math.nan, interval=None)], COLORS)
     assert "width:0.00%" in unknown
     assert ">10 of 40</span>" in unknown
@@ -92,15 +92,15 @@ def test_plot_of_a_number_has_the_rate_of_each_bin():
     values = np.linspace(0.0, 10.0, 101)  # ten bins of ten values; the last has the upper end too
     figure = _argument_plot("ego.speed", "speed (m/s)", {"a": (values, values >= 5.0)}, COLORS)
     found = points_of(figure)
-    assert [title for *_, title in found] == ["0 % of 10 trials"] * 5 + ["100 % of 10 trials"] * 4 + [
-        "100 % of 11 trials"
+    assert [title for *_, title in found] == ["0 per trial, 10 trials"] * 5 + ["1 per trial, 10 trials"] * 4 + [
+        "1 per trial, 11 trials"
     ]
     assert found[0][:2] == pytest.approx((52 + 216 * 0.05, 148), abs=0.06)
     assert found[-1][:2] == pytest.approx((52 + 216 * 0.95, 12), abs=0.06)
     assert re.findall(r'x="(\d+)" y="163" text-anchor="(\w+)">([\d.]+)<', figure) == [
         ("52", "start", "0"), ("268", "end", "10")
     ]  # fmt: skip
-    assert ">100 %</text>" in figure
+    assert ">1</text>" in figure
 
 
 def test_plot_of_words_has_a_place_for_each_word_of_all_hunts():
@@ -111,7 +111,7 @@ def test_plot_of_words_has_a_place_for_each_word_of_all_hunts():
         ("88", "middle", "x"), ("160", "middle", "y"), ("232", "middle", "z")
     ]  # fmt: skip
     assert [(x, title) for x, _, title in points_of(figure)] == [
-        (88.0, "33.3 % of 3 trials"), (160.0, "0 % of 1 trials"), (232.0, "25 % of 4 trials")
+        (88.0, "0.333 per trial, 3 trials"), (160.0, "0 per trial, 1 trials"), (232.0, "0.25 per trial, 4 trials")
     ]  # fmt: skip
     assert figure.count('stroke="#a00"') == figure.count('stroke="#0b0"') == 1
 
@@ -119,4 +119,4 @@ def test_plot_of_words_has_a_place_for_each_word_of_all_hunts():
 def test_axis_without_crashes_reaches_from_0_to_100_percent():
     values = np.linspace(0.0, 10.0, 101)
     figure = _argument_plot("ego.speed", "speed (m/s)", {"a": (values, values > 99.0)}, COLORS)
-    assert ">100 %</text>" in figure
+    assert ">1</text>" in figure

@@ -16,7 +16,7 @@ def test_lines_of_a_verdict_fit_a_terminal_of_80_columns():
     )  # fmt: skip
     text = describe_gate(found)
     assert max(map(len, text.splitlines())) <= 80
-    for part in ("12,138 pairs:", "evidence: 1.23e21; 20 decides", "-1.74 to +19.4 crashes", "HEAD minus BASE"):
+    for part in ("12,138 pairs:", "evidence: 1.23e21; 20 decides", "-0.0174 to +0.194 crashes", "HEAD minus BASE"):
         assert part in text
 
 
@@ -73,7 +73,7 @@ def test_trials_that_do_not_start_or_have_no_result_are_counted_with_their_reaso
             "1 pair not counted: the trial is invalid with both versions",
         ):
             assert part in text
-    assert "difference: +0.4 to +20 failures per 100 trials" in describe_gate(found)
+    assert "difference: +0.004 to +0.2 failures per trial" in describe_gate(found)
     assert "60 pairs: 0 fail only with BASE, 8 only with HEAD, 1 with both" in describe_gate(found)
     assert "the verdict must hold for any result" in describe_gate(report("undecided", base=base))
     assert "60 pairs: 0 crash only with BASE" in describe_gate(report())
@@ -90,8 +90,8 @@ def test_crash_types_that_only_one_version_has_are_named():
 
 
 def test_interval_of_a_verdict_shows_on_which_side_of_0_it_lies():
-    assert "difference: +0.0004 to +20 crashes" in describe_gate(report(difference=Interval(4e-6, 0.2)))
-    assert "difference: -20 to -0.0004 crashes" in describe_gate(report("better", difference=Interval(-0.2, -4e-6)))
+    assert "difference: +4e-6 to +0.2 crashes" in describe_gate(report(difference=Interval(4e-6, 0.2)))
+    assert "difference: -0.2 to -4e-6 crashes" in describe_gate(report("better", difference=Interval(-0.2, -4e-6)))
 
 
 def test_cautions_are_on_the_screen_and_in_the_summary():

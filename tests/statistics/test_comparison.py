@@ -105,7 +105,7 @@ def test_difference_is_in_the_requested_unit_and_decides_although_the_intervals_
     few = hunt(tmp_path / "few", 4, trials=120, drive=lambda n: 4.0 if n < 4 else 9.0)
     many = hunt(tmp_path / "many", 17, trials=120, drive=lambda n: 4.0 if n < 17 else 9.0)
     for per, low, unit in (
-        ("trial", 0.02, "per 100 trials"),
+        ("trial", 0.02, "per trial"),
         ("hour", 5.0, "per hour"),
         ("1000km", 100.0, "per 1,000 km"),
     ):

@@ -5,7 +5,7 @@ let data = null;
 const loaded = window.Plotly ? Promise.resolve() : new Promise((resolve) => { document.querySelector('script[src^="/static/plotly.js"]').addEventListener("load", resolve); });
 
 function showTable() {
-  const columns = [["Hunt"], ["Trials", "number"], ["Crashes", "number"], ["Crash rate", "number"], ["95 % interval", "number"], ["Median step", "number"], ["Median time to collision", "number"]];
+  const columns = [["Hunt"], ["Trials", "number"], ["Crashes", "number"], ["Crash rate per trial", "number"], ["95 % interval", "number"], ["Median step", "number"], ["Median time to collision", "number"]];
   const lines = data.hunts.map((hunt, place) => {
     const figures = hunt.figures, key = make("span", "", "key"), name = make("span");
     key.style.background = css(PALETTE[place % PALETTE.length]);
@@ -13,7 +13,7 @@ function showTable() {
     if (figures?.why_not || hunt.problem) name.append(make("span", hunt.problem || `${Number.isFinite(figures.crash_rate) ? "no interval" : "no crash rate"}: ${figures.why_not}`, "sub"));
     if (!figures) return [name, count(hunt.trials_run), count(hunt.crashed_trials), "-", "-", "-", "-"];
     const time_s = figures.median_time_to_collision_s;
-    return [name, count(figures.trials), count(figures.crashes), Number.isFinite(figures.crash_rate) ? formatPercent(figures.crash_rate) : "-", figures.interval ? `${formatPercent(figures.interval[0])} to ${formatPercent(figures.interval[1])}` : "-", figures.median_steps_to_crash ?? "-", time_s === null ? "-" : `${time_s.toFixed(1)} s`];
+    return [name, count(figures.trials), count(figures.crashes), Number.isFinite(figures.crash_rate) ? formatNumber(figures.crash_rate) : "-", figures.interval ? `${formatNumber(figures.interval[0])} to ${formatNumber(figures.interval[1])}` : "-", figures.median_steps_to_crash ?? "-", time_s === null ? "-" : `${time_s.toFixed(1)} s`];
   });
   $("table").replaceChildren(table(columns, lines, "Hunts next to each other"));
   $("verdicts").replaceChildren(...data.pairs.flatMap((pair) => [make("p", pair.verdict), ...(pair.caution ? [make("p", `But ${pair.caution}.`, "faint")] : [])]));
