@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
 FUTURES = 50
 """How many futures are run where the user gives no number: their interval is at most 0.27 wide."""
+_MAX_RUNS = 1_000_000  # each keeps its result in memory
 _SELF_TEST_RUNS = 4  # futures to begin with, of which one is run twice
 _COMPARED_FUTURES = 20  # futures that must not all be equal
 _HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)
@@ -153,8 +154,8 @@ def future_seed(seed: int, number: int) -> int:
 def _check(bundle: Bundle, interventions: Sequence[Intervention], options: WhatIfOptions) -> None:
     if options.code == "log":
         raise UsageError("recorded actions cannot react to a change", fix="use --code snapshot or --code current")
-    if options.times < 0:
-        raise UsageError(f"--times is {options.times}", fix="give at least 1")
+    if not 0 <= options.times <= _MAX_RUNS:
+        raise UsageError(f"--times is {options.times}", fix=f"give 1 to {_MAX_RUNS}")
     last = bundle.result.steps - 1
     for one in interventions:
         if one.from_step is not None and not 0 <= one.from_step <= max(0, last):

@@ -189,6 +189,10 @@ def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the ty
     return cast(T, found)
 
 
+MAX_INTEGER = 2**63 - 1
+"""The greatest integer of a bundle, of SQLite and of TOML."""
+
+
 FILES = dict[str, dict[str, int | str]]
 """The type of what `describe_files` returns, for `typed`."""
 
@@ -223,7 +227,7 @@ def _is(value: object, kind: Any) -> bool:
     if kind is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     if kind is int:
-        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_INTEGER
     return isinstance(value, kind)
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 from crashhunt.base import layout
 from crashhunt.base.errors import FULL, CrashhuntError, UntrustedError, UsageError
 from crashhunt.base.files import cannot_write
+from crashhunt.base.integrity import MAX_INTEGER
 from crashhunt.base.programs import is_program
 from crashhunt.base.removed import removed_fix
 from crashhunt.base.text import command_line, did_you_mean, one_line, one_of, visible
@@ -232,9 +233,12 @@ def pairs(words: list[str], option: str, *, named: bool = True) -> dict[str, str
 def integer(text: str) -> int:
     """Convert a text to a whole number."""
     try:
-        return int(text)
+        value = int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+    if abs(value) > MAX_INTEGER:
+        raise argparse.ArgumentTypeError(f"{text!r} is out of range (allowed: up to {MAX_INTEGER})")
+    return value
 
 
 def number(text: str) -> float:

@@ -11,6 +11,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeAlias, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from crashhunt.base.errors import UsageError
+from crashhunt.base.integrity import MAX_INTEGER
 
 T = TypeVar("T")
 
@@ -67,9 +68,9 @@ def option(default: T, meaning: str, **about: Any) -> T:
 
 
 def at_least(least: int, *, zero: str = "") -> Check:
-    """Return a check that a number is at least a bound; ``zero`` is the meaning of 0, if 0 is allowed."""
+    """Return a check that an integer is at least a bound; ``zero`` is the meaning of 0, if 0 is allowed."""
     fix = f"give at least {least}{f' (0: {zero})' if zero else ''}"
-    return lambda value: fix if value < least else ""
+    return lambda value: fix if value < least else f"give at most {MAX_INTEGER}" if value > MAX_INTEGER else ""
 
 
 def within(least: float, most: float, fix: str) -> Check:

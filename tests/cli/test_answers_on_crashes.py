@@ -436,6 +436,10 @@ def test_whatif_asks_for_the_change_that_is_named(opened, monkeypatch, capsys, s
     ("words", "message"),
     [
         (["whatif", "h", "--times", "-1"], "--times is -1; give at least 1"),
+        (
+            ["whatif", "h", "--times", str(2**63)],
+            f"argument --times: '{2**63}' is out of range (allowed: up to {2**63 - 1})",
+        ),
         (["whatif", "h", "--parallel", "-1"], "--parallel is -1; give at least 0 (0: one per core)"),
         (["whatif", "h", "--for", "soon"], "--for is 'soon'; give a time above 0, such as 90s"),
         (["shrink", "h", "--budget", "0"], "--budget is 0; give at least 1"),

@@ -139,6 +139,7 @@ def test_futures_on_highway_env_exist_where_it_draws_random_numbers(shell, made_
         3,
         [
             (("--times", "-1"), "--times is -1"),
+            (("--times", "1000001"), "--times is 1000001; give 1 to 1000000"),
             (("--parallel", "-2"), "--parallel is -2"),
             (("--for", "soon"), "--for is 'soon'"),
             (("--from-step", "53", "--futures"), "--from-step is 53; give 0 to 52"),

@@ -205,6 +205,8 @@ def test_hunt_toml_is_what_it_was_to_the_byte(tmp_path):
         ({"points": True}, "--points is True; give a whole number"),
         ({"points": 0}, "--points is 0; give at least 1"),
         ({"seed": -1}, "--seed is -1; give at least 0"),
+        ({"seed": 2**63}, f"--seed is {2**63}; give at most {2**63 - 1}"),
+        ({"near_misses": 2**63}, f"--near-misses is {2**63}; give at most {2**63 - 1}"),
         ({"timeout_s": float("inf")}, "--timeout is inf; give seconds above 0"),
         ({"timeout_s": float("nan")}, "--timeout is nan; give seconds above 0"),
         ({"timeout_s": "long"}, "--timeout is 'long'; give a number"),
