@@ -137,8 +137,10 @@ _TESTS_ELSEWHERE = {
     "statistics/_hunt_pairs.py": ("e2e/test_gate.py",),
     # Processes of trials are seen by what is left of trials that harm them.
     "executors/_fork_server.py": (
+        "executors/test_harm.py",
         "executors/test_lost_processes.py",
         "executors/test_warm_traffics.py",
+        "executors/test_what_is_left.py",
         "executors/test_zygotes.py",
     ),
     "executors/_fresh.py": (
@@ -177,12 +179,6 @@ _TESTS_ELSEWHERE = {
         "executors/test_warm_traffics.py",
     ),
     "executors/_warm_traffics.py": ("executors/test_warm_traffics.py", "executors/test_zygotes.py"),
-    "executors/_zygote.py": (
-        "executors/test_harm.py",
-        "executors/test_warm_traffics.py",
-        "executors/test_what_is_left.py",
-        "executors/test_zygotes.py",
-    ),
     "executors/ray": (
         "executors/test_ray_address.py",
         "executors/test_ray_bridge.py",

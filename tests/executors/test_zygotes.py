@@ -15,10 +15,10 @@ import pytest
 from crashhunt.base import forks
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import stage_of
-from crashhunt.executors import _fork_server, _fresh, _rehearsal, _time_limits, _warm_traffics, _zygote
+from crashhunt.executors import _fork_server, _fresh, _rehearsal, _time_limits, _warm_traffics
+from crashhunt.executors._fork_server import Imported
 from crashhunt.executors._time_limits import ImportKilledError
 from crashhunt.executors._warm_traffics import WarmTraffics
-from crashhunt.executors._zygote import Imported
 from crashhunt.trial import TrialSpec
 
 PID = 4321  # of each fork
@@ -220,13 +220,13 @@ def zygote(monkeypatch, tmp_path):
         make_simulator=lambda: "simulator", record_shared_state=lambda control: "", run=lambda job: leave("trial")
     )
     spared, killed, adopted = [], [], []
-    monkeypatch.setattr(_zygote, "TrialProcess", lambda *given: trial)
-    monkeypatch.setattr(_zygote, "adopt_orphans", lambda: adopted.append(True))
-    monkeypatch.setattr(_zygote, "end_descendants", lambda *given: spared.extend(given or [None]))
-    monkeypatch.setattr(_zygote, "kill", killed.append)
-    monkeypatch.setattr(_zygote.gc, "freeze", lambda: None)
+    monkeypatch.setattr(_fork_server, "TrialProcess", lambda *given: trial)
+    monkeypatch.setattr(_fork_server, "adopt_orphans", lambda: adopted.append(True))
+    monkeypatch.setattr(_fork_server, "end_descendants", lambda *given: spared.extend(given or [None]))
+    monkeypatch.setattr(_fork_server, "kill", killed.append)
+    monkeypatch.setattr(_fork_server.gc, "freeze", lambda: None)
     monkeypatch.setattr(os, "_exit", leave)
-    found = _zygote._Zygote(theirs, settings, Imported(None, makes_simulator=True))
+    found = _fork_server._Zygote(theirs, settings, Imported(None, makes_simulator=True))
     assert adopted
     found.test = SimpleNamespace(supervisor=ours, trial=trial, spared=spared, killed=killed, settings=settings)
     with ours, theirs:
@@ -296,7 +296,7 @@ def test_trial_runs_in_a_fork_that_is_waited_for(zygote, monkeypatch, reports):
     monkeypatch.setattr(os, "fork", lambda: PID)
     monkeypatch.setattr(os, "pidfd_open", pidfd_open)
     monkeypatch.setattr(os, "waitpid", lambda pid, options: next(waited))
-    monkeypatch.setattr(_zygote, "ended", lambda pid: 3 if pid == PID else None)
+    monkeypatch.setattr(_fork_server, "ended", lambda pid: 3 if pid == PID else None)
     zygote._makes_simulator = False
     stage = stage_of(zygote.test.settings.scratch, PID)
     stage.mkdir(parents=True)
@@ -335,7 +335,7 @@ def test_copies_are_spared_when_a_trial_has_ended(zygote, monkeypatch):
 def test_process_of_a_trial_has_no_connection_to_the_supervisor(zygote, monkeypatch):
     died, forgotten = [], []
     monkeypatch.setattr(os, "fork", lambda: 0)
-    monkeypatch.setattr(_zygote, "die_with", died.append)
+    monkeypatch.setattr(_fork_server, "die_with", died.append)
     zygote._warm = SimpleNamespace(run=lambda *_: None, processes=frozenset(), forget=lambda: forgotten.append(True))
     with pytest.raises(Left, match="trial"):
         zygote._run(job(0))
@@ -825,9 +825,9 @@ def test_rehearsal_comes_before_the_imports_and_leaves_nothing(tmp_path, monkeyp
         return run(*given, **options)
 
     monkeypatch.setattr(_rehearsal, "run_episode", run_episode)
-    monkeypatch.setattr(_zygote, "Parts", lambda _: parts)
-    monkeypatch.setattr(_zygote, "_can_be_forked", lambda: True)
-    assert _zygote.import_parts(settings, said.append, rehearses=True) is not None
+    monkeypatch.setattr(_fork_server, "Parts", lambda _: parts)
+    monkeypatch.setattr(_fork_server, "_can_be_forked", lambda: True)
+    assert _fork_server.import_parts(settings, said.append, rehearses=True) is not None
     assert said[:2] == ["Gymnasium cannot be imported", f"a module, {1 if fails else 10} rehearsals"]
     assert not list(tmp_path.iterdir())
 
@@ -840,16 +840,16 @@ def test_imports_decide_who_makes_the_simulator(monkeypatch, forkable, forks_wel
     backend = SimpleNamespace(forkable=forkable)
     settings = SimpleNamespace(scenario=SimpleNamespace(backend=backend, simulator="toy"))
     parts = SimpleNamespace(load=lambda report: report("a module"))
-    monkeypatch.setattr(_zygote, "Parts", lambda given: parts if given is settings else None)
-    monkeypatch.setattr(_zygote, "_is_forkable_with", lambda given: forks_well if given is parts else None)
-    monkeypatch.setattr(_zygote, "_can_be_forked", lambda: True)
-    assert _zygote.import_parts(settings, said.append) == Imported(parts, makes_simulator=makes)
+    monkeypatch.setattr(_fork_server, "Parts", lambda given: parts if given is settings else None)
+    monkeypatch.setattr(_fork_server, "_is_forkable_with", lambda given: forks_well if given is parts else None)
+    monkeypatch.setattr(_fork_server, "_can_be_forked", lambda: True)
+    assert _fork_server.import_parts(settings, said.append) == Imported(parts, makes_simulator=makes)
     assert said == ["a module", "the simulator cannot be made", ""]
-    monkeypatch.setattr(_zygote, "_can_be_forked", lambda: False)
-    assert _zygote.import_parts(settings, said.append) is None
+    monkeypatch.setattr(_fork_server, "_can_be_forked", lambda: False)
+    assert _fork_server.import_parts(settings, said.append) is None
     located = []
-    monkeypatch.setattr(_zygote, "locate", lambda *given: located.append(given))
-    assert _zygote.import_nothing(settings) == Imported(None, makes_simulator=False)
+    monkeypatch.setattr(_fork_server, "locate", lambda *given: located.append(given))
+    assert _fork_server.import_nothing(settings) == Imported(None, makes_simulator=False)
     settings.scenario.simulator = "mine:Simulator"
-    _zygote.import_nothing(settings)
+    _fork_server.import_nothing(settings)
     assert located == [("simulators", "toy")]
