@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import os
 import pty
 import re
 import subprocess
 import tomllib
+import traceback
 from itertools import pairwise
 from pathlib import Path
 
@@ -198,6 +200,51 @@ def test_every_file_that_the_architecture_names_is_there():
     for name in re.findall(r"`((?:\w+/)+\w+\.(?:py|cpp|hpp|html|js))`", text):
         if "NAME" not in name:
             assert (top / name).is_file() or (top.parent / name).is_file(), name
+
+
+SPY = """
+import traceback
+from contextlib import suppress
+
+class Spy:
+    def reset(self, seed): ...
+
+    def act(self, observation):
+        with suppress(FileExistsError), open({file!r}, "x") as file:  # not in the confirmation
+            file.write("\\n".join(frame.filename for frame in traceback.extract_stack()))
+        raise ValueError
+"""
+
+
+def test_files_of_one_trial_are_those_of_the_stacks_of_its_processes(toy, monkeypatch):
+    text = find_page("architecture").file.read_text().partition("## The way of one trial")[2].partition("1. **Req")[0]
+    listed = set(re.findall(r"`([\w/]+\.py)`", text))
+    (toy.folder / "spy.py").write_text(SPY.format(file=str(toy.folder / "stack")))
+    monkeypatch.chdir(toy.folder)
+    stacks = []
+
+    def record(place, name):
+        original = getattr(place, name)
+
+        def call(*given, **more):
+            monkeypatch.setattr(place, name, original)  # the confirmation calls it as well
+            stacks.extend([*(frame.filename for frame in traceback.extract_stack()), inspect.getfile(original)])
+            return original(*given, **more)
+
+        monkeypatch.setattr(place, name, call)
+
+    record(importlib.import_module("crashhunt.plans._plan"), "sampler_of")
+    record(importlib.import_module("crashhunt.executors._pool").PoolExecutor, "submit")
+    record(importlib.import_module("crashhunt.recording"), "write_log")
+    words = ["run", "h", "1", "1", "9", "--scenario", "toy", "--agent", "spy:Spy"]
+    options = make_parser().parse_args(words)
+    assert options.command(options, words) == 0
+    top = f"{Path(crashhunt.__file__).parent}/"
+    found = {file.removeprefix(top) for file in (*stacks, *(toy.folder / "stack").read_text().splitlines())}
+    found = {file for file in found if file.endswith(".py") and not file.startswith(("/", "base/", "<", "cli/__"))}
+    assert found <= listed
+    # The supervisor runs no code of a test, the records are written between two calls of agents, and this is the toy.
+    assert listed - found == {"executors/_supervisor.py", "recording/_blackbox.py", "sumo/_simulator.py"}
 
 
 def test_table_of_packages_has_all_of_them_in_the_order_of_their_imports():
