@@ -18,12 +18,13 @@ import sys
 import tempfile
 import threading
 import tomllib
+import warnings
 from dataclasses import dataclass
 from importlib.machinery import SourceFileLoader
 from importlib.metadata import distribution
 from itertools import islice
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import hypothesis
@@ -215,8 +216,8 @@ def _commands() -> Commands:
 def pytest_configure(config: pytest.Config) -> None:
     """Do once, before several workers of pytest-xdist start, what each of them would do: compile, start servers.
 
-    Compiling the tests of a fresh clone takes 7 s of a processor, most of it for what pytest adds to assertions, and
-    the servers that commands are forked from take 3 s.
+    Compiling the tests of a fresh clone takes 7 s of a processor, most of it for what pytest adds to assertions, the
+    constants that Hypothesis reads from crashhunt 2 s, and the servers that commands are forked from 3 s.
     """
     if "PYTEST_XDIST_WORKER" in os.environ:
         return
@@ -262,6 +263,7 @@ def compile_once(config: pytest.Config, tests: Path, processes: int) -> None:
 
     def compile_module(file: Path) -> None:
         SourceFileLoader("", str(file)).get_code("")  # which keeps it
+        keep_constants(file)
 
     work = [(compile_test, file) for file in sorted(tests.rglob("test_*.py"))]
     work += [(compile_module, file) for file in sorted(Path(_core.__file__).parents[1].rglob("*.py"))]
@@ -269,6 +271,7 @@ def compile_once(config: pytest.Config, tests: Path, processes: int) -> None:
     for number in range(processes):
         pid = os.fork()
         if pid == 0:
+            warnings.simplefilter("ignore")  # Hypothesis warns of what takes long before tests are collected
             with contextlib.suppress(Exception):  # the worker that imports the module reports what is wrong with it
                 for compile_file, file in work[number::processes]:
                     compile_file(file)
@@ -276,6 +279,17 @@ def compile_once(config: pytest.Config, tests: Path, processes: int) -> None:
         started.append(pid)
     for pid in started:
         os.waitpid(pid, 0)
+
+
+def keep_constants(file: Path) -> None:
+    """Have Hypothesis write down which constants a module has, for its examples; each worker reads all modules else."""
+    try:
+        from hypothesis.internal.constants_ast import constants_from_module
+    except ImportError:  # of another version, where each worker reads for itself
+        return
+    module = ModuleType(file.stem)
+    module.__file__ = str(file)
+    constants_from_module(module)
 
 
 # Thousands of tests and their modules live to the end: the garbage collector need not walk them each time, neither
