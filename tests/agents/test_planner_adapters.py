@@ -7,7 +7,9 @@ import io
 import sys
 import tokenize
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import crashhunt
@@ -57,3 +59,26 @@ def test_trial_of_a_planner_is_bit_identical_in_a_new_process(name, scenario, tm
     assert (report.outcomes, report.trial_steps) == ({"survived": 1}, 40)
     # The trial was run again in a new process, and compared bit by bit.
     assert (report.audit.trials, report.audit.differences, report.audit.not_finished) == (1, (), 0)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("gap_m", [2.1, 4.0])
+def test_frenetix_brakes_although_its_costs_prefer_to_drive_through_the_vehicle_ahead(gap_m):
+    pytest.importorskip("frenetix")
+    from crashhunt.agents.planners.frenetix_agent import Frenetix
+
+    times = np.arange(1, 31) * 0.1
+    route, actors = np.zeros((60, 6)), np.zeros((9, 15))
+    route[:, 0], route[:, 1], route[:, 4] = 1.0, np.arange(-20, 100, 2), 13.9
+    actors[0, :9] = 1.0, 5.0 + gap_m, 0.0, 0.0, 1.6, 0.0, 0.0, 5.0, 1.8
+    predictions, covariance = np.zeros((9, 30, 4)), np.zeros((9, 30, 3))
+    predictions[0, :, 0], predictions[0, :, 3] = 5.0 + gap_m + 1.6 * times, 1.6
+    covariance[0, :, 0], covariance[0, :, 1] = (0.3 * times) ** 2, (0.1 * times) ** 2
+    seen = {
+        "ego": np.array([0.0, 0.0, 0.0, 5.7, -2.0, 0.0, 0.0]), "actors": actors, "route": route,
+        "predictions": predictions, "prediction_covariance": covariance,
+    }  # fmt: skip
+    vehicle = SimpleNamespace(length=5.0, width=1.8, rear_axle_offset=1.5, wheelbase=3.0)
+    plan = Frenetix(vehicle, 19.0).act(seen)
+    assert plan[5, 4] < 4.0
+    assert (np.diff(plan[:10, 4]) < 0).all()

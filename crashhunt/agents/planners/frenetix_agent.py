@@ -10,7 +10,7 @@ PARTS = "ego actors:rows=9 predictions:rows=9 prediction_covariance:rows=9:along
 
 
 class Frenetix:
-    """Samples end speeds, end times and end offsets; the probability of collisions is one of the costs."""
+    """Samples end speeds, end times and end offsets; drives the cheapest curve that touches no predicted actor."""
 
     observation, action = PARTS.split(), "trajectory"
 
@@ -28,7 +28,7 @@ class Frenetix:
         frame = fx.CoordinateSystemWrapper(np.vstack([path, path[-1] + 50 * (path[-1] - path[-2])]))  # beyond its end
         state = fx.CartesianPlannerState(np.array([x, y]), heading, speed, acceleration, steering)
         start = fx.compute_initial_state(frame, state, wheelbase, is_slow)
-        ends = product((1.5, 2.0, 3.0), np.linspace(0, wanted, 6), (-0.5, 0, 0.5))
+        ends = product((1.0, 1.5, 2.0, 3.0), np.linspace(0, wanted, 6), (-0.5, 0, 0.5))
         rows = [(0, time, *start.x0_lon, v, 0, *start.x0_lat, offset, 0, 0) for time, v, offset in ends]
         handler = fx.TrajectoryHandler(0.1)
         handler.add_function(FillCoordinates(is_slow, heading, frame, 3))
@@ -43,8 +43,21 @@ class Frenetix:
         handler.generate_trajectories(np.array(rows), is_slow)
         handler.evaluate_all_current_functions(True)
         valid = [one for one in handler.get_sorted_trajectories() if one.valid]  # the first is the cheapest
-        plan = min(valid, key=lambda one: not one.feasible).cartesian
+        feasible = [one.cartesian for one in valid if one.feasible] or [valid[0].cartesian]
+        # To drive through an actor fast has a smaller sum of probabilities than to brake, so exclude it; else brake.
+        free = (one for one in feasible if not self._touches(one, observation))
+        plan = next(free, None) or min(feasible, key=lambda one: one.v[5])
         return np.column_stack((np.arange(len(plan.x)) * 0.1, plan.x, plan.y, plan.theta, plan.v))
+
+    def _touches(self, plan, observation):
+        for actor, poses in zip(observation["actors"], observation["predictions"], strict=True):
+            last = min(len(poses), len(plan.x) - 1) if actor[0] else 0
+            own = np.column_stack([plan.x, plan.y, plan.theta])[1 : last + 1]
+            (dx, dy, turn), c, s = (poses[:last, :3] - own).T, np.cos(own[:, 2]), np.sin(own[:, 2])
+            sizes = np.abs([np.cos(turn), np.sin(turn)]).T @ [actor[7:9], actor[8:6:-1]] + self.size[:2]
+            if (sizes / 2 > np.abs([dx * c + dy * s, dy * c - dx * s]).T).all(axis=1).any():  # outlines overlap
+                return True
+        return False
 
 
 def _predicted(observation):
