@@ -14,6 +14,7 @@ from crashhunt.scenario import load_scenario
 from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._options import SumoSetup
 from crashhunt.testing._kinematic_cases import solve
+from crashhunt.world import manoeuvre_motions
 
 CUT_IN = {"ego_kmh": 60.0, "other_kmh": 40.0, "gap_m": 12.5, "lateral_mps": 0.9}
 
@@ -104,54 +105,15 @@ STRAIGHT = {
 }
 
 
-def tracks(simulate, name, steps):
-    scenes = drive(*simulate(f"r157-{name}", ego_kmh=60.0, **STRAIGHT[name]), KeepsSpeed(), steps)
-    found = {}
-    for step, scene in enumerate(scenes):
-        for actor, row in scene.roster.index.items():
-            found.setdefault(actor, {})[step] = (*scene.points[row], scene.speeds[row])
-    return found
-
-
-def test_vehicle_ahead_swerves_in_its_lane_next_to_another_vehicle(simulate):
-    found = tracks(simulate, "lane-keeping", 80)
-    leader, beside = (np.array(list(found[name].values())) for name in ("leader", "beside"))
-    assert leader[:, 1].max() == pytest.approx(-5.25 + 0.5, abs=0.01)
-    assert leader[:, 1].min() == pytest.approx(-5.25 - 0.5, abs=0.01)
-    assert beside[0, :2] == pytest.approx([305.0, -1.75])
-    assert {60 / 3.6} == set(leader[:, 2]) | set(beside[:, 2])
-
-
-def test_speed_of_the_vehicle_ahead_varies(simulate):
-    leader = np.array(list(tracks(simulate, "following", 100)["leader"].values()))
-    assert leader[:, 1] == pytest.approx(-1.25)
-    assert leader[[0, 50, 100], 2] * 3.6 == pytest.approx([60, 40, 60])
-
-
-def test_vehicle_ahead_stops_where_it_would_lose_more_than_its_speed(simulate):
-    given = STRAIGHT["following"] | {"ego_kmh": 20.0, "slower_kmh": 60.0}
-    scenes = drive(*simulate("r157-following", **given), KeepsSpeed(), 50)
-    assert min(scene.speeds[scene.roster.index["leader"]] for scene in scenes) == 0.0
-
-
-def test_vehicles_that_stand_in_the_lane_are_where_the_arguments_say(simulate):
-    standing = tracks(simulate, "blocked-lane", 1)["standing"]
-    assert standing[0] == standing[1] == pytest.approx((404.3, -2.25, 0.0))
-    found = tracks(simulate, "multiple-targets", 1)
-    assert found["motorcycle"][1] == pytest.approx((402.2, -1.25, 0.0))
-    assert found["standing"][1] == pytest.approx((416.5, -1.75, 0.0))
-
-
-def test_person_is_at_the_middle_of_the_lane_when_a_constant_speed_arrives(simulate):
-    person = tracks(simulate, "pedestrian", 60)["person walker"]
-    assert person[60][:2] == pytest.approx((400.0, -1.75 - 0.2))  # 100 m with 60 km/h take 60 steps
-    assert person[60][1] - person[59][1] == pytest.approx(5 / 36)
-
-
-def test_target_appears_when_a_constant_speed_has_come_near(simulate):
-    motorcycle = tracks(simulate, "detection-range", 80)["motorcycle"]
-    assert min(motorcycle) == math.ceil((150 - 46) / (60 / 3.6) / 0.1)
-    assert motorcycle[80] == pytest.approx((452.2, 3.5, 0.0))
+@pytest.mark.parametrize("name", STRAIGHT)
+def test_other_road_users_are_at_the_places_of_their_motions(simulate, name):
+    values, side = {"ego_kmh": 60.0, **STRAIGHT[name]}, STRAIGHT[name].get("side", -1)
+    scenes = drive(*simulate(f"r157-{name}", **values), KeepsSpeed(), 80)
+    motions = manoeuvre_motions(name.replace("-", "_"), values, -3.5 - 1.75 * side, -3.5 + 1.75 * side, 0.1)
+    for step, (scene, motion) in enumerate(zip(scenes, motions, strict=False)):
+        found = {name: (*scene.points[row], scene.speeds[row]) for name, row in scene.roster.index.items()}
+        assert found.pop("ego")[:2] == pytest.approx((300 + step * 6 / 3.6, -3.5 - 1.75 * side), abs=0.01)
+        assert found == {name: pytest.approx((one.x, one.y, one.speed), abs=0.01) for name, one in motion.items()}
 
 
 def touch(scene):
