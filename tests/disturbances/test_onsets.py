@@ -140,11 +140,3 @@ def test_same_root_has_the_same_onsets():
     first, second = (run(FirstOnsets(some, Forcing(0.1, {"brake=4.0": 3.0}), 9, LAST), is_even) for _ in range(2))
     assert first == second
     assert run(FirstOnsets(some, Forcing(0.1), 10, LAST), is_even) != first
-
-
-@pytest.mark.parametrize("model", [brake(), cut_in()])
-def test_models_list_every_draw_with_its_probability(model):
-    listed = dict(model.possibilities())
-    assert math.fsum(listed.values()) == pytest.approx(1.0)
-    for drawn, share in listed.items():
-        assert math.log(share) == pytest.approx(model.log_likelihood(drawn))

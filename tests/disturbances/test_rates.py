@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import math
+import zlib
+from collections import Counter
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from conftest import examples
+from hypothesis import given, settings, strategies as st
 
 from crashhunt.base.plugins import locate, registered
 from crashhunt.disturbances import (
@@ -15,7 +20,6 @@ from crashhunt.disturbances import (
     Drawn,
     ModelApart,
     brake,
-    cut_in,
     disturber_of,
     parse_rates,
 )
@@ -235,11 +239,52 @@ def test_a_model_draws_only_what_its_kind_may_be(what, who, strong):
     assert DisturbanceSampler({"own": own}, {"own": 5.0}, ("ego",), DT).draw(1, 100)
 
 
-def test_weights_are_shares():
-    model = cut_in()
-    rng = np.random.default_rng(1)
-    assert {model.draw(rng).who for _ in range(200)} == set(model.who)
-    assert math.isclose(sum(math.exp(model.log_likelihood(Drawn(who, 0.0, 2.0))) for who in model.who), 0.5 * 0.5)
+class Evenly:
+    """A random generator that returns every combination of evenly spread numbers once."""
+
+    def __init__(self, *counts):
+        self._numbers = itertools.chain(*itertools.product(*([(k + 0.5) / n for k in range(n)] for n in counts)))
+
+    def random(self):
+        return next(self._numbers)
+
+
+weights = st.dictionaries(st.integers(1, 9).map(float), st.integers(1, 4), min_size=1, max_size=4)
+built_in = st.sampled_from(sorted(registered("disturbances"))).map(lambda name: locate("disturbances", name)())
+models = built_in | st.builds(Choices, st.just("brake"), st.just({"ahead": 3, "behind": 1}), weights, weights)
+
+
+@settings(max_examples=examples(60))
+@given(models)
+def test_a_draw_is_as_likely_as_the_share_of_all_random_numbers_that_give_it(model):
+    totals = [round(sum(part.values())) for part in (model.who, model.how_strong, model.how_long)]
+    rng, count = Evenly(*totals), math.prod(totals)
+    shares = {drawn: times / count for drawn, times in Counter(model.draw(rng) for _ in range(count)).items()}
+    assert dict(model.possibilities()) == pytest.approx(shares)
+    assert {drawn: math.exp(model.log_likelihood(drawn)) for drawn in shares} == pytest.approx(shares)
+    assert shares.keys() == {Drawn(*part) for part in itertools.product(model.who, model.how_strong, model.how_long)}
+
+
+def test_built_in_models_draw_as_in_version_1():
+    """A seed gives the same disturbances in every version, so that hunts resume and their rates compare."""
+    drawn = {}
+    for name in sorted(registered("disturbances")):
+        model, rng = locate("disturbances", name)(), np.random.default_rng(1)
+        drawn[name] = zlib.crc32(repr([dataclasses.astuple(model.draw(rng)) for _ in range(200)]).encode())
+    assert drawn == {
+        "brake": 4089475030,
+        "cut_in": 273597808,
+        "dawdle": 3479028362,
+        "ignore_priority": 3077076100,
+        "late_action": 892198863,
+        "late_merge": 530080000,
+        "late_observation": 892198863,
+        "noisy_observation": 852994988,
+        "speed": 3348799866,
+        "step_out": 2833426313,
+        "stop": 3029222793,
+        "unseen": 1188916016,
+    }
 
 
 def test_the_strongest_that_a_model_may_draw_comes_first_and_is_as_likely_as_any():
