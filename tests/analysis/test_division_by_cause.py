@@ -8,8 +8,10 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.analysis import _types_by_cause
-from crashhunt.analysis._types_by_cause import divide_by_cause
+from crashhunt.analysis._types_by_cause import divide_by_cause, find_cause
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.crashes import INTERRUPTED, Judgement, Reference, Why
+from crashhunt.trial import Outcome
 
 
 class AllChosen:
@@ -50,6 +52,43 @@ def bundles(monkeypatch):
     monkeypatch.setattr(_types_by_cause, "judgement_of", lambda bundle: None)
     monkeypatch.setattr(_types_by_cause, "Division", AllChosen)
     return SimpleNamespace(group=SimpleNamespace(bundles=made), written=written, made=made)
+
+
+@pytest.mark.parametrize(
+    ("known", "omission", "runs", "cause"),
+    [
+        (None, "braked too late", ["omission"], (None, "braked too late")),
+        (None, None, ["omission", "why"], ("found", None)),
+        (Judgement(why=Why(steps=7)), None, ["omission"], (Why(steps=7), None)),
+        (Judgement(reference=Reference(omission="x")), None, [], (None, "x")),
+        (Judgement(reference=Reference()), None, ["why"], ("found", None)),
+        (Judgement(why=Why(why_not=INTERRUPTED)), None, ["omission", "why"], ("found", None)),
+    ],
+    ids=str,
+)
+def test_only_missing_runs_are_made_and_factors_are_removed_only_without_an_omission(
+    monkeypatch, known, omission, runs, cause
+):
+    made = []
+
+    def find_omission(rerun, **words):
+        made.append("omission")
+        return Reference(omission=omission)
+
+    def judge(bundle, options, **words):
+        made.append("why")
+        assert words["why"] > 0
+        return Judgement(why="found")
+
+    for name, function in {
+        "find_omission": find_omission, "judge": judge, "prepare": lambda *_: None,
+        "judgement_of": lambda _: known, "with_judgement": lambda bundle, found: found,
+        "cause_of": lambda bundle, found: (found.why, found.reference.omission),
+    }.items():  # fmt: skip
+        monkeypatch.setattr(_types_by_cause, name, function)
+    collision = SimpleNamespace(result=SimpleNamespace(outcome=Outcome.COLLISION), is_near_miss=False)
+    assert find_cause(collision)[0] == cause
+    assert made == runs
 
 
 def test_most_frequent_cause_comes_first_and_an_error_costs_one_crash_only(bundles):

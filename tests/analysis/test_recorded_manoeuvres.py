@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from crashhunt.analysis._causes import Manoeuvre, manoeuvres_of, relevant_actors
+from crashhunt.crashes import LaneMap
 from crashhunt.world import Actor, Roster, Scene
 
 DT = 0.1
@@ -76,6 +79,26 @@ def test_only_the_ten_seconds_before_the_crash_count():
     assert found((0, 5), (-3, 1), end=1) == []
     manoeuvre = manoeuvres_of(recording({"x": speeds((0, 5), (-3, 1))}, 120), "x", (), 110)[0]
     assert manoeuvre == Manoeuvre(actor="x", what="braked", step=50, speed=20.0)
+
+
+@pytest.mark.parametrize(
+    ("asides", "began"),
+    [
+        ([0.0] * 11 + [0.17 * k for k in range(1, 11)], 10),
+        ([0.0] * 20 + [3.2], 19),  # at once, with the collision
+        ([1.592] * 20 + [1.601], 19),  # it has drifted to the border, and crosses it with the collision
+        ([0.0] * 21, None),
+    ],
+    ids=str,
+)
+def test_agent_changed_lanes_from_the_scene_in_which_it_began_to_move_there(asides, began):
+    borders = [[(x, y - 1.6) for x in (0, 200)] for y in (0.0, 3.2, 6.4)]
+    lanes = LaneMap([*itertools.pairwise(map(np.array, borders))], (100, 0))
+    way = {"ego": lambda time_s: (80 + 10 * time_s, asides[round(time_s / DT)], 10.0)}
+    changed = [] if began is None else [Manoeuvre("ego", "changed lanes", began, 10.0)]
+    assert manoeuvres_of(recording(way, 21), "ego", lanes, 20) == changed
+    other = manoeuvres_of(recording(way, 21, agents=("x",)), "ego", lanes, 20)
+    assert other == (changed if began == 10 else [])  # of another vehicle, the scene after the collision does not count
 
 
 def stands(x, y=0.0, *, since=0.0, until=99.0):

@@ -161,7 +161,7 @@ def test_what_came_of_a_candidate_is_remembered(make_runs, tmp_path):
     others = [candidate("no"), candidate("yes", 7), candidate("yes", 8)]
     assert runs.first(others) == 1
     known = make_runs(budget=99)
-    assert known.first(others) == 1
+    assert known.first([*others, candidate("yes", name=1)]) == 1
     assert known.first([candidate("no")]) is None
     assert (known.count, known.steps) == (3, 5 + 7 + 5)
     assert Instant.made[1].ran == []
