@@ -23,10 +23,14 @@ from crashhunt.plans import (
     plan,
     read_settings,
     takes_of,
+    with_settings,
     write_settings,
 )  # fmt: skip
+from crashhunt.plans._plan import _spec
 from crashhunt.plans._settings import executor_of, parallel_here, sizes_itself
 from crashhunt.scenario import copy_shipped_scenario
+from crashhunt.sumo._options import SumoSetup
+from crashhunt.trial import Argument, parse_spec
 
 EXECUTORS = """
 class Cluster:
@@ -297,6 +301,22 @@ def test_a_survey_sees_what_was_asked_and_its_scenario_is_planned(folder):
     assert plan(asked(), survey=lambda scenario, *_: scenario)[1] == plan(asked())[1]
 
 
+def test_compiled_core_is_switched_off_as_the_settings_say_where_there_is_one(folder):
+    for name, core in (("scenario.toml", False), ("r157-following", True)):
+        for native in (True, False):
+            scenario, settings = plan(replace(asked(native=native), scenario=name))
+            used = with_settings(scenario, settings)
+            assert (scenario.backend.core is not None) is core
+            assert not core or (used.table(SumoSetup).native is not False) is native
+
+
+def test_range_of_the_scenario_comes_before_that_of_the_agents_own_code():
+    own, its = (Argument("speed", "float", distribution=parse_spec(text)) for text in ("1.0:2.0", "8.0:14.0"))
+    for known, declared, spec in ((its, own, "8.0:14.0"), (None, own, "1.0:2.0"), (its, None, "8.0:14.0")):
+        assert _spec("speed", declared, known, None, hunted=True).spec == spec
+        assert _spec("speed", declared, known, None, hunted=False) is None
+
+
 def test_unused_statistics_next_to_a_policy_are_a_note(folder, tmp_path):
     for name in ("model.zip", "norm.pkl", "other.txt"):
         (tmp_path / name).touch()
@@ -334,6 +354,12 @@ def test_no_trials_are_fine_with_a_time_and_drivers_have_to_be_importable(folder
     options = {option.name for option in hunt_options()}
     name = "duration" if "duration" in options else "for"
     assert Request(**{name: "5s"}, trials=0, max_steps=1).checked().trials == 0
+    assert Request(until_rate="1/hour", trials=0, max_steps=1).checked().keep_going
+    for other in ({"distinct": 2}, {"only_at_fault": True}):
+        with pytest.raises(
+            UsageError, match=f"--until-rate and --{next(iter(other)).replace('_', '-')} contradict each other"
+        ):
+            Request(until_rate="1/hour", trials=0, max_steps=1, **other).checked()
     sys.modules.pop("drives", None)
     import drives
 
