@@ -245,7 +245,8 @@ def between(case, lane="road_0"):
 def test_who_steps_out_so_late_that_no_one_could_have_stopped():
     found = fault_in(between(drive(straight(12), walks(1.2), name="person 1")))
     assert (found.verdict, found.findings[0].rule) == ("the other", "steps out")
-    assert "m ahead of ego, which needs 21.0 m to stop" in found.findings[0].words
+    # 0.53 s before, its middle was 2 m from the axis of the car, which is 1 m from its side.
+    assert "came onto the road 0.5 s before, 8.5 m ahead of ego, which needs 21.0 m" in found.findings[0].words
     silent = [
         drive(straight(12), walks(1.2)),  # no person
         drive(straight(25), walks(4.5, speed=0.8), name="person 1"),  # it had been on the road for 2 s
@@ -257,6 +258,12 @@ def test_who_steps_out_so_late_that_no_one_could_have_stopped():
     # At a junction somebody may cross; and who was not seen on a road is nowhere.
     assert verdict(between(drive(straight(12), walks(1.2), name="person 1"), ":c_w0_0")) == "nobody can tell"
     assert verdict(drive(straight(12), walks(1.2), name="person 1")) == "nobody can tell"
+
+
+def test_a_crash_in_the_first_scene_has_no_lane_changes():
+    case = drive(straight(20), straight(10, 5), seconds=0.0)
+    assert case.lane_changers(5.0) == ()
+    assert verdict(case) == "nobody can tell"
 
 
 def test_who_turns_off_behind_an_actor_has_changed_no_lanes():

@@ -115,7 +115,9 @@ def test_an_agent_that_has_to_brake_hard_is_in_danger_though_it_never_gets_there
 
     for braking in (3.0, 8.0):
         standing = 45 + 225 / (2 * braking) + 1 + LENGTH
-        steps, most = level(stop(braking), straight(standing, 0, 0, 0, 120))
+        left = straight(standing, 0, 0, 0, 120)
+        left[int(40 + 150 / braking) :, 1] = 20.0  # 1 s after the agent has stopped, it is gone
+        steps, most = level(stop(braking), left, straight(standing + 60, 0, 0, 0, 120))
         assert steps.max() == pytest.approx(braking / 12, rel=0.2), braking
         assert most.other == "other"
         assert most.step > 20
