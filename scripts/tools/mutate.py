@@ -249,6 +249,7 @@ _TESTS_ELSEWHERE = {
         "hunts/test_whole_hunts.py",
         "e2e/test_audit.py",
     ),
+    "oracles/_requirement_oracle.py": ("episode/test_trial_signals.py", "native/test_usual_steps.py"),
     # These are fast, and their tests lie by what a user does, not by module.
     "sumo/maps": ("on_sumo/maps/test_*.py",),
     "recording": ("recording/test_*.py",),
@@ -292,6 +293,7 @@ _TESTS_ELSEWHERE = {
         "on_sumo/test_surroundings.py",
         "on_sumo/test_world.py",
     ),
+    "sumo/_manoeuvres.py": ("on_sumo/test_manoeuvres.py",),
     "sumo/_fast_step.py": ("native/test_usual_steps.py",),
     "sumo/_traffic_survey.py": ("hunts/test_traffic_survey.py", "on_sumo/test_sumo_reports.py"),
     "simulators/toy.py": (
@@ -315,6 +317,10 @@ _TESTS_ELSEWHERE = {
     "analysis/_avoidability.py": ("analysis/test_avoiding.py", "e2e/test_judging.py"),
     "analysis/_causes.py": ("analysis/test_recorded_manoeuvres.py", "e2e/test_judging.py"),
     "analysis/_whatif_runs.py": ("analysis/test_what_is_counted.py", "analysis/test_reruns.py", "e2e/test_what_if.py"),
+    "analysis/_delta_debugging.py": ("analysis/test_what_is_tried.py",),
+    "analysis/_driver_runs.py": ("analysis/test_driver_runs.py", "e2e/test_preventability.py"),
+    "analysis/_shrink_runs.py": ("analysis/test_runs.py", "analysis/test_shrink_bundle.py"),
+    "analysis/_shrink_stages.py": ("analysis/test_what_is_tried.py", "analysis/test_shrink_bundle.py"),
     "analysis/_interventions.py": (
         "analysis/test_what_is_counted.py",
         "analysis/test_instead.py",
@@ -322,6 +328,7 @@ _TESTS_ELSEWHERE = {
     ),
     "analysis/_types_by_cause.py": ("analysis/test_division_by_cause.py", "e2e/test_types_by_cause.py"),
     "world": ("world/test_*.py",),
+    "world/_manoeuvre_motions.py": ("world/test_manoeuvre_motions.py",),
 }
 """Module or package to its nearest tests, as patterns below `tests`."""
 
