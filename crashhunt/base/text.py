@@ -14,7 +14,7 @@ import unicodedata
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Container, Iterable, Sequence
     from pathlib import Path
 
 
@@ -91,8 +91,36 @@ def format_percent(share: float) -> str:
 
 
 def count_of(number: int, noun: str) -> str:
-    """Return a number with its noun, such as ``1 trial`` or ``3 trials``; the plural is formed with s."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+    """Return a number with its noun.
+
+    >>> count_of(1, "trial"), count_of(3, "trial"), count_of(1200, "crash")
+    ('1 trial', '3 trials', '1,200 crashes')
+    """
+    plural = "es" if noun.endswith(("s", "sh")) else "s"
+    return f"{number:,} {noun}{'' if number == 1 else plural}"
+
+
+def aligned(rows: Sequence[Sequence[str]], *, left: Container[int] = (), width: int = 0) -> list[str]:
+    """Return rows of a table as lines with columns that are two spaces apart.
+
+    Args:
+        rows: rows of the table, the heading first; cells beyond the columns of the heading are appended without
+            alignment.
+        left: indices of the columns that are aligned to the left; the other columns are aligned to the right.
+        width: maximum number of characters in a line; if the columns need more, they are only one space apart. A width
+            of 0 sets no limit.
+    """
+    count = len(rows[0])
+    widths = [max(len(row[column]) for row in rows) for column in range(count)]
+    gap = " " if 0 < width < sum(widths) + 2 * (count - 1) else "  "
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(wide) if column in left else cell.rjust(wide)
+            for column, (cell, wide) in enumerate(zip(row, widths, strict=False))
+        ]
+        lines.append(one_line(gap.join([*cells, *row[count:]])))
+    return lines
 
 
 def command_line(*words: str | Path) -> str:

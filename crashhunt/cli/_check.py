@@ -52,8 +52,7 @@ def _check(options: argparse.Namespace, _words: list[str]) -> int:
     saved = None
     if options.salvage is not None:
         saved = salvage(found[0], options.salvage)
-        crashes = f"{saved['crashes']} crash{'' if saved['crashes'] == 1 else 'es'}"
-        counts = f"{count_of(saved['trials'], 'trial')} and {crashes}"
+        counts = f"{count_of(saved['trials'], 'trial')} and {count_of(saved['crashes'], 'crash')}"
         say(
             f"{counts} are in {command_line(options.salvage)}; resume the hunt there with crashhunt run",
             as_json=options.json,
@@ -67,9 +66,9 @@ def _check(options: argparse.Namespace, _words: list[str]) -> int:
 def _describe(found: Checked) -> str:
     parts = [count_of(len(found.trials), "trial")] if found.kind == "hunt" else []
     near, crashes, minimized = len(found.near_misses), found.crash_count, found.minimized
-    parts += [f"{crashes} crash{'' if crashes == 1 else 'es'}"] if crashes or not near or found.kind == "hunt" else []
-    parts += [f"{minimized} minimized crash{'' if minimized == 1 else 'es'}"] if minimized else []
-    parts += [f"{near} near miss{'' if near == 1 else 'es'}"] if near else []
+    parts += [count_of(crashes, "crash")] if crashes or not near or found.kind == "hunt" else []
+    parts += [count_of(minimized, "minimized crash")] if minimized else []
+    parts += [count_of(near, "near miss")] if near else []
     listed = " and ".join(", ".join(parts).rsplit(", ", 1))
     lines = [f"{command_line(found.dir)}: {listed} {'are' if found.kind == 'hunt' else 'is'} intact"]
     if not found.fine:

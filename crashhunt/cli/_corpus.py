@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
-from crashhunt.base.text import command_line, in_lines
+from crashhunt.base.text import command_line, count_of, in_lines
 from crashhunt.cli._common import (
     add_ci_options,
     add_json,
@@ -210,7 +210,7 @@ def _summary_of(reports: list[CaseReport], count: int) -> str:
     wrong = sum(not report.ok for report in reports)
     ended = "" if len(reports) == count else f"; interrupted after {len(reports)}"
     lines.append(
-        f"{count} {'case' if count == 1 else 'cases'}: {counts or 'none has ended'}{ended}"
+        f"{count_of(count, 'case')}: {counts or 'none has ended'}{ended}"
         + (f"; {wrong} not as expected" if wrong else "")
     )
     return "\n".join(lines)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
+from crashhunt.base.text import count_of
 from crashhunt.cli._common import add_ci_options, add_json, add_trust, check_trust, integer, say, tell
 from crashhunt.cli._exit_codes import DONE, INTERRUPTED, THE_ANSWER_IS_NO
 
@@ -154,7 +155,7 @@ class _Comparison:
             lines.append("the corpus has no case yet, so every crash type is new")
         if known is not None and self.has_news:
             new, unknown = len(self._found.groups) - len(known), len(self._found.left_out)
-            words = [f"{new} new crash type{'' if new == 1 else 's'}"] if new else []
+            words = [count_of(new, "new crash type")] if new else []
             words += [f"{unknown} not compared"] if unknown else []
             lines.append(", ".join(words))
         return ["", *lines] if lines else []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from crashhunt.base.text import visible
+from crashhunt.base.text import aligned, visible
 from crashhunt.cli._common import add_json, pairs
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ _ANY_STEPS = 1_000_000  # so that windows of requirements in the scenario fit; o
 def _signals(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.hunts import list_signals
     from crashhunt.plans import Request, plan
-    from crashhunt.report import aligned
 
     agents = pairs(options.agent, "--agent", named=False)
     asked = Request(scenario=options.scenario, ego=options.ego, agents=agents, trials=1, max_steps=_ANY_STEPS)
@@ -46,7 +45,7 @@ def _signals(options: argparse.Namespace, _words: list[str]) -> int:
         print(json.dumps(found))
         return 0
     rows = [["signal", "unit", "meaning"], *([one["name"], one["unit"], one["meaning"]] for one in found["signals"])]
-    lines = aligned(rows, left=3)
+    lines = aligned(rows, left=range(3))
     if len(found["agents"]) > 1:
         lines.append(f"each agent has these signals; {found['agents'][0]}.speed names one of an agent")
     print(visible("\n".join(lines)))

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.base.text import one_line, out_of
+from crashhunt.base.text import count_of, one_line, out_of
 from crashhunt.cli._common import add_json, make_console
 from crashhunt.cli._exit_codes import BAD_INPUT, DONE
 
@@ -162,7 +162,7 @@ def _facts(state: HuntState) -> list[str]:
     from crashhunt.report import describe_note, describe_running, describe_versions
 
     crashes = _crashes(state)
-    lines = [f"{state.crashes} {'crash' if state.crashes == 1 else 'crashes'}: {crashes}"] if crashes else []
+    lines = [f"{count_of(state.crashes, 'crash')}: {crashes}"] if crashes else []
     lines += [describe_running(state.rate) + _not_counted(state)] if state.rate is not None else []
     lines += [describe_versions(state.code_versions)] if state.code_versions else []
     lines += fork_lines(state)
@@ -187,8 +187,8 @@ def _not_counted(state: HuntState) -> str:
     count = state.trials_run - state.outcomes.get("invalid", 0) - rate["trials"]
     if count <= 0:
         return ""
-    trials, are = ("1 trial", "is") if count == 1 else (f"{count} trials", "are")
-    return f"; {trials} after a trial that has not ended {are} excluded"
+    are = "is" if count == 1 else "are"
+    return f"; {count_of(count, 'trial')} after a trial that has not ended {are} excluded"
 
 
 def _state(state: HuntState) -> str:
@@ -202,8 +202,7 @@ def _state(state: HuntState) -> str:
 
 def state_words(state: HuntState) -> str:
     """Return the state of a hunt as text; a hunt that has ended with crashes is finished, with their number."""
-    many = f"{state.crashes} {'crash' if state.crashes == 1 else 'crashes'}"
-    return f"finished, {many}" if state.state == "crashed" else state.state
+    return f"finished, {count_of(state.crashes, 'crash')}" if state.state == "crashed" else state.state
 
 
 def fork_lines(state: HuntState) -> list[str]:
@@ -225,7 +224,7 @@ def fork_lines(state: HuntState) -> list[str]:
 
 def _not_fully_asked(sums: ProbeSums | BranchSums) -> str:
     count = sums["not_fully_asked"]
-    return f", not fully asked {count} {'trial' if count == 1 else 'trials'}" if count else ""
+    return f", not fully asked {count_of(count, 'trial')}" if count else ""
 
 
 def _confirmed(sums: ProbeSums | BranchSums) -> str:

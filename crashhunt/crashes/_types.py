@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError
+from crashhunt.base.text import count_of
 from crashhunt.crashes import Bundle, judgement_of, preventable_by
 from crashhunt.crashes._contact_record import contact_record
 from crashhunt.crashes._fault import Verdict, fault_of
@@ -314,7 +315,7 @@ def group_crashes(
         )
     typed = {str(group.signature) for group in groups}
     unsigned += [
-        f"{count} {'crash' if count == 1 else 'crashes'} of the type {words!r}: no bundle of this type is left"
+        f"{count_of(count, 'crash')} of the type {words!r}: no bundle of this type is left"
         for words, count in (dropped or {}).items()
         if words not in typed
     ]

@@ -64,7 +64,6 @@ if TYPE_CHECKING:
         format_seconds as format_seconds,
     )
     from ._step_table import (
-        aligned as aligned,
         argument_units as argument_units,
         check_fields as check_fields,
         format_table as format_table,

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import count_of, format_number, in_lines
+from crashhunt.base.text import aligned, count_of, format_number, in_lines
 from crashhunt.report._rate_text import count_training_trials
-from crashhunt.report._step_table import aligned, argument_units
+from crashhunt.report._step_table import argument_units
 from crashhunt.results import FACTS, HuntResults, columns_of
 from crashhunt.statistics import PER_WORDS, held_out_by_seed
 from crashhunt.trial import Outcome, in_order
@@ -74,7 +74,7 @@ def describe_comparison(found: Comparison) -> str:
         )
         for hunt in found.hunts
     ]
-    lines = aligned([header, *rows], left=1)
+    lines = aligned([header, *rows], left=range(1))
     lines += [
         f"{hunt.dir}: only trials of origin {hunt.counted} count, because the search guided all others"
         for hunt in found.hunts

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.text import count_of, format_number, format_time, in_lines
+from crashhunt.base.text import aligned, count_of, format_number, format_time, in_lines
 from crashhunt.crashes import (
     Encounter,
     contact_record,
@@ -24,7 +24,7 @@ from crashhunt.crashes import (
 )
 from crashhunt.recording import describe_value, is_opaque
 from crashhunt.report._status_screen import draw_signals, format_inputs, input_signals
-from crashhunt.report._step_table import NEAREST, aligned, stacked, steps_table
+from crashhunt.report._step_table import NEAREST, stacked, steps_table
 from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import (
     COLUMNS,

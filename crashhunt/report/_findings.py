@@ -15,7 +15,7 @@ from urllib.parse import quote
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import command_line, one_line
+from crashhunt.base.text import command_line, count_of, one_line
 from crashhunt.base.version import __version__
 from crashhunt.crashes import own_frames
 from crashhunt.report._words import list_preventing
@@ -64,11 +64,10 @@ def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None =
     for group in groups:
         example = group.shortest
         file, line = _place(example)
-        count = "1 crash" if group.count == 1 else f"{group.count} crashes"
         fault = f" At fault: {group.fault}." if group.fault not in ("", "nobody can tell") else ""
         show = command_line("crashhunt", "show", example.path)
         prevented = f" Preventable ({words})." if (words := list_preventing(group.preventable_by)) else ""
-        message = f"{example.result.summary}.{fault}{prevented} {count}. To look at it: {show}"
+        message = f"{example.result.summary}.{fault}{prevented} {count_of(group.count, 'crash')}. To look at it: {show}"
         found.append(
             CrashFinding(
                 rule=group.signature.outcome,
@@ -152,7 +151,7 @@ def crashes_summary(findings: Sequence[CrashFinding], *, compared: bool = False)
     if not findings:
         return "### crashhunt: no crash was saved\n"
     crashes, new = sum(finding.group.count for finding in findings), sum(not finding.known for finding in findings)
-    title = f"### crashhunt: {_count(crashes, 'crash', 'crashes')} of {_count(len(findings), 'type', 'types')}"
+    title = f"### crashhunt: {count_of(crashes, 'crash')} of {count_of(len(findings), 'type')}"
     lines = [f"{title}, {new} new" if compared else title, ""]
     names = ["crashes", "type", "at fault", "shortest", "steps", *(["in the corpus"] if compared else [])]
     lines += [row_of(names), row_of(["---:", "---", "---", "---", "---:", *(["---"] if compared else [])])]
@@ -189,8 +188,8 @@ def crash_annotations(findings: Sequence[CrashFinding]) -> list[str]:
 def corpus_summary(reports: Sequence[CaseReport]) -> str:
     """Return the results of a corpus as Markdown. Unexpected results come first."""
     wrong = sum(not report.ok for report in reports)
-    said = f"{_count(wrong, 'is', 'are')} not as expected" if wrong else "all as expected"
-    lines = [f"### crashhunt corpus: {_count(len(reports), 'case', 'cases')}, {said}", ""]
+    said = f"{wrong} {'is' if wrong == 1 else 'are'} not as expected" if wrong else "all as expected"
+    lines = [f"### crashhunt corpus: {count_of(len(reports), 'case')}, {said}", ""]
     lines += [row_of(["", "case", "expected", "today", "what happens", "note"]), row_of(["---"] * 6)]
     for report in sorted(reports, key=lambda report: report.ok):
         got = report.got.replace("_", " ")
@@ -229,10 +228,6 @@ def _limited(annotations: Sequence[str], what: str) -> list[str]:
         return shown
     said = f"{_MAX_ANNOTATIONS} of {count} {what} are annotated. The summary of the job has all of them."
     return [_command("notice", f"{_MAX_ANNOTATIONS} of {count} {what} shown", said, "", 1), *shown]
-
-
-def _count(number: int, one: str, many: str) -> str:
-    return f"{number} {one if number == 1 else many}"
 
 
 def row_of(cells: Sequence[str]) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree as Xml
 
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import command_line, format_number, in_lines, visible
+from crashhunt.base.text import command_line, count_of, format_number, in_lines, visible
 from crashhunt.report._findings import escaped, row_of
 from crashhunt.report._rate_text import count_training_trials, format_interval
 
@@ -104,7 +104,7 @@ def _invalid_pairs(found: GateReport) -> list[str]:
     ]
     lines += [_lost(name, side, found.verdict) for name, side in sides if side.lost]
     if found.invalid:
-        lines.append(f"{_pairs(found.invalid)} not counted: the trial is invalid with both versions")
+        lines.append(f"{count_of(found.invalid, 'pair')} not counted: the trial is invalid with both versions")
     return lines
 
 
@@ -118,7 +118,7 @@ def _lost(name: str, side: SideCounts, verdict: str) -> str:
     example = "" if side.not_started else f" ({side.example})"
     effect = "must hold" if verdict == "undecided" else "holds"
     words = f"{name} {' and '.join(reasons)}{example}"
-    return f"{_pairs(side.lost)} without a result: {words}; the verdict {effect} for any result"
+    return f"{count_of(side.lost, 'pair')} without a result: {words}; the verdict {effect} for any result"
 
 
 def _new_types(found: GateReport) -> list[str]:
@@ -127,18 +127,10 @@ def _new_types(found: GateReport) -> list[str]:
     for side, name in ((1, "HEAD"), (0, "BASE")):
         types = sorted(found.new_types(side).items(), key=lambda one: (-one[1], one[0]))
         if types:
-            words = ", ".join(f"{what} ({_count_of(count)})" for what, count in types[:_MAX_TYPES])
+            words = ", ".join(f"{what} ({count_of(count, 'crash')})" for what, count in types[:_MAX_TYPES])
             more = f" and {len(types) - _MAX_TYPES} more" if len(types) > _MAX_TYPES else ""
             lines.append(f"crash {'type' if len(types) == 1 else 'types'} only with {name}: {words}{more}")
     return lines
-
-
-def _pairs(count: int) -> str:
-    return f"{count:,} {'pair' if count == 1 else 'pairs'}"
-
-
-def _count_of(crashes: int) -> str:
-    return f"{crashes:,} {'crash' if crashes == 1 else 'crashes'}"
 
 
 def _training_pairs(found: GateReport) -> str:
@@ -155,7 +147,7 @@ def _rates(found: GateReport) -> list[str]:
 
 
 def _rate(rate: CrashRate) -> str:
-    crashes = f"{_count_of(rate.crashes)} in {rate.trials:,} trials"
+    crashes = f"{count_of(rate.crashes, 'crash')} in {rate.trials:,} trials"
     if invalid := rate.excluded.get("invalid"):
         crashes += f" and {invalid:,} invalid"
     if trained_on := rate.excluded.get("trained_on"):
@@ -167,7 +159,7 @@ def _rate(rate: CrashRate) -> str:
 
 def _scenarios(found: GateReport) -> list[str]:
     return [
-        f"{one.name}: {_pairs(one.pairs)}, {one.only_base} {_plural(found)} only with BASE, "
+        f"{one.name}: {count_of(one.pairs, 'pair')}, {one.only_base} {_plural(found)} only with BASE, "
         f"{one.only_head} only with HEAD, {one.both} with both"
         for one in found.scenarios
     ]
@@ -176,8 +168,7 @@ def _scenarios(found: GateReport) -> list[str]:
 def _corpus(found: GateReport) -> list[str]:
     if found.corpus is None:
         return []
-    cases = f"{len(found.corpus)} {'case' if len(found.corpus) == 1 else 'cases'}"
-    lines = [f"corpus of HEAD: {cases}, {len(found.back)} crash again"]
+    lines = [f"corpus of HEAD: {count_of(len(found.corpus), 'case')}, {len(found.back)} crash again"]
     lines += [f"  {case.name} was fixed, now: {case.now}" for case in found.back]
     lines += [f"  {case.name} cannot run: {case.now}" for case in found.corpus if case.got == "cannot_run"]
     return lines
@@ -243,18 +234,18 @@ def write_gate_junit(found: GateReport, path: Path) -> None:
     """
     suite = Xml.Element("testsuite", name="crashhunt gate")
     for case in found.corpus or ():
-        test = Xml.SubElement(suite, "testcase", classname="crashhunt.gate.corpus", name=_text(case.name))
+        test = Xml.SubElement(suite, "testcase", classname="crashhunt.gate.corpus", name=visible(case.name))
         if case.has_come_back:
-            Xml.SubElement(test, "failure", message=_text(f"was fixed, now: {case.now}"), type="came_back")
+            Xml.SubElement(test, "failure", message=visible(f"was fixed, now: {case.now}"), type="came_back")
         elif case.got == "cannot_run":
-            Xml.SubElement(test, "error", message=_text(case.now), type="cannot_run")
+            Xml.SubElement(test, "error", message=visible(case.now), type="cannot_run")
     if found.pairs or not found.back:
         test = Xml.SubElement(suite, "testcase", classname="crashhunt.gate", name="paired trials")
-        said = _text(describe_gate(found))
+        said = visible(describe_gate(found))
         if found.verdict == "worse" and not found.back:
-            Xml.SubElement(test, "failure", message=_text(_answer(found)), type="worse").text = said
+            Xml.SubElement(test, "failure", message=visible(_answer(found)), type="worse").text = said
         elif found.verdict == "undecided":
-            Xml.SubElement(test, "error", message=_text(_answer(found)), type="undecided").text = said
+            Xml.SubElement(test, "error", message=visible(_answer(found)), type="undecided").text = said
         else:
             Xml.SubElement(test, "system-out").text = said
     suite.set("tests", str(len(suite)))
@@ -265,8 +256,3 @@ def write_gate_junit(found: GateReport, path: Path) -> None:
     Xml.indent(root)
     with whole_file(path) as temporary:
         Xml.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
-
-
-def _text(text: str) -> str:
-    """Return text without the characters that XML does not allow."""
-    return visible(text)

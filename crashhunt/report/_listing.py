@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import work_apart
 from crashhunt.base.plugins import is_foreign, locate, registered
+from crashhunt.base.text import aligned
 from crashhunt.requirements import TRAFFIC_RULES
 from crashhunt.scenario import ACTIONS, installed_backends, load_scenario, shipped_scenarios
 from crashhunt.simulators import MODIFIERS, PARTS, parse_parts
@@ -250,9 +251,5 @@ def _table(indent: str, arguments: Sequence[ArgumentEntry]) -> list[str]:
 
 
 def _columns(indent: str, rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return the rows of a table as aligned lines; the last column is not padded."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
-    return [
-        (indent + "  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=True))).rstrip()
-        for row in rows
-    ]
+    """Return the rows of a table as aligned lines; all columns are aligned to the left."""
+    return [indent + line for line in aligned(rows, left=range(len(rows[0])))] if rows else []

@@ -9,7 +9,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING, TextIO
 
 from crashhunt.base.files import whole_file
-from crashhunt.base.text import format_number, in_lines
+from crashhunt.base.text import count_of, format_number, in_lines
 from crashhunt.statistics import PER_WORDS, Interval
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ th, td { text-align: left; padding: .4rem .7rem; border: 1px solid #ccc; }
 
 def count_training_trials(count: int) -> str:
     """Return text on the trials that are not counted because an agent was trained on their traffic."""
-    return f"{_count(count, 'trial', 'trials')} on training traffic {'is' if count == 1 else 'are'} excluded"
+    return f"{count_of(count, 'trial')} on training traffic {'is' if count == 1 else 'are'} excluded"
 
 
 def format_interval(interval: Interval) -> str:
@@ -59,14 +59,14 @@ def describe_running(rate: RunningRate) -> str:
     if rate["certain"] is None:
         return f"crash rate: not known yet ({rate['why_not']}){bar}"
     kind = "random trial" if rate["origin"] else "trial"
-    trials = f"{_count(rate['crashes'], 'crash', 'crashes')} in {_count(rate['trials'], kind, f'{kind}s')}"
+    trials = f"{count_of(rate['crashes'], 'crash')} in {count_of(rate['trials'], kind)}"
     if trained_on := rate.get("trained_on"):
         bar += f"; {count_training_trials(trained_on)}"
     return f"crash rate: {_certain(rate['certain'])} {PER_WORDS[rate['per']]} ({trials}, {rate['confidence']:g} %){bar}"
 
 
 def _describe_rare(rate: RunningRate) -> str:
-    roots = _count(rate["units"], "root", "roots")
+    roots = count_of(rate["units"], "root")
     certain = f"; certain: {_certain(rate['certain'])} ({rate['confidence']:g} %)" if rate["certain"] else ""
     if rate["estimate"] is None:
         return f"crash rate: not known yet ({rate['why_not']}){certain}"
@@ -94,9 +94,9 @@ def describe_rates(rates: Sequence[CrashRate]) -> str:
 
 def _of_hunt(rates: list[CrashRate]) -> list[str]:
     first = rates[0]
-    head = f"{first.dir}: {_count(first.crashes, 'crash', 'crashes')} in {_count(first.trials, 'trial', 'trials')}"
+    head = f"{first.dir}: {count_of(first.crashes, 'crash')} in {count_of(first.trials, 'trial')}"
     if first.units != first.trials:
-        head += f" of {_count(first.units, 'traffic', 'traffics')}"
+        head += f" of {count_of(first.units, 'traffic')}"
     confidence = f"({first.confidence:g} %, valid whenever you look)"
     known = [rate for rate in rates if rate.certain is not None]
     lines: list[str]
@@ -171,10 +171,6 @@ def _part_lines(rate: CrashRate) -> list[str]:
         f"  {PER_WORDS[rate.per]}, by {rate.parts[0].by} ({together}):",
         *(f"    {part.name}: {part.crashes} of {part.trials:,} trials, {_answer(part)}" for part in rate.parts),
     ]
-
-
-def _count(count: int, one: str, many: str) -> str:
-    return f"{count:,} {one if count == 1 else many}"
 
 
 _COLUMNS = (

@@ -5,10 +5,9 @@ from __future__ import annotations
 import html
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.base.text import command_line, count_of
+from crashhunt.base.text import aligned, command_line, count_of
 from crashhunt.crashes import COMPETENT_DRIVERS
 from crashhunt.report._page import player_parts
-from crashhunt.report._step_table import aligned
 from crashhunt.report._words import DRIVER_NAMES
 
 if TYPE_CHECKING:

@@ -328,7 +328,7 @@ def describe_types(count: int, by_cause: int | None, noun: str = "type") -> str:
         by_cause: number of crash types by cause; None if the hunt counts types.
         noun: word for a crash type in the text.
     """
-    words = f"{count} {noun}{'' if count == 1 else 's'}"
+    words = count_of(count, noun)
     return words if by_cause is None else f"{words}, {by_cause} by cause"
 
 
@@ -339,12 +339,12 @@ def describe_kinds(status: HuntStatus) -> str:
         return words
     ago, trials = format_seconds(status.newest_kind_s), status.newest_kind_trials
     if trials is not None:
-        ago = f"{trials} {'trial' if trials == 1 else 'trials'} / {ago}"
+        ago = f"{count_of(trials, 'trial')} / {ago}"
     return f"{words} (last new type: {ago} ago)"
 
 
 def _disturbed(status: HuntStatus) -> str:
-    return f"{status.disturbed} of {status.crashes} {'crash' if status.crashes == 1 else 'crashes'} with disturbances"
+    return f"{status.disturbed} of {count_of(status.crashes, 'crash')} with disturbances"
 
 
 def _progress(status: HuntStatus) -> tuple[str, int, int] | None:
@@ -389,7 +389,7 @@ def _strategies(search: SearchStatus) -> str:
     parts = []
     for one in search.strategies:
         came = [] if one.danger is None else [f"mean criticality {one.danger:.2f}"]
-        came += [f"{one.crashes} {'crash' if one.crashes == 1 else 'crashes'}"] if one.crashes else []
+        came += [count_of(one.crashes, "crash")] if one.crashes else []
         parts.append(f"{one.name} {format_percent(one.share)} of trials" + (f" ({', '.join(came)})" if came else ""))
     return f"search: {', '.join(parts)}"
 
@@ -398,8 +398,7 @@ def _describe_growth(search: SearchStatus) -> str:
     """Return as text how long ago the greatest criticality of the hunt rose."""
     if search.grown_trials is None or search.grown_s is None:
         return ""
-    count = search.grown_trials
-    return f" ({count} {'trial' if count == 1 else 'trials'} / {format_seconds(search.grown_s)} ago)"
+    return f" ({count_of(search.grown_trials, 'trial')} / {format_seconds(search.grown_s)} ago)"
 
 
 def _nearest_words(result: TrialResult) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.plugins import locate
-from crashhunt.base.text import did_you_mean, one_line
+from crashhunt.base.text import aligned, did_you_mean
 from crashhunt.crashes import Encounter
 from crashhunt.recording import describe_value, is_opaque
 from crashhunt.snapshots import latest_snapshot
@@ -113,29 +113,6 @@ def format_table(rows: Sequence[TableRow]) -> list[str]:
     if not rows:
         return []
     return aligned([list(rows[0])] + [[_format(value) for value in row.values()] for row in rows])
-
-
-def aligned(rows: Sequence[Sequence[str]], *, left: int = 0, width: int = 0) -> list[str]:
-    """Return rows of a table as lines with columns that are two spaces apart.
-
-    Args:
-        rows: rows of the table, the heading first; cells beyond the columns of the heading are appended without
-            alignment.
-        left: number of columns that are aligned to the left; the other columns are aligned to the right.
-        width: maximum number of characters in a line; if the columns need more, they are only one space apart. A width
-            of 0 sets no limit.
-    """
-    count = len(rows[0])
-    widths = [max(len(row[column]) for row in rows) for column in range(count)]
-    gap = " " if 0 < width < sum(widths) + 2 * (count - 1) else "  "
-    lines = []
-    for row in rows:
-        cells = [
-            cell.ljust(wide) if column < left else cell.rjust(wide)
-            for column, (cell, wide) in enumerate(zip(row, widths, strict=False))
-        ]
-        lines.append(one_line(gap.join([*cells, *row[count:]])))
-    return lines
 
 
 def stacked(heading: Sequence[str]) -> list[list[str]]:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.text import command_line, count_of, in_lines, out_of
+from crashhunt.base.text import aligned, command_line, count_of, in_lines, out_of
 from crashhunt.crashes import count_causes, join_causes
 from crashhunt.report._rate_text import describe_rates
 from crashhunt.report._status_screen import describe_types, format_arguments, format_inputs, format_seconds
@@ -68,11 +68,11 @@ def describe_groups(
             ]
         )
     count = sum(group.count for group in groups)
-    words = f"{count} {'crash' if count == 1 else 'crashes'} of {describe_types(len(groups), by_cause)}"
+    words = f"{count_of(count, 'crash')} of {describe_types(len(groups), by_cause)}"
     saved = sum(len(group.bundles) for group in groups)
     if saved < count:
         words += f" ({saved} of {count} have a bundle{', and faults are of these' if faults else ''})"
-    return "\n".join([f"{words}:", "", *_lines(rows)])
+    return "\n".join([f"{words}:", "", *aligned(rows, left=range(1, len(rows[0]) - 1))])
 
 
 def _describe_prevented(group: Group) -> str:
@@ -101,20 +101,8 @@ def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGrou
     count, unknown = count_causes(joined)
     words = f"{describe_types(count, None)} by cause"
     if unknown:
-        words += f" (the cause of {unknown} more {'crash' if unknown == 1 else 'crashes'} is unknown)"
-    return "\n".join(["", f"{words}:", "", *_lines(rows)])
-
-
-def _lines(rows: list[list[str]]) -> list[str]:
-    """Return rows with aligned columns: numbers right-aligned, words left-aligned."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            cell.rjust(width) if place in (0, len(row) - 1) else cell.ljust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+        words += f" (the cause of {count_of(unknown, 'more crash')} is unknown)"
+    return "\n".join(["", f"{words}:", "", *aligned(rows, left=range(1, len(rows[0]) - 1))])
 
 
 _MAX_SHOWN = 10
@@ -254,7 +242,7 @@ def _near_misses(report: HuntReport, program: str) -> list[str]:
     if not report.near_misses:
         return []
     if report.crashes:
-        count = f"{len(report.near_misses)} near {'miss' if len(report.near_misses) == 1 else 'misses'}"
+        count = count_of(len(report.near_misses), "near miss")
         return [f"{count} saved in {command_line(report.directory / layout.NEAR_MISSES)}"]
     lines = ["", f"Near misses, saved in {command_line(report.directory / layout.NEAR_MISSES)}:"]
     for bundle in report.near_misses[:_MAX_SHOWN]:
@@ -272,8 +260,7 @@ def _describe_events(report: HuntReport) -> list[str]:
     if not others:
         return []
     counts = ", ".join(
-        f"{event_counts({kind: count})} in {trials} {'trial' if trials == 1 else 'trials'}"
-        for kind, (count, trials) in others.items()
+        f"{event_counts({kind: count})} in {count_of(trials, 'trial')}" for kind, (count, trials) in others.items()
     )
     return [f"Traffic events: {counts}. To hunt for them: --crash-on {','.join(others)}"]
 
@@ -342,15 +329,11 @@ def _verdict(report: ReplayReport) -> list[str]:
 def _table_around(report: ReplayReport) -> list[str]:
     if not report.around or report.divergence is None:
         return []
-    cells = [("step", "recorded", "replayed", "")]
+    rows = [("step", "recorded", "replayed")]
     for step, was, now in report.around:
-        mark = "<- first difference" if step == report.divergence.step else ""
-        cells.append((str(step), "-" if was is None else f"{was!r}", "-" if now is None else f"{now!r}", mark))
-    widths = [max(len(row[column]) for row in cells) for column in range(3)]
-    return [
-        "  ".join([*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), row[3]]).rstrip()
-        for row in cells
-    ]
+        mark = ("<- first difference",) if step == report.divergence.step else ()
+        rows.append((str(step), "-" if was is None else f"{was!r}", "-" if now is None else f"{now!r}", *mark))
+    return aligned(rows)
 
 
 def _wanted_types(report: HuntReport) -> str:

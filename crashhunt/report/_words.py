@@ -309,7 +309,7 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
         agent: identifier of the controlled vehicle.
         other: identifier of the collision partner.
     """
-    best, runs = judgement.best, f"{judgement.runs} {'run' if judgement.runs == 1 else 'runs'}"
+    best, runs = judgement.best, count_of(judgement.runs, "run")
     sentences = []
     if best is not None:
         sentences = [_until(best, ago)]
@@ -650,10 +650,10 @@ def describe_probes(report: HuntReport) -> list[str]:
         safe = sum(margin == 1.0 for margin in found.margins)
         least, median = min(found.margins), statistics.median(found.margins)
         said = f"{safe} of them crashed under no plausible disturbance"
-        many = _count_words(len(found.margins), "trial")
+        many = count_of(len(found.margins), "trial")
         lines = [f"Robustness margin of {many}: least {least:.2f}, median {median:.2f}; {said}."]
     lines += _not_fully_asked(found.not_fully_asked, found.why_unasked)
-    lines.append(f"  {_count_words(found.probes, 'probe')} took {steps}{enough}")
+    lines.append(f"  {count_of(found.probes, 'probe')} took {steps}{enough}")
     if found.run_again:
         lines.append(
             f"  crashes by the mildest disturbance that reproduce from the start: {len(found.crashes)} of "
@@ -670,8 +670,8 @@ def describe_branches(report: HuntReport) -> list[str]:
     if found is None or not found.trials:
         return []
     enough = _skipped(found.skipped)
-    moments = f"{_count_words(found.moments, 'moment')} of {_count_words(found.trials, 'trial')}"
-    crashed = f"{found.crashed} crashed, of {_count_words(found.crashed_trials, 'trial')}"
+    moments = f"{count_of(found.moments, 'moment')} of {count_of(found.trials, 'trial')}"
+    crashed = f"{found.crashed} crashed, of {count_of(found.crashed_trials, 'trial')}"
     lines = [
         f"Branches: {found.branches} forks with other disturbances, from {moments}; {crashed}.",
         f"  they took {found.steps} steps, in addition to {report.trial_steps} steps of trials{enough}",
@@ -697,12 +697,8 @@ def _not_fully_asked(count: int, why: str) -> list[str]:
     """Return a line on the trials in which a fork has no result; an empty list if ``count`` is 0."""
     if not count:
         return []
-    return [f"  {_count_words(count, 'trial')} {'was' if count == 1 else 'were'} not fully probed: {why}"]
+    return [f"  {count_of(count, 'trial')} {'was' if count == 1 else 'were'} not fully probed: {why}"]
 
 
 def _not_finished(count: int) -> str:
     return f", and {count} did not finish" if count else ""
-
-
-def _count_words(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -19,7 +19,7 @@ from crashhunt.base.errors import BundleError, HuntDirectoryError, UntrustedErro
 from crashhunt.base.extras import install_command
 from crashhunt.base.files import whole_file
 from crashhunt.base.temporary import temporary_beside, temporary_folder, temporary_name
-from crashhunt.base.text import one_of, out_of
+from crashhunt.base.text import count_of, one_of, out_of
 from crashhunt.crashes import (
     Bundle,
     crash_folders,
@@ -84,7 +84,7 @@ class HuntResults:
         state = self.state
         return (
             f"<hunt {str(self.directory)!r}: {state.state}, {out_of(state.trials_run, state.trials_planned)} trials, "
-            f"{state.crashes} crash{'' if state.crashes == 1 else 'es'}>"
+            f"{count_of(state.crashes, 'crash')}>"
         )
 
     @cached_property

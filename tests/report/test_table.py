@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from crashhunt.base.text import aligned
 from crashhunt.crashes import find_bundle
 from crashhunt.errors import UsageError
-from crashhunt.report._step_table import NEAREST, aligned, check_fields, format_table, stacked, steps_table
+from crashhunt.report._step_table import NEAREST, check_fields, format_table, stacked, steps_table
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1" / "hunt"
 
