@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from contextlib import closing
 from typing import TYPE_CHECKING, NamedTuple
 
 from crashhunt.base import layout
@@ -14,8 +15,7 @@ from crashhunt.dashboard._catalog import is_inside, unreadable, unreadable_below
 from crashhunt.dashboard._hunt_page import read_tail
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.recording import read_lanes
-from crashhunt.report import Story, player_data
-from crashhunt.results import TrialRow
+from crashhunt.report import Story, lineage_of, player_data
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,7 +29,6 @@ _BUNDLE_FOLDERS = (layout.CRASHES, layout.NEAR_MISSES)
 _MAX_LISTED = 2_000
 _MAX_LANES = 4_000
 _MAX_MAP_LOGS = 40  # that lanes are read from
-_MAX_GENERATIONS = 50  # of a lineage
 
 
 class _Entry(NamedTuple):
@@ -198,21 +197,8 @@ class CrashList:
         path = self._found.path / layout.LEDGER
         if not has_begun(path):
             return []
-        found: list[list[object]] = []
-        ledger = Ledger(path, read_only=True)
-        try:
-            data = ledger.plain_trial(number)
-            while data is not None and len(found) < _MAX_GENERATIONS:
-                row = TrialRow(data)
-                if row.parent is None or row.parent >= row.number:
-                    break
-                data = ledger.plain_trial(row.parent)
-                if data is not None:
-                    parent = TrialRow(data)
-                    found.append([parent.number, parent.origin, parent.danger])
-        finally:
-            ledger.close()
-        return found
+        with closing(Ledger(path, read_only=True)) as ledger:
+            return lineage_of(number, ledger.plain_trial)
 
     def log(self, crash: str) -> Path | None:
         """Return the path of a crash's log inside the hunt; None if there is no log."""

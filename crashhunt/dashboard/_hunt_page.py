@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
@@ -173,29 +173,25 @@ class HuntView:
     def _read(self, path: Path, *, points: bool) -> None:
         settings = self.settings
         assert settings is not None
-        ledger = Ledger(path, read_only=True)
-        try:
-            with ledger.one_moment():
-                file = path.stat().st_ino, ledger.replaced_count()
-                if file != self._file:  # another ledger, or trials that run again
-                    self._file, self.counts, self.sample = file, None, None
-                self.facts = ledger.facts()
-                self.events = ledger.events()
-                self._last = ledger.last_ended_at()
-                if self.counts is None:
-                    self.counts = TrialCounts(settings.crash_on)
-                began = self.counts.last >= 0
-                new = self.counts.refresh(ledger)
-                if self.sample is not None and began:
-                    self.sample.add(ledger, new)
-                elif points and self.counts.last >= 0:
-                    sample = Sample(settings.crash_on)
-                    sample.begin(ledger, self.counts.last, self.counts.crashes)
-                    self.sample = sample
-                self._versions = [asdict(one) for one in count_versions(ledger, self.facts, settings.crash_on)]
-                self._read_copies(ledger)
-        finally:
-            ledger.close()
+        with closing(Ledger(path, read_only=True)) as ledger, ledger.one_moment():
+            file = path.stat().st_ino, ledger.replaced_count()
+            if file != self._file:  # another ledger, or trials that run again
+                self._file, self.counts, self.sample = file, None, None
+            self.facts = ledger.facts()
+            self.events = ledger.events()
+            self._last = ledger.last_ended_at()
+            if self.counts is None:
+                self.counts = TrialCounts(settings.crash_on)
+            began = self.counts.last >= 0
+            new = self.counts.refresh(ledger)
+            if self.sample is not None and began:
+                self.sample.add(ledger, new)
+            elif points and self.counts.last >= 0:
+                sample = Sample(settings.crash_on)
+                sample.begin(ledger, self.counts.last, self.counts.crashes)
+                self.sample = sample
+            self._versions = [asdict(one) for one in count_versions(ledger, self.facts, settings.crash_on)]
+            self._read_copies(ledger)
 
     def _read_copies(self, ledger: Ledger) -> None:
         """Sum up the results of robustness probes and branches.
@@ -295,14 +291,12 @@ class HuntView:
         began = time.monotonic()
         key = (self._key, counts.trials)
         if key != self._rate_key and (began >= self._rate_due or state.state != "running"):
-            ledger = Ledger(self.path / layout.LEDGER, read_only=True)
             try:
-                found = rate_of_trials(self.path, settings, self.facts, ledger.plain_results(), held_out)
+                with closing(Ledger(self.path / layout.LEDGER, read_only=True)) as ledger:
+                    found = rate_of_trials(self.path, settings, self.facts, ledger.plain_results(), held_out)
                 self._rate, self._rate_key = _rate_data(found), key
             except HuntDirectoryError as error:
                 self._rate, self._rate_key = {"why_not": str(error)}, key
-            finally:
-                ledger.close()
             ended = time.monotonic()
             self._rate_due = ended + (ended - began) / _MAX_SHARE_OF_TIME
         return self._rate

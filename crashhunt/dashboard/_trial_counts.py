@@ -11,14 +11,13 @@ sample has more than `MAX_POINTS` trials.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.report import trial_point
+from crashhunt.report import GOLDEN_RATIO, is_drawn, trial_point
 from crashhunt.results import TrialRow
 from crashhunt.trial import Outcome
 
@@ -35,7 +34,6 @@ MAX_POINTS = 4_000
 MAX_CRASHES = 5_000
 """Crashes in a plot, at most. Of more, an even share is shown, and the page says so."""
 
-_GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 _TAIL = 4_000  # numbers among which workers leave gaps
 _CHUNK_TRIALS = 65_536  # numbers at a time, so that the memory does not grow with the hunt
 _MAX_GAPS = 1_000  # that are read one by one; of more, the range over all of them is read
@@ -286,10 +284,10 @@ class Sample:
             self.share /= 2
         while crashes * self.crash_share > MAX_CRASHES:
             self.crash_share /= 2
-        numbers = {number for number in ledger.numbers_of(self._crash_on) if _is_drawn(number, self.crash_share)}
+        numbers = {number for number in ledger.numbers_of(self._crash_on) if is_drawn(number, self.crash_share)}
         for first in range(0, last + 1, _CHUNK_TRIALS):
             block = np.arange(first, min(first + _CHUNK_TRIALS, last + 1))
-            numbers.update(block[block * _GOLDEN_RATIO % 1.0 < self.share].tolist())
+            numbers.update(block[block * GOLDEN_RATIO % 1.0 < self.share].tolist())
         self._take(ledger, sorted(numbers))
 
     def add(self, ledger: Ledger, trials: Iterable[tuple[int, str]]) -> None:
@@ -304,7 +302,7 @@ class Sample:
             [
                 number
                 for number, outcome in trials
-                if _is_drawn(number, self.crash_share if outcome in self._crash_on else self.share)
+                if is_drawn(number, self.crash_share if outcome in self._crash_on else self.share)
             ],
         )
 
@@ -325,17 +323,17 @@ class Sample:
         others = len(self.points) - self._crashes
         while others > MAX_POINTS:
             self.share /= 2
-            others = sum(not point["crash"] and _is_drawn(_number(point), self.share) for point in self.points)
+            others = sum(not point["crash"] and is_drawn(_number(point), self.share) for point in self.points)
         crashes = self._crashes
         while crashes > MAX_CRASHES:
             self.crash_share /= 2
-            crashes = sum(bool(point["crash"]) and _is_drawn(_number(point), self.crash_share) for point in self.points)
+            crashes = sum(bool(point["crash"]) and is_drawn(_number(point), self.crash_share) for point in self.points)
         if (self.share, self.crash_share) == before:
             return
         self.points = [
             point
             for point in self.points
-            if _is_drawn(_number(point), self.crash_share if point["crash"] else self.share)
+            if is_drawn(_number(point), self.crash_share if point["crash"] else self.share)
         ]
         self._crashes = crashes
         self.generation += 1
@@ -357,11 +355,6 @@ def _number(point: Point) -> int:
     number = point["number"]
     assert isinstance(number, int)
     return number
-
-
-def _is_drawn(number: int, share: float) -> bool:
-    """Return whether a trial belongs to a given share of all trials, evenly spaced; a smaller share is a subset."""
-    return number * _GOLDEN_RATIO % 1.0 < share
 
 
 def _point(data: JsonObject, crash_on: Collection[str]) -> Point:

@@ -32,9 +32,11 @@ if TYPE_CHECKING:
         list_scenarios as list_scenarios,
     )
     from ._page import (
+        GOLDEN_RATIO as GOLDEN_RATIO,
         UNCHOSEN as UNCHOSEN,
         PlayerParts as PlayerParts,
         importance_of as importance_of,
+        is_drawn as is_drawn,
         lineage_of as lineage_of,
         player_data as player_data,
         player_parts as player_parts,

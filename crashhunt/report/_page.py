@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import closing
 from dataclasses import asdict
 from importlib import resources
 from typing import TYPE_CHECKING, NamedTuple, TypedDict
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.base.progress import Watch
     from crashhunt.crashes import Bundle, Encounter
     from crashhunt.ledger import RunningRate
@@ -165,27 +167,25 @@ def _explained(ranks: NDArray[np.intp], parts: NDArray[np.intp]) -> float:
     return max(0.0, 1.0 - (whole - between) / (total - groups) * (total - 1) / whole)
 
 
-def lineage_of(number: int, trial: Callable[[int], TrialResult | None]) -> list[TrialResult]:
-    """Return the ancestors of a trial: its parent, the parent of its parent, and so on.
+def lineage_of(number: int, trial: Callable[[int], JsonObject | None]) -> list[list[object]]:
+    """Return the ancestors of a trial, the parent first, each with its number, origin and criticality.
 
     Args:
         number: number of the trial.
-        trial: function that returns a trial by its number; None if the trial is missing.
+        trial: function that returns the JSON data of a trial by its number; None if the trial is missing.
     """
-    found: list[TrialResult] = []
-    result = trial(number)
-    while result is not None and result.spec.parent is not None and len(found) < _MAX_GENERATIONS:
-        if result.spec.parent >= result.spec.number:
-            break
-        result = trial(result.spec.parent)
-        if result is not None:
-            found.append(result)
+    found: list[list[object]] = []
+    row = TrialRow(data) if (data := trial(number)) is not None else None
+    while row is not None and row.parent is not None and row.parent < row.number and len(found) < _MAX_GENERATIONS:
+        row = TrialRow(data) if (data := trial(row.parent)) is not None else None
+        found += [[row.number, row.origin, row.danger]] if row is not None else []
     return found
 
 
 _MAX_SHOWN_ACTIONS = 12  # numbers of an action
 _MAX_PLOTTED_TRIALS = 4000  # trials in a plot; more cannot be distinguished
-_GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
+GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
+"""Multiples of it, without their whole parts, are spread evenly over 0 to 1."""
 
 
 def write_report(
@@ -311,14 +311,9 @@ def _lineages(directory: Path, bundles: Sequence[Bundle]) -> dict[str, list[list
     path = directory / layout.LEDGER
     if not bundles or not has_begun(path):
         return {}
-    ledger = Ledger(path)
-    try:
-        lines = {bundle.id: lineage_of(bundle.result.spec.number, ledger.result) for bundle in bundles}
-    finally:
-        ledger.close()
-    return {
-        crash: [[one.spec.number, one.spec.origin, one.danger] for one in line] for crash, line in lines.items() if line
-    }
+    with closing(Ledger(path)) as ledger:
+        lines = {bundle.id: lineage_of(bundle.result.spec.number, ledger.plain_trial) for bundle in bundles}
+    return {crash: line for crash, line in lines.items() if line}
 
 
 def _crashes(bundles: Sequence[Bundle], found: FoundCrashes, watch: Watch | None) -> dict[str, object]:
@@ -374,8 +369,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
     if not has_begun(path):
         nothing = {"outcomes": {}, "categories": {}, "steps": 0, "trials": [], "stress": None, "drawn": None}
         return {**nothing, "importance": [], "weighed": None, "not_fully_asked": 0, "rate": None}
-    ledger = Ledger(path)
-    try:
+    with closing(Ledger(path)) as ledger:
         outcomes, facts = ledger.outcomes(), ledger.facts()
         versions = count_versions(ledger, facts, settings.crash_on)
         apart = ledger.numbers_from(CodeVersions.of(facts).earlier)
@@ -394,9 +388,9 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
             counts = outcome in settings.crash_on
             if row.origin in UNCHOSEN and row.parent is None and danger is not None and row.number not in apart:
                 unchosen_in_all += 1
-                if _is_drawn(number, 2 * _MOST / max(total, 1)):
+                if is_drawn(number, 2 * _MOST / max(total, 1)):
                     unchosen.append((values_of(row), danger))
-            if _is_drawn(number, share_of_crashes if counts else share):
+            if is_drawn(number, share_of_crashes if counts else share):
                 trials.append(trial_point(row))
         return {
             "outcomes": outcomes,
@@ -412,8 +406,6 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
             "typesByCause": facts.get("types_by_cause"),
             "weighed": [min(len(unchosen), _MOST), unchosen_in_all] if unchosen_in_all > _MOST else None,
         }
-    finally:
-        ledger.close()
 
 
 def _rate(rate: RunningRate | None, versions: str) -> dict[str, object] | None:
@@ -441,13 +433,13 @@ def _plot_counts(
     return {"crashes": shown, "allCrashes": crashes, "others": len(trials) - shown, "allOthers": total - crashes}
 
 
-def _is_drawn(number: int, share: float) -> bool:
+def is_drawn(number: int, share: float) -> bool:
     """Return whether a trial belongs to a given share of all trials, selected evenly over the hunt.
 
-    The selection is not periodic. Every fifth trial of a guided hunt is random, so a periodic selection would be
-    biased.
+    A smaller share is a subset of a greater one. The selection is not periodic, because every fifth trial of a guided
+    hunt is random, so that a periodic selection would be biased.
     """
-    return number * _GOLDEN_RATIO % 1.0 < share
+    return number * GOLDEN_RATIO % 1.0 < share
 
 
 def _crash(bundle: Bundle, story: Story) -> dict[str, object]:

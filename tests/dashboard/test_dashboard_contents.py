@@ -15,6 +15,7 @@ from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.dashboard import _crash_list as _crashes, _details
 from crashhunt.dashboard._crash_list import CrashList
 from crashhunt.recording import Phase
+from crashhunt.report import _page
 from crashhunt.trial import Outcome
 
 # Details of a hunt.
@@ -426,7 +427,7 @@ def test_lineage_names_ancestors_up_to_a_trial_without_a_known_parent(crashes, t
     assert crashes._lineage(8) == crashes._lineage(6) == crashes._lineage(5) == []
     assert opened == [(tmp_path / layout.LEDGER, True)] * 4
     assert len(closed) == 4
-    monkeypatch.setattr(_crashes, "_MAX_GENERATIONS", 1)
+    monkeypatch.setattr(_page, "_MAX_GENERATIONS", 1)
     assert crashes._lineage(9) == [[7, "start", 0.7]]
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.dashboard import _trial_counts as _trials
-from crashhunt.dashboard._trial_counts import Sample, TrialCounts, _is_drawn, _point
+from crashhunt.dashboard._trial_counts import Sample, TrialCounts, _point, is_drawn
 from crashhunt.report._page import _rounded
 from crashhunt.results import TrialRow
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
@@ -42,12 +42,12 @@ def ledger_of(trials, damaged=()):
 
 def test_drawn_trials_are_evenly_spaced_and_of_a_smaller_share_a_subset():
     whole = range(2_000)
-    assert all(_is_drawn(number, 1.0) for number in whole)
-    assert not any(_is_drawn(number, 0.0) for number in whole)
+    assert all(is_drawn(number, 1.0) for number in whole)
+    assert not any(is_drawn(number, 0.0) for number in whole)
     for share in (0.5, 0.25, 0.125):
-        drawn = [number for number in whole if _is_drawn(number, share)]
+        drawn = [number for number in whole if is_drawn(number, share)]
         assert len(drawn) == pytest.approx(2_000 * share, abs=3)
-        assert all(_is_drawn(number, 2 * share) for number in drawn)
+        assert all(is_drawn(number, 2 * share) for number in drawn)
         gaps = {after - before for before, after in pairwise(drawn)}
         assert max(gaps) <= 3 / share
 
@@ -67,7 +67,7 @@ def test_first_sample_has_the_trials_that_each_one_is_asked_for(monkeypatch):
         sample = Sample(CRASH_ON)
         sample.begin(ledger_of(trials), last, crashes)
         assert (sample.share, sample.crash_share) == (share, crash_share)
-        expected = [n for n in trials if _is_drawn(n, max(share, crash_share) if n % 50 == 1 else share)]
+        expected = [n for n in trials if is_drawn(n, max(share, crash_share) if n % 50 == 1 else share)]
         assert [point["number"] for point in sample.points] == expected
         assert sample.generation == 0
 
@@ -88,14 +88,14 @@ def test_sample_is_halved_when_it_has_one_too_many(monkeypatch, outcome):
     shares = (0.5, 1.0) if outcome is Outcome.SURVIVED else (1.0, 0.5)
     assert (sample.generation, (sample.share, sample.crash_share)) == (1, shares)
     assert sorted(point["number"] for point in sample.points) == [
-        *[n for n in range(21) if _is_drawn(n, 0.5)], *range(60, 70)
+        *[n for n in range(21) if is_drawn(n, 0.5)], *range(60, 70)
     ]  # fmt: skip
     assert sample.since(cursor)[2]
     sample.add(ledger_of(trials), [(n, str(outcome)) for n in range(21, 60)])
     kept = [point["number"] for point in sample.points if point["number"] < 60]
     share = min(sample.share, sample.crash_share)
     assert share == 0.25
-    assert kept == [n for n in range(60) if _is_drawn(n, 0.25)]
+    assert kept == [n for n in range(60) if is_drawn(n, 0.25)]
     before = len(sample.points)
     sample.add(ledger_of(trials), [(0, str(outcome))])
     assert len(sample.points) == before + 1  # the counts are those of what was kept
