@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.base.text import in_lines
+from crashhunt.base.text import in_lines, one_line
 from crashhunt.cli._common import (
     add_build,
     add_crash,
     add_json,
     add_trust,
+    answer,
     build_limit_s,
     check_trust,
     opened_crash,
@@ -68,10 +68,8 @@ def _bisect(options: argparse.Namespace, _words: list[str]) -> int:
             bundle, options.good, bad=options.bad, folder=options.folder, watch=show, tell=tell, build=options.build,
             build_limit_s=build_limit_s(options),
         )  # fmt: skip
+    text = f"it is one of {', '.join(one[:12] for one in found.candidates)}"
     if found.commit:
-        say(in_lines([f"{found.commit[:12]} is the first in which it crashes: {found.subject}"]), as_json=options.json)
-    else:
-        say(f"it is one of {', '.join(one[:12] for one in found.candidates)}", as_json=options.json)
-    if options.json:
-        print(json.dumps(found.to_json()))
+        text = one_line(f"{found.commit[:12]} is the first in which it crashes: {found.subject}")
+    answer(options, text, found.to_json())
     return 0 if found.commit else 1

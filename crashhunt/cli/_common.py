@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import json
 import os
 import re
 import sys
@@ -208,6 +209,13 @@ def say(text: str, *, as_json: bool) -> None:
     print(visible(text), file=sys.stderr if as_json else sys.stdout)
 
 
+def answer(options: argparse.Namespace, text: str, data: object) -> None:
+    """Print the answer of a command: the text for the user, and with ``--json`` the data as one JSON object."""
+    say(text, as_json=options.json)
+    if options.json:
+        print(json.dumps(data))
+
+
 def pairs(words: list[str], option: str, *, named: bool = True) -> dict[str, str]:
     """Split repeated ``NAME=VALUE`` options.
 
@@ -258,6 +266,44 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def add_parallel(parser: argparse._ActionsContainer, what: str = "trials that run at a time") -> None:
+    """Add the option ``--parallel``.
+
+    Args:
+        parser: parser of the command.
+        what: description of what is counted.
+    """
+    parser.add_argument(
+        "--parallel", metavar="N", type=integer, default=0, help=f"number of {what}; default: one per core"
+    )
+
+
+def refuse_below(options: argparse.Namespace, **least: int) -> None:
+    """Refuse whole numbers below their least value, such as ``runs=1`` for an option ``--runs``.
+
+    Raises:
+        UsageError: a value is too small.
+    """
+    for name, minimum in least.items():
+        value = getattr(options, name)
+        if value is not None and value < minimum:
+            also = " (0: one per core)" if name == "parallel" else ""
+            raise UsageError(f"--{name.replace('_', '-')} is {value}", fix=f"give at least {minimum}{also}")
+
+
+def duration_s(text: str, option: str) -> float:
+    """Return a time such as ``1h30m`` in s; infinite for an empty text.
+
+    Raises:
+        UsageError: the value of the option is not a time.
+    """
+    from crashhunt.plans import check_duration, seconds_of
+
+    if fix := check_duration(text):
+        raise UsageError(f"{option} is {text!r}", fix=fix)
+    return seconds_of(text)
+
+
 _BUILD_TIMEOUT = "1h"
 
 
@@ -280,11 +326,9 @@ def build_limit_s(options: argparse.Namespace) -> float:
     Raises:
         UsageError: the value is not a time.
     """
-    from crashhunt.plans import check_duration, seconds_of
-
-    if fix := check_duration(options.build_timeout) or ("" if options.build_timeout else "give a time, such as 10m"):
-        raise UsageError(f"--build-timeout is {options.build_timeout!r}", fix=fix)
-    return seconds_of(options.build_timeout)
+    if not options.build_timeout:
+        raise UsageError("--build-timeout is ''", fix="give a time, such as 10m")
+    return duration_s(options.build_timeout, "--build-timeout")
 
 
 def run_trusted(

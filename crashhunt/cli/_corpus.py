@@ -13,10 +13,11 @@ from crashhunt.base.text import command_line, count_of, in_lines
 from crashhunt.cli._common import (
     add_ci_options,
     add_json,
+    add_parallel,
     add_trust,
     check_trust,
-    integer,
     opened_crash,
+    refuse_below,
     run_trusted,
     say,
     shown_progress,
@@ -86,13 +87,7 @@ def _add_run(commands: Commands) -> None:
         "--keep", metavar="DIR", type=Path,
         help="save every crash in this folder, in the form of a hunt that crashhunt show, replay and report accept",
     )  # fmt: skip
-    run.add_argument(
-        "--parallel",
-        metavar="N",
-        type=integer,
-        default=0,
-        help="number of cases that run at a time; default: one per core",
-    )
+    add_parallel(run, "cases that run at a time")
     add_trust(run)
     add_ci_options(run)
     add_json(run)
@@ -156,8 +151,7 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.corpus import find_cases, run_cases
     from crashhunt.report import corpus_annotations, corpus_summary
 
-    if options.parallel < 0:
-        raise UsageError(f"--parallel is {options.parallel}", fix="give at least 1, or 0 for one per core")
+    refuse_below(options, parallel=0)
     cases = find_cases(options.places)
     if not options.trust:
         _trust_cases(cases, options)

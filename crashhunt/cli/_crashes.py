@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import count_of
-from crashhunt.cli._common import add_ci_options, add_json, add_trust, check_trust, integer, say, tell
+from crashhunt.cli._common import add_ci_options, add_json, add_trust, check_trust, integer, refuse_below, say, tell
 from crashhunt.cli._exit_codes import DONE, INTERRUPTED, THE_ANSWER_IS_NO
 
 if TYPE_CHECKING:
@@ -68,8 +68,7 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.report import describe_causes, describe_groups, describe_note, describe_types_by_version
     from crashhunt.results import crashes_by_version, dropped_crashes, find_hunts
 
-    if options.by_cause is not None and options.by_cause < 1:
-        raise UsageError(f"--by-cause is {options.by_cause}", fix="give at least 1")
+    refuse_below(options, by_cause=1)
     cases = checked_cases(options)
     hunts = list(dict.fromkeys(hunt for directory in options.directories for hunt in find_hunts(directory)))
     bundles = (bundle for hunt in hunts for bundle in list_bundles(hunt))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import add_crash, add_json, opened_crash, say, shown_progress
+from crashhunt.cli._common import add_crash, add_json, answer, opened_crash, shown_progress
 
 if TYPE_CHECKING:
     import argparse
@@ -61,9 +60,8 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
         shown_progress(f"writing {options.file}", as_json=options.json) as watch,
     ):
         size = export_crash(bundle, options.file, watch=watch)
-    say(f"{bundle.id} is in {command_line(options.file)} ({size / 1e6:.2f} MB)", as_json=options.json)
-    if options.json:
-        print(json.dumps({"crash": bundle.id, "file": str(options.file), "bytes": size}))
+    text = f"{bundle.id} is in {command_line(options.file)} ({size / 1e6:.2f} MB)"
+    answer(options, text, {"crash": bundle.id, "file": str(options.file), "bytes": size})
     return 0
 
 
@@ -84,11 +82,7 @@ def _convert(options: argparse.Namespace) -> int:
         files.append(options.file.with_suffix(".xodr"))
     size = sum(file.stat().st_size for file in files)
     names = " and ".join(map(command_line, files))
-    say(f"{bundle.id} is in {names} ({size / 1e6:.2f} MB), for {options.form}", as_json=options.json)
-    if options.json:
-        print(
-            json.dumps(
-                {"crash": bundle.id, "file": str(options.file), "bytes": size, "as": options.form, "actors": actors}
-            )
-        )
+    text = f"{bundle.id} is in {names} ({size / 1e6:.2f} MB), for {options.form}"
+    facts = {"crash": bundle.id, "file": str(options.file), "bytes": size, "as": options.form, "actors": actors}
+    answer(options, text, facts)
     return 0

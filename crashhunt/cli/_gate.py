@@ -18,9 +18,11 @@ from crashhunt.cli._common import (
     add_ci_options,
     add_json,
     add_options,
+    add_parallel,
     add_trust,
     build_limit_s,
     chosen_options,
+    duration_s,
     integer,
     make_console,
     number,
@@ -101,11 +103,7 @@ def add_gate(commands: Commands) -> None:
         default=95.0,
         help="confidence of the verdict, in percent; default: 95",
     )
-    how.add_argument(
-        "--parallel", metavar="N", type=integer, default=0,
-        help="number of trials that run at a time, counted over BASE and HEAD together; at least 2; default: one per "
-        "core",
-    )  # fmt: skip
+    add_parallel(how, "trials that run at a time, counted over BASE and HEAD together; at least 2")
     how.add_argument(
         "--keep", metavar="DIR", type=Path,
         help="keep the hunts of BASE and HEAD in this folder, for crashhunt compare, rate and report; the same command "
@@ -122,12 +120,9 @@ def add_gate(commands: Commands) -> None:
 
 
 def _gate(options: argparse.Namespace, words: list[str]) -> int:
-    from crashhunt.plans import check_duration, seconds_of
     from crashhunt.report import describe_gate, gate_annotations, gate_summary, write_gate_junit
     from crashhunt.suites import Gate, GateVersion
 
-    if fix := check_duration(options.duration):
-        raise UsageError(f"--for is {options.duration}", fix=fix)
     folder = Path.cwd()
     hunts = _of_suite(options, words) if options.suite is not None else _of_options(options, folder)
     gate = Gate(
@@ -136,7 +131,7 @@ def _gate(options: argparse.Namespace, words: list[str]) -> int:
         hunts=hunts,
         folder=folder,
         most=options.most,
-        duration_s=seconds_of(options.duration),
+        duration_s=duration_s(options.duration, "--for"),
         margin=_margin(options.margin),
         confidence=options.confidence,
         corpus=options.corpus,

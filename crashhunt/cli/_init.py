@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import add_json, say
+from crashhunt.cli._common import add_json, answer
 from crashhunt.cli._exit_codes import DONE
 
 if TYPE_CHECKING:
@@ -98,9 +97,7 @@ def _init(options: argparse.Namespace, _words: list[str]) -> int:
     finally:
         tell("")
     lines = [f"made {command_line(options.directory)}", "", *describe_place(made), "", "Next:"]
-    say("\n".join([*lines, *(f"  {command}" for command in made.commands)]), as_json=options.json)
-    if options.json:
-        print(json.dumps(made.to_json()))
+    answer(options, "\n".join([*lines, *(f"  {command}" for command in made.commands)]), made.to_json())
     return DONE
 
 
@@ -123,9 +120,7 @@ def _init_from_parameters(options: argparse.Namespace) -> int:
         "All other arguments of the scenario keep their values.", "",
         "Next:", f"  {run}",
     ]  # fmt: skip
-    say("\n".join(lines), as_json=options.json)
-    if options.json:
-        print(json.dumps(made.to_json()))
+    answer(options, "\n".join(lines), made.to_json())
     return DONE
 
 

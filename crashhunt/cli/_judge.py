@@ -10,6 +10,7 @@ from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import (
     add_crash,
     add_json,
+    add_parallel,
     add_trust,
     check_trust,
     integer,
@@ -63,13 +64,7 @@ def add_judge(commands: Commands) -> None:
         "--no-drivers", action="store_true",
         help="do not ask models of a competent driver (UN R157) whether they would have prevented a collision",
     )  # fmt: skip
-    judge.add_argument(
-        "--parallel",
-        metavar="N",
-        type=integer,
-        default=0,
-        help="number of trials that run at a time; default: one per core",
-    )
+    add_parallel(judge)
     add_trust(judge)
     add_json(judge)
     judge.set_defaults(command=_judge)
@@ -146,8 +141,6 @@ def _judge_one(
     found = judgement_of(bundle)
     assert found is not None
     story = Story(bundle)
-    say(
-        "\n".join([f"{bundle.id}: {bundle.result.summary}", *(f"  {line}" for line in story.about_judgement())]),
-        as_json=options.json,
-    )
+    lines = [f"{bundle.id}: {bundle.result.summary}", *(f"  {line}" for line in story.about_judgement())]
+    say("\n".join(lines), as_json=options.json)
     return {"crash": bundle.id, **found.to_json()}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_line, visible
-from crashhunt.cli._common import GivenOnce, chosen_runs, integer
+from crashhunt.cli._common import GivenOnce, chosen_runs, integer, refuse_below
 
 if TYPE_CHECKING:
     import argparse
@@ -50,8 +50,7 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
 
     if options.errors_only and options.type not in (None, "error"):
         raise UsageError(f"--errors-only and --type {options.type} contradict each other", fix="give one of them")
-    if options.trial is not None and options.trial < 0:
-        raise UsageError(f"--trial is {options.trial}", fix="give at least 0")
+    refuse_below(options, trial=0)
     hunts = chosen_runs(options.directory, options.run)
     kinds: tuple[LogKind, ...] = ("run", "error", "state")
     if options.errors_only or options.type is not None:

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.errors import HuntDirectoryError, UsageError
+from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, say, shown_progress
+from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, refuse_below, say, shown_progress
 
 if TYPE_CHECKING:
     import argparse
@@ -48,8 +48,7 @@ def _report(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.report import write_report
     from crashhunt.results import find_crashes, hunt_state
 
-    if options.crashes < 0:
-        raise UsageError(f"--crashes is {options.crashes}", fix="give at least 0")
+    refuse_below(options, crashes=0)
     with opened_hunt(options.directory) as (hunt, exported):
         state = hunt_state(hunt)
         alone = exported or (hunt / layout.CASE).is_file()  # one crash, which never had a ledger

@@ -15,9 +15,10 @@ from crashhunt.cli._common import (
     WordsWithCommas,
     add_json,
     add_options,
+    add_parallel,
     add_trust,
+    answer,
     chosen_options,
-    integer,
     say,
 )
 from crashhunt.cli._exit_codes import DONE, NO_ANSWER
@@ -56,8 +57,7 @@ def add_scorecard(commands: Commands) -> None:
     how.add_argument(
         "--to", metavar="DIR", type=Path, help="directory of the scorecard; default: scorecard-SUITE-AGENT"
     )
-    how.add_argument("--parallel", metavar="N", type=integer, default=0,
-                     help="number of trials that run at a time; default: one per core")  # fmt: skip
+    add_parallel(how)
     add_options(defaultdict(lambda: how, what=what), _HUNT_OPTIONS)
     add_trust(scorecard)
     add_json(scorecard)
@@ -96,9 +96,7 @@ def _scorecard(options: argparse.Namespace, _words: list[str]) -> int:
     ):
         with whole_file(directory / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    say(describe_scorecard(card, str(directory)), as_json=options.json)
-    if options.json:
-        print(json.dumps(card))
+    answer(options, describe_scorecard(card, str(directory)), card)
     return DONE if found.is_complete else NO_ANSWER
 
 

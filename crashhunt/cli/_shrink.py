@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
@@ -10,11 +9,14 @@ from crashhunt.base.text import command_line, in_lines
 from crashhunt.cli._common import (
     add_crash,
     add_json,
+    add_parallel,
     add_trust,
+    answer,
+    duration_s,
     integer,
     opened_crash,
+    refuse_below,
     run_trusted,
-    say,
     shown_progress,
 )
 from crashhunt.cli._exit_codes import INTERRUPTED
@@ -56,13 +58,7 @@ def add_shrink(commands: Commands) -> None:
         help="whether other actors keep driving (traffic), or are moved along their recorded paths (scripted); "
             "default: traffic if few actors remain, otherwise scripted",
     )  # fmt: skip
-    shrink.add_argument(
-        "--parallel",
-        metavar="N",
-        type=integer,
-        default=0,
-        help="number of trials that run at a time; default: one per core",
-    )
+    add_parallel(shrink)
     add_trust(shrink)
     add_json(shrink)
     shrink.set_defaults(command=_shrink)
@@ -71,16 +67,9 @@ def add_shrink(commands: Commands) -> None:
 def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.analysis import shrink
     from crashhunt.base.signals import stop_requests
-    from crashhunt.plans import seconds_of
 
-    if options.budget < 1:
-        raise UsageError(f"--budget is {options.budget}", fix="give at least 1")
-    if options.parallel < 0:
-        raise UsageError(f"--parallel is {options.parallel}", fix="give at least 0 (0: one per core)")
-    try:
-        time_s = seconds_of(options.time)
-    except ValueError:
-        raise UsageError(f"--for is {options.time!r}", fix="give a time above 0, such as 90s, 1m or 1h30m") from None
+    refuse_below(options, budget=1, parallel=0)
+    time_s = duration_s(options.time, "--for")
     if options.directory.is_file():
         raise UsageError(
             "shrink writes its result next to the crash, and cannot write into an exported file",
@@ -97,9 +86,7 @@ def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
                 )  # fmt: skip
 
         found = run_trusted(run, bundle, None, options)
-    say(_summary_of(found), as_json=options.json)
-    if options.json:
-        print(json.dumps(found.to_json()))
+    answer(options, _summary_of(found), found.to_json())
     if found.ended == "interrupted":
         return INTERRUPTED
     return 1 if found.verdict == "not_reproduced" else 0

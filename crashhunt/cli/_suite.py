@@ -11,6 +11,7 @@ from crashhunt.base.text import command_line
 from crashhunt.cli._common import (
     add_json,
     add_options_of_machine,
+    add_parallel,
     add_trust,
     ask_to_trust,
     chosen_of_machine,
@@ -93,9 +94,7 @@ def add_rerun(commands: Commands) -> None:
         help="keep DIR as it is, and run the hunt in the new directory NEW; if the same command was interrupted or "
         "killed in NEW, it continues",
     )
-    rerun.add_argument("--parallel", metavar="N", type=integer, default=0,
-                       help="number of trials that run at a time, "
-                       "counted over all hunts; default: one per core")  # fmt: skip
+    add_parallel(rerun, "trials that run at a time, counted over all hunts")
     add_options_of_machine(rerun)
     add_trust(rerun)
     add_json(rerun)

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import os
 from typing import TYPE_CHECKING, get_args
 
-from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import (
     GivenOnce,
     WordsWithCommas,
     add_crash,
     add_json,
+    add_parallel,
     add_trust,
+    answer,
+    duration_s,
     integer,
     number,
     opened_crash,
     pairs,
+    refuse_below,
     run_trusted,
-    say,
     shown_progress,
 )
 from crashhunt.cli._exit_codes import DONE, INTERRUPTED
@@ -96,9 +97,7 @@ def add_whatif(commands: Commands) -> None:
     whatif.add_argument(
         "--times", metavar="N", type=integer, help="number of runs; default: 50 with --futures, otherwise 1"
     )
-    whatif.add_argument(
-        "--parallel", metavar="N", type=integer, default=0, help="number of runs at a time; default: one per core"
-    )
+    add_parallel(whatif, "runs at a time")
     whatif.add_argument(
         "--for", metavar="TIME", default="", dest="time",
         help="stop after this time; the counts then include only the runs with lower numbers than the first "
@@ -111,16 +110,9 @@ def add_whatif(commands: Commands) -> None:
 
 def _whatif(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.base.signals import stop_requests
-    from crashhunt.plans import seconds_of
 
-    if options.times is not None and options.times < 1:
-        raise UsageError(f"--times is {options.times}", fix="give at least 1")
-    if options.parallel < 0:
-        raise UsageError(f"--parallel is {options.parallel}", fix="give at least 0 (0: one per core)")
-    try:
-        time_s = seconds_of(options.time)
-    except ValueError:
-        raise UsageError(f"--for is {options.time!r}", fix="give a time above 0, such as 90s, 1m or 1h30m") from None
+    refuse_below(options, times=1, parallel=0)
+    time_s = duration_s(options.time, "--for")
     sets, arguments = pairs(options.sets, "--set"), pairs(options.arg, "--arg")
     from crashhunt.analysis import WhatIfOptions, interventions_of, what_if
 
@@ -148,7 +140,5 @@ def _whatif(options: argparse.Namespace, _words: list[str]) -> int:
                 )
 
         counts = run_trusted(run, bundle, archive, options)
-    say("\n".join(counts.lines()), as_json=options.json)
-    if options.json:
-        print(json.dumps(counts.to_json()))
+    answer(options, "\n".join(counts.lines()), counts.to_json())
     return INTERRUPTED if stops else DONE
