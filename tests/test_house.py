@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 import crashhunt
-from crashhunt.recording import RECORD_TYPES, Tag
+from crashhunt.recording import Tag
+from crashhunt.recording.records import RECORD_TYPES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -6,7 +6,7 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._avoidability import check_numbers as check_numbers, judge as judge, judge_bundle as judge_bundle
-    from ._delta_debugging import Tried as Tried, fewest as fewest, plainest as plainest
+    from ._delta_debugging import Tried as Tried, fewest as fewest
     from ._driver_runs import judge_preventability as judge_preventability
     from ._interventions import (
         Disturb as Disturb,

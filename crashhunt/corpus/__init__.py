@@ -17,11 +17,9 @@ if TYPE_CHECKING:
         Case as Case,
         KnownType as KnownType,
         add_case as add_case,
-        cases_of_type as cases_of_type,
         compare_types as compare_types,
         find_cases as find_cases,
         read_case as read_case,
-        signature_today as signature_today,
     )
 
 offer_lazily(__name__)

@@ -57,7 +57,6 @@ if TYPE_CHECKING:
         DangerCourse as DangerCourse,
         Encounter as Encounter,
         Moment as Moment,
-        Position as Position,
         closest_actors as closest_actors,
         danger_course as danger_course,
         last_escape as last_escape,
@@ -66,7 +65,6 @@ if TYPE_CHECKING:
     )
     from ._fault import (
         Fault as Fault,
-        Verdict as Verdict,
         fault_of as fault_of,
         stop_lines_of as stop_lines_of,
         yielding_actor as yielding_actor,

@@ -8,15 +8,14 @@ if TYPE_CHECKING:
     from ._action_override import (
         Braking as Braking,
         HandedOver as HandedOver,
-        Keeping as Keeping,
         ReferenceDriver as ReferenceDriver,
         overruled_agent as overruled_agent,
     )
     from ._blame import has_users_code as has_users_code, internal_error as internal_error
     from ._branches import Brancher as Brancher
     from ._competent_driver import CompetentDriver as CompetentDriver
-    from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
-    from ._failures import are_functions_replaced as are_functions_replaced, failure_of as failure_of
+    from ._episode import Episode as Episode, Reset as Reset
+    from ._failures import are_functions_replaced as are_functions_replaced
     from ._fast_path import FastEpisode as FastEpisode
     from ._forced_onsets import OnsetForcer as OnsetForcer
     from ._forks import FirstCopy as FirstCopy, ForkRunner as ForkRunner
@@ -30,13 +29,7 @@ if TYPE_CHECKING:
         options_of as options_of,
         ready_recorder as ready_recorder,
     )
-    from ._probes import (
-        BUDGET as BUDGET,
-        BUDGET_BESIDE as BUDGET_BESIDE,
-        PROBED as PROBED,
-        Probed as Probed,
-        Prober as Prober,
-    )
+    from ._probes import BUDGET as BUDGET, BUDGET_BESIDE as BUDGET_BESIDE, Prober as Prober
     from ._run_episode import (
         Parts as Parts,
         generators as generators,

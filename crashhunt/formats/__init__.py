@@ -9,10 +9,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._alks_parameters import (
-        ReadParameters as ReadParameters,
-        scenario_from_openscenario as scenario_from_openscenario,
-    )
+    from ._alks_parameters import scenario_from_openscenario as scenario_from_openscenario
     from ._commonroad import write_commonroad as write_commonroad
     from ._openscenario import write_openscenario as write_openscenario
 

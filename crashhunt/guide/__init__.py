@@ -8,7 +8,6 @@ from crashhunt.guide._pages import (
     find_page as find_page,
     for_terminal as for_terminal,
     list_pages as list_pages,
-    pages_folder as pages_folder,
     search_pages as search_pages,
 )
 from crashhunt.guide._reference import (

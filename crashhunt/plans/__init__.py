@@ -6,13 +6,7 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._argument_owners import Owners as Owners, Takes as Takes, agent_of as agent_of, takes_of as takes_of
-    from ._choices import parse_crash_on as parse_crash_on
-    from ._code import (
-        CodeFacts as CodeFacts,
-        describe_code as describe_code,
-        imported_by as imported_by,
-        reused_agents as reused_agents,
-    )
+    from ._code import imported_by as imported_by, reused_agents as reused_agents
     from ._declaration import Given as Given, HuntOption as HuntOption
     from ._durations_and_rates import (
         RATE_PERS as RATE_PERS,

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
         BlackBoxFile as BlackBoxFile,
         BlackBoxHeader as BlackBoxHeader,
         Phase as Phase,
-        Record as Record,
         digest_of as digest_of,
         is_evidence as is_evidence,
         read_black_box as read_black_box,
@@ -34,24 +33,21 @@ if TYPE_CHECKING:
         Prologue as Prologue,
         StepRecord as StepRecord,
     )
-    from ._recording import Compact as Compact, Recording as Recording
+    from ._recording import Recording as Recording
     from ._values import (
         OPAQUE_SHAPE as OPAQUE_SHAPE,
-        OpaqueValue as OpaqueValue,
         decode_value as decode_value,
         describe_value as describe_value,
         encode_value as encode_value,
         is_opaque as is_opaque,
     )
-    from .records import RECORD_TYPES as RECORD_TYPES, Tag as Tag
+    from .records import Tag as Tag
     from .records._scene_record import (
         encode_actors as encode_actors,
         encode_disturbance as encode_disturbance,
         encode_events as encode_events,
         encode_heights as encode_heights,
-        encode_lanes as encode_lanes,
         encode_notes as encode_notes,
-        encode_roster as encode_roster,
         encode_spines as encode_spines,
     )
 

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._edits import edited_disturbances as edited_disturbances, with_other_words as with_other_words
     from ._prepare import (
         Code as Code,
         Look as Look,
@@ -15,12 +14,6 @@ if TYPE_CHECKING:
         prepare as prepare,
         reruns_of as reruns_of,
     )
-    from ._replaying import (
-        ReplayReport as ReplayReport,
-        Verdict as Verdict,
-        confirm as confirm,
-        replay as replay,
-        up_to as up_to,
-    )
+    from ._replaying import ReplayReport as ReplayReport, confirm as confirm, replay as replay, up_to as up_to
 
 offer_lazily(__name__)

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
         write_gate_junit as write_gate_junit,
     )
     from ._listing import (
-        ArgumentEntry as ArgumentEntry,
         ListingEntry as ListingEntry,
         describe as describe,
         list_actions as list_actions,
@@ -34,21 +33,17 @@ if TYPE_CHECKING:
     from ._page import (
         GOLDEN_RATIO as GOLDEN_RATIO,
         UNCHOSEN as UNCHOSEN,
-        PlayerParts as PlayerParts,
         importance_of as importance_of,
         is_drawn as is_drawn,
         lineage_of as lineage_of,
         player_data as player_data,
         player_parts as player_parts,
-        report_data as report_data,
         trial_point as trial_point,
-        values_of as values_of,
         write_report as write_report,
     )
     from ._rate_text import (
         describe_rates as describe_rates,
         describe_running as describe_running,
-        format_interval as format_interval,
         rates_page as rates_page,
         write_rates_csv as write_rates_csv,
     )
@@ -61,7 +56,6 @@ if TYPE_CHECKING:
         Watcher as Watcher,
         describe_phase as describe_phase,
         describe_types as describe_types,
-        format_arguments as format_arguments,
         format_pace as format_pace,
         format_seconds as format_seconds,
     )

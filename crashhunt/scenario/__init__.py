@@ -8,8 +8,6 @@ if TYPE_CHECKING:
     from ._action_forms import (
         ACTIONS as ACTIONS,
         OVERRIDES_ONLY as OVERRIDES_ONLY,
-        ActionComponent as ActionComponent,
-        ActionDescription as ActionDescription,
         action_settings as action_settings,
         canonical_action as canonical_action,
         check_action as check_action,
@@ -42,7 +40,6 @@ if TYPE_CHECKING:
         argument_values as argument_values,
         as_in_file as as_in_file,
         as_plain_data as as_plain_data,
-        backend_names as backend_names,
         backend_of as backend_of,
         configurations as configurations,
         digest_of_described as digest_of_described,

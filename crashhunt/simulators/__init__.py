@@ -96,14 +96,12 @@ if TYPE_CHECKING:
         TranslatesMotion as TranslatesMotion,
     )
     from ._scene_observation import (
-        SCENE_PARTS as SCENE_PARTS,
         LanePlace as LanePlace,
         SceneObserver as SceneObserver,
         bicycle_steering as bicycle_steering,
     )
     from ._scene_parts import (
         ActorNumbers as ActorNumbers,
-        NearActor as NearActor,
         RayCaster as RayCaster,
         center_of as center_of,
         covariances_of as covariances_of,

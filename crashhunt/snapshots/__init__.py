@@ -12,18 +12,12 @@ if TYPE_CHECKING:
         program_warnings as program_warnings,
     )
     from ._environment import (
-        Environment as Environment,
         environment as environment,
         environment_changes as environment_changes,
         processor as processor,
         versions as versions,
     )
-    from ._snapshot import (
-        Manifest as Manifest,
-        Snapshot as Snapshot,
-        latest_snapshot as latest_snapshot,
-        without_code as without_code,
-    )
+    from ._snapshot import Snapshot as Snapshot, latest_snapshot as latest_snapshot, without_code as without_code
     from ._take import SnapshotOptions as SnapshotOptions, take_snapshot as take_snapshot
     from ._unsaved import (
         describe_missing as describe_missing,

@@ -12,22 +12,14 @@ if TYPE_CHECKING:
         compare as compare,
         held_out_by_seed as held_out_by_seed,
     )
-    from ._hunt_pairs import (
-        GateCase as GateCase,
-        GateReport as GateReport,
-        PairedHunts as PairedHunts,
-        ScenarioCounts as ScenarioCounts,
-    )
+    from ._hunt_pairs import GateCase as GateCase, GateReport as GateReport, PairedHunts as PairedHunts
     from ._hunt_rate import (
         counts_suffice as counts_suffice,
         measure_rates as measure_rates,
         rate_of_counts as rate_of_counts,
         rate_of_trials as rate_of_trials,
     )
-    from ._paired_rates import difference_of_rates as difference_of_rates
     from ._paired_test import (
-        Pair as Pair,
-        PairSequence as PairSequence,
         PairTest as PairTest,
         PairVerdict as PairVerdict,
         PairWatch as PairWatch,
@@ -39,46 +31,22 @@ if TYPE_CHECKING:
         Estimated as Estimated,
         RareCounter as RareCounter,
         RareEstimate as RareEstimate,
-        Root as Root,
-        is_root as is_root,
         learn_forcing as learn_forcing,
-        rare_estimate as rare_estimate,
         root_of as root_of,
-        with_plain as with_plain,
     )
     from ._rate_of_running_hunt import (
         Forcings as Forcings,
         RareWatch as RareWatch,
         bar_watch as bar_watch,
-        counting_rule as counting_rule,
         crashed_copies as crashed_copies,
         forcings_of as forcings_of,
         rare_watch as rare_watch,
         rate_of_bar as rate_of_bar,
         rate_watch as rate_watch,
         refuse_training_traffic as refuse_training_traffic,
-        why_no_interval as why_no_interval,
     )
-    from ._rate_report import (
-        CrashRate as CrashRate,
-        RatePart as RatePart,
-        check_confidence as check_confidence,
-        make_rate as make_rate,
-    )
-    from ._running import (
-        BarWatch as BarWatch,
-        Paced as Paced,
-        RateWatch as RateWatch,
-    )
-    from ._units import (
-        MAX_INVALID_SHARE as MAX_INVALID_SHARE,
-        PER_WORDS as PER_WORDS,
-        CountingRule as CountingRule,
-        Per as Per,
-        RateCounter as RateCounter,
-        TrialFacts as TrialFacts,
-        UnitSequence as UnitSequence,
-        facts_of as facts_of,
-    )
+    from ._rate_report import CrashRate as CrashRate, RatePart as RatePart, check_confidence as check_confidence
+    from ._running import BarWatch as BarWatch, RateWatch as RateWatch
+    from ._units import PER_WORDS as PER_WORDS, CountingRule as CountingRule, Per as Per, TrialFacts as TrialFacts
 
 offer_lazily(__name__)

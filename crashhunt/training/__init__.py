@@ -6,18 +6,11 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._crash_env import CrashEnv as CrashEnv, make_training_env as make_training_env
-    from ._traffic_split import (
-        SavedCrash as SavedCrash,
-        Split as Split,
-        check_test_share as check_test_share,
-        is_test_traffic as is_test_traffic,
-        split_crashes as split_crashes,
-    )
+    from ._traffic_split import Split as Split, check_test_share as check_test_share, split_crashes as split_crashes
     from ._trained_on import (
         HeldOutTraffics as HeldOutTraffics,
         TrainedOn as TrainedOn,
         held_out_traffics as held_out_traffics,
-        read_trained_on as read_trained_on,
     )
 
 offer_lazily(__name__)

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from ._contact import (
         MAX_CONTACT_GAP_M as MAX_CONTACT_GAP_M,
         STANDS_MPS as STANDS_MPS,
-        Face as Face,
         Touch as Touch,
         contact_at as contact_at,
         first_contact as first_contact,

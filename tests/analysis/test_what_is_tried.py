@@ -8,7 +8,8 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given, strategies as st
 
-from crashhunt.analysis import _shrink_stages as _stages, fewest, plainest
+from crashhunt.analysis import _shrink_stages as _stages, fewest
+from crashhunt.analysis._delta_debugging import plainest
 from crashhunt.analysis._shrink_stages import Minimizer, Part
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.reruns import OutOfTimeError, StoppedError

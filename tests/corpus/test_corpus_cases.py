@@ -17,12 +17,12 @@ from crashhunt.corpus import (
     _case_runs as _run,
     _cases,
     add_case,
-    cases_of_type,
     compare_types,
     find_cases,
     read_case,
     run_cases,
 )
+from crashhunt.corpus._cases import cases_of_type
 from crashhunt.crashes import Cause, Judgement, Signature, judgement_of, with_judgement
 from crashhunt.reruns import EndedRun, StoppedError
 from crashhunt.trial import Outcome, TrialResult, TrialSpec

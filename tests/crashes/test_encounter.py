@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.crashes import Encounter, Position, last_escape
-from crashhunt.crashes._encounter import _Path
+from crashhunt.crashes import Encounter, last_escape
+from crashhunt.crashes._encounter import Position, _Path
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.world import Actor, Roster, Scene
 

@@ -77,7 +77,7 @@ def test_what_cannot_be_meant_is_one_line_before_the_hunt(toy, words, says):
 )
 def test_edits_that_cannot_be_meant(toy, change, says):
     from crashhunt.errors import ArgumentError
-    from crashhunt.replays import edited_disturbances
+    from crashhunt.replays._edits import edited_disturbances
     from crashhunt.trial import Disturbance
 
     name, _, text = change.format(step=7).partition("=")
@@ -86,7 +86,7 @@ def test_edits_that_cannot_be_meant(toy, change, says):
 
 
 def test_a_stronger_one_and_none(toy):
-    from crashhunt.replays import edited_disturbances
+    from crashhunt.replays._edits import edited_disturbances
     from crashhunt.trial import Disturbance
 
     planned = [Disturbance(7, "ahead", "brake", 2.0, 1.0, "ego"), Disturbance(9, "ahead", "stop", 2.0, 8.0, "ego")]
@@ -98,7 +98,7 @@ def test_a_stronger_one_and_none(toy):
 
 def test_one_is_added_replaced_and_taken_out():
     from crashhunt.errors import ArgumentError
-    from crashhunt.replays import edited_disturbances
+    from crashhunt.replays._edits import edited_disturbances
     from crashhunt.trial import Disturbance
 
     planned = (Disturbance(7, "ahead", "brake", 2.0, 1.0, "ego"), Disturbance(7, "ahead", "stop", 2.0, 8.0, "ego"))
@@ -131,7 +131,7 @@ def test_one_is_added_replaced_and_taken_out():
     ],
 )
 def test_disturb_is_edited_in_the_hunts_file(after, left, says, ignored):
-    from crashhunt.replays import with_other_words
+    from crashhunt.replays._edits import with_other_words
     from crashhunt.trial import Disturbance
 
     planned = (

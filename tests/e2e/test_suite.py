@@ -111,7 +111,8 @@ def test_all_runs_again_with_the_same_seeds_and_crashes(toy):
 
 @pytest.mark.nightly
 def test_a_damaged_plan_leaves_the_others_untouched(toy):
-    from crashhunt.suites import Suite, run_all
+    from crashhunt.suites import Suite
+    from crashhunt.suites._processes import run_all
 
     written(toy, SUITE)
     folders = Suite.read(toy.folder / "suite.toml").plan(toy.folder / "out")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from crashhunt.agents import KeepLaneWithSpeed
-from crashhunt.episode import Episode, Nearness, Observer, Recorder, failure_of, run_episode
-from crashhunt.episode._failures import are_functions_replaced, record_originals
+from crashhunt.episode import Episode, Nearness, Observer, Recorder, run_episode
+from crashhunt.episode._failures import are_functions_replaced, failure_of, record_originals
 from crashhunt.errors import RecorderError, SimulatorError
 from crashhunt.oracles import Overlap, ReportedCollision
 from crashhunt.recording import BlackBox

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from crashhunt.disturbances import disturber_of
-from crashhunt.episode import PROBED
+from crashhunt.episode._probes import PROBED
 from crashhunt.trial import CELLS, KINDS, SENSOR_KINDS, steps_of
 
 

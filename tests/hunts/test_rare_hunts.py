@@ -16,7 +16,8 @@ from crashhunt.errors import UsageError
 from crashhunt.hunts._reports import RareReport
 from crashhunt.ledger import Ledger
 from crashhunt.results import hunt_state
-from crashhunt.statistics import BLOCK, TRIALS_PER_ROOT, _rate_of_running_hunt as rare_module, is_root
+from crashhunt.statistics import BLOCK, TRIALS_PER_ROOT, _rate_of_running_hunt as rare_module
+from crashhunt.statistics._rare import is_root
 from crashhunt.statistics._rate_of_running_hunt import Forcings, RareWatch
 from crashhunt.trial import (
     CRASHES,

@@ -20,7 +20,8 @@ from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, first_divergence, read_black_box, read_log, write_log
 from crashhunt.render import SceneView
 from crashhunt.scenario import argument_values, load_scenario
-from crashhunt.sumo import SumoSimulator, height_at
+from crashhunt.sumo import SumoSimulator
+from crashhunt.sumo._bent_vehicles import height_at
 from crashhunt.trial import Outcome, TrialSpec
 from crashhunt.world import approaches, outlines, outlines_overlap
 

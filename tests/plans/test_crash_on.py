@@ -10,7 +10,8 @@ import pytest
 
 from crashhunt.errors import ScenarioError, UsageError
 from crashhunt.ledger import Ledger
-from crashhunt.plans import Request, parse_crash_on, plan, read_settings, with_settings, write_settings
+from crashhunt.plans import Request, plan, read_settings, with_settings, write_settings
+from crashhunt.plans._choices import parse_crash_on
 from crashhunt.scenario import load_scenario, shipped_folder
 from crashhunt.trial import CRASHES, EVENTS, Outcome, TrialResult, TrialSpec
 from crashhunt.world import EVENT_WORDS, Event, event_counts

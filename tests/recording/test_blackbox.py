@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from crashhunt.base.errors import BundleError, RecorderError
-from crashhunt.recording import BlackBox, Phase, Record, Tag, read_black_box, read_header
-from crashhunt.recording._blackbox import Records
+from crashhunt.recording import BlackBox, Phase, Tag, read_black_box, read_header
+from crashhunt.recording._blackbox import Record, Records
 from crashhunt.world import Actor, Roster, Scene
 
 ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "passenger", 5.0, 2.0)))

@@ -8,19 +8,18 @@ from test_compare import ACTORS, AGENTS, SPINE
 
 from crashhunt.recording import (
     Prologue,
-    Record,
     Recording,
     Tag,
     encode_actors,
     encode_heights,
-    encode_lanes,
-    encode_roster,
     encode_spines,
     first_divergence,
     has_same_scenes,
     read_log,
     write_log,
 )
+from crashhunt.recording._blackbox import Record
+from crashhunt.recording.records._scene_record import encode_lanes, encode_roster
 from crashhunt.world import Actor, Roster, Scene
 
 FAR = Actor("far", "bus", 18.0, 2.5)

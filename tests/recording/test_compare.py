@@ -11,7 +11,6 @@ import pytest
 from crashhunt.recording import (
     AgentChannel,
     Prologue,
-    Record,
     Recording,
     Tag,
     encode_actors,
@@ -22,6 +21,7 @@ from crashhunt.recording import (
     first_divergence,
     values_around,
 )
+from crashhunt.recording._blackbox import Record
 from crashhunt.trial import Disturbance
 from crashhunt.world import Actor, Contact, Event, Roster, Scene
 

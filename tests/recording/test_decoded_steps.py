@@ -16,17 +16,16 @@ from crashhunt.crashes import Encounter, closest_actors, danger_course
 from crashhunt.recording import (
     BlackBox,
     Prologue,
-    Record,
     Recording,
     Tag,
     _recording,
     encode_actors,
     encode_disturbance,
-    encode_roster,
     read_black_box,
 )
-from crashhunt.recording._blackbox import Records
+from crashhunt.recording._blackbox import Record, Records
 from crashhunt.recording._log import read_log, write_log
+from crashhunt.recording.records._scene_record import encode_roster
 from crashhunt.trial import Disturbance
 from crashhunt.world import Actor, Roster, Scene, join_frames
 

@@ -13,7 +13,6 @@ from crashhunt.base.errors import BundleError
 from crashhunt.recording import (
     AgentChannel,
     Prologue,
-    Record,
     Recording,
     Tag,
     digest_of,
@@ -23,6 +22,7 @@ from crashhunt.recording import (
     encode_notes,
     encode_spines,
 )
+from crashhunt.recording._blackbox import Record
 from crashhunt.world import Actor, Contact, Event, Roster, Scene
 
 AGENTS = (

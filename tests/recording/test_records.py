@@ -12,7 +12,6 @@ from mcap.reader import make_reader
 
 from crashhunt.errors import BundleError
 from crashhunt.recording import (
-    RECORD_TYPES,
     AgentChannel,
     BlackBox,
     Divergence,
@@ -20,7 +19,6 @@ from crashhunt.recording import (
     Recording,
     digest_of,
     encode_actors,
-    encode_roster,
     first_divergence,
     read_black_box,
     read_log,
@@ -28,6 +26,8 @@ from crashhunt.recording import (
     write_log,
 )
 from crashhunt.recording._blackbox import FIRST_NON_EVIDENCE_TAG, is_evidence
+from crashhunt.recording.records import RECORD_TYPES
+from crashhunt.recording.records._scene_record import encode_roster
 from crashhunt.recording.records._type import BytesForm, RecordType, TextForm
 from crashhunt.world import Actor, Roster, Scene
 

@@ -16,7 +16,6 @@ from crashhunt.base.errors import BundleError
 from crashhunt.recording import (
     AgentChannel,
     Prologue,
-    Record,
     Recording,
     Tag,
     encode_actors,
@@ -28,6 +27,7 @@ from crashhunt.recording import (
     read_lanes,
     write_log,
 )
+from crashhunt.recording._blackbox import Record
 from crashhunt.recording._foxglove import MESSAGES
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Actor, Event, Lane, Roster, Scene

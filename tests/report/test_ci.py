@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.corpus import Case, CaseReport, cases_of_type
+from crashhunt.corpus import Case, CaseReport
+from crashhunt.corpus._cases import cases_of_type
 from crashhunt.crashes import Bundle, Group, Signature
 from crashhunt.report import (
     corpus_annotations,

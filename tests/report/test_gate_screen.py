@@ -6,7 +6,8 @@ from types import SimpleNamespace
 
 from crashhunt.report import describe_gate, gate_summary
 from crashhunt.report._gate_report import _rate
-from crashhunt.statistics import GateReport, Interval, ScenarioCounts, SideCounts
+from crashhunt.statistics import GateReport, Interval, SideCounts
+from crashhunt.statistics._hunt_pairs import ScenarioCounts
 
 
 def test_lines_of_a_verdict_fit_a_terminal_of_80_columns():

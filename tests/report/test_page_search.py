@@ -11,8 +11,8 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.crashes import list_bundles
 from crashhunt.ledger import Ledger
-from crashhunt.report import _page, report_data
-from crashhunt.report._page import importance_of, lineage_of
+from crashhunt.report import _page
+from crashhunt.report._page import importance_of, lineage_of, report_data
 from crashhunt.results import HuntResults, find_crashes
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 

@@ -14,7 +14,8 @@ from conftest import keeps_going
 from rich.console import Console
 
 from crashhunt.executors import NodeFigures
-from crashhunt.hunts import HuntStatus, PhaseStatus, SearchStatus, StrategyStatus
+from crashhunt.hunts import HuntStatus, PhaseStatus, SearchStatus
+from crashhunt.hunts._progress import StrategyStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher, describe_running
 from crashhunt.report._status_screen import _line, _nearest_words, describe_kinds, format_inputs

@@ -15,12 +15,12 @@ from crashhunt.scenario import (
     Backend,
     Scenario,
     as_plain_data,
-    backend_names,
     backend_of,
     load_scenario,
     scenario_from_dict,
     shipped_folder,
 )
+from crashhunt.scenario._scenario import backend_names
 from crashhunt.sumo import SumoSetup
 from crashhunt.testing import BackendContract
 

@@ -32,8 +32,8 @@ from crashhunt.scenario import (
 )
 from crashhunt.scenario._load import check, copy_shipped_scenario, scenario_from_dict
 from crashhunt.scenario._scenario import STEP_LENGTH_S, digest_of_described, with_action
-from crashhunt.sumo import BACKEND as SUMO, StagedFiles, SumoSetup, _ego
-from crashhunt.sumo._files import filled_in, movable, nested_files, read_xml, references, written_by
+from crashhunt.sumo import BACKEND as SUMO, SumoSetup, _ego
+from crashhunt.sumo._files import StagedFiles, filled_in, movable, nested_files, read_xml, references, written_by
 from crashhunt.sumo._options import HARMLESS
 from crashhunt.sumo._side_effects import _check_text, _SideEffectError
 

@@ -22,7 +22,6 @@ from crashhunt.gym import GymSimulator
 from crashhunt.gym._descriptor import CrashRule, GymSetup
 from crashhunt.recording import (
     BlackBox,
-    OpaqueValue,
     Recording,
     decode_value,
     describe_value,
@@ -33,6 +32,7 @@ from crashhunt.recording import (
     read_log,
     write_log,
 )
+from crashhunt.recording._values import OpaqueValue
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.simulators import action_form, native
 from crashhunt.simulators._any_space import FlatAction, ObservationForm

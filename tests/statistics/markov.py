@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.disturbances import Choices, DisturbanceSampler, FirstOnsets, first_forcing
-from crashhunt.statistics import BLOCK, TRIALS_PER_ROOT, learn_forcing, root_of, with_plain
+from crashhunt.statistics import BLOCK, TRIALS_PER_ROOT, learn_forcing, root_of
+from crashhunt.statistics._rare import with_plain
 from crashhunt.trial import CRASHES, Disturbance, Forced, ForcedCopy, Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:

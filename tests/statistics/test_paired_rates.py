@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from crashhunt.statistics import CountingRule, Interval, RateTest, TrialFacts, difference_of_rates
+from crashhunt.statistics import CountingRule, Interval, RateTest, TrialFacts
+from crashhunt.statistics._paired_rates import difference_of_rates
 from crashhunt.trial import Failure
 
 RULE = CountingRule(max_steps=300)

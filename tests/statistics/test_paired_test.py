@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from crashhunt.statistics import CountingRule, PairSequence, PairTest, PairWatch, TrialFacts
+from crashhunt.statistics import CountingRule, PairTest, PairWatch, TrialFacts
+from crashhunt.statistics._paired_test import PairSequence
 from crashhunt.trial import Failure
 
 RULE = CountingRule(max_steps=9)

@@ -11,7 +11,8 @@ import pytest
 from markov import Model, run_root, run_roots
 
 from crashhunt.disturbances import SECONDS_PER_COPY, first_forcing
-from crashhunt.statistics import TRIALS_PER_ROOT, Root, learn_forcing, rare_estimate, root_of, with_plain
+from crashhunt.statistics import TRIALS_PER_ROOT, learn_forcing, root_of
+from crashhunt.statistics._rare import Root, rare_estimate, with_plain
 from crashhunt.trial import CRASHES, Disturbance, Forced, ForcedCopy, Forcing, Outcome, TrialResult, TrialSpec
 
 SPARSE = {"late_action": 1e-4, "brake": 2e-4, "stop": 1e-4}

@@ -16,7 +16,8 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, NoValidTrialError, UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, RunSettings, write_settings
-from crashhunt.statistics import ScenarioCounts, SideCounts
+from crashhunt.statistics import SideCounts
+from crashhunt.statistics._hunt_pairs import ScenarioCounts
 from crashhunt.suites import Gate, GateVersion, RunRequest, _gate_runs as _gate
 from crashhunt.suites._processes import REQUEST, write_request
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec

@@ -17,8 +17,8 @@ from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.plans import Request, plan
 from crashhunt.results import hunt_state
-from crashhunt.suites import RunRequest, Suite, SuiteEntry, _processes, _rerun, rerun, run_all
-from crashhunt.suites._processes import REQUEST, check_machine, set_aside, write_request
+from crashhunt.suites import RunRequest, Suite, SuiteEntry, _processes, _rerun, rerun
+from crashhunt.suites._processes import REQUEST, check_machine, run_all, set_aside, write_request
 
 ASKED = RunRequest(
     Request(

@@ -20,25 +20,12 @@ from crashhunt.errors import HuntDirectoryError, UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.report import comparison_page, describe_comparison, describe_gate, describe_running, gate_summary
 from crashhunt.results import hunt_state
-from crashhunt.statistics import (
-    CountingRule,
-    GateReport,
-    PairedHunts,
-    PairWatch,
-    RateCounter,
-    TrialFacts,
-    UnitSequence,
-    make_rate,
-    measure_rates,
-)
-from crashhunt.training import (
-    CrashEnv,
-    HeldOutTraffics,
-    TrainedOn,
-    is_test_traffic,
-    read_trained_on,
-    split_crashes,
-)
+from crashhunt.statistics import CountingRule, GateReport, PairedHunts, PairWatch, TrialFacts, measure_rates
+from crashhunt.statistics._rate_report import make_rate
+from crashhunt.statistics._units import RateCounter, UnitSequence
+from crashhunt.training import CrashEnv, HeldOutTraffics, TrainedOn, split_crashes
+from crashhunt.training._traffic_split import is_test_traffic
+from crashhunt.training._trained_on import read_trained_on
 
 TOY = """
 title = "A toy"

@@ -10,7 +10,6 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._make import (
-        MadeScenario as MadeScenario,
         MapOptions as MapOptions,
         PlainTrial as PlainTrial,
         cached_scenario as cached_scenario,
