@@ -206,7 +206,7 @@ def test_rates_of_a_comparison_exclude_training_traffic_on_both_sides(place):
     comparison_page(found, place / "page.html")
     page = (place / "page.html").read_text()
     assert page.count(f"{TRIALS - held_out} trials on training traffic are excluded") == 2
-    drawn = [int(count) for count in re.findall(r"of (\d+) trials</title>", page)]
+    drawn = [int(count) for count in re.findall(r", (\d+) trials</title>", page)]
     assert sum(drawn) == 2 * held_out  # the plot of the only argument
     # Hunts of other traffic do not exclude it.
     (alone, elsewhere) = crashhunt.compare("before", "elsewhere").hunts
