@@ -166,7 +166,7 @@ def shrink(
             message = f"{shrunk_name(bundle.id)!r} cannot be written: {error.strerror or error}"
             raise BundleError(message, fix=_DISK_FIX, where=str(bundle.path.parent)) from None
         if small is None:
-            why = "what was left did not do the same in a fresh process"
+            why = "the minimized trial differs when replayed in a new process"
     found = Shrunk(
         bundle=bundle,
         verdict="unchanged" if search.reproduced or ended != "done" else "not_reproduced",

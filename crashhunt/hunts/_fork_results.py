@@ -362,7 +362,7 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
                 one.write(was, confirmed=True)
             else:
                 again.progress.failed.append(now)
-                what = f"trial {now.spec.number}, a near miss, is another one in a fresh process"
+                what = f"trial {now.spec.number}, a near miss, differs when replayed in a new process"
                 again.progress.notes.append(f"{what}: it has no bundle")
     except CrashhuntError as error:
         again.progress.notes.append(f"near misses could not be run again: {error}")

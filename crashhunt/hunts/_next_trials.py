@@ -397,7 +397,7 @@ class Unanswered:
             progress.counted_before.add(result.spec.number)
         if before.digest and before.digest != result.digest:
             again = f"trial {result.spec.number} was run again for the answers of its copies"
-            note = f"{again}, and is another one: it is not determined by its specification"
+            note = f"{again}, and differs: it is not determined by its specification"
             self._ledger.remark(note)
             progress.notes.append(note)
         return True

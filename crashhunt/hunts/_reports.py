@@ -47,7 +47,7 @@ class Difference(Serializable):
         whose = f" of {self.agent}" if self.agent else ""
         where = "" if self.step is None else f"at step {self.step}, "
         return (
-            f"trial {self.trial} is another one in a fresh process: {where}{self.field}{whose} was "
+            f"trial {self.trial} differs when replayed in a new process: {where}{self.field}{whose} was "
             f"{self.recorded} and is {self.replayed}"
         )
 

@@ -463,7 +463,7 @@ def test_most_critical_trials_run_again_and_are_kept(near, tmp_path):
     assert found.phases == [("near misses", 3), "one", "one", "one"]
     assert [one.spec.number for one in found.again.progress.failed] == [2]
     assert found.again.progress.notes == [
-        "trial 2, a near miss, is another one in a fresh process: it has no bundle",
+        "trial 2, a near miss, differs when replayed in a new process: it has no bundle",
         "trial 3, a near miss, was killed 3 times: it has no bundle until the same command is run again",
     ]
 

@@ -909,8 +909,8 @@ def test_report_of_copies_has_each_count_under_its_name(tmp_path):
 @pytest.mark.parametrize(
     ("step", "agent", "says"),
     [
-        (None, "", "trial 7 is another one in a fresh process: the digest was a and is b"),
-        (0, "ego", "trial 7 is another one in a fresh process: at step 0, the digest of ego was a and is b"),
+        (None, "", "trial 7 differs when replayed in a new process: the digest was a and is b"),
+        (0, "ego", "trial 7 differs when replayed in a new process: at step 0, the digest of ego was a and is b"),
     ],
 )
 def test_difference_of_an_audit_is_a_sentence(step, agent, says):

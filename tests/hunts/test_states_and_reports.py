@@ -250,7 +250,7 @@ def test_trials_that_were_killed_are_run_again_and_counted_once(tmp_path):
         assert unanswered.account(again, progress)
         assert progress.outcomes["invalid"] == 1
         assert len(progress.notes) == 1
-        assert "is another one: it is not determined by its specification" in progress.notes[0]
+        assert "differs: it is not determined by its specification" in progress.notes[0]
         assert not unanswered.account(result(3, Outcome.INVALID, failure=KILLED_TRIAL), progress)
         assert progress.outcomes["invalid"] == 1
         assert len(unanswered) == 1  # in the next run of the hunt
