@@ -1,15 +1,17 @@
 """Hunt for crashes of planners of others, and print a row for each hunt.
 
 Prints the table of crashhunt/guide/reference/evaluation/planner-evaluation.md. Each planner needs its own package: see
-the page. The hunts are kept in the folder ``planners``, and each takes at most TIME, such as 60s. ``traffic`` instead
-of a planner counts the collisions of SUMO's own cars in as many episodes.
-usage: scripts/studies/run planners PLANNER SCENARIO TRIALS [TIME]
+the page. The hunts are kept in the folder ``planners``, and each takes at most TIME, such as 60s. More options go to
+``crashhunt run``, such as ``--disturb brake=0.02``. ``traffic`` instead of a planner counts the collisions of SUMO's own
+cars in as many episodes.
+usage: scripts/studies/run planners PLANNER SCENARIO TRIALS [TIME [OPTION...]]
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -36,17 +38,18 @@ PLANNERS = {
 """Agent, form of actions and arguments of each planner; ``commonroad`` is a virtual environment."""
 
 
-def hunt(planner: str, scenario: str, trials: int, time: str) -> str:
+def hunt(planner: str, scenario: str, trials: int, time: str = "", *options: str) -> str:
     """Return a row of the table: planner, scenario, trials, steps per second of CPU, outcomes and first crash."""
     agent, action, arguments = PLANNERS[planner]
     if Path(scenario).stem.startswith("motorway"):
         arguments = [one.replace("=10:25", "=20:34") for one in arguments]
-    out = Path("planners") / f"{planner}-{Path(scenario).stem}"
+    name = re.sub(r"[^\w=.]+", "-", " ".join([planner, Path(scenario).stem, *options]))
+    out = Path("planners") / name
     out.parent.mkdir(exist_ok=True)
     command = [
         "crashhunt", "run", str(out), "1", str(trials), str(STEPS), "--scenario", scenario, "--agent", agent,
         "--action", action, *(word for one in arguments for word in ("--arg", one)), "--seed", "1", "--keep-going",
-        "--timeout", "900", *(("--for", time) if time else ()), "--json",
+        "--timeout", "900", *(("--for", time) if time else ()), *options, "--json",
     ]  # fmt: skip
     if planner == "commonroad":
         command.append("--reuse")  # it imports for seconds
@@ -58,7 +61,7 @@ def hunt(planner: str, scenario: str, trials: int, time: str) -> str:
     outcomes = ", ".join(f"{name} {count}" for name, count in found["outcomes"].items() if count)
     rate = found["steps_total"] / (used.ru_utime + used.ru_stime)
     first = min((one.name for one in (out / "crashes").glob("*")), default="-")
-    return f"| {planner} | {scenario} | {found['trials_run']} | {rate:.0f} | {outcomes} | {first} |"
+    return f"| {name} | {found['trials_run']} | {rate:.0f} | {outcomes} | {first} |"
 
 
 def traffic(scenario: str, episodes: int) -> str:
@@ -85,5 +88,5 @@ def traffic(scenario: str, episodes: int) -> str:
 
 if __name__ == "__main__":
     which, place, count, *rest = sys.argv[1:]
-    row = traffic(place, int(count)) if which == "traffic" else hunt(which, place, int(count), rest[0] if rest else "")
+    row = traffic(place, int(count)) if which == "traffic" else hunt(which, place, int(count), *rest)
     print(row, flush=True)
