@@ -29,7 +29,9 @@ def test_a_difference_is_reported_with_the_first_step_and_field(toy):
     others = done.json["steps_total"] - 6 * 20  # of runs that ended otherwise, which are as long
     assert others == 20 * len(audit["differences"])
     first = audit["differences"][0]
-    line = f"trial {first['trial']} differs when replayed in a new process: at step {first['step']}, action[target_speed]"
+    line = (
+        f"trial {first['trial']} differs when replayed in a new process: at step {first['step']}, action[target_speed]"
+    )
     assert line in done.err
     assert f"audit: {line}" in toy.crashhunt("logs", "h").out
 
