@@ -124,12 +124,14 @@ class TrialSignals:
 
     def reader(self, names: Sequence[str], agent: str) -> Callable[[], Sequence[float] | None]:
         """Return a function that returns the values of signals in the last scene; see `SignalSource`."""
-        readers = [self._one(name, agent) for name in names]
+        owners = [self._owner(name, agent) for name in names]
+        readers = [self._one(name, whose) for whose, name in owners]
         episode = self._episode
-        has_actors = agent in self._scene().roster.index
+        read_from = {agent, *(whose for whose, _ in owners)}
+        actors = read_from.intersection(self._scene().roster.index)
 
         def read() -> Sequence[float] | None:
-            if has_actors and episode.live is None and agent not in self._scene().roster.index:
+            if actors and episode.live is None and not actors <= self._scene().roster.index.keys():
                 return None
             row = [one() for one in readers]
             for value in row:
@@ -137,7 +139,7 @@ class TrialSignals:
                     break
             else:
                 return cast("list[float]", row)
-            if None in row and not episode.steps:
+            if None in row and (not episode.steps or any(map(self._has_ended, read_from))):
                 return None
             return [_known(value, name) for value, name in zip(row, names, strict=True)]
 
@@ -200,11 +202,20 @@ class TrialSignals:
         lacks |= set() if supports(simulator, HasMap) else {"lane", "lane_offset_m"}
         return {name: known.unit for name, known in SIGNALS.items() if name not in lacks}
 
+    def _owner(self, name: str, agent: str) -> tuple[str, str]:
+        """Return the agent whose signal a name means, and the name without this agent."""
+        for one in sorted(self._episode.names, key=len, reverse=True):
+            if name.startswith(f"{one}."):
+                return one, name[len(one) + 1 :]
+        return agent, name
+
+    def _has_ended(self, agent: str) -> bool:
+        """Whether an agent did not act in the last step, although other agents did."""
+        rewards = self._episode.rewards
+        return bool(rewards) and agent not in rewards
+
     def _one(self, name: str, agent: str) -> Read:
-        """Return the function that reads one signal."""
-        whose = next((one for one in sorted(self._episode.names, key=len)[::-1] if name.startswith(f"{one}.")), "")
-        if whose:
-            agent, name = whose, name[len(whose) + 1 :]
+        """Return the function that reads one signal of an agent."""
         if name in self._of_scene(agent):
             if agent not in self._readers:
                 self._readers[agent] = _SceneReader(self._episode, agent)
@@ -219,17 +230,19 @@ class TrialSignals:
         element = _OBSERVATION.fullmatch(name)
         if element is not None:
             return self._element(int(element[1]), agent, name)
-        key = name.removeprefix(_INFO)
-        if self._scene().roster.index and name == key and not self._episode.infos:
-            raise self._unknown(name, agent)
-        return lambda: self._info_value(key, agent, name)
+        return lambda: self._info_value(name.removeprefix(_INFO), agent, name)
 
     def _element(self, number: int, agent: str, name: str) -> Read:
         size = self._episode.observations[agent].size
         if number >= size:
             fix = f"give an index from 0 to {size - 1}"
             raise UnusableValueError(f"the signal {name!r} is not in the observation of {size} numbers", fix=fix)
-        return lambda: float(self._episode.observations[agent].flat[number])
+
+        def read() -> float | None:
+            observation = self._episode.observations.get(agent)
+            return None if observation is None else float(observation.flat[number])
+
+        return read
 
     def _info_value(self, key: str, agent: str, name: str) -> float | None:
         info = self._info(agent)
@@ -237,7 +250,7 @@ class TrialSignals:
             value = info[key]
             number = number_of(value, f"info[{key!r}]", "name a key of info whose value is a number")
             return bool(number) if isinstance(value, bool | np.bool_) else number
-        if not self._episode.steps:
+        if not self._episode.steps or self._has_ended(agent):
             return None
         raise self._unknown(name, agent)
 

@@ -224,6 +224,19 @@ def test_an_agent_that_has_left_has_no_further_samples(tmp_path):
     assert finish(episode).outcome == "requirement"
 
 
+@pytest.mark.parametrize("other", ["b.x < 99", "b.reward > -99", "b.observation[0] > -99"])
+def test_another_agent_that_has_left_ends_the_samples_of_its_signals(other, tmp_path):
+    agents = iter([Scripted([4.0] * 20), Scripted([10.0] * 20)])
+    episode = episode_of(
+        toy(tmp_path, ("a", "b")), f"always ({other} and speed >= 0)", agent=lambda: next(agents), steps=15,
+        arguments={"gap_m": 60.0, "road_m": 40.0},
+    )  # fmt: skip
+    result = finish(episode)
+    assert (result.outcome, result.failure) == ("survived", None)
+    assert "b" not in episode.scene.roster.index
+    assert "a" in episode.scene.roster.index
+
+
 def test_signals_are_listed_with_their_units(tmp_path):
     episode = episode_of(toy(tmp_path), agent=lambda: Scripted([10.0]))
     episode.start()

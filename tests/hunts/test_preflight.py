@@ -62,6 +62,13 @@ def test_unknown_signal_is_refused_before_the_first_trial(tmp_path):
     require_known_signals(*plan(Request(requirements=("always (west.gap_m > 0 or info.speed > 0)",), **asked)))
 
 
+def test_key_of_info_of_another_agent_can_be_required(tmp_path):
+    asked = {"scenario": "intersection-two-agents", "max_steps": 30, "keep_going": True}
+    found = run(tmp_path / "h", 2, 6, requirements=["hit=always (not west.crashed)"], seed=1, **asked)
+    assert sum(found.outcomes.values()) == 6
+    assert found.outcomes.keys() - {"collision"}  # after which west has left, or drives on
+
+
 def test_constructor_that_needs_more_than_it_is_given_is_not_blamed_on_a_line_of_crashhunt():
     failure = result(0, "missing 1 required positional argument: 'a'", kind="TypeError")
     called = f'Traceback:\n  File "{layout.PACKAGE}/episode/_run_episode.py", line 272, in agent\n'
