@@ -34,6 +34,7 @@ from crashhunt.base.scalars import number_of, truth_of
 from crashhunt.highway._config import configured, mistake, restore_classes
 from crashhunt.highway._descriptor import BACKEND, HighwaySetup
 from crashhunt.highway._disturbances import HighwayDisturbances
+from crashhunt.highway._lane_parts import LANE_PARTS, LaneParts
 from crashhunt.highway._lanes_and_contacts import Hidden, HighwayEvents, VehicleFilter, contact_of, lane_place, lanes_of
 from crashhunt.highway._scripted import Puppet, Puppets
 from crashhunt.highway._steering import action_with, is_steered, motion_of
@@ -100,7 +101,7 @@ class HighwaySimulator:
         self._setup = scenario.table(HighwaySetup)
         self._kinematics = Kinematics(scenario.observation) if scenario.observation is not None else None
         self._possible = tuple(scenario.agents)
-        self._parts = SceneObserver(scenario.agents)
+        self._parts = SceneObserver(scenario.agents, LANE_PARTS)
         self.observation_layouts = self._parts.layouts
         reason = ""
         if not self._setup.accelerate:
@@ -374,6 +375,7 @@ class HighwaySimulator:
     def _adopt(self, env: AbstractEnv) -> None:
         """Read the vehicles, spaces and action forms of a new environment."""
         self._env = env
+        self._lane_parts = LaneParts(env.road.network)
         is_unused = self._kinematics is not None or len(self.observation_layouts) == len(self._possible)
         self._skipping = SkippedObservation(env) if is_unused else nullcontext()
         rate = env.config["simulation_frequency"]
@@ -448,6 +450,7 @@ class HighwaySimulator:
             place=lambda row: lane_place(network, vehicle, objects[row]),
             # highway-env's y points down, so that its positive angles turn to the right.
             steering=0.0 - float(vehicle.action["steering"]) if "steering" in (vehicle.action or {}) else None,
+            other=lambda request: self._lane_parts.read(vehicle, request),
         )
 
     def _observe(self, agent: str) -> NDArray[np.float32]:

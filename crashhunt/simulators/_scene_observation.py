@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import AgentSetup
+    from crashhunt.simulators._observation_parts import RequestedPart
     from crashhunt.simulators._scene_parts import NearActor
     from crashhunt.world import Scene
 
@@ -60,14 +61,15 @@ class SceneObserver:
 
     Args:
         setups: The setups of all agents of the scenario, by agent.
+        others: Names of the parts that the simulator reads itself.
 
     Attributes:
         layouts: The layout of each such agent's observation.
         hidden: Pairs of identifiers: an agent, and an actor that this agent does not see.
     """
 
-    def __init__(self, setups: Mapping[str, AgentSetup]) -> None:
-        self.layouts = layouts_of(setups, SCENE_PARTS)
+    def __init__(self, setups: Mapping[str, AgentSetup], others: Iterable[str] = ()) -> None:
+        self.layouts = layouts_of(setups, (*SCENE_PARTS, *others))
         for agent, layout in self.layouts.items():
             if "predictions" in layout.parts and layout.parts["predictions"].settings["along"]:
                 where = f"agents.{agent}.observation: predictions:along is 'lanes'"
@@ -98,6 +100,7 @@ class SceneObserver:
         distance: float,
         place: Callable[[int], LanePlace],
         steering: float | None = None,
+        other: Callable[[RequestedPart], NDArray[np.float64]] | None = None,
     ) -> NDArray[np.generic]:
         """Return the recorded array of an agent's observation; crashhunt calls this method once per step.
 
@@ -107,6 +110,7 @@ class SceneObserver:
             distance: The distance that the vehicle has driven, in m.
             place: Function that returns the place on the lanes of the actor in a row of the scene.
             steering: The steering angle, in rad, positive to the left; None to compute it from the yaw rate.
+            other: Function that returns a part that the simulator reads itself.
         """
         layout, row = self.layouts[agent], scene.roster.index[agent]
         motion = _Motion(scene, self._before.get(agent, {}), self._step_length_s)
@@ -118,6 +122,9 @@ class SceneObserver:
         for name, one in layout.parts.items():
             if name == "ego":
                 arrays[name] = self._ego(scene, row, motion, place(row), distance=distance, steering=steering)
+                continue
+            if other is not None and name not in SCENE_PARTS:
+                arrays[name] = other(one)
                 continue
             reach = one.settings["range"] + max(scene.roster.lengths) if name == "lidar2d" else one.settings["radius"]
             limit = None if name == "lidar2d" else int(one.settings["rows"])
