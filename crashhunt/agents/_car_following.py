@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 CAR_LENGTH_M = 5.0  # highway-env's, and SUMO's default; the observation does not say how long others are
+_PATH_HALF_WIDTH_M = 1.7
+_STANDSTILL_GAP_M = 4.0  # includes the part of half a truck that exceeds half a car
 # The default layout: presence, x, y, vx, vy, cos_h, sin_h; x ahead and y to the right of the vehicle.
 PRESENCE, X, Y, VX, VY, COS_H, SIN_H = range(7)
 
@@ -77,10 +79,8 @@ def off_path(row: Sequence[float], *, lateral: float, curvature: float) -> float
     return max(low - right, right - high, 0.0)
 
 
-def find_leader(
-    observation: NDArray[np.float32], *, lateral: float = 0.0, curvature: float = 0.0, half_width: float = 1.7
-) -> Leader | None:
-    """Return the nearest vehicle ahead whose centre is within ``half_width`` of a path.
+def find_leader(observation: NDArray[np.float32], *, lateral: float = 0.0, curvature: float = 0.0) -> Leader | None:
+    """Return the nearest vehicle ahead whose centre is within 1.7 m of a path.
 
     Oncoming traffic is never a leader, because it keeps to its own side of the road.
 
@@ -88,11 +88,12 @@ def find_leader(
         observation: observation in the default layout.
         lateral: distance of the path to the right of the vehicle, in m.
         curvature: curvature of the path at the vehicle, positive to the right, in 1/m.
-        half_width: half the width of the path, in m.
     """
     nearest: Leader | None = None
     for row in actors(observation):
-        if row[X] <= 0 or row[COS_H] < -0.5 or off_path(row, lateral=lateral, curvature=curvature) >= half_width:
+        if row[X] <= 0 or row[COS_H] < -0.5:
+            continue
+        if off_path(row, lateral=lateral, curvature=curvature) >= _PATH_HALF_WIDTH_M:
             continue
         gap = row[X] - CAR_LENGTH_M
         if nearest is None or gap < nearest.gap:
@@ -133,7 +134,6 @@ def idm_acceleration(
     *,
     desired_speed: float,
     headway_s: float,
-    standstill_gap: float = 4.0,
     comfort: float = 2.0,
 ) -> float:
     """Return the acceleration of the Intelligent Driver Model, in m/s².
@@ -146,18 +146,39 @@ def idm_acceleration(
         leader: the vehicle ahead; None on a free road.
         desired_speed: desired speed on a free road, in m/s.
         headway_s: time gap, in s.
-        standstill_gap: gap at standstill, in m; it includes the part of half a truck that exceeds half a car.
         comfort: maximum acceleration and comfortable deceleration, which are equal, in m/s².
     """
     free = 1 - (speed / max(desired_speed, 0.1)) ** 4
     if leader is None:
         return comfort * free
     dynamic = speed * headway_s + speed * leader.closing_speed / (2 * comfort)
-    wanted = standstill_gap + max(0.0, dynamic)
+    wanted = _STANDSTILL_GAP_M + max(0.0, dynamic)
     return comfort * (free - (wanted / max(leader.gap, 0.1)) ** 2)
 
 
-class CarFollowing:
+class SpeedAgent:
+    """The parts that agents share which choose an acceleration from an observation in the default layout."""
+
+    actions = SPEED_OR_META
+
+    def __init__(
+        self, step_length_s: float, observation_space: Space[object] | None, action_space: Space[object] | None
+    ) -> None:
+        if not step_length_s > 0:
+            raise ValueError(f"step_length_s must be above 0, not {step_length_s}")
+        check_layout(observation_space)
+        self._meta = meta_actions(action_space)
+        self.step_length_s = step_length_s
+        self._path = PathCurvature(step_length_s)
+
+    def _action(self, speed: float, acceleration: float, change: int = 0) -> tuple[float, int] | int:
+        """Return (target speed, lane change) for an acceleration in m/s², or the corresponding meta-action."""
+        if self._meta is not None:
+            return self._meta[wanted_meta_action(acceleration, change)]
+        return max(0.0, speed + acceleration * self.step_length_s), change
+
+
+class CarFollowing(SpeedAgent):
     """Follows the vehicle in front by the Intelligent Driver Model, with a delayed observation.
 
     The agent is safe for most of its arguments. The agent is not safe with a long delay, a short headway and weak
@@ -175,8 +196,6 @@ class CarFollowing:
     Raises:
         ValueError: an argument is out of range, or the observation does not have the default columns.
     """
-
-    actions = SPEED_OR_META
 
     def __init__(
         self,
@@ -196,31 +215,23 @@ class CarFollowing:
     ) -> None:
         if not delay_s >= 0:
             raise ValueError(f"delay_s must be at least 0, not {delay_s}")
-        if not step_length_s > 0:
-            raise ValueError(f"step_length_s must be above 0, not {step_length_s}")
-        check_layout(observation_space)
-        self._meta = meta_actions(action_space)
+        super().__init__(step_length_s, observation_space, action_space)
         self.headway_s = headway_s
         self.max_brake = max_brake
         self.desired_speed = desired_speed
-        self.step_length_s = step_length_s
         self._seen: deque[NDArray[np.float32]] = deque(maxlen=round(delay_s / step_length_s) + 1)
-        self._curvature = PathCurvature(step_length_s)
 
     def reset(self, seed: int) -> None:
         """Delete all earlier observations."""
         self._seen.clear()
-        self._curvature.reset()
+        self._path.reset()
 
     def act(self, observation: NDArray[np.float32]) -> tuple[float, int] | int:
         """Return (target speed, 0), or the corresponding meta-action."""
         self._seen.append(observation)
         seen = self._seen[0]
-        leader = find_leader(seen, curvature=self._curvature.update(seen))
+        leader = find_leader(seen, curvature=self._path.update(seen))
         wanted = idm_acceleration(
             float(seen[0, VX]), leader, desired_speed=self.desired_speed, headway_s=self.headway_s
         )
-        acceleration = max(-self.max_brake, min(2.0, wanted))
-        if self._meta is not None:
-            return self._meta[wanted_meta_action(acceleration)]
-        return max(0.0, float(observation[0, VX]) + acceleration * self.step_length_s), 0
+        return self._action(float(observation[0, VX]), max(-self.max_brake, min(2.0, wanted)))

@@ -9,20 +9,18 @@ from crashhunt.agents._car_following import (
     COS_H,
     VX,
     Leader,
-    PathCurvature,
+    SpeedAgent,
     X,
     Y,
     actors,
-    check_layout,
     find_leader,
     idm_acceleration,
     off_path,
 )
-from crashhunt.agents._protocol import SPEED_OR_META, meta_actions, wanted_meta_action
 from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     import numpy as np
     from gymnasium import Space
@@ -36,7 +34,7 @@ REACTION_S = 1.0  # of the follower in the target lane, before it brakes
 BRAKE = 4.0  # m/s²: deceleration that it accepts for the follower in the target lane
 
 
-class LaneChanger:
+class LaneChanger(SpeedAgent):
     """Overtakes slower traffic on either side, and observes the next lane except for a blind spot.
 
     Without a blind spot, the agent changes lanes only into a gap in which no vehicle has to brake hard. The agent
@@ -55,8 +53,6 @@ class LaneChanger:
         ValueError: an argument is out of range, or the observation does not have the default columns.
     """
 
-    actions = SPEED_OR_META
-
     def __init__(
         self,
         blind_spot_m: Annotated[
@@ -72,15 +68,10 @@ class LaneChanger:
         observation_space: Space[object] | None = None,
         action_space: Space[object] | None = None,
     ) -> None:
-        if not step_length_s > 0:
-            raise ValueError(f"step_length_s must be above 0, not {step_length_s}")
-        check_layout(observation_space)
-        self._meta = meta_actions(action_space)
+        super().__init__(step_length_s, observation_space, action_space)
         self.blind_spot_m = blind_spot_m
         self.patience_s = patience_s
         self.desired_speed = desired_speed
-        self.step_length_s = step_length_s
-        self._path = PathCurvature(step_length_s)
         self.reset(0)
 
     def reset(self, seed: int) -> None:
@@ -97,25 +88,26 @@ class LaneChanger:
         speed = float(observation[0, VX])
         leader = find_leader(observation, curvature=curvature)
         acceleration = idm_acceleration(speed, leader, desired_speed=self.desired_speed, headway_s=1.2)
-        target = max(0.0, speed + max(-8.0, min(2.5, acceleration)) * self.step_length_s)
         blocked = leader is not None and leader.gap < 2.5 * max(speed, 5.0) and speed < 0.9 * self.desired_speed
         self._waited_s = self._waited_s + self.step_length_s if blocked else 0.0
         change = self._choose(observation, curvature) if self._waited_s >= self.patience_s else 0
         if change:
             self._waited_s = 0.0
             self._from_left -= change * LANE_WIDTH_M
-        if self._meta is not None:
-            return self._meta[wanted_meta_action(acceleration, change)]
-        return target, change
+        return self._action(speed, max(-8.0, min(2.5, acceleration)), change)
 
     def _choose(self, observation: NDArray[np.float32], curvature: float) -> int:
-        for change, exists in (
-            (LEFT, self._from_left > LANE_WIDTH_M / 2),
-            (RIGHT, self._rightmost - self._from_left > LANE_WIDTH_M / 2),
-        ):
-            if exists and self._is_clear(observation, -change * LANE_WIDTH_M, curvature):
+        for change in self._changes():
+            if self._is_clear(observation, -change * LANE_WIDTH_M, curvature):
                 return change
         return 0
+
+    def _changes(self) -> Iterator[int]:
+        """Yield the lane changes for which there is a lane, the left one first."""
+        if self._from_left > LANE_WIDTH_M / 2:
+            yield LEFT
+        if self._rightmost - self._from_left > LANE_WIDTH_M / 2:
+            yield RIGHT
 
     def _update_lanes(self, observation: NDArray[np.float32], curvature: float) -> None:
         """Update the agent's lane, and the rightmost lane in which a vehicle in its direction was seen."""
@@ -150,9 +142,8 @@ def _is_too_close(row: Sequence[float]) -> bool:
 
 # The Intelligent Driver Model with MOBIL lane changes: the baseline against which others are compared.
 
-_MAX_IMPOSED_DECELERATION_MPS2 = (
-    2.0  # m/s²: the greatest deceleration that MOBIL imposes on the follower in the new lane
-)
+_MAX_IMPOSED_DECELERATION_MPS2 = 2.0
+"""The greatest deceleration that MOBIL imposes on the follower in the new lane."""
 
 
 class IntelligentDriver(LaneChanger):
@@ -174,8 +165,6 @@ class IntelligentDriver(LaneChanger):
     Raises:
         ValueError: an argument is out of range, or the observation does not have the default columns.
     """
-
-    actions = SPEED_OR_META
 
     def __init__(
         self,
@@ -218,20 +207,14 @@ class IntelligentDriver(LaneChanger):
             self._waited_s = 0.0
             change = self._best(observation, curvature, speed, own)
             self._from_left -= change * LANE_WIDTH_M
-        acceleration = max(-8.0, min(2.5, own))
-        if self._meta is not None:
-            return self._meta[wanted_meta_action(acceleration, change)]
-        return max(0.0, speed + acceleration * self.step_length_s), change
+        return self._action(speed, max(-8.0, min(2.5, own)), change)
 
     def _accelerate(self, speed: float, leader: Leader | None) -> float:
         return idm_acceleration(speed, leader, desired_speed=self.desired_speed, headway_s=self.headway_s)
 
     def _best(self, observation: NDArray[np.float32], curvature: float, speed: float, own: float) -> int:
         best, change = self.gain, 0
-        lanes = ((1, self._from_left > LANE_WIDTH_M / 2), (-1, self._rightmost - self._from_left > LANE_WIDTH_M / 2))
-        for side, exists in lanes:
-            if not exists:
-                continue
+        for side in self._changes():
             lateral = -side * LANE_WIDTH_M
             leader = find_leader(observation, lateral=lateral, curvature=curvature)
             after = self._accelerate(speed, leader)

@@ -13,16 +13,14 @@ from crashhunt.agents._car_following import (
     COS_H,
     VX,
     VY,
-    PathCurvature,
+    SpeedAgent,
     X,
     Y,
     actors,
-    check_layout,
     find_leader,
     idm_acceleration,
     off_path,
 )
-from crashhunt.agents._protocol import meta_actions, wanted_meta_action
 from crashhunt.agents._reference_models import REFERENCE_MODELS, Situation
 from crashhunt.trial import Argument
 
@@ -58,7 +56,7 @@ class _Watched:
     aside: float
 
 
-class ReferenceDriver:
+class ReferenceDriver(SpeedAgent):
     """Keeps its lane, follows at 2 s, and brakes in a risk as a reference model of a competent driver.
 
     The models and their sources are those of UN R157 and of the literature: `REFERENCE_MODELS`. Without a risk, the
@@ -102,11 +100,8 @@ class ReferenceDriver:
         ):
             if not least <= value < math.inf:
                 raise ValueError(f"{name} must be a number {'of at least 0' if least == 0 else 'above 0'}, not {value}")
-        check_layout(observation_space)
-        self._meta = meta_actions(action_space)
+        super().__init__(step_length_s, observation_space, action_space)
         self.model, self.desired_speed, self.length, self.width = model, desired_speed, length, width
-        self.step_length_s = step_length_s
-        self._path = PathCurvature(step_length_s)
         self.reset(0)
 
     def reset(self, seed: int) -> None:
@@ -114,7 +109,6 @@ class ReferenceDriver:
         self._path.reset()
         self._watched: list[_Watched] = []
         self._desired = self.desired_speed
-        self._accelerated = 0.0
 
     def act(self, observation: NDArray[np.float32]) -> tuple[float, int] | int:
         """Return (target speed, 0), or the corresponding meta-action."""
@@ -128,9 +122,7 @@ class ReferenceDriver:
                 speed, leader, desired_speed=self._desired, headway_s=_HEADWAY_S, comfort=_COMFORT_MPS2
             )
             acceleration = max(-_GENTLE_BRAKING_MPS2, min(_COMFORT_MPS2, wanted))
-        if self._meta is not None:
-            return self._meta[wanted_meta_action(acceleration)]
-        return max(0.0, speed + acceleration * self.step_length_s), 0
+        return self._action(speed, acceleration)
 
     def _reaction(self, observation: NDArray[np.float32], curvature: float, speed: float) -> tuple[float, bool]:
         """Return the hardest deceleration that the model asks for, and whether it perceives a risk."""
