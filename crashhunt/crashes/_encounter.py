@@ -21,6 +21,7 @@ from crashhunt.world import (
     join_frames,
     lane_jump,
     on_one_level,
+    outline_gap,
     outlines,
     outlines_overlap,
     rectangle_gap,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.recording import Recording
-    from crashhunt.world import Frame, Rectangle
+    from crashhunt.world import Frame
 
 
 _LOOKS_BACK_S = 30.0  # before the end; what was longer ago has not led to it
@@ -503,7 +504,7 @@ def _nearest(scenes: Sequence[Scene], frames: Sequence[Frame], agent: str) -> tu
     for _, other in scene.neighbors(row):
         pairs = [(one, two) for one in outlines(scene, row) for two in outlines(scene, other)]
         if on_one_level(scene, row, other):
-            found.append((min(_outline_gap(one, two) for one, two in pairs), scene.roster.actors[other].id))
+            found.append((min(outline_gap(one, two) for one, two in pairs), scene.roster.actors[other].id))
     return (min(found)[1], float(gaps[number]), number) if found else None
 
 
@@ -550,16 +551,6 @@ def _only(scene: Scene, measured: NDArray[np.float64], least: float) -> str:
         return ""
     rows = np.flatnonzero(np.abs(measured - least) <= _EQUAL_TOLERANCE)
     return scene.roster.actors[rows[0]].id if len(rows) == 1 else ""
-
-
-def _outline_gap(one: Rectangle, two: Rectangle) -> float:
-    """Return the gap between two outlines, in m."""
-    (x, y, heading, length, width), (its_x, its_y, its_heading, its_length, its_width) = one, two
-    dx = its_x - its_length / 2 * math.cos(its_heading) - x + length / 2 * math.cos(heading)
-    dy = its_y - its_length / 2 * math.sin(its_heading) - y + length / 2 * math.sin(heading)
-    offset = _turned(np.array([[dx, dy]]), np.array([heading]))
-    halves = np.array([[length / 2, width / 2]]), np.array([[its_length / 2, its_width / 2]])
-    return float(rectangle_gap(offset, np.array([its_heading - heading]), *halves)[0])
 
 
 def most_dangerous(recording: Recording) -> DangerousMoment | None:

@@ -11,11 +11,10 @@ from operator import sub
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-import numpy as np
 from libsumo import _libsumo as sumo
 
 from crashhunt.simulators import Standstill
-from crashhunt.world import Event, is_person, outlines, rectangle_gap
+from crashhunt.world import Event, is_person, outline_gap, outlines
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -432,14 +431,5 @@ def _ways_between(lane: str, edge: str) -> list[tuple[str, ...]]:
 
 def _gap(scene: Scene, one: str, two: str) -> float:
     """Return the distance between the outlines of two actors, seen from above, in m."""
-    index = scene.roster.index
-    nearest = math.inf
-    for x, y, heading, length, width in outlines(scene, index[one]):
-        c, s = math.cos(heading), math.sin(heading)
-        for other_x, other_y, other_heading, other_length, other_width in outlines(scene, index[two]):
-            dx = other_x - other_length / 2 * math.cos(other_heading) - (x - length / 2 * c)
-            dy = other_y - other_length / 2 * math.sin(other_heading) - (y - length / 2 * s)
-            offset, turn = np.array([[dx * c + dy * s, dy * c - dx * s]]), np.array([other_heading - heading])
-            halves = np.array([[length / 2, width / 2]]), np.array([[other_length / 2, other_width / 2]])
-            nearest = min(nearest, float(rectangle_gap(offset, turn, *halves)[0]))
-    return nearest
+    mine, theirs = (outlines(scene, scene.roster.index[name]) for name in (one, two))
+    return min(outline_gap(own, other) for own in mine for other in theirs)

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
         corners as corners,
         levels as levels,
         on_one_level as on_one_level,
+        outline_gap as outline_gap,
         outlines as outlines,
         outlines_overlap as outlines_overlap,
         rectangle_gap as rectangle_gap,

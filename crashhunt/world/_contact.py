@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
-from crashhunt.world._geometry import levels, outlines, same_level, separation
+from crashhunt.world._geometry import center, levels, outlines, same_level, separation
 from crashhunt.world._scene import is_person
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ class _Way:
         self.end = end
         self._heading, self._size = start[2], start[3:]
         self.reach = math.hypot(start[3], start[4]) / 2
-        (x0, y0), (x1, y1) = _center(start), _center(end)
+        (x0, y0), (x1, y1) = center(start), center(end)
         self.turn = turn = math.remainder(end[2] - start[2], math.tau)
         middle = start[2] + turn / 2
         dx, dy = x1 - x0, y1 - y0
@@ -451,7 +451,7 @@ def _direction(first: _Party, second: _Party) -> tuple[float, float, bool]:
         # overlap, or the sign of a lateral offset of 1e-14 m, then says nothing. The jump itself is the direction.
         return jump_x / length, jump_y / length, True
     _, x, y = separation(first.rectangle, second.rectangle)
-    (own_x, own_y), (its_x, its_y) = _center(first.rectangle), _center(second.rectangle)
+    (own_x, own_y), (its_x, its_y) = center(first.rectangle), center(second.rectangle)
     if abs((its_x - own_x) * x + (its_y - own_y) * y) < _MIN_OVERLAP_M:  # the sign of the axis is a rounding error
         approach = (first.velocity[0] - second.velocity[0]) * x + (first.velocity[1] - second.velocity[1]) * y
         if approach < 0:
@@ -484,10 +484,5 @@ def _drives_into(first: _Party, second: _Party, x: float, y: float, *, jumps: bo
         return fronts[0] if towards > 0 or its_towards <= 0 else fronts[1]
     if abs(own - its) > _DRIFT_MPS:
         return own > its
-    (own_x, own_y), (its_x, its_y) = _center(first.rectangle), _center(second.rectangle)
+    (own_x, own_y), (its_x, its_y) = center(first.rectangle), center(second.rectangle)
     return (its_x - own_x) * math.cos(first.rectangle[2]) + (its_y - own_y) * math.sin(first.rectangle[2]) > 0
-
-
-def _center(rectangle: Rectangle) -> tuple[float, float]:
-    x, y, heading, length, _ = rectangle
-    return x - length / 2 * math.cos(heading), y - length / 2 * math.sin(heading)

@@ -101,6 +101,15 @@ def rectangle_gap(
     return np.where(apart, nearest, 0.0)
 
 
+def outline_gap(one: Rectangle, two: Rectangle) -> float:
+    """Return the distance between two outlines, in m; 0 if they overlap."""
+    (x, y), (other_x, other_y) = center(one), center(two)
+    c, s, dx, dy = cos(one[2]), sin(one[2]), other_x - x, other_y - y
+    offset, turn = np.array([[dx * c + dy * s, dy * c - dx * s]]), np.array([two[2] - one[2]])
+    halves = (np.array([[length / 2, width / 2]]) for *_, length, width in (one, two))
+    return float(rectangle_gap(offset, turn, *halves)[0])
+
+
 def time_to_contact(
     offset: NDArray[np.float64],
     velocity: NDArray[np.float64],
@@ -187,6 +196,12 @@ Rectangle = tuple[float, float, float, float, float]
 
 Level = tuple[float, float]
 """z of the front of a rectangle (m), and how far the road rises a metre there, ahead."""
+
+
+def center(rectangle: Rectangle) -> tuple[float, float]:
+    """Return the centre of a rectangle."""
+    x, y, heading, length, _ = rectangle
+    return x - length / 2 * cos(heading), y - length / 2 * sin(heading)
 
 
 def outlines(scene: Scene, row: int, *, parts: int = 0) -> list[Rectangle]:

@@ -7,7 +7,7 @@ import math
 import pytest
 from scenes import scene
 
-from crashhunt.world import _contact, first_contact
+from crashhunt.world import _contact, _geometry, first_contact
 
 TURNS = [0.0, 0.8, -2.6]
 
@@ -280,13 +280,13 @@ def test_which_way_it_moves_is_how_its_place_changes(end):
     way = _contact._Way((1.0, 2.0, 0.3, 4.0, 1.8), (1.0 + end[0], 2.0 + end[1], 0.3 + end[2], 4.0, 1.8), bends=True)
     assert way.reach == pytest.approx(math.hypot(4.0, 1.8) / 2)
     for share in (0.1, 0.5, 0.9):
-        before, after = (_contact._center(way.at(share + change)) for change in (-1e-6, 1e-6))
+        before, after = (_geometry.center(way.at(share + change)) for change in (-1e-6, 1e-6))
         rate = [(now - was) / 2e-6 for was, now in zip(before, after, strict=True)]
         assert way.moving(share) == pytest.approx(rate, abs=1e-5)
     assert way.moving(1.0) == pytest.approx(way.moving(1 - 1e-9), abs=1e-6)
     if any(way.jump):  # at once, at the end
         assert math.hypot(*way.jump) > 1.5
-        old, new = _contact._center(way.at(1 - 1e-9)), _contact._center(way.at(1.0))
+        old, new = _geometry.center(way.at(1 - 1e-9)), _geometry.center(way.at(1.0))
         assert (new[0] - old[0], new[1] - old[1]) == pytest.approx(way.jump, abs=1e-6)
 
 
