@@ -18,7 +18,6 @@ from crashhunt.simulators import (
     bicycle_steering,
     center_of,
     kind_number,
-    nearest_actors,
     wrapped,
 )
 from crashhunt.sumo._reader_protocol import Reader
@@ -153,9 +152,7 @@ class ActorsReader(Reader):
         path = self._path.update(moment.lane)
         found, last_speeds = [], self._speeds
         self._speeds = {}
-        near = nearest_actors(
-            scene, row, hidden=moment.hidden, radius=self._setup.settings["radius"], limit=self._setup.limit
-        )
+        near = self._actors_near(moment)
         for _, other, x, y in near:
             actor, heading, speed = actors[other], headings[other], speeds[other]
             lane, offset, acceleration, signals = _state_of(actor.id)

@@ -232,7 +232,7 @@ class LaneGraph:
             ends.flags.writeable = False
             inside = next((link.inside[0] for link in lane.links if link.inside), "")
             signal = next((link.signal for link in lane.links if link.signal), "")
-            found.append(StopLine(lane=lane.id, junction=_junction_of(inside), ends=ends, kind=kind, signal=signal))
+            found.append(StopLine(lane=lane.id, junction=junction_of(inside), ends=ends, kind=kind, signal=signal))
         return tuple(found)
 
     def _stop_kind(self, lane: GraphLane) -> str:
@@ -278,8 +278,9 @@ def allowed_classes(lane: NetworkLane) -> frozenset[str]:
     return frozenset(name for name in VEHICLE_CLASSES if lane.admits(name))
 
 
-def _junction_of(inside: str) -> str:
-    return inside[1:].rpartition("_")[0].rpartition("_")[0]
+def junction_of(lane: str) -> str:
+    """Return the junction of a lane inside a junction, such as ``A_1`` of ``:A_1_0_0``; empty for other lanes."""
+    return lane[1:].rpartition("_")[0].rpartition("_")[0] if lane.startswith(":") else ""
 
 
 class _PointIndex:

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from libsumo import _libsumo as sumo
 
+from crashhunt.simulators import nearest_actors
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
     from crashhunt.native import Core, Draft
-    from crashhunt.simulators import RequestedPart
+    from crashhunt.simulators import NearActor, RequestedPart
     from crashhunt.sumo._conflicts import Conflicts
     from crashhunt.sumo._lane_graph import GraphLane, LaneGraph, RouteGuide
     from crashhunt.sumo._lane_paths import NearLanesOf
@@ -189,6 +191,12 @@ class Reader:
         The array has the shape and the data type of the part. The method changes nothing in the simulation.
         """
         raise NotImplementedError
+
+    def _actors_near(self, moment: Moment) -> list[NearActor]:
+        """Return the actors in the rows of a part with one row per actor, the nearest first."""
+        setup = self._setup
+        radius = setup.settings["radius"]
+        return nearest_actors(moment.scene, moment.row, hidden=moment.hidden, radius=radius, limit=setup.limit)
 
     def write(self, draft: Draft, place: int, moment: Moment) -> None:
         """Write the same values into a draft of the compiled core, which replaces a call of `observe`."""

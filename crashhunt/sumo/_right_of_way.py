@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.sumo._files import read_xml
-from crashhunt.sumo._lane_graph import LaneGraph
+from crashhunt.sumo._lane_graph import LaneGraph, junction_of
 from crashhunt.sumo._options import SumoSetup
 from crashhunt.sumo.maps import read_network
 from crashhunt.world import Link, RightOfWay
@@ -28,23 +28,23 @@ _UNREGULATED_TYPES = ("unregulated", "internal", "dead_end", "rail_signal", "rai
 
 def right_of_way(scenario: Scenario) -> RightOfWay | None:
     """Return the right of way at the junctions of a scenario; None if its network cannot be read."""
-    path = scenario.folder / scenario.table(SumoSetup).net
-    try:
-        return _read(path, path.stat().st_mtime_ns, right_of_way_in)
-    except _UNREADABLE:
-        return None
+    return _derived(scenario, _right_of_way_in)
 
 
 def stop_lines(scenario: Scenario) -> tuple[StopLine, ...]:
     """Return the stop lines of a scenario's network; none if the network cannot be read."""
-    path = scenario.folder / scenario.table(SumoSetup).net
-    try:
-        return _read(path, path.stat().st_mtime_ns, stop_lines_in) or ()
-    except _UNREADABLE:
-        return ()
+    return _derived(scenario, _stop_lines_in) or ()
 
 
 Found = TypeVar("Found")
+
+
+def _derived(scenario: Scenario, derive: Callable[[RoadNetwork], Found]) -> Found | None:
+    path = scenario.folder / scenario.table(SumoSetup).net
+    try:
+        return _read(path, path.stat().st_mtime_ns, derive)
+    except _UNREADABLE:
+        return None
 
 
 @lru_cache(maxsize=8)
@@ -55,12 +55,11 @@ def _read(path: Path, _changed: int, derive: Callable[[RoadNetwork], Found]) -> 
     return derive(read_network(path, with_junctions=True))
 
 
-def stop_lines_in(network: RoadNetwork) -> tuple[StopLine, ...]:
-    """Return the stop lines of a network that was read with its junctions."""
+def _stop_lines_in(network: RoadNetwork) -> tuple[StopLine, ...]:
     return LaneGraph(network).stop_lines
 
 
-def right_of_way_in(network: RoadNetwork) -> RightOfWay:
+def _right_of_way_in(network: RoadNetwork) -> RightOfWay:
     """Return the right of way at the junctions of a network that was read with its junctions."""
     shapes = {
         f"{edge.id}_{index}": lane.shape for edge in network.inside.values() for index, lane in enumerate(edge.lanes)
@@ -77,7 +76,7 @@ def right_of_way_in(network: RoadNetwork) -> RightOfWay:
         places |= dict.fromkeys(inside, len(links))
         links.append(
             Link(
-                junction=one.via[1:].rpartition("_")[0].rpartition("_")[0],
+                junction=junction_of(one.via),
                 source=one.source,
                 target=one.target,
                 inside=tuple(inside),

@@ -53,10 +53,7 @@ class PredictionsReader(Reader):
 
     def observe(self, moment: Moment) -> NDArray[np.float64]:
         """Return the columns of ``predictions``."""
-        settings = self._setup.settings
-        near = nearest_actors(
-            moment.scene, moment.row, hidden=moment.hidden, radius=settings["radius"], limit=self._setup.limit
-        )
+        settings, near = self._setup.settings, self._actors_near(moment)
         share, interval, scene = self._setup.reference_share, settings["interval"], moment.scene
         found = predictions_of(scene, near, shape=self._setup.shape, interval=interval, reference_share=share)
         for place, one in enumerate(near if settings["along"] else ()):
@@ -128,11 +125,7 @@ class CovarianceReader(Reader):
 
     def observe(self, moment: Moment) -> NDArray[np.float64]:
         """Return the columns of ``prediction_covariance``."""
-        settings = self._setup.settings
-        near = nearest_actors(
-            moment.scene, moment.row, hidden=moment.hidden, radius=settings["radius"], limit=self._setup.limit
-        )
-        return covariances_of(moment.scene, near, settings, shape=self._setup.shape)
+        return covariances_of(moment.scene, self._actors_near(moment), self._setup.settings, shape=self._setup.shape)
 
 
 class ActorIdsReader(Reader):
@@ -148,9 +141,7 @@ class ActorIdsReader(Reader):
 
     def observe(self, moment: Moment) -> NDArray[np.int64]:
         """Return the values of ``actor_ids``."""
-        radius, limit = self._setup.settings["radius"], self._setup.limit
-        near = nearest_actors(moment.scene, moment.row, hidden=moment.hidden, radius=radius, limit=limit)
-        return self._numbers.of(moment.scene, near, limit)
+        return self._numbers.of(moment.scene, self._actors_near(moment), self._setup.limit)
 
 
 class RangesReader(Reader):

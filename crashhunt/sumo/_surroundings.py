@@ -10,6 +10,7 @@ import libsumo
 from libsumo import _libsumo as sumo
 
 from crashhunt.sumo._files import read_xml
+from crashhunt.sumo._lane_graph import junction_of
 from crashhunt.world import Crossing, Neighbor, Side, Surroundings
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def nearest_ahead_of(agent: str, kind: str) -> Neighbor | None:
     """Return the nearest object of a kind that `surroundings_of` returns ahead; None without one."""
     look_m = _look_m(max(0.0, float(sumo.vehicle_getSpeed(agent))))
     found = _leaders(agent, look_m) if kind == "vehicle" else _red_lights(agent, look_m)
-    return min(found, key=lambda one: one.gap_m, default=None)
+    return _nearest(found)
 
 
 def _look_m(speed: float) -> float:
@@ -107,19 +108,14 @@ def _regulated_m(agent: str, look_m: float, unregulated: Collection[str]) -> flo
     if not unregulated:
         return look_m
     lane = sumo.vehicle_getLaneID(agent)
-    if _junction_of(lane) in unregulated:
+    if junction_of(lane) in unregulated:
         return 0.0
     distance_m = float(sumo.lane_getLength(lane)) - float(sumo.vehicle_getLanePosition(agent))
     for target, _, _, _, inside, _, _, length_m in sumo.vehicle_getNextLinks(agent):
-        if _junction_of(inside) in unregulated:
+        if junction_of(inside) in unregulated:
             return min(look_m, distance_m - _STOP_LINE_MARGIN_M)
         distance_m += float(length_m) + float(sumo.lane_getLength(target))
     return look_m
-
-
-def _junction_of(lane: str) -> str:
-    """Return the junction of a lane inside a junction, such as ``A_1`` of ``:A_1_0_0``; empty for other lanes."""
-    return lane[1:].rpartition("_")[0].rpartition("_")[0] if lane.startswith(":") else ""
 
 
 def _crossing(agent: str, look_m: float) -> list[Crossing]:
