@@ -94,6 +94,12 @@ def took_longer(timeout_s: float) -> NoAnswer:
     return NoAnswer(f"took longer than {timeout_s:g} s")
 
 
+def write_all(file: int, data: bytes) -> None:
+    """Write data to a pipe, which may take only a part of them at a time."""
+    while data:
+        data = data[_write(file, data) :]
+
+
 def explain_silence(pid: int) -> NoAnswer:
     """Return why a fork with a closed pipe has sent no answer; the caller still has to end its process."""
     deadline = time.monotonic() + _ENDS_S
@@ -123,7 +129,7 @@ _alive: set[int] = set()  # copies of this process, and processes that its copie
 _answers_to: list[int] = []  # the pipe to the process that awaits the answer of this fork
 
 # Keep references: an agent may replace these functions.
-_fork, _leave, _dumps = os.fork, os._exit, json.dumps
+_fork, _leave, _dumps, _loads, _write = os.fork, os._exit, json.dumps, json.loads, os.write
 
 
 class CannotForkError(CrashhuntError):
@@ -293,9 +299,7 @@ class Copy:
             except BaseException as error:
                 said = {"raised": f"{type(error).__name__}: {error}"}
             end_descendants()
-            text = _dumps(said).encode() + b"\n"
-            while text:
-                text = text[os.write(theirs, text) :]
+            write_all(theirs, _dumps(said).encode() + b"\n")
 
         try:
             self.pid = fork(answer, known, keeps=(theirs, *keeps))
@@ -513,9 +517,6 @@ def _open() -> dict[int, str]:
 
 _MORE_S = 1.0  # beyond the time limit of a job, for the suspended fork to report that there is no answer
 
-# Keep references: an agent may replace these functions.
-_loads, _write = json.loads, os.write
-
 
 class SuspendedFork:
     """A suspended fork, which runs each job in a fork of its own, so that its state never changes.
@@ -567,11 +568,9 @@ class SuspendedFork:
                 end_orphans(children)
 
     def _ask(self, job: Plain, timeout_s: float) -> Plain | None:
-        text, received = _dumps([job, timeout_s]).encode() + b"\n", bytearray()
-        deadline = time.monotonic() + timeout_s + _MORE_S
+        received, deadline = bytearray(), time.monotonic() + timeout_s + _MORE_S
         try:
-            while text:
-                text = text[_write(self._jobs, text) :]
+            write_all(self._jobs, _dumps([job, timeout_s]).encode() + b"\n")
         except BrokenPipeError:
             self._record_end(explain_silence(self.pid))
             return None
@@ -624,6 +623,4 @@ def _serve_jobs(requests: int, answers: int, work: Callable[[Plain], Plain], kno
             except CannotForkError as error:
                 raised = error.message
                 why = NoAnswer(f"could not be made: {raised}", isinstance(error, NoProcessError))
-            text = _dumps([answer, raised, [why.why, why.is_from_outside]]).encode() + b"\n"
-            while text:
-                text = text[_write(answers, text) :]
+            write_all(answers, _dumps([answer, raised, [why.why, why.is_from_outside]]).encode() + b"\n")

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from crashhunt.base import errors
 from crashhunt.base.errors import CrashhuntError, PluginError
-from crashhunt.base.forks import CannotForkError, Copy, ends, held, threads
+from crashhunt.base.forks import CannotForkError, Copy, ends, held, threads, write_all
 from crashhunt.base.opened_files import OpenedFiles
 from crashhunt.base.processes import die_with, end_descendants
 
@@ -131,11 +131,9 @@ class ServerApart:
             return self._work(request)
         if self._requests < 0:
             raise PluginError(f"{self._task}: its process has ended", fix=self._fix)
-        text, received = json.dumps(request).encode() + b"\n", bytearray()
-        deadline = time.monotonic() + self._timeout_s
+        received, deadline = bytearray(), time.monotonic() + self._timeout_s
         with suppress(BrokenPipeError):  # which the missing answer shows
-            while text:
-                text = text[os.write(self._requests, text) :]
+            write_all(self._requests, json.dumps(request).encode() + b"\n")
         while not received.endswith(b"\n"):
             watched = (
                 self._answers,
@@ -176,9 +174,7 @@ def _serve(work: Callable[[Plain], Plain], requests: int, answers: int) -> Plain
                 answer: Plain = {"result": work(json.loads(line))}
             except CrashhuntError as error:
                 answer = _described(error)
-            text = json.dumps(answer).encode() + b"\n"
-            while text:
-                text = text[os.write(answers, text) :]
+            write_all(answers, json.dumps(answer).encode() + b"\n")
     return {}
 
 
