@@ -6,9 +6,9 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._car_following import CarFollowing as CarFollowing
-    from ._fmu_agents import FmuAgent as FmuAgent, FmuFactory as FmuFactory
+    from ._fmu_agents import FmuFactory as FmuFactory
     from ._lane_changing import IntelligentDriver as IntelligentDriver, LaneChanger as LaneChanger
-    from ._library_agents import LibraryAgent as LibraryAgent, LibraryFactory as LibraryFactory
+    from ._library_agents import LibraryFactory as LibraryFactory
     from ._policies import (
         NumpyPolicy as NumpyPolicy,
         OnnxPolicy as OnnxPolicy,

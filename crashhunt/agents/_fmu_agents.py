@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from crashhunt.agents._library_agents import Action, Parts
+from crashhunt.agents._protocol import ForeignFactory
 from crashhunt.base.errors import PluginError, ProgramError
 from crashhunt.base.fmus import places_of
 from crashhunt.base.text import listed, one_line
@@ -72,7 +73,7 @@ class _Instance(Protocol):
     def freeInstance(self) -> None: ...  # noqa: N802
 
 
-class FmuFactory:
+class FmuFactory(ForeignFactory):
     """Creates the agents of one ``fmu:`` locator.
 
     Args:
@@ -85,14 +86,9 @@ class FmuFactory:
         self._folder: Path | None = None
 
     def declared_signature(self, agent: str = "", simulator: Simulator | None = None) -> Signature:
-        """Return the parameters of the FMU as arguments.
+        """Return the parameters of the FMU as arguments, which are the same for every vehicle.
 
-        Args:
-            agent: not used, because an FMU has the same parameters for every vehicle.
-            simulator: not used, because options may choose other observations and actions than the scenario.
-
-        Raises:
-            PluginError: the FMU cannot be used.
+        Options may choose other observations and actions than the scenario, so the simulator is not used.
         """
         return self._read({}).signature()
 
@@ -117,19 +113,9 @@ class FmuFactory:
         self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path,
         files: Mapping[str, str], limit_s: float | None = None, is_forked: bool = False,
     ) -> FmuAgent:  # fmt: skip
-        """Return the agent of a vehicle; its instance of the FMU begins in the first step.
+        """Return the agent of a vehicle. The limit holds for each step of the FMU.
 
-        Args:
-            name: identifier of the vehicle.
-            simulator: the simulator, with the spaces of the vehicle.
-            arguments: arguments of the agent.
-            folder: folder for the files of the FMU, if it has not been loaded.
-            files: file of the snapshot by the text that names the original file.
-            limit_s: time limit for each step of the FMU, in s; None if only that of the trial applies.
-            is_forked: not used, because a fork of the process contains the agent.
-
-        Raises:
-            PluginError: the FMU cannot be used, or its variables do not fit the spaces of the vehicle.
+        A fork of the process contains the agent, so it does not matter whether there are forks.
         """
         self.load(files, folder)
         assert self._model is not None

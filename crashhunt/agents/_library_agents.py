@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crashhunt.agents._programs import _signature_in, write_road_map
+from crashhunt.agents._protocol import ForeignFactory, shown_space
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, PluginError, ProgramError
 from crashhunt.base.libraries import describe_library, load_order, path_of
 from crashhunt.base.library_probe import declaration_of, loaded_files, missing_symbols
 from crashhunt.base.text import one_line
-from crashhunt.simulators import FlattensObservations, NamesObservations, ObservesParts
+from crashhunt.simulators import ObservesParts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -75,7 +76,7 @@ class _Observation(ctypes.Structure):
     )
 
 
-class LibraryFactory:
+class LibraryFactory(ForeignFactory):
     """Creates the agents of one ``lib:`` locator.
 
     Args:
@@ -92,15 +93,7 @@ class LibraryFactory:
         self._defaults: dict[str, Value] = {}
 
     def declared_signature(self, agent: str = "", simulator: Simulator | None = None) -> Signature:
-        """Return the arguments that the library declares; another process loads it for this.
-
-        Args:
-            agent: not used, because a library declares the same arguments for every vehicle.
-            simulator: not used.
-
-        Raises:
-            PluginError: the library cannot be used.
-        """
+        """Return the arguments that the library declares for every vehicle; another process loads it for this."""
         return self._signature(describe_library(self._locator, path_of(self._locator)).declaration)
 
     def load(self, files: Mapping[str, str], scratch: Path) -> None:
@@ -140,16 +133,9 @@ class LibraryFactory:
         self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path,
         files: Mapping[str, str], limit_s: float | None = None, is_forked: bool = False,
     ) -> LibraryAgent:  # fmt: skip
-        """Return the agent of a vehicle; the library creates it in the first step.
+        """Return the agent of a vehicle. The limit holds for each call of ``crashhunt_act``.
 
-        Args:
-            name: identifier of the vehicle.
-            simulator: the simulator, with the spaces of the vehicle.
-            arguments: arguments of the agent.
-            folder: scratch folder of the trial, for the road map.
-            files: file of the snapshot by the text that names the original file.
-            limit_s: time limit for each call of ``crashhunt_act``, in s; None if only that of the trial applies.
-            is_forked: not used, because a fork of the process contains the agent.
+        A fork of the process contains the agent, so it does not matter whether there are forks.
         """
         self.load(files, folder)
         assert self._library is not None
@@ -365,9 +351,7 @@ class Parts:
         layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
         if agent in layouts:
             return cls(layouts[agent].space, layouts[agent].columns, "")
-        shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
-        names = simulator.observation_names if supports(simulator, NamesObservations) else ()
-        space = shown.get(agent) or simulator.observation_spaces[agent]
+        space, names = shown_space(simulator, agent)
         return cls(space, {"kinematics": names}, "kinematics" if names else "observation")
 
     def write(self, observation: object) -> None:

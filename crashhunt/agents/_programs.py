@@ -31,19 +31,14 @@ from crashhunt.agents._program_processes import (
     read_format,
     reused_folder,
 )
+from crashhunt.agents._protocol import ForeignFactory, shown_space
 from crashhunt.base import forks
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError, ProgramError
 from crashhunt.base.processes import descendants_of, kill
 from crashhunt.base.programs import command_of, is_path, library_path, words_of
 from crashhunt.base.text import one_line
-from crashhunt.simulators import (
-    FlattensObservations,
-    NamesMetaActions,
-    NamesObservations,
-    ObservesParts,
-    ProvidesRoadMaps,
-)
+from crashhunt.simulators import NamesMetaActions, ObservesParts, ProvidesRoadMaps
 from crashhunt.trial import Argument, Signature, kind_of, parse_spec
 from crashhunt.world import describe_road_map
 
@@ -92,7 +87,7 @@ _inherited: list[ProgramProcess] = []
 """Programs of the process of which this one is a fork. Their pipes are closed here, so nothing may close them again."""
 
 
-class ProgramFactory:
+class ProgramFactory(ForeignFactory):
     """Creates the agents of one ``exec:`` locator: one process per trial and vehicle.
 
     Args:
@@ -106,15 +101,8 @@ class ProgramFactory:
     def declared_signature(self, agent: str = "", simulator: Simulator | None = None) -> Signature:
         """Run the program once, and return the arguments that it declares in its first answer.
 
-        The program receives ``hello`` without arguments, and then ``close``.
-
-        Args:
-            agent: the vehicle that the program drives.
-            simulator: the simulator, which need not have been reset; without it, ``hello`` has no spaces.
-
-        Raises:
-            PluginError: the program does not exist or cannot be executed.
-            ProgramError: the program does not start, or does not answer according to the protocol.
+        The program receives ``hello`` without arguments, and then ``close``. Without a simulator, ``hello`` has no
+        spaces.
         """
         command = command_of(self._locator)
         with tempfile.TemporaryDirectory(prefix="crashhunt-agent-") as folder, tempfile.TemporaryFile() as log:
@@ -131,17 +119,7 @@ class ProgramFactory:
         self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path,
         files: Mapping[str, str], limit_s: float | None = None, is_forked: bool = False,
     ) -> ProgramAgent:  # fmt: skip
-        """Return the agent of a vehicle; its program starts in the first step.
-
-        Args:
-            name: identifier of the vehicle.
-            simulator: the simulator, with the spaces of the vehicle.
-            arguments: arguments of the agent.
-            folder: scratch folder of the trial, in which the program gets a folder of its own.
-            files: file of the snapshot by the word that names the original file.
-            limit_s: time limit for the answer to each observation, in s; None if only that of the trial applies.
-            is_forked: whether the trial is forked while it runs.
-        """
+        """Return the agent of a vehicle; its program runs in a folder of its own."""
         given = {key: _absolute(value) for key, value in arguments.items()}
         hello = _hello(name, simulator, given)
         is_scalar = simulator.actions[name].space.shape == ()
@@ -606,12 +584,11 @@ def _hello(agent: str, simulator: Simulator | None, arguments: Mapping[str, Valu
         "action": {"shape": [], "columns": [], "units": []}, "step_length_s": 0.0,
     }  # fmt: skip
     if simulator is not None:
-        shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
-        names = simulator.observation_names if supports(simulator, NamesObservations) else ()
         layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
-        space = shown.get(agent) or simulator.observation_spaces[agent]
         layout = layouts.get(agent)
-        found["observation"] = layout.describe() if layout is not None else _described_observation(space, names)
+        found["observation"] = (
+            layout.describe() if layout is not None else _described_observation(*shown_space(simulator, agent))
+        )
         found["action"] = _described_action(simulator.actions[agent])
         found["step_length_s"] = simulator.step_length_s
     return found

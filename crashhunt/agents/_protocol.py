@@ -5,12 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from crashhunt.base.capabilities import supports
-from crashhunt.simulators import NamesMetaActions
+from crashhunt.simulators import FlattensObservations, NamesMetaActions, NamesObservations
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from gymnasium import Space
+
+    from crashhunt.simulators import Simulator
+    from crashhunt.trial import Signature, Value
 
 
 @runtime_checkable
@@ -38,6 +42,48 @@ class Agent(Protocol):
         Args:
             observation: the observation, inside the observation space. No other code changes it afterwards.
         """
+
+
+class ForeignFactory(Protocol):
+    """Creates the agents of one locator that names no Python code, such as ``exec:./planner``."""
+
+    def declared_signature(self, agent: str = "", simulator: Simulator | None = None) -> Signature:
+        """Return the arguments that the program, library or FMU declares.
+
+        Args:
+            agent: the vehicle that it drives.
+            simulator: the simulator, which need not have been reset.
+
+        Raises:
+            PluginError: it cannot be used.
+            ProgramError: it does not answer according to the protocol.
+        """
+
+    def agent(
+        self, name: str, simulator: Simulator, arguments: Mapping[str, Value], *, folder: Path,
+        files: Mapping[str, str], limit_s: float | None = None, is_forked: bool = False,
+    ) -> Agent:  # fmt: skip
+        """Return the agent of a vehicle, which begins in the first step.
+
+        Args:
+            name: identifier of the vehicle.
+            simulator: the simulator, with the spaces of the vehicle.
+            arguments: arguments of the agent.
+            folder: scratch folder of the trial.
+            files: file of the snapshot by the text that names the original file; empty if there is no snapshot.
+            limit_s: time limit for the answer to each observation, in s; None if only that of the trial applies.
+            is_forked: whether the trial is forked while it runs.
+
+        Raises:
+            PluginError: it cannot be used, or does not fit the spaces of the vehicle.
+        """
+
+
+def shown_space(simulator: Simulator, agent: str) -> tuple[Space[object], Sequence[str]]:
+    """Return the space of a vehicle's observations as its agent receives them, and the names of their columns."""
+    shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
+    names = simulator.observation_names if supports(simulator, NamesObservations) else ()
+    return shown.get(agent) or simulator.observation_spaces[agent], names
 
 
 class DrawsPanels(Protocol):
