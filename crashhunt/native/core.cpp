@@ -206,6 +206,28 @@ bool numbers_of(PyObject *list, std::vector<double> &values) {
     return true;
 }
 
+// Frees an object of Python together with what it holds.
+template <typename Object, auto held> void free_object(PyObject *object) {
+    PyTypeObject *type = Py_TYPE(object);
+    delete (reinterpret_cast<Object *>(object)->*held);
+    type->tp_free(object);
+    Py_DECREF(type);
+}
+
+// A name as libsumo's own getters take it; false with an exception.
+bool encode_name(PyObject *name, std::string &encoded) {
+    PyObject *text = PyUnicode_AsEncodedString(name, "utf-8", "surrogateescape");
+    if (text) {
+        encoded.assign(PyBytes_AS_STRING(text), static_cast<size_t>(PyBytes_GET_SIZE(text)));
+        Py_DECREF(text);
+    }
+    return text != nullptr;
+}
+
+PyObject *text_of(const std::string &text) {
+    return PyUnicode_DecodeUTF8(text.data(), static_cast<Py_ssize_t>(text.size()), "surrogateescape");
+}
+
 // Pairs of floats, as x and y alternating.
 bool pairs(PyObject *list, std::vector<double> &values) {
     if (!PyList_CheckExact(list)) {
@@ -278,14 +300,10 @@ PyObject *vehicles_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
             continue;
         }
         PyErr_Clear();
-        // As libsumo's own getters take names.
-        PyObject *text = PyUnicode_AsEncodedString(PyTuple_GET_ITEM(names, row), "utf-8", "surrogateescape");
-        if (!text) {
+        if (!encode_name(PyTuple_GET_ITEM(names, row), roster->ids.emplace_back())) {
             Py_DECREF(self);
             return nullptr;
         }
-        roster->ids.emplace_back(PyBytes_AS_STRING(text), static_cast<size_t>(PyBytes_GET_SIZE(text)));
-        Py_DECREF(text);
     }
     if (!numbers_of(lengths, roster->lengths) || !numbers_of(widths, roster->widths) || !numbers_of(reaches, roster->reaches) ||
         roster->lengths.size() != roster->widths.size() || roster->lengths.size() != roster->reaches.size()) {
@@ -294,13 +312,6 @@ PyObject *vehicles_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
         return nullptr;
     }
     return reinterpret_cast<PyObject *>(self);
-}
-
-void vehicles_free(PyObject *object) {
-    PyTypeObject *type = Py_TYPE(object);
-    delete reinterpret_cast<Vehicles *>(object)->roster;
-    type->tp_free(object);
-    Py_DECREF(type);
 }
 
 Vehicles *vehicles_of(PyObject *object) {
@@ -322,12 +333,8 @@ Columns *new_columns(Vehicles *vehicles, std::vector<double> &&values) {
 }
 
 void columns_free(PyObject *object) {
-    PyTypeObject *type = Py_TYPE(object);
-    Columns *self = reinterpret_cast<Columns *>(object);
-    delete self->values;
-    Py_XDECREF(self->vehicles);
-    type->tp_free(object);
-    Py_DECREF(type);
+    Py_XDECREF(reinterpret_cast<Columns *>(object)->vehicles);
+    free_object<Columns, &Columns::values>(object);
 }
 
 Columns *columns_of(PyObject *object) {
@@ -533,8 +540,7 @@ Surroundings around; // used again: looks are many and alike
 PyObject *near_names() {
     PyObject *ids = PyTuple_New(static_cast<Py_ssize_t>(around.near.size()));
     for (size_t number = 0; ids && number < around.near.size(); number++) {
-        const std::string &name = around.names[around.near[number]];
-        PyObject *id = PyUnicode_DecodeUTF8(name.data(), static_cast<Py_ssize_t>(name.size()), "surrogateescape");
+        PyObject *id = text_of(around.names[around.near[number]]);
         if (!id) {
             Py_CLEAR(ids);
         } else {
@@ -1536,12 +1542,12 @@ PyObject *write_step(PyObject *, PyObject *const *given, Py_ssize_t count) {
     return PyLong_FromSize_t(static_cast<size_t>(offset) + 8 + payload);
 }
 
+#define FAST(function) reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function)), METH_FASTCALL
+
 #include "fast_step.hpp"
 #include "observed_parts.hpp"
 
 // ---------------------------------------------------------------------------------------------------------- the module
-
-#define FAST(function) reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function)), METH_FASTCALL
 
 PyMethodDef vehicles_methods[] = {
     {"read", vehicles_read, METH_NOARGS, "Return where everybody is; None where libsumo refuses."},
@@ -1550,7 +1556,7 @@ PyMethodDef vehicles_methods[] = {
 };
 PyType_Slot vehicles_slots[] = {
     {Py_tp_new, reinterpret_cast<void *>(vehicles_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(vehicles_free)},
+    {Py_tp_dealloc, reinterpret_cast<void *>(free_object<Vehicles, &Vehicles::roster>)},
     {Py_tp_methods, vehicles_methods},
     {Py_tp_doc, const_cast<char *>("Vehicles of the running simulation, by their ids.")},
     {0, nullptr},

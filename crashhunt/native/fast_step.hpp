@@ -23,10 +23,6 @@ struct Moment {
     std::string lanes; // a line each; empty where the step does not look
 };
 
-PyObject *text_of(const std::string &text) {
-    return PyUnicode_DecodeUTF8(text.data(), static_cast<Py_ssize_t>(text.size()), "surrogateescape");
-}
-
 template <typename Kept> void keep(Kept *&place, PyObject *value) {
     Py_INCREF(value);
     Py_XDECREF(reinterpret_cast<PyObject *>(std::exchange(place, reinterpret_cast<Kept *>(value))));
@@ -452,19 +448,17 @@ PyObject *usual_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
         !vehicles_of(eyes)) {
         return nullptr;
     }
-    PyObject *text = PyUnicode_AsEncodedString(name, "utf-8", "surrogateescape");
-    UsualSteps *self = text ? reinterpret_cast<UsualSteps *>(type->tp_alloc(type, 0)) : nullptr;
-    if (!self || others < 0 || every < 1) {
-        if (text && self) {
-            PyErr_SetString(PyExc_ValueError, "it looks around every so many steps, and sees so many others");
-        }
-        Py_XDECREF(text);
-        Py_XDECREF(self);
+    if (others < 0 || every < 1) {
+        PyErr_SetString(PyExc_ValueError, "it looks around every so many steps, and sees so many others");
+        return nullptr;
+    }
+    std::string agent;
+    UsualSteps *self = encode_name(name, agent) ? reinterpret_cast<UsualSteps *>(type->tp_alloc(type, 0)) : nullptr;
+    if (!self) {
         return nullptr;
     }
     Steps &steps = *(self->steps = new Steps());
-    steps.agent.assign(PyBytes_AS_STRING(text), static_cast<size_t>(PyBytes_GET_SIZE(text)));
-    Py_DECREF(text);
+    steps.agent = agent;
     keep(steps.name, name);
     keep(steps.libsumo, libsumo);
     keep(steps.array, array);
@@ -487,13 +481,6 @@ PyObject *usual_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
     return reinterpret_cast<PyObject *>(self);
 }
 
-void usual_free(PyObject *object) {
-    PyTypeObject *type = Py_TYPE(object);
-    delete reinterpret_cast<UsualSteps *>(object)->steps;
-    type->tp_free(object);
-    Py_DECREF(type);
-}
-
 // heed(limits, limit, stood, standstill): what SumoEvents counts
 PyObject *usual_heed(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
@@ -508,24 +495,14 @@ PyObject *usual_heed(PyObject *object, PyObject *arguments) {
 }
 
 // listen(enter, record_roster): who is called where others than before are in sight
-PyObject *usual_listen(PyObject *object, PyObject *arguments) {
-    PyObject *enter, *record_roster;
-    if (!PyArg_ParseTuple(arguments, "OO", &enter, &record_roster)) {
-        return nullptr;
-    }
-    keep(steps_of(object).enter, enter);
-    keep(steps_of(object).record_roster, record_roster);
-    Py_RETURN_NONE;
-}
-
 // perceive(make, restore): an observation is an array that the first makes, and the agent receives what the second returns
-PyObject *usual_perceive(PyObject *object, PyObject *arguments) {
-    PyObject *perceive, *restore;
-    if (!PyArg_ParseTuple(arguments, "OO", &perceive, &restore)) {
+template <PyObject *Steps::*first, PyObject *Steps::*second> PyObject *usual_keep(PyObject *object, PyObject *arguments) {
+    PyObject *one, *other;
+    if (!PyArg_ParseTuple(arguments, "OO", &one, &other)) {
         return nullptr;
     }
-    keep(steps_of(object).perceive, perceive);
-    keep(steps_of(object).restore, restore);
+    keep(steps_of(object).*first, one);
+    keep(steps_of(object).*second, other);
     Py_RETURN_NONE;
 }
 
@@ -785,8 +762,10 @@ PyMethodDef usual_methods[] = {
     {"note", usual_note, METH_O, "Record an action; return whether that could be done."},
     {"go_on", usual_go_on, METH_O, "Simulate, and look where nothing has happened yet; return what has come of it."},
     {"heed", usual_heed, METH_VARARGS, "Take what is counted of braking and of standing."},
-    {"listen", usual_listen, METH_VARARGS, "Take who is called where others than before are in sight."},
-    {"perceive", usual_perceive, METH_VARARGS, "Take what makes and restores observations that consist of parts."},
+    {"listen", usual_keep<&Steps::enter, &Steps::record_roster>, METH_VARARGS,
+     "Take who is called where others than before are in sight."},
+    {"perceive", usual_keep<&Steps::perceive, &Steps::restore>, METH_VARARGS,
+     "Take what makes and restores observations that consist of parts."},
     {"judge", usual_judge, METH_VARARGS, "Take when somebody has to be asked about a step."},
     {"resume", usual_resume, METH_VARARGS, "Go on from a step that is complete."},
     {"borrow", usual_borrow, METH_VARARGS, "Record into a buffer from now on."},
@@ -808,7 +787,7 @@ PyGetSetDef usual_getters[] = {
 };
 PyType_Slot usual_slots[] = {
     {Py_tp_new, reinterpret_cast<void *>(usual_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(usual_free)},
+    {Py_tp_dealloc, reinterpret_cast<void *>(free_object<UsualSteps, &UsualSteps::steps>)},
     {Py_tp_methods, usual_methods},
     {Py_tp_getset, usual_getters},
     {Py_tp_doc, const_cast<char *>("Steps of an episode in which nothing happens, each in one call.")},

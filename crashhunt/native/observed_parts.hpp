@@ -111,13 +111,6 @@ PyObject *lane_block_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
     return reinterpret_cast<PyObject *>(self);
 }
 
-void lane_block_free(PyObject *object) {
-    PyTypeObject *type = Py_TYPE(object);
-    delete reinterpret_cast<LaneBlock *>(object)->lanes;
-    type->tp_free(object);
-    Py_DECREF(type);
-}
-
 struct Draft {
     PyObject_HEAD std::vector<double> *values;
 };
@@ -135,13 +128,6 @@ PyObject *draft_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
         self->values = new std::vector<double>(static_cast<size_t>(size));
     }
     return reinterpret_cast<PyObject *>(self);
-}
-
-void draft_free(PyObject *object) {
-    PyTypeObject *type = Py_TYPE(object);
-    delete reinterpret_cast<Draft *>(object)->values;
-    type->tp_free(object);
-    Py_DECREF(type);
 }
 
 // Where a part begins; null with an exception where it does not fit.
@@ -510,21 +496,18 @@ PyObject *vehicle_states(PyObject *, PyObject *given) {
 }
 
 PyMethodDef draft_methods[] = {
-    {"put", reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(draft_put)), METH_FASTCALL, "Write numbers."},
-    {"put_array", reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(draft_put_array)), METH_FASTCALL,
-     "Write an array."},
-    {"actors", reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(draft_actors)), METH_FASTCALL,
+    {"put", FAST(draft_put), "Write numbers."},
+    {"put_array", FAST(draft_put_array), "Write an array."},
+    {"actors", FAST(draft_actors),
      "Write the part actors; return the rows in the scene, and the speeds; None where Python has to do it."},
-    {"lanes", reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(draft_lanes)), METH_FASTCALL,
-     "Write the part lanes."},
-    {"route", reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(draft_route)), METH_FASTCALL,
-     "Write the part route."},
+    {"lanes", FAST(draft_lanes), "Write the part lanes."},
+    {"route", FAST(draft_route), "Write the part route."},
     {"take", draft_take, METH_NOARGS, "Return what has been written as bytes, and begin again."},
     {nullptr, nullptr, 0, nullptr},
 };
 PyType_Slot draft_slots[] = {
     {Py_tp_new, reinterpret_cast<void *>(draft_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(draft_free)},
+    {Py_tp_dealloc, reinterpret_cast<void *>(free_object<Draft, &Draft::values>)},
     {Py_tp_methods, draft_methods},
     {Py_tp_doc, const_cast<char *>("An observation that is being written, part by part.")},
     {0, nullptr},
@@ -532,7 +515,7 @@ PyType_Slot draft_slots[] = {
 PyType_Spec draft_spec = {"_crashhunt_core.Draft", sizeof(Draft), 0, Py_TPFLAGS_DEFAULT, draft_slots};
 PyType_Slot lane_block_slots[] = {
     {Py_tp_new, reinterpret_cast<void *>(lane_block_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(lane_block_free)},
+    {Py_tp_dealloc, reinterpret_cast<void *>(free_object<LaneBlock, &LaneBlock::lanes>)},
     {Py_tp_doc, const_cast<char *>("The candidates of the lanes around a vehicle.")},
     {0, nullptr},
 };
