@@ -64,11 +64,7 @@ class Approach(NamedTuple):
 
 
 class Conflicts:
-    """The conflicts at all junctions of a network, computed when they are used for the first time.
-
-    Args:
-        graph: the lanes.
-    """
+    """The conflicts at all junctions of a network, computed when they are used for the first time."""
 
     def __init__(self, graph: LaneGraph) -> None:
         self._graph = graph

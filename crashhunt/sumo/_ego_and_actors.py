@@ -63,11 +63,7 @@ def _known(value: float) -> float:
 
 
 class EgoReader(Reader):
-    """Reads the controlled vehicle.
-
-    Args:
-        setup: The part, the vehicle and the start of the episode.
-    """
+    """Reads the controlled vehicle."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
@@ -108,11 +104,7 @@ class EgoReader(Reader):
 
 
 class ActorsReader(Reader):
-    """Reads the actors around the controlled vehicle.
-
-    Args:
-        setup: The part and the vehicle.
-    """
+    """Reads the actors around the controlled vehicle."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)

@@ -75,9 +75,6 @@ class OmittedDemand:
     """Reads from SUMO's output which vehicles, flows and persons of a scenario take no part in an episode.
 
     The output is that of the process, if it is a file, as it is in a trial. Elsewhere the user sees the output itself.
-
-    Args:
-        scenario: The scenario.
     """
 
     def __init__(self, scenario: Scenario) -> None:

@@ -54,11 +54,7 @@ _FIXED_TIMES = 0  # type of a traffic light program
 
 
 class LanesReader(Reader):
-    """Reads the lanes around the controlled vehicle.
-
-    Args:
-        setup: The part and the vehicle.
-    """
+    """Reads the lanes around the controlled vehicle."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
@@ -244,11 +240,7 @@ def _block_of(paths: list[LanePath | None], middle_x: float, middle_y: float, wi
 
 
 class RouteReader(Reader):
-    """Reads points along the route.
-
-    Args:
-        setup: The part and the vehicle.
-    """
+    """Reads points along the route."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
@@ -307,11 +299,7 @@ _ROUTE_COLUMNS = (0, 1, 2, 3, 5, 6)
 
 
 class RouteStateReader(Reader):
-    """Reads the state of the controlled vehicle on its route.
-
-    Args:
-        setup: The part and the vehicle.
-    """
+    """Reads the state of the controlled vehicle on its route."""
 
     def observe(self, moment: Moment) -> Array:
         """Return the columns of ``route_state``."""
@@ -337,11 +325,7 @@ class RouteStateReader(Reader):
 
 
 class SignalsReader(Reader):
-    """Reads the next traffic lights on the route.
-
-    Args:
-        setup: The part and the vehicle.
-    """
+    """Reads the next traffic lights on the route."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
@@ -399,11 +383,7 @@ def _time_in_state(light: str, link: int, state: float) -> float:
 
 
 class RightOfWayReader(Reader):
-    """Reads the actors on streams that conflict with the route at the next junction.
-
-    Args:
-        setup: The part and the vehicle.
-    """
+    """Reads the actors on streams that conflict with the route at the next junction."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
@@ -603,11 +583,7 @@ def _distance_to(line: Array, x: float, y: float) -> float:
 
 
 class StopLineReader(Reader):
-    """Reads the stop line of the next junction.
-
-    Args:
-        setup: The part and the vehicle.
-    """
+    """Reads the stop line of the next junction."""
 
     def observe(self, moment: Moment) -> Array:
         """Return the columns of ``stop_line``."""
@@ -622,11 +598,7 @@ class StopLineReader(Reader):
 
 
 class SpeedLimitReader(Reader):
-    """Reads the speed limit of the controlled vehicle's lane.
-
-    Args:
-        setup: The part and the vehicle.
-    """
+    """Reads the speed limit of the controlled vehicle's lane."""
 
     def observe(self, moment: Moment) -> Array:
         """Return the speed limit, which can differ from that of the network file while a sign changes it."""

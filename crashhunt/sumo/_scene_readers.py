@@ -37,11 +37,7 @@ _MAX_HALF_WIDTH_M = 10.0  # of a lane, and half the distance of two points of it
 
 
 class PredictionsReader(Reader):
-    """Predicts the actors at constant speed, straight on or along lanes.
-
-    Args:
-        setup: The part.
-    """
+    """Predicts the actors at constant speed, straight on or along lanes."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
@@ -129,11 +125,7 @@ class CovarianceReader(Reader):
 
 
 class ActorIdsReader(Reader):
-    """Numbers the actors.
-
-    Args:
-        setup: The part.
-    """
+    """Numbers the actors."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
@@ -145,11 +137,7 @@ class ActorIdsReader(Reader):
 
 
 class RangesReader(Reader):
-    """Casts rays to the outlines of the actors.
-
-    Args:
-        setup: The part.
-    """
+    """Casts rays to the outlines of the actors."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
@@ -165,11 +153,7 @@ class RangesReader(Reader):
 
 
 class _RasterReader(Reader):
-    """Finds the cells around the vehicle that are on lanes or inside outlines.
-
-    Args:
-        setup: The part, the vehicle and the lanes.
-    """
+    """Finds the cells around the vehicle that are on lanes or inside outlines."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
