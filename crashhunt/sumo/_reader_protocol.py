@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import cos, sin
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from libsumo import _libsumo as sumo
 
-from crashhunt.simulators import nearest_actors
+from crashhunt.simulators import center_of, nearest_actors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -155,12 +154,10 @@ class Places:
         number = sumo.vehicle_getRouteIndex(agent)
         if not self._guide.follows(number, lane):
             number = -1
-        (x, y), heading = scene.points[row], scene.headings[row]
         position = sumo.vehicle_getLanePosition(agent)
         if position < 0.0:  # off every lane
-            position = _position_on(self._graph, lane, x, y)
-        half = scene.roster.actors[row].length / 2
-        return Place(lane, position, self._guide, number, x - half * cos(heading), y - half * sin(heading))
+            position = _position_on(self._graph, lane, *scene.points[row])
+        return Place(lane, position, self._guide, number, *center_of(scene, row))
 
 
 def _position_on(graph: LaneGraph, lane: GraphLane, x: float, y: float) -> float:

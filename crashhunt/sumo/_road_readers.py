@@ -12,6 +12,7 @@ import libsumo
 import numpy as np
 from libsumo import _libsumo as sumo
 
+from crashhunt.simulators import center_of
 from crashhunt.sumo._lane_graph import is_open
 from crashhunt.sumo._lane_paths import (
     CENTER_BEHIND_M,
@@ -324,24 +325,31 @@ class RouteStateReader(Reader):
         return np.array((max(0.0, rest + left), changes, max(0.0, run + left), *guide.goal))
 
 
-class SignalsReader(Reader):
+class _RowsReader(Reader):
+    """Reads a part as rows of numbers; the rows after the last one are 0."""
+
+    def observe(self, moment: Moment) -> Array:
+        """Return the columns of the part."""
+        found = np.zeros(self._setup.shape)
+        for number, values in enumerate(self._rows(moment)):
+            found[number] = values
+        return found
+
+    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+        """Write the columns of the part."""
+        draft.put(at, tuple([value for row in self._rows(moment) for value in row]))
+
+    def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
+        raise NotImplementedError
+
+
+class SignalsReader(_RowsReader):
     """Reads the next traffic lights on the route."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
         self._ahead: dict[tuple[int, int, str], list[Signal]] = {}
         self._seen: dict[tuple[str, int], tuple[float, float]] = {}  # state of the lights ahead, and since when
-
-    def observe(self, moment: Moment) -> Array:
-        """Return the columns of ``signals``."""
-        found = np.zeros(self._setup.shape)
-        for row, values in enumerate(self._rows(moment)):
-            found[row] = values
-        return found
-
-    def write(self, draft: Draft, at: int, moment: Moment) -> None:
-        """Write the columns of ``signals``."""
-        draft.put(at, tuple([value for row in self._rows(moment) for value in row]))
 
     def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
         seen, self._seen = self._seen, {}
@@ -382,24 +390,13 @@ def _time_in_state(light: str, link: int, state: float) -> float:
     return found
 
 
-class RightOfWayReader(Reader):
+class RightOfWayReader(_RowsReader):
     """Reads the actors on streams that conflict with the route at the next junction."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
         self._graph = setup.graph
         self._takes: dict[tuple[int, str, int, str], list[tuple[Conflict, float]]] = {}
-
-    def observe(self, moment: Moment) -> Array:
-        """Return the columns of ``right_of_way``."""
-        found = np.zeros(self._setup.shape)
-        for number, values in enumerate(self._rows(moment)):
-            found[number] = values
-        return found
-
-    def write(self, draft: Draft, at: int, moment: Moment) -> None:
-        """Write the columns of ``right_of_way``."""
-        draft.put(at, tuple([value for row in self._rows(moment) for value in row]))
 
     def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
         place = self._setup.places.find(moment)
@@ -535,24 +532,21 @@ def path_across(place: Place) -> tuple[LaneLink, float] | None:
     return entry, -(entry.length_m - link.length_m - lane.data.length_m) - place.position_m
 
 
-class CrossingsReader(Reader):
+class CrossingsReader(_RowsReader):
     """Reads the pedestrian crossings within the next junction, and the persons near them."""
 
-    def observe(self, moment: Moment) -> Array:
-        """Return the columns of ``crossings``."""
-        found = np.zeros(self._setup.shape)
+    def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
         place = self._setup.places.find(moment)
         path = path_across(place) if place is not None else None
         if path is None:
-            return found
+            return []
         link, line = path
         graph, scene = self._setup.graph, moment.scene
-        persons = [
-            (*point, cos(heading), sin(heading), actor.length)
-            for actor, point, heading in zip(scene.roster.actors, scene.points, scene.headings, strict=True)
+        middles = [
+            center_of(scene, row)
+            for row, actor in enumerate(scene.roster.actors)
             if is_person(actor.id) and actor.id not in moment.hidden
         ]
-        middles = [(x - length / 2 * c, y - length / 2 * s) for x, y, c, s, length in persons]
         rows = []
         for lane, approaches in self._setup.conflicts.around(link).items():
             for conflict in (one.conflict for one in approaches if one.conflict.link is None):
@@ -562,10 +556,7 @@ class CrossingsReader(Reader):
                 near = [one for one in middles if _distance_to(center, *one) <= self._setup.settings["near"]]
                 nearest = min((math.dist(area, one) for one in middles), default=_NO_PERSON_M)
                 rows.append((line + conflict.begin_m, conflict.must_yield, len(near), min(nearest, _NO_PERSON_M)))
-        rows.sort()
-        for number, values in enumerate(rows[: self._setup.limit]):
-            found[number] = 1.0, *values
-        return found
+        return [(1.0, *values) for values in sorted(rows)[: self._setup.limit]]
 
 
 def _point_at(line: Array, share: float) -> tuple[float, float]:

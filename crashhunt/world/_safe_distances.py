@@ -58,15 +58,8 @@ def safe_speed(
 ) -> float:
     """Return the greatest speed of the rear vehicle for which a gap is safe, in m/s; 0 if no speed is safe.
 
-    This function is the inverse of `safe_distance`, with the same arguments: the positive root of a quadratic equation.
-
-    Args:
-        gap_m: gap between the vehicles, in m.
-        front_mps: speed of the front vehicle, as in `safe_distance`.
-        response_s: response time, as in `safe_distance`.
-        acceleration_mps2: acceleration of the rear vehicle, as in `safe_distance`.
-        braking_mps2: deceleration of the rear vehicle, as in `safe_distance`.
-        front_braking_mps2: deceleration of the front vehicle, as in `safe_distance`.
+    This function is the inverse of `safe_distance`: the positive root of a quadratic equation. The gap between the
+    vehicles is in m, and all other arguments are those of `safe_distance`.
     """
     # With the response time t: later² / (2 b) + later t - a t² / 2 = gap + front² / (2 b_front), later = v + a t.
     room = gap_m + front_mps * front_mps / (2 * front_braking_mps2) + acceleration_mps2 * response_s * response_s / 2
