@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 import re
-from contextlib import suppress
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import libsumo
 from libsumo import _libsumo as sumo
 
+from crashhunt.sumo._driving import VehicleCommand
 from crashhunt.trial import steps_of
 from crashhunt.world import PERSON, is_person
 
@@ -260,7 +260,7 @@ class SteppingOut:
         self._left = len(walks)
         self._walk = libsumo.person.getStage(person)
         self._edge = str(sumo.person_getRoadID(person))
-        self._start, self._way, self._far = _Way.of(person, agent)
+        self._way = _Way.of(person, agent)
         self._out = 0.0
         self._command()
 
@@ -293,12 +293,10 @@ class SteppingOut:
         before = self._out
         # Walk out at most so far that the remaining steps suffice for the way back.
         back = self._left * reach if self._is_steady else sum(later) * self._dt
-        self._out = min(self._far, before + reach, back)
-        away = self._out - before
-        towards = self._way if away >= 0 else (-self._way[0], -self._way[1])
-        (x, y), (way_x, way_y) = self._start, self._way
-        angle = 90.0 - math.degrees(math.atan2(towards[1], towards[0]))
-        sumo.person_moveToXY(self._person, "", x + self._out * way_x, y + self._out * way_y, angle, 2, 100.0)
+        self._out = min(self._way.far_m, before + reach, back)
+        away, (way_x, way_y) = self._out - before, self._way.direction
+        way = self._way if away >= 0 else self._way._replace(direction=(-way_x, -way_y))
+        sumo.person_moveToXY(self._person, "", *self._way.at(self._out), way.angle, 2, 100.0)
         self._speeds[self._person] = abs(away) / self._dt
 
 
@@ -310,7 +308,6 @@ _IGNORES_JUNCTIONS = 7  # speed mode: safe speed and physical limits, no checks 
 _NO_LANE_CHANGES = 0  # lane change mode
 _COMMANDED_LANE_CHANGES = 256  # lane change mode: commanded changes only, and not into another vehicle
 _FOR_EVER_S = 3600.0  # how long a command to change lanes holds: longer than any disturbance
-_IGNORE_DEPARTED = suppress(libsumo.TraCIException)  # SUMO's error for a vehicle that has left the simulation
 _LATERAL_M = 1.6  # half a lane: a vehicle with a smaller lateral offset is ahead or behind, not to the side
 
 
@@ -403,7 +400,7 @@ class SumoDisturbances:
         return min(found)[1] if found else ""
 
 
-class _Slows:
+class _Slows(VehicleCommand):
     """Makes the vehicle brake to a target speed and keep it where that is safe."""
 
     def __init__(
@@ -416,20 +413,12 @@ class _Slows:
         target: float = 0.0,
         strengths: Sequence[float] = (),
     ) -> None:
+        super().__init__(vehicle)
         self.how_strong = how_strong
-        self._vehicle = vehicle
         self._change = deceleration * dt
         self._changes = iter([one * dt for one in strengths])
         self._target = target
         self._command()
-
-    def keep(self) -> None:
-        with _IGNORE_DEPARTED:
-            self._command()
-
-    def end(self) -> None:
-        with _IGNORE_DEPARTED:
-            sumo.vehicle_setSpeed(self._vehicle, -1.0)
 
     def _command(self) -> None:
         self._change = next(self._changes, self._change)
@@ -440,57 +429,51 @@ class _Slows:
             sumo.vehicle_setSpeed(self._vehicle, max(self._target, speed - self._change))
 
 
-class _Speeds:
+class _Speeds(VehicleCommand):
     """Raises the vehicle's desired speed; the vehicle keeps its distance to others as before."""
 
     def __init__(self, vehicle: str, share: float) -> None:
+        super().__init__(vehicle)
         self.how_strong = share
-        self._vehicle = vehicle
         self._before = sumo.vehicle_getSpeedFactor(vehicle)
         sumo.vehicle_setSpeedFactor(vehicle, (1.0 + share) * self._before)
 
-    def keep(self) -> None:
-        pass
-
-    def end(self) -> None:
-        with _IGNORE_DEPARTED:
-            sumo.vehicle_setSpeedFactor(self._vehicle, self._before)
+    def _release(self) -> None:
+        sumo.vehicle_setSpeedFactor(self._vehicle, self._before)
 
 
-class _CutsIn:
+class _CutsIn(VehicleCommand):
     """Makes the vehicle change lanes as soon as no vehicle overlaps it there, and optionally brake in the new lane."""
 
     def __init__(self, vehicle: str, lane: str, deceleration: float, dt: float, how_long: float) -> None:
+        super().__init__(vehicle)
         self.how_strong = deceleration
-        self._vehicle = vehicle
         self._lane = lane
         self._before = sumo.vehicle_getLaneChangeMode(vehicle)
         self._change = deceleration * dt
         sumo.vehicle_setLaneChangeMode(vehicle, _COMMANDED_LANE_CHANGES)
         sumo.vehicle_changeLane(vehicle, int(lane.rpartition("_")[2]), how_long)
 
-    def keep(self) -> None:
-        with _IGNORE_DEPARTED:
-            if self._change and sumo.vehicle_getLaneID(self._vehicle) == self._lane:
-                speed = sumo.vehicle_getSpeed(self._vehicle)
-                sumo.vehicle_setSpeed(self._vehicle, max(0.0, speed - self._change))
+    def _command(self) -> None:
+        if self._change and sumo.vehicle_getLaneID(self._vehicle) == self._lane:
+            speed = sumo.vehicle_getSpeed(self._vehicle)
+            sumo.vehicle_setSpeed(self._vehicle, max(0.0, speed - self._change))
 
-    def end(self) -> None:
-        with _IGNORE_DEPARTED:
-            sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
-            if self._change:
-                sumo.vehicle_setSpeed(self._vehicle, -1.0)
+    def _release(self) -> None:
+        sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
+        if self._change:
+            super()._release()
 
 
-class _MergesLate:
+class _MergesLate(VehicleCommand):
     """Keeps the vehicle in a lane that ends, and lets it change lanes late.
 
     The change begins when the rest of the lane is short enough and no vehicle overlaps in the neighbouring lane.
     """
 
     def __init__(self, vehicle: str, target: int, length: float, how_strong: float) -> None:
+        super().__init__(vehicle)
         self.how_strong = how_strong
-        self._vehicle = vehicle
         self._edge = sumo.vehicle_getRoadID(vehicle)
         self._target = target
         self._length = length
@@ -498,44 +481,35 @@ class _MergesLate:
         sumo.vehicle_setLaneChangeMode(vehicle, _NO_LANE_CHANGES)
         self._is_waiting = True
 
-    def keep(self) -> None:
-        with _IGNORE_DEPARTED:
-            if self._is_waiting and (
-                sumo.vehicle_getRoadID(self._vehicle) != self._edge
-                or self._length - sumo.vehicle_getLanePosition(self._vehicle) <= self.how_strong
-            ):
-                self._is_waiting = False
-                sumo.vehicle_setLaneChangeMode(self._vehicle, _COMMANDED_LANE_CHANGES)
-                if sumo.vehicle_getRoadID(self._vehicle) == self._edge:
-                    sumo.vehicle_changeLane(self._vehicle, self._target, _FOR_EVER_S)
+    def _command(self) -> None:
+        if self._is_waiting and (
+            sumo.vehicle_getRoadID(self._vehicle) != self._edge
+            or self._length - sumo.vehicle_getLanePosition(self._vehicle) <= self.how_strong
+        ):
+            self._is_waiting = False
+            sumo.vehicle_setLaneChangeMode(self._vehicle, _COMMANDED_LANE_CHANGES)
+            if sumo.vehicle_getRoadID(self._vehicle) == self._edge:
+                sumo.vehicle_changeLane(self._vehicle, self._target, _FOR_EVER_S)
 
-    def end(self) -> None:
-        with _IGNORE_DEPARTED:
-            sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
-            if not self._is_waiting:  # otherwise the command would keep the vehicle in its lane for an hour
-                sumo.vehicle_changeLane(self._vehicle, sumo.vehicle_getLaneIndex(self._vehicle), 0.0)
+    def _release(self) -> None:
+        sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
+        if not self._is_waiting:  # otherwise the command would keep the vehicle in its lane for an hour
+            sumo.vehicle_changeLane(self._vehicle, sumo.vehicle_getLaneIndex(self._vehicle), 0.0)
 
 
-class _Ignores:
+class _Ignores(VehicleCommand):
     """Makes the vehicle ignore red lights and right of way; for that, SUMO needs a commanded speed in every step."""
 
-    how_strong = 1.0
-
     def __init__(self, vehicle: str, dt: float) -> None:
-        self._vehicle = vehicle
+        super().__init__(vehicle)
         self._dt = dt
         self._before = sumo.vehicle_getSpeedMode(vehicle)
         sumo.vehicle_setSpeedMode(vehicle, _IGNORES_JUNCTIONS)
         self._command()
 
-    def keep(self) -> None:
-        with _IGNORE_DEPARTED:
-            self._command()
-
-    def end(self) -> None:
-        with _IGNORE_DEPARTED:
-            sumo.vehicle_setSpeedMode(self._vehicle, self._before)
-            sumo.vehicle_setSpeed(self._vehicle, -1.0)
+    def _release(self) -> None:
+        sumo.vehicle_setSpeedMode(self._vehicle, self._before)
+        super()._release()
 
     def _command(self) -> None:
         allowed, speed = sumo.vehicle_getAllowedSpeed(self._vehicle), sumo.vehicle_getSpeed(self._vehicle)

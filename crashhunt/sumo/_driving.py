@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -305,56 +306,68 @@ def hold_vehicle(vehicle: str, what: str) -> ActiveDisturbance | None:
         return None
     if what == "gone":
         libsumo.vehicle.remove(vehicle)
-        return _Gone()
+        return _Gone(vehicle)
     return _KeepsSpeed(vehicle) if what == "keep_speed" else _KeepsLane(vehicle)
 
 
-class _Gone:
-    """The hold of a vehicle that has been removed for the rest of the episode."""
+class VehicleCommand:
+    """A command to a vehicle until its end. The vehicle may leave the simulation before.
+
+    Args:
+        vehicle: Identifier of the vehicle.
+    """
 
     how_strong = 1.0
 
+    def __init__(self, vehicle: str) -> None:
+        self._vehicle = vehicle
+
     def keep(self) -> None:
-        """Do nothing, because the vehicle is gone."""
+        """Continue the command for a step."""
+        with suppress(libsumo.TraCIException):  # SUMO's error for a vehicle that has left
+            self._command()
 
     def end(self) -> None:
+        """Let the vehicle drive by itself again."""
+        with suppress(libsumo.TraCIException):
+            self._release()
+
+    def _command(self) -> None:
+        """Command the vehicle in a step; by default, SUMO keeps the first command."""
+
+    def _release(self) -> None:
+        sumo.vehicle_setSpeed(self._vehicle, -1.0)
+
+
+class _Gone(VehicleCommand):
+    """The hold of a vehicle that has been removed for the rest of the episode."""
+
+    def _release(self) -> None:
         """Do nothing, because the vehicle does not return."""
 
 
-class _KeepsSpeed:
+class _KeepsSpeed(VehicleCommand):
     """Makes the vehicle keep its speed, even with an obstacle ahead."""
 
     def __init__(self, vehicle: str) -> None:
+        super().__init__(vehicle)
         self.how_strong = float(sumo.vehicle_getSpeed(vehicle))
-        self._vehicle = vehicle
         self._before = sumo.vehicle_getSpeedMode(vehicle)
         sumo.vehicle_setSpeedMode(vehicle, _NO_SPEED_CHECKS)
         sumo.vehicle_setSpeed(vehicle, self.how_strong)
 
-    def keep(self) -> None:
-        """Do nothing, because SUMO keeps the command."""
-
-    def end(self) -> None:
-        """Let the vehicle drive by itself again."""
-        if self._vehicle in sumo.vehicle_getIDList():
-            sumo.vehicle_setSpeedMode(self._vehicle, self._before)
-            sumo.vehicle_setSpeed(self._vehicle, -1.0)
+    def _release(self) -> None:
+        sumo.vehicle_setSpeedMode(self._vehicle, self._before)
+        super()._release()
 
 
-class _KeepsLane:
+class _KeepsLane(VehicleCommand):
     """Makes the vehicle keep its lane."""
 
-    how_strong = 1.0
-
     def __init__(self, vehicle: str) -> None:
-        self._vehicle = vehicle
+        super().__init__(vehicle)
         self._before = sumo.vehicle_getLaneChangeMode(vehicle)
         sumo.vehicle_setLaneChangeMode(vehicle, _NO_LANE_CHANGES)
 
-    def keep(self) -> None:
-        """Do nothing, because SUMO keeps the command."""
-
-    def end(self) -> None:
-        """Let the vehicle change lanes by itself again."""
-        if self._vehicle in sumo.vehicle_getIDList():
-            sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
+    def _release(self) -> None:
+        sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)

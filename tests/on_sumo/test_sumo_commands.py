@@ -113,6 +113,8 @@ def test_vehicle_that_ignores_priority_is_commanded_a_speed_that_it_can_reach(su
         lambda: _disturbances._CutsIn("other", "e_1", 3.0, 0.5, 4.0),
         lambda: _disturbances._MergesLate("other", 2, 41.0, 30.0),
         lambda: _disturbances._Ignores("other", 0.5),
+        lambda: _driving._KeepsSpeed("other"),
+        lambda: _driving._KeepsLane("other"),
     ],
 )
 def test_vehicle_that_has_left_is_let_go_and_other_errors_are_raised(sumo, make):
@@ -576,7 +578,8 @@ def test_traffic_drives_on_the_left_where_lane_1_is_right_of_lane_0(sumo, turn):
 
 def test_holds_are_commands_that_end(sumo, monkeypatch):
     removed = []
-    monkeypatch.setattr(_driving, "libsumo", SimpleNamespace(vehicle=SimpleNamespace(remove=removed.append)))
+    namespace = SimpleNamespace(vehicle=SimpleNamespace(remove=removed.append), TraCIException=libsumo.TraCIException)
+    monkeypatch.setattr(_driving, "libsumo", namespace)
     assert _driving.hold_vehicle("nobody", "keep_lane") is None
     speed, lane = _driving.hold_vehicle("other", "keep_speed"), _driving.hold_vehicle("other", "keep_lane")
     assert (speed.how_strong, lane.how_strong) == (10.0, 1.0)
@@ -596,6 +599,4 @@ def test_holds_are_commands_that_end(sumo, monkeypatch):
     away = _driving.hold_vehicle("other", "gone")
     assert (removed, away.how_strong) == (["other"], 1.0)
     away.keep(), away.end()
-    sumo.answers["vehicle_getIDList"] = ()
-    speed.end(), lane.end()
     assert sumo.taken() == []
