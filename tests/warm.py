@@ -27,6 +27,7 @@ import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import traceback
@@ -362,6 +363,8 @@ def _import_ours(simulator: str = "") -> None:
         for name in (begins_with, *_GO_ON_WITH[simulator]):
             importlib.import_module(name)
         prepare_ours()
+        if begins_with == "crashhunt.executors._fork_server":
+            _rehearse()
         found = _imported[begins_with] = {}
         for name in filter(_is_ours, [*sys.modules]):
             module = sys.modules.pop(name)
@@ -383,6 +386,13 @@ def prepare_ours() -> None:
     prepare(importlib.import_module("crashhunt.trial").TrialResult)
     prepare(importlib.import_module("crashhunt.episode").WorkerSettings)
     importlib.import_module("crashhunt.base.plugins").registered("agents")
+
+
+def _rehearse() -> None:
+    """Rehearse trials once, so that the rehearsal of each fork finds most caches filled: 30 ms in place of 45 ms."""
+    rehearse = importlib.import_module("crashhunt.executors._rehearsal").rehearse_trial
+    with tempfile.TemporaryDirectory() as folder:
+        rehearse(Path(folder), lambda _: None)
 
 
 class _Contents:
