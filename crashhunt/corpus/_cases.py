@@ -31,11 +31,12 @@ from crashhunt.crashes import (
     judgement_of,
     list_bundles,
     signature_of,
+    snapshot_of,
     with_judgement,
     without_chance_lengths,
 )
 from crashhunt.recording import write_log
-from crashhunt.snapshots import Snapshot, without_code
+from crashhunt.snapshots import without_code
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -297,7 +298,7 @@ def _build(bundle: Bundle, case: Case, folder: Path) -> None:
     crash = folder / layout.CRASHES / _id(bundle)
     crash.mkdir(parents=True)
     shutil.copyfile(bundle.hunt / layout.HUNT, folder / layout.HUNT)
-    snapshot = without_code(Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot), folder / layout.SNAPSHOTS)
+    snapshot = without_code(snapshot_of(bundle), folder / layout.SNAPSHOTS)
     case.write(folder)
     result = replace(bundle.result, spec=_with_relative_paths(bundle.result.spec, folder))
     kept = replace(bundle, path=crash, result=result, snapshot=snapshot.digest, files={}, authentication_code="")

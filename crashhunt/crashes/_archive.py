@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
-from crashhunt.base.integrity import FILES, parse_object, too_large, typed
+from crashhunt.base.integrity import FILES, digest_of_content, parse_object, too_large, typed
 from crashhunt.base.progress import watched
 from crashhunt.base.temporary import temporary_folder
-from crashhunt.crashes._bundle import ArchiveIndex, is_bundle_made_here
+from crashhunt.crashes._bundle import ArchiveIndex, is_bundle_made_here, snapshot_of
 from crashhunt.crashes._bundle_trust import is_made_here, signature
 from crashhunt.crashes._notes import notes_as_text, read_notes, subject_of, user_name
-from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -72,7 +71,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
     """
     hunt = bundle.hunt
     bundle.recording()  # refuses what is damaged
-    snapshot = Snapshot(hunt / layout.SNAPSHOTS / bundle.snapshot)
+    snapshot = snapshot_of(bundle)
     snapshot.verify(to_run=False)  # the dashboard exports, and writes nothing into a hunt
     files = [hunt / layout.HUNT, *sorted(bundle.path.rglob("*"))]
     # Export only the snapshot's files that its manifest names, because an agent may have written data into its folder.
@@ -84,7 +83,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
             if path.is_file() and not path.is_symlink():
                 name = path.relative_to(hunt).as_posix()
                 data = path.read_bytes()
-                entries[name] = {"size": len(data), "blake2b": _hash(data)}
+                entries[name] = {"size": len(data), "blake2b": digest_of_content(data)}
                 info = zipfile.ZipInfo(name)
                 if path.stat().st_mode & stat.S_IXUSR:
                     entries[name]["executable"] = 1
@@ -207,7 +206,3 @@ def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, directory: Path, 
 
 def _refusal(path: Path, message: str) -> BundleError:
     return BundleError(message, fix="get an undamaged copy from the person who exported it", where=str(path))
-
-
-def _hash(data: bytes) -> str:
-    return hashlib.blake2b(data, digest_size=16).hexdigest()

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
-from crashhunt.base.errors import BundleError, CrashhuntError
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.crashes._bundle import snapshot_of
 from crashhunt.crashes._contact_record import SAME_WAY, contact_record
-from crashhunt.snapshots import Snapshot
 from crashhunt.trial import Outcome
 from crashhunt.world import STANDS_MPS, is_person
 
@@ -86,8 +85,9 @@ def safe_gap_m(speed: float, ahead: float) -> float:
     )
 
 
-def _name_of(case: ContactRecord, actor: str) -> Blame:
-    return "ego" if actor == case.agent else "other"
+def _blaming(case: ContactRecord, actor: str, rule: str, words: str, source: str) -> FaultFinding:
+    """Return the finding of a rule that blames one actor of the contact."""
+    return FaultFinding(rule=rule, blames="ego" if actor == case.agent else "other", words=words, source=source)
 
 
 def _red_light(case: ContactRecord) -> FaultFinding | None:
@@ -102,10 +102,8 @@ def _red_light(case: ContactRecord) -> FaultFinding | None:
             ran[event.agent] = f"{event.what}, {case.ago(case.time_s - time_s)}"
     if not ran:
         return None
-    blames = "both" if len(ran) == 2 else _name_of(case, *ran)
-    return FaultFinding(
-        rule="red light", blames=blames, words=", and ".join(ran.values()), source=_SOURCES["red_light"]
-    )
+    found = _blaming(case, next(iter(ran)), "red light", ", and ".join(ran.values()), _SOURCES["red_light"])
+    return replace(found, blames="both") if len(ran) == 2 else found
 
 
 def _wrong_way(case: ContactRecord) -> FaultFinding | None:
@@ -117,12 +115,7 @@ def _wrong_way(case: ContactRecord) -> FaultFinding | None:
         if event.kind == "wrong_way" and event.agent in against and case.time_s - time_s <= _RED_S:
             if against[event.agent] is False or against[case.partner(event.agent)]:
                 continue  # it has returned to a lane of its direction
-            return FaultFinding(
-                rule="wrong way",
-                blames=_name_of(case, event.agent),
-                words=event.what,
-                source=_SOURCES["wrong_way"],
-            )
+            return _blaming(case, event.agent, "wrong way", event.what, _SOURCES["wrong_way"])
     wrong = [actor for actor, is_wrong in against.items() if is_wrong]
     if len(wrong) != 1 or not case.is_oncoming:
         return None
@@ -138,12 +131,8 @@ def _wrong_way(case: ContactRecord) -> FaultFinding | None:
         since -= 1
     since_s = float(case.times[since + 1]) if since < lately[-1] else 0.0
     when = f"for the last {since_s:.1f} s" if since_s else "just before the contact"
-    return FaultFinding(
-        rule="wrong way",
-        blames=_name_of(case, driver),
-        words=f"{driver} drove against the direction of its lane {when}, towards {other}, which stayed in its lane",
-        source="Vienna, articles 10 and 11; StVO §§ 2 and 5",
-    )
+    words = f"{driver} drove against the direction of its lane {when}, towards {other}, which stayed in its lane"
+    return _blaming(case, driver, "wrong way", words, "Vienna, articles 10 and 11; StVO §§ 2 and 5")
 
 
 def _lane_change(case: ContactRecord) -> FaultFinding | None:
@@ -174,7 +163,7 @@ def _lane_change(case: ContactRecord) -> FaultFinding | None:
         if not case.meets_sideways(changer):
             return None
         words = f"{changer} moved sideways into {other}, which was next to it and stayed in its lane"
-        return FaultFinding(rule="lane change", blames=_name_of(case, changer), words=words, source=source)
+        return _blaming(case, changer, "lane change", words, source)
     if case.follower == changer:
         if case.hardest_braking(other) > _IMPOSSIBLE_BRAKING_MPS2 or case.way(other).speeds[-1] < -STANDS_MPS:
             return None
@@ -183,7 +172,7 @@ def _lane_change(case: ContactRecord) -> FaultFinding | None:
         ):
             return None  # it turned off, or was behind all the time: that leaves a lane sideways, too
         words = f"{changer} changed lanes {case.ago(before)}, to behind {other}, and drove into it"
-        return FaultFinding(rule="lane change", blames=_name_of(case, changer), words=words, source=source)
+        return _blaming(case, changer, "lane change", words, source)
     return _cut_in(case, changer, before, source)
 
 
@@ -198,7 +187,7 @@ def _into_changed_vehicle(case: ContactRecord, changer: str, source: str) -> Fau
     else:
         return None  # the other may have been about to change as well, or came there in a bend
     words = f"{changer} moved sideways into {other}, {words}"
-    return FaultFinding(rule="lane change", blames=_name_of(case, changer), words=words, source=source)
+    return _blaming(case, changer, "lane change", words, source)
 
 
 def _cut_in(case: ContactRecord, changer: str, before: float, source: str) -> FaultFinding | None:
@@ -214,12 +203,7 @@ def _cut_in(case: ContactRecord, changer: str, before: float, source: str) -> Fa
         return None
     if before > _AT_ONCE_S and case.slowed(other, before - _RESPONSE_S) < _RSS_MIN_BRAKING_MPS2:
         return None  # who drove behind had the time, and did not use it
-    return FaultFinding(
-        rule="lane change",
-        blames=_name_of(case, changer),
-        words=f"{words}; {safe:.1f} m would have been safe (RSS)",
-        source=source,
-    )
+    return _blaming(case, changer, "lane change", f"{words}; {safe:.1f} m would have been safe (RSS)", source)
 
 
 def _rear_end(case: ContactRecord) -> FaultFinding | None:
@@ -238,12 +222,7 @@ def _rear_end(case: ContactRecord) -> FaultFinding | None:
     gap, safe = max(0.0, case.gap_m(leader, back)), safe_gap_m(float(follow.speeds[back]), float(lead.speeds[back]))
     words = f"{follower} drove into the back of {leader}, which had been ahead of it for at least {_FOLLOWS_S:g} s"
     words += f"; {case.ago(case.times[back])}, the gap was {gap:.1f} m, and {safe:.1f} m is safe (RSS)"
-    return FaultFinding(
-        rule="rear end",
-        blames=_name_of(case, follower),
-        words=words,
-        source="Vienna, article 13 (5); StVO § 4 (1); RSS, definition 1",
-    )
+    return _blaming(case, follower, "rear end", words, "Vienna, article 13 (5); StVO § 4 (1); RSS, definition 1")
 
 
 def _turns_off(case: ContactRecord) -> FaultFinding | None:
@@ -262,9 +241,7 @@ def _turns_off(case: ContactRecord) -> FaultFinding | None:
             continue
         words = f"{follower} drove straight on into {leader}, which had been ahead of it until {case.ago(left_s)}"
         words += " and was turning"
-        return FaultFinding(
-            rule="rear end", blames=_name_of(case, follower), words=words, source="Vienna, article 13 (5); StVO § 4 (1)"
-        )
+        return _blaming(case, follower, "rear end", words, "Vienna, article 13 (5); StVO § 4 (1)")
     return None
 
 
@@ -284,9 +261,7 @@ def _steps_out(case: ContactRecord) -> FaultFinding | None:
         return None
     words = f"{person} came onto the road {case.ago(case.times[inside])}, {max(0.0, gap):.1f} m ahead of {driver}"
     words += f", which needs {stops:.1f} m to stop"
-    return FaultFinding(
-        rule="steps out", blames=_name_of(case, person), words=words, source="Vienna, article 20 (6); StVO § 25 (3)"
-    )
+    return _blaming(case, person, "steps out", words, "Vienna, article 20 (6); StVO § 25 (3)")
 
 
 def _standing(case: ContactRecord) -> FaultFinding | None:
@@ -299,9 +274,7 @@ def _standing(case: ContactRecord) -> FaultFinding | None:
     if stood < needs or is_person(mover):
         return None
     words = f"{mover} drove into {actor}, which had stood for at least {stood:.1f} s"
-    return FaultFinding(
-        rule="standing", blames=_name_of(case, mover), words=words, source="Vienna, article 13 (1); StVO § 3 (1)"
-    )
+    return _blaming(case, mover, "standing", words, "Vienna, article 13 (1); StVO § 3 (1)")
 
 
 def _right_of_way(case: ContactRecord) -> FaultFinding | None:
@@ -318,12 +291,7 @@ def _right_of_way(case: ContactRecord) -> FaultFinding | None:
     if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKING_SPEED_MPS:
         return None  # a vehicle that starts off must let the vehicle inside the junction clear it first
     words = f"{yields} had to give way to {goes} at the junction {junction}"
-    return FaultFinding(
-        rule="right of way",
-        blames=_name_of(case, yields),
-        words=words,
-        source="the map of the scenario; Vienna, article 18; StVO § 8",
-    )
+    return _blaming(case, yields, "right of way", words, "the map of the scenario; Vienna, article 18; StVO § 8")
 
 
 def _yielding(case: ContactRecord) -> tuple[str, str] | None:
@@ -390,32 +358,23 @@ def fault_of(bundle: Bundle, recording: Recording | None = None, record: Contact
     result = bundle.result
     hit = result.collision
     if result.outcome is Outcome.AGENT_ERROR:
-        words = "the code of the agent failed"
-        return Fault(
-            "ego",
-            (FaultFinding(rule="agent error", blames="ego", words=words, source="the agent controls the vehicle"),),
-        )
+        return _egos("agent error", "the code of the agent failed", "the agent controls the vehicle")
     if result.outcome is Outcome.OFF_ROAD and hit is not None and not hit.other:
-        words = "it left the road without contact"
-        return Fault(
-            "ego",
-            (
-                FaultFinding(
-                    rule="off the road", blames="ego", words=words, source="Vienna, article 13 (1); StVO § 3 (1)"
-                ),
-            ),
-        )
+        return _egos("off the road", "it left the road without contact", "Vienna, article 13 (1); StVO § 3 (1)")
     event = result.event
     driven_s = result.steps * (result.step_length_s or 0.0)  # results of early versions have no length of a step
     if event is not None and event.kind in _SOURCES and driven_s >= _INSERTED_S:
-        rule, source = event.kind.replace("_", " "), _SOURCES[event.kind]
-        return Fault("ego", (FaultFinding(rule=rule, blames="ego", words=event.what, source=source),))
+        return _egos(event.kind.replace("_", " "), event.what, _SOURCES[event.kind])
     if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
         return Fault("nobody can tell")
     contact = record or contact_record(bundle, recording)
     if contact is None:
         return Fault("nobody can tell")
     return fault_in(replace(contact, right_of_way=_right_of_way_of(bundle)))
+
+
+def _egos(rule: str, words: str, source: str) -> Fault:
+    return Fault("ego", (FaultFinding(rule=rule, blames="ego", words=words, source=source),))
 
 
 def fault_in(case: ContactRecord) -> Fault:
@@ -439,10 +398,10 @@ def _verdict(findings: Iterable[FaultFinding]) -> Verdict:
 
 def _right_of_way_of(bundle: Bundle) -> RightOfWay | None:
     try:
-        scenario = Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot).scenario()
+        scenario = snapshot_of(bundle).scenario()
         ask = scenario.backend.right_of_way
         return ask(scenario) if ask is not None else None
-    except (BundleError, CrashhuntError, OSError):
+    except (CrashhuntError, OSError):
         return None
 
 
@@ -457,8 +416,8 @@ def yielding_actor(bundle: Bundle, contact: ContactRecord | None) -> str:
 def stop_lines_of(bundle: Bundle) -> tuple[StopLine, ...]:
     """Return the stop lines of a crash's map; none if the simulator has none, or the scenario is not in the hunt."""
     try:
-        scenario = Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot).scenario()
+        scenario = snapshot_of(bundle).scenario()
         ask = scenario.backend.stop_lines
         return ask(scenario) if ask is not None else ()
-    except (BundleError, CrashhuntError, OSError):
+    except (CrashhuntError, OSError):
         return ()
