@@ -7,7 +7,7 @@ contact is computed by `crashhunt.world.contact_at`, from which the oracles also
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, takewhile
 from typing import TYPE_CHECKING
@@ -559,17 +559,16 @@ class ContactRecord:
 
     def is_between_junctions(self, *actors: str) -> bool:
         """Return whether all given actors were on SUMO roads, outside junctions, in the seconds before the contact."""
-        lanes = {
-            actor: [
-                scene.lanes[scene.roster.index[actor]]
-                for scene in _scenes_since(self.scenes, self.time_s - _WINDOW_S)
-                if scene.lanes and actor in scene.roster.index
-            ]
-            for actor in actors
-        }
-        return all(
-            bool(found) and not any(lane.startswith(":") or not lane for lane in found) for found in lanes.values()
-        )
+        lanes = [self._lanes_since(actor, self.time_s - _WINDOW_S) for actor in actors]
+        return all(bool(found) and not any(lane.startswith(":") or not lane for lane in found) for found in lanes)
+
+    def _lanes_since(self, actor: str, time_s: float) -> list[str]:
+        """Return the lanes of an actor in SUMO, in the scenes since a time that contain it."""
+        return [
+            scene.lanes[scene.roster.index[actor]]
+            for scene in _scenes_since(self.scenes, time_s)
+            if scene.lanes and actor in scene.roster.index
+        ]
 
     def was_in_junction(self, actor: str, before_s: float) -> bool:
         """Return whether an actor was inside a junction of SUMO at the given time before the contact."""
@@ -641,11 +640,7 @@ class ContactRecord:
     def links(self, actor: str) -> tuple[int, ...]:
         """Return the indices of the connections across a junction that an actor may have used."""
         assert self.right_of_way is not None
-        lanes = [
-            scene.lanes[scene.roster.index[actor]]
-            for scene in _scenes_since(self.scenes, self.time_s - 3 * _WINDOW_S)
-            if scene.lanes and actor in scene.roster.index
-        ]
+        lanes = self._lanes_since(actor, self.time_s - 3 * _WINDOW_S)
         if actor == self.agent and self.lane:
             lanes.append(self.lane)
         x, y = self.way(actor).points[-1].tolist()
@@ -662,15 +657,13 @@ def record_in(scenes: Sequence[Scene], hit: Collision) -> ContactRecord | None:
     agent, other = hit.agent, hit.other
     if not scenes or not all(name in scenes[-1].roster.index for name in (agent, other)):
         return None
-    time_s = scenes[-1].time_s
-    lanes = LaneMap((), (0.0, 0.0))
     return ContactRecord(
         agent=agent,
         other=other,
         scenes=scenes,
-        time_s=time_s,
+        time_s=scenes[-1].time_s,
         began_s=scenes[0].time_s,
-        lanes=lanes,
+        lanes=LaneMap((), (0.0, 0.0)),
         swept=hit.kind != _UNSWEPT_CONTACT,
         reported=hit,
     )
@@ -695,24 +688,19 @@ def contact_record(bundle: Bundle, recording: Recording | None = None) -> Contac
     from crashhunt.recording import read_lanes  # MCAP takes longer than a list of software faults
 
     found = recording or bundle.recording()
-    scenes = found.scenes()
-    if not scenes or not all(name in scenes[-1].roster.index for name in (hit.agent, hit.other)):
+    record = record_in(found.scenes(), hit)
+    if record is None:
         return None
-    last = scenes[-1]
-    events = tuple(
-        (scene.time_s, event) for scene in _scenes_since(scenes, last.time_s - _EVENTS_S) for event in scene.events
-    )
-    return ContactRecord(
-        agent=hit.agent,
-        other=hit.other,
-        scenes=scenes,
+    last = record.scenes[-1]
+    since_s = last.time_s - _EVENTS_S
+    return replace(
+        record,
         time_s=hit.time_s if last.time_s - found.prologue.step_length_s <= hit.time_s <= last.time_s else last.time_s,
-        began_s=scenes[0].time_s,
         lanes=LaneMap(read_lanes(bundle.path / layout.LOG), (hit.x, hit.y)),
-        events=events,
+        events=tuple(
+            (scene.time_s, event) for scene in _scenes_since(record.scenes, since_s) for event in scene.events
+        ),
         # Earlier versions wrote the lane of SUMO's report, which may be the other actor's.
-        swept=hit.kind != _UNSWEPT_CONTACT,
-        reported=hit,
         lane=(last.lanes[last.roster.index[hit.agent]] if last.lanes else "") or hit.lane,
     )
 
