@@ -557,25 +557,6 @@ class RareCounter:
         return joint, "", None
 
 
-def rare_estimate(
-    roots: Iterable[Root], *, least_bound: float | None = None, excluded: int = 0, confidence: float = 0.95
-) -> RareEstimate:
-    """Return the crash probability per trial with its intervals.
-
-    Args:
-        roots: roots with a complete result, in the order of their numbers.
-        least_bound: lower limit of every `Root.bound`, fixed before the first root; None for no certain interval.
-        excluded: number of roots without a complete result.
-        confidence: confidence of all intervals, in (0, 1).
-    """
-    counter = RareCounter(least_bound, confidence)
-    for root in roots:
-        counter.add(root)
-    for _ in range(excluded):
-        counter.add(None)
-    return counter.estimate()
-
-
 def _at_most_1(one: Estimated | None) -> Estimated | None:
     """Return the interval without its part above 1: a sum of weights can exceed 1, a probability cannot."""
     return None if one is None else replace(one, low=min(1.0, one.low), high=min(1.0, one.high))

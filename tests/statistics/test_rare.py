@@ -12,12 +12,19 @@ from markov import Model, run_root, run_roots
 
 from crashhunt.disturbances import SECONDS_PER_COPY, first_forcing
 from crashhunt.statistics import TRIALS_PER_ROOT, learn_forcing, root_of
-from crashhunt.statistics._rare import Root, rare_estimate, with_plain
+from crashhunt.statistics._rare import RareCounter, Root, with_plain
 from crashhunt.trial import CRASHES, Disturbance, Forced, ForcedCopy, Forcing, Outcome, TrialResult, TrialSpec
 
 SPARSE = {"late_action": 1e-4, "brake": 2e-4, "stop": 1e-4}
 DENSE = {"late_action": 0.05, "brake": 0.1, "stop": 0.02}
 TWO = {"late_action": 2e-3, "brake": 4e-3}
+
+
+def rare_estimate(roots, *, least_bound=None, excluded=0, confidence=0.95):
+    counter = RareCounter(least_bound, confidence)
+    for root in [*roots, *[None] * excluded]:
+        counter.add(root)
+    return counter.estimate()
 
 
 def z_score(values, truth):
