@@ -13,6 +13,10 @@ import importlib
 import re
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 _BLOCK = re.compile(r"^if TYPE_CHECKING:\n((?: {4}.*\n|\n)*)", re.MULTILINE)
 _IMPORT = re.compile(r"^ {4}from (\S+) import (?:\(([^)]*)\)|(.*))$", re.MULTILINE)
@@ -41,3 +45,17 @@ def offer_lazily(package: str) -> None:
 
     offered = sorted(homes)
     namespace.update(__all__=offered, __getattr__=import_name, __dir__=offered.copy)
+
+
+def import_at_call(place: str) -> Callable[..., Any]:
+    """Return a function that imports another function at each call, and calls it.
+
+    Args:
+        place: the module and the name of the other function, such as ``crashhunt.sumo._names:check_names``.
+    """
+
+    def call(*given: object, **named: object) -> Any:
+        module, _, name = place.partition(":")
+        return getattr(importlib.import_module(module), name)(*given, **named)
+
+    return call

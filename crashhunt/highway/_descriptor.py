@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from crashhunt.base.errors import ScenarioError
 from crashhunt.highway.accelerator._known_versions import ACCELERATED
 from crashhunt.scenario import STEP_LENGTH_S, Accelerator, Backend
+from crashhunt.simulators import SCENE_PARTS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -105,17 +106,7 @@ BACKEND: Backend = Backend(
     reported_events=("wrong_way", "not_moving"),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "ignore_priority", "unseen"),
     varying_disturbances=("brake", "stop"),
-    observations=(
-        "ego",
-        "actors",
-        "actor_ids",
-        "predictions",
-        "prediction_covariance",
-        "lidar2d",
-        "lanes",
-        "route",
-        "speed_limit",
-    ),
+    observations=(*SCENE_PARTS, "lanes", "route", "speed_limit"),
     implied={"time_limit": "none"},
     accelerator=Accelerator(switched_off=_as_it_is, note=_not_accelerated),
     side_effect=_side_effect,

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         PARTS as PARTS,
         REACH_M as REACH_M,
         REFERENCE_SHARES as REFERENCE_SHARES,
+        SCENE_PARTS as SCENE_PARTS,
         History as History,
         ObservationLayout as ObservationLayout,
         RequestedPart as RequestedPart,

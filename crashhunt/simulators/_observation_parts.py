@@ -486,6 +486,9 @@ PARTS: Mapping[str, Part] = {
 }  # fmt: skip
 """All parts by name."""
 
+SCENE_PARTS = ("ego", "actors", "actor_ids", "predictions", "prediction_covariance", "lidar2d")
+"""The parts that follow from scenes and from `LanePlace`, for every simulator with scenes."""
+
 
 @dataclass(frozen=True, slots=True)
 class RequestedPart:

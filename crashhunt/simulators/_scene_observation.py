@@ -12,7 +12,7 @@ import numpy as np
 from crashhunt.base.errors import UsageError
 from crashhunt.simulators._bicycle_model import WHEELBASE_SHARE
 from crashhunt.simulators._kinematics_observation import kind_number
-from crashhunt.simulators._observation_parts import REACH_M, History, layouts_of
+from crashhunt.simulators._observation_parts import REACH_M, SCENE_PARTS, History, layouts_of
 from crashhunt.simulators._scene_parts import (
     ActorNumbers,
     RayCaster,
@@ -36,9 +36,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
 _MAX_BEND = 2.0  # of the wheelbase times the curvature, with the front wheels across
-
-SCENE_PARTS = ("ego", "actors", "actor_ids", "predictions", "prediction_covariance", "lidar2d")
-"""The parts that follow from scenes and from `LanePlace`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from crashhunt.scenario import Backend, refuse
+from crashhunt.simulators._observation_parts import SCENE_PARTS
 
 if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
@@ -23,7 +24,7 @@ BACKEND: Backend = Backend(
     check=_check,
     reported_events=(),
     disturbances=("brake", "stop", "unseen"),
-    observations=("ego", "actors", "actor_ids", "predictions", "prediction_covariance", "lidar2d"),
+    observations=SCENE_PARTS,
     side_effect=lambda *_: "",
     forkable=True,
 )

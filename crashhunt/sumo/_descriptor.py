@@ -6,19 +6,16 @@ from dataclasses import replace
 from importlib import metadata
 from typing import TYPE_CHECKING
 
+from crashhunt.base.doors import import_at_call
 from crashhunt.scenario import ACTIONS, Backend, CompiledCore, Configuration, LoadOrder, TrafficSurvey
+from crashhunt.simulators import PARTS
 from crashhunt.sumo._options import INPUTS, SIGNAL_ARGUMENTS, SumoSetup, canonical, writes
 from crashhunt.world import EVENT_WORDS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
-    from pathlib import Path
+    from collections.abc import Iterator
 
-    from crashhunt.base.errors import ScenarioError
-    from crashhunt.base.json_types import Json
     from crashhunt.scenario import Scenario
-    from crashhunt.trial import Value
-    from crashhunt.world import RightOfWay, StopLine
 
 _VEHICLE_KEYS = (
     "existing",
@@ -41,18 +38,6 @@ MAP_ARGUMENTS = ("demand", "imperfection", "speed_spread", "trucks_per_100_cars"
 # A listing of backends imports this module, so everything else is imported where it is needed.
 
 
-def _check(scenario: Scenario, where: str) -> None:
-    from crashhunt.sumo._setup_check import check
-
-    check(scenario, where)
-
-
-def _check_names(scenario: Scenario, ego: str) -> None:
-    from crashhunt.sumo._names import check_names
-
-    check_names(scenario, ego)
-
-
 def _files(scenario: Scenario) -> Iterator[str]:
     sumo = scenario.table(SumoSetup)
     yield sumo.net
@@ -72,12 +57,6 @@ def _texts(scenario: Scenario) -> Iterator[str]:
     yield from nested_files(scenario.folder, named, inside=True)
 
 
-def _relocated(path: Path) -> bytes | None:
-    from crashhunt.sumo._files import movable
-
-    return movable(path)
-
-
 def _notes(scenario: Scenario) -> Iterator[str]:
     """Yield notes on output files that a trial does not write, and on demand that SUMO omits."""
     from crashhunt.sumo._demand_order import unsorted_notes
@@ -91,54 +70,6 @@ def _notes(scenario: Scenario) -> Iterator[str]:
         yield f"of {scenario.file}, a trial does not take over: {'; '.join(found)}"
     begin_s = sumo.options.get("begin", 0.0)
     yield from unsorted_notes(scenario.folder, sumo.routes, float(begin_s) if isinstance(begin_s, int | float) else 0.0)
-
-
-def _load(path: Path, ego: str) -> Scenario:
-    from crashhunt.sumo._sumocfg import load_sumocfg
-
-    return load_sumocfg(path, ego=ego)
-
-
-def _load_map(path: Path, ego: str) -> Scenario:
-    from crashhunt.sumo._map import load_map
-
-    return load_map(path, ego)
-
-
-def _explained(message: str, output: str, scenario: Scenario) -> ScenarioError | None:
-    from crashhunt.sumo._names import explained
-
-    return explained(message, output, scenario)
-
-
-def _right_of_way(scenario: Scenario) -> RightOfWay | None:
-    from crashhunt.sumo._right_of_way import right_of_way
-
-    return right_of_way(scenario)
-
-
-def _stop_lines(scenario: Scenario) -> tuple[StopLine, ...]:
-    from crashhunt.sumo._right_of_way import stop_lines
-
-    return stop_lines(scenario)
-
-
-def _side_effect(scenario: Scenario, values: Mapping[str, Value], specifications: Iterable[str]) -> str:
-    from crashhunt.sumo._side_effects import side_effect
-
-    return side_effect(scenario, values, specifications)
-
-
-def _refined(scenario: Scenario, answer: Json) -> Scenario:
-    from crashhunt.sumo._ego import refine
-
-    return refine(scenario, answer)
-
-
-def _restored(scenario: Scenario, kept: Scenario) -> Scenario | None:
-    from crashhunt.sumo._ego import restore
-
-    return restore(scenario, kept)
 
 
 def _without_core(scenario: Scenario) -> Scenario:
@@ -170,11 +101,11 @@ BACKEND: Backend = Backend(
     table=SumoSetup,
     example="net and routes",
     keys=frozenset({"warmup_s", "insertion_timeout_s", *(f"agents.{key}" for key in (*_VEHICLE_KEYS, *_DRIVING_KEYS))}),
-    check=_check,
-    check_names=_check_names,
+    check=import_at_call("crashhunt.sumo._setup_check:check"),
+    check_names=import_at_call("crashhunt.sumo._names:check_names"),
     files=_files,
     texts=_texts,
-    relocated=_relocated,
+    relocated=import_at_call("crashhunt.sumo._files:movable"),
     notes=_notes,
     versions=("libsumo",),
     one_per_process=True,
@@ -182,35 +113,18 @@ BACKEND: Backend = Backend(
     reported_events=tuple(EVENT_WORDS),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "step_out", "ignore_priority", "unseen"),
     actions=tuple(ACTIONS),
-    observations=(
-        "ego",
-        "actors",
-        "actor_ids",
-        "lanes",
-        "route",
-        "route_state",
-        "signals",
-        "right_of_way",
-        "stop_line",
-        "speed_limit",
-        "crossings",
-        "predictions",
-        "prediction_covariance",
-        "lidar2d",
-        "grid",
-        "image",
-    ),
+    observations=tuple(PARTS),
     configurations=(
         Configuration(
             endings=(".sumocfg", ".sumo.cfg"),
-            load=_load,
+            load=import_at_call("crashhunt.sumo._sumocfg:load_sumocfg"),
             arguments=("scale", "vehicle"),
             waiting="simulating the plain traffic, to find vehicles that enter (60 s of processor time at most)",
         ),
         *(
             Configuration(
                 endings=endings,
-                load=_load_map,
+                load=import_at_call("crashhunt.sumo._map:load_map"),
                 arguments=MAP_ARGUMENTS,
                 takes_ego=False,
                 waiting="making a scenario from the map, which is kept for the next hunt",
@@ -224,9 +138,13 @@ BACKEND: Backend = Backend(
     forkable=True,
     core=CompiledCore(switched_off=_without_core, why_not=_why_no_core),
     load_order=LoadOrder(what="SUMO's links", keep=_keep_link_order, why_not=_why_no_link_order),
-    explained=_explained,
-    side_effect=_side_effect,
-    right_of_way=_right_of_way,
-    stop_lines=_stop_lines,
-    survey=TrafficSurvey(module="crashhunt.sumo._traffic_survey", refine=_refined, restore=_restored),
+    explained=import_at_call("crashhunt.sumo._names:explained"),
+    side_effect=import_at_call("crashhunt.sumo._side_effects:side_effect"),
+    right_of_way=import_at_call("crashhunt.sumo._right_of_way:right_of_way"),
+    stop_lines=import_at_call("crashhunt.sumo._right_of_way:stop_lines"),
+    survey=TrafficSurvey(
+        module="crashhunt.sumo._traffic_survey",
+        refine=import_at_call("crashhunt.sumo._ego:refine"),
+        restore=import_at_call("crashhunt.sumo._ego:restore"),
+    ),
 )

@@ -135,7 +135,7 @@ _TELEPORT_S = "300"  # SUMO's own
 _PATIENCE_S = 300.0
 
 
-def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
+def load_sumocfg(path: Path, ego: str = "") -> Scenario:
     """Turn a SUMO configuration into a scenario.
 
     The network, routes, additional files and options of the configuration are kept. The output files that the
