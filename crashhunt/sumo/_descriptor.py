@@ -59,8 +59,8 @@ def _texts(scenario: Scenario) -> Iterator[str]:
 
 def _notes(scenario: Scenario) -> Iterator[str]:
     """Yield notes on output files that a trial does not write, and on demand that SUMO omits."""
-    from crashhunt.sumo._demand_order import unsorted_notes
     from crashhunt.sumo._files import written_by
+    from crashhunt.sumo._omitted_demand import unsorted_notes
 
     sumo = scenario.table(SumoSetup)
     named = [name for option in sumo.options if writes(name := canonical(option))]
@@ -124,7 +124,7 @@ BACKEND: Backend = Backend(
         *(
             Configuration(
                 endings=endings,
-                load=import_at_call("crashhunt.sumo._map:load_map"),
+                load=import_at_call("crashhunt.sumo.maps._make:load_map"),
                 arguments=MAP_ARGUMENTS,
                 takes_ego=False,
                 waiting="making a scenario from the map, which is kept for the next hunt",

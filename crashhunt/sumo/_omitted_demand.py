@@ -1,24 +1,96 @@
-"""Demand that SUMO omits of a simulation with a warning only, or without one; a hunt then tests other traffic."""
+"""Demand that SUMO omits of a simulation with a warning only, or without one; a hunt then tests other traffic.
+
+`unsorted_notes` searches a scenario's files before a hunt, and so imports no libsumo. `OmittedDemand` reads SUMO's
+output in a trial.
+"""
 
 from __future__ import annotations
 
 import os
 import re
 import stat
+from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
+from xml.parsers import expat
 
-import libsumo
-
-from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.base.text import NOTICE_TOPIC
-from crashhunt.sumo._demand_order import SORT_FIX, is_searched
+from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
+from crashhunt.base.text import NOTICE_TOPIC, count_of
+from crashhunt.sumo._ego import seconds
+from crashhunt.sumo._files import read_xml
 from crashhunt.sumo._names import places_of
 from crashhunt.sumo._options import SumoSetup
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
+    from pathlib import Path
 
     from crashhunt.scenario import Scenario
+
+
+# Route files that are not sorted by departure time.
+
+SORT_FIX = "sort the file, for example with SUMO's tools/route/sort_routes.py, or put each flow into a file of its own"
+_MAX_SORTED_BYTES = 20 * 2**20  # of all route files: half a second. SUMO itself reports what a trial omits
+_DEPARTING = {
+    **dict.fromkeys(("vehicle", "trip", "person", "container"), "depart"),
+    **dict.fromkeys(("flow", "personFlow", "containerFlow"), "begin"),
+}
+"""The elements whose order SUMO checks, and the attribute with the departure time."""
+
+
+def is_searched(folder: Path, routes: tuple[str, ...]) -> bool:
+    """Return whether `unsorted_notes` searches the route files: they are small, and no trial changes their times."""
+    with suppress(OSError, ScenarioError):
+        size = sum((folder / name).stat().st_size for name in routes)
+        return size <= _MAX_SORTED_BYTES and not any(b"${" in read_xml(folder / name) for name in routes)
+    return False
+
+
+def unsorted_notes(folder: Path, routes: tuple[str, ...], begin_s: float) -> Iterator[str]:
+    """Yield a warning for each route file from which SUMO omits demand that departs before an earlier element.
+
+    Args:
+        folder: folder of the scenario.
+        routes: names of the route files. SUMO does not check the order of additional files.
+        begin_s: start of the simulation, which is the departure time of a flow without one, in s.
+    """
+    for name in routes if is_searched(folder, routes) else ():
+        late: list[tuple[str, str]] = []
+        last = [0.0]
+        # SUMO itself reports a file that is no XML.
+        with suppress(ScenarioError, expat.ExpatError, OSError, LookupError, ValueError, RecursionError):
+            _search(folder / name, begin_s, last, late)
+            if late:
+                what = count_of(len(late), "element")
+                example, place = late[0]
+                yield (
+                    f"warning: SUMO omits {what} of the demand, such as {example} in {place}, because {name} is "
+                    f"not sorted by departure time. Fix: {SORT_FIX}"
+                )
+
+
+def _search(file: Path, begin_s: float, last: list[float], late: list[tuple[str, str]]) -> None:
+    """Add the elements of a file and of its included files that SUMO omits: tag with id, and file with line."""
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if tag == "include" and "href" in attributes:
+            _search(file.parent / attributes["href"], begin_s, last, late)
+        attribute = _DEPARTING.get(tag, "")
+        try:
+            depart = round(seconds(attributes.get(attribute, repr(begin_s) if attribute == "begin" else ""), file), 3)
+        except ScenarioError:  # "triggered" and similar
+            return
+        if depart < last[0]:
+            late.append((f"{tag} {attributes.get('id', '')!r}", f"{file.name}, line {parser.CurrentLineNumber}"))
+        else:
+            last[0] = depart
+
+    parser.StartElementHandler = start
+    parser.Parse(read_xml(file), True)
+
+
+# What SUMO reports in a trial.
 
 _STANDARD_ERROR = 2
 _MAX_OUTPUT_BYTES = 2**20  # of one episode; a scenario with more warnings has reported enough
@@ -137,6 +209,8 @@ class OmittedDemand:
         return f" ({places[0]})" if len(places) == 1 else ""
 
     def _late(self) -> int:
+        import libsumo
+
         try:
             loaded, inserted, waiting = (
                 int(libsumo.simulation.getParameter("", f"stats.vehicles.{what}"))

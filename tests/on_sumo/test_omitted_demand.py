@@ -15,7 +15,7 @@ from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.base.text import NOTICE_TOPIC
 from crashhunt.executors._protocol import Notes
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.sumo import BACKEND as SUMO, SumoSetup, SumoSimulator, _demand_order
+from crashhunt.sumo import BACKEND as SUMO, SumoSetup, SumoSimulator, _omitted_demand
 
 NET = Path(__file__).with_name("signal.net.xml")
 EGO = '<vehicle id="ego" route="across" depart="3"/>'
@@ -62,7 +62,7 @@ def simulate(tmp_path):
 
 def test_omitted_demand_is_reported_with_reason_and_place(simulate, monkeypatch):
     assert simulate(UNSORTED).reported == []  # the note of the scenario says so already
-    monkeypatch.setattr(_demand_order, "_MAX_SEARCHED_BYTES", 10)
+    monkeypatch.setattr(_omitted_demand, "_MAX_SORTED_BYTES", 10)
     (notice,) = simulate(UNSORTED).reported
     topic, _, text = notice.partition(NOTICE_TOPIC)
     assert topic == "its route file is not sorted by departure time"
@@ -98,7 +98,7 @@ def test_note_names_what_sumo_leaves_out(simulate, tmp_path, seed):
     simulator = simulate(f"{head}{''.join(demand)}</routes>", steps=100)
     said = re.findall(r"ignoring '(\d+)'!", (tmp_path / "scenario0" / "run.log").read_text())
     late = []
-    _demand_order._search(tmp_path / "scenario0" / "r.rou.xml", 0.0, [0.0], late)
+    _omitted_demand._search(tmp_path / "scenario0" / "r.rou.xml", 0.0, [0.0], late)
     assert [name.split("'")[1] for name, _ in late] == said
     assert said
     (note,) = [note for note in SUMO.notes(simulator._scenario) if "sorted" in note]

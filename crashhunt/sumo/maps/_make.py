@@ -21,6 +21,7 @@ from crashhunt.base.integrity import changed_file, describe_files, digest_of_fil
 from crashhunt.base.temporary import new_folder, remove_tree, temporary_beside, temporary_folder
 from crashhunt.base.text import count_of
 from crashhunt.base.version import __version__
+from crashhunt.scenario import load_scenario
 from crashhunt.sumo.maps._convert import NET, ConvertOptions, convert
 from crashhunt.sumo.maps._demand import ROUTES, Demand, find_demand, route_file
 from crashhunt.sumo.maps._folder import (
@@ -42,6 +43,7 @@ from crashhunt.sumo.maps._traffic_flow import RUN_S, PlainRun, calibrate
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from crashhunt.scenario import Scenario
     from crashhunt.sumo.maps._source import BBox
     from crashhunt.sumo.maps._tools import Tools
 
@@ -54,6 +56,21 @@ _FORMAT = 1
 _COMPLETION_MARK = "made.json"
 _MAX_KEPT = 20
 """Maps; a town takes up to 20 MB."""
+
+
+def load_map(path: Path, ego: str) -> Scenario:
+    """Return the scenario of a map. The scenario is made once, and then kept in the user's cache.
+
+    Raises:
+        ScenarioError: the map cannot be used, or ``ego`` names a vehicle.
+    """
+    if ego:
+        fix = "omit the option, or make the scenario yourself: crashhunt init DIR"
+        raise ScenarioError(f"--ego {ego!r} cannot be used with a map", fix=fix, where=str(path))
+    folder = cached_scenario(path)
+    scenario = load_scenario(folder)
+    note = f"the scenario of {path.name} is {folder}; crashhunt init makes one that you can edit"
+    return replace(scenario, name=path.name.partition(".")[0] or path.name, notes=(note, *scenario.notes))
 
 
 def cached_scenario(path: Path) -> Path:
