@@ -14,6 +14,8 @@ from highway_env.road.regulation import RegulatedRoad
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle
 
+from crashhunt.world import place_words
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
 
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
 _REACH_M = 80.0  # length of a path ahead of its vehicle
 _STEP_M = 2.0  # distance between the points of a path
 _MEETS_M = 2.5  # two paths cross if two of their points are nearer than this
-_HALF_LANE_M = 1.6  # a vehicle with a smaller lateral offset is ahead or behind, not to the side
 
 _Road = tuple[str, str]
 
@@ -38,10 +39,7 @@ def place_of(agent: Any, other: Any) -> str:
     """Return the place of a vehicle relative to an agent, such as ``left ahead``, from positions and not from lanes."""
     dx, dy = (other.position - agent.position).tolist()
     c, s = math.cos(agent.heading), math.sin(agent.heading)
-    ahead, right = dx * c + dy * s, dy * c - dx * s  # y points down
-    side = "" if abs(right) <= _HALF_LANE_M else "right" if right > 0 else "left"
-    along = "ahead" if ahead > agent.LENGTH / 2 else "behind" if ahead < -agent.LENGTH / 2 else ""
-    return f"{side} {along}".strip()
+    return place_words(dx * c + dy * s, dx * s - dy * c, agent.LENGTH)  # y points down
 
 
 def crosses(network: RoadNetwork, agent: Any, other: Any) -> bool:
@@ -295,14 +293,25 @@ class _Speeds(_Active):
         super().end()
 
 
-class _CutsIn(_Active):
+class _WithoutOwnChanges(_Active):
+    """A disturbance in which the vehicle does not change lanes by its own model (MOBIL)."""
+
+    def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], how_strong: float) -> None:
+        super().__init__(vehicle, let_go, how_strong)
+        self._before = vehicle.enable_lane_change
+        vehicle.enable_lane_change = False
+
+    def end(self) -> None:
+        self.vehicle.enable_lane_change = self._before
+        super().end()
+
+
+class _CutsIn(_WithoutOwnChanges):
     """Makes the vehicle change lanes as soon as no vehicle overlaps it there, and optionally brake in the new lane."""
 
     def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], deceleration: float, lane: Any) -> None:
         super().__init__(vehicle, let_go, deceleration)
         self._lane = lane
-        self._before = vehicle.enable_lane_change
-        vehicle.enable_lane_change = False  # the MOBIL model would change back
         self._begin()
 
     def override(self, dt: float) -> None:
@@ -313,10 +322,6 @@ class _CutsIn(_Active):
 
     def _begin(self) -> None:
         _change(self.vehicle, self._lane)
-
-    def end(self) -> None:
-        self.vehicle.enable_lane_change = self._before
-        super().end()
 
 
 class _KeepsSpeed(_Active):
@@ -330,21 +335,15 @@ class _KeepsSpeed(_Active):
         self.vehicle.action["acceleration"] = (self._speed - float(self.vehicle.speed)) / dt
 
 
-class _KeepsLane(_Active):
+class _KeepsLane(_WithoutOwnChanges):
     """Makes the vehicle keep its lane."""
 
     def __init__(self, vehicle: Any, let_go: Callable[[_Active], None], how_strong: float) -> None:
         super().__init__(vehicle, let_go, how_strong)
-        self._before = vehicle.enable_lane_change
-        vehicle.enable_lane_change = False
         vehicle.target_lane_index = vehicle.lane_index
 
-    def end(self) -> None:
-        self.vehicle.enable_lane_change = self._before
-        super().end()
 
-
-class _MergesLate(_Active):
+class _MergesLate(_WithoutOwnChanges):
     """Keeps the vehicle in a lane that ends, and lets it change lanes late.
 
     The change begins when the rest of the lane is short enough and no vehicle overlaps in the neighbouring lane.
@@ -354,17 +353,11 @@ class _MergesLate(_Active):
         super().__init__(vehicle, let_go, left)
         start, end, number = self._ending = vehicle.lane_index
         self._lane = (start, end, number - 1)
-        self._before = vehicle.enable_lane_change
-        vehicle.enable_lane_change = False
 
     def override(self, dt: float) -> None:
         vehicle = self.vehicle
         if vehicle.target_lane_index == self._ending and _distance_to_lane_end(vehicle) <= self.how_strong:
             _change(vehicle, self._lane)
-
-    def end(self) -> None:
-        self.vehicle.enable_lane_change = self._before
-        super().end()
 
 
 class _Ignores(_Active):

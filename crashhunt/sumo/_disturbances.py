@@ -16,7 +16,7 @@ from libsumo import _libsumo as sumo
 
 from crashhunt.sumo._driving import VehicleCommand
 from crashhunt.trial import steps_of
-from crashhunt.world import PERSON, is_person
+from crashhunt.world import PERSON, is_person, place_words
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -308,7 +308,6 @@ _IGNORES_JUNCTIONS = 7  # speed mode: safe speed and physical limits, no checks 
 _NO_LANE_CHANGES = 0  # lane change mode
 _COMMANDED_LANE_CHANGES = 256  # lane change mode: commanded changes only, and not into another vehicle
 _FOR_EVER_S = 3600.0  # how long a command to change lanes holds: longer than any disturbance
-_LATERAL_M = 1.6  # half a lane: a vehicle with a smaller lateral offset is ahead or behind, not to the side
 
 
 class SumoDisturbances:
@@ -552,10 +551,7 @@ def _place(scene: Scene, here: int, row: int) -> str:
     (x, y), (own_x, own_y), heading = scene.points[row], scene.points[here], scene.headings[here]
     dx, dy = x - own_x, y - own_y
     ahead, left = dx * math.cos(heading) + dy * math.sin(heading), dy * math.cos(heading) - dx * math.sin(heading)
-    half = scene.roster.actors[here].length / 2
-    side = "" if abs(left) <= _LATERAL_M else "left" if left > 0 else "right"
-    along = "ahead" if ahead > half else "behind" if ahead < -half else ""
-    return f"{side} {along}".strip()
+    return place_words(ahead, left, scene.roster.actors[here].length)
 
 
 def _cut_in(vehicle: str, side: int, how_long: float, deceleration: float, dt: float) -> _CutsIn | None:

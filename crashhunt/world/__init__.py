@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         outline_gap as outline_gap,
         outlines as outlines,
         outlines_overlap as outlines_overlap,
+        place_words as place_words,
         rectangle_gap as rectangle_gap,
         time_to_contact as time_to_contact,
     )

@@ -186,6 +186,16 @@ def _separations(
     )
 
 
+_HALF_LANE_M = 1.6  # an actor with a smaller lateral offset is ahead or behind, not to the side
+
+
+def place_words(ahead_m: float, left_m: float, length_m: float) -> str:
+    """Return a place around a vehicle, such as ``left ahead``; empty if it is within the vehicle's length and lane."""
+    side = "" if abs(left_m) <= _HALF_LANE_M else "left" if left_m > 0 else "right"
+    along = "ahead" if ahead_m > length_m / 2 else "behind" if ahead_m < -length_m / 2 else ""
+    return f"{side} {along}".strip()
+
+
 # What actors cover: rectangles, seen from above, and at which height.
 
 LEVEL_M = 3.0
