@@ -256,12 +256,12 @@ def _tables(path: Path | None) -> tuple[dict[str, str | float], dict[str, str | 
 class _Group:
     """Variables of the same type, which FMPy sets or gets at once.
 
-    Args:
+    Attributes:
         type_name: type of the variables in the names of FMPy's methods.
     """
 
-    def __init__(self, type_name: str) -> None:
-        self.type_name = type_name
+    def __init__(self) -> None:
+        self.type_name = ""
         self.references: list[int] = []
         self.places: list[tuple[np.ndarray[Any, np.dtype[np.generic]], int]] = []
         """For each value, the flat array that contains it, and its index."""
@@ -284,8 +284,8 @@ class _Wiring:
         self.parts, self.action = parts, action
         self.constants: list[tuple[_Variable, float]] = []
         self.fixed_actions: list[tuple[int, float]] = []
-        inputs: defaultdict[str, _Group] = defaultdict(lambda: _Group(""))
-        outputs: defaultdict[str, _Group] = defaultdict(lambda: _Group(""))
+        inputs: defaultdict[str, _Group] = defaultdict(_Group)
+        outputs: defaultdict[str, _Group] = defaultdict(_Group)
         arrays = {leaf.name: leaf.values for leaf in parts.leaves}
         columns = {leaf.name: leaf.columns for leaf in parts.leaves}
         known = {one.name for one in model.of("input")}

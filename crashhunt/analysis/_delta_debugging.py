@@ -27,19 +27,16 @@ Tried = Callable[[Sequence[T]], int | None]
 _ROUNDING_DIGITS = (1, 2, 3, 4)
 
 
-def fewest(items: Sequence[T], tried: Tried[tuple[T, ...]], likely: Sequence[Sequence[T]] = ()) -> tuple[T, ...]:
+def fewest(items: Sequence[T], tried: Tried[tuple[T, ...]]) -> tuple[T, ...]:
     """Return a minimal part of some items that still passes a test: without any single remaining item, the test fails.
 
     Args:
         items: all items, with which the test is known to pass.
         tried: function that runs the test with some of the items.
-        likely: parts of the items that are tested first.
     """
     found = tuple(items)
-    if not found:
-        return found
-    if (first := tried([(), *map(tuple, likely)])) is not None:
-        found = ((), *map(tuple, likely))[first]
+    if not found or tried([()]) is not None:
+        return ()
     parts = 2
     while len(found) > 1:
         chunks = _chunks(found, min(parts, len(found)))

@@ -101,15 +101,12 @@ def find_preventability(
     return Preventability(since_step=since, runs=_in_order(runs))
 
 
-def judge_preventability(
-    bundle: Bundle, *, parallel: int = 1, stopped: Callable[[], bool] = lambda: False
-) -> bool | None:
+def judge_preventability(bundle: Bundle, *, parallel: int = 1) -> bool | None:
     """Return whether any model of a competent driver would have prevented a crash, by running its trial again.
 
     Args:
         bundle: the crash. The code of its snapshot runs, and must be trusted.
         parallel: number of runs at a time.
-        stopped: function that returns whether to stop.
 
     Returns:
         None if no model applies, or the runs do not decide it.
@@ -121,7 +118,7 @@ def judge_preventability(
     if bundle.result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
         return None
     rerun = prepare(bundle, ReplayOptions(force=True, trusted=True))
-    return find_preventability(rerun, parallel=parallel, stopped=stopped, tell=lambda _: None).by_any
+    return find_preventability(rerun, parallel=parallel, stopped=lambda: False, tell=lambda _: None).by_any
 
 
 def _in_order(runs: dict[str, DriverRun]) -> tuple[DriverRun, ...]:

@@ -40,12 +40,6 @@ def test_exactly_what_it_takes_is_left(count, data):
     assert len(seen) <= 4 * (len(needed) + 1) * (count.bit_length() + len(needed) + 2)
 
 
-def test_what_is_likely_is_tried_first():
-    seen = []
-    assert fewest(range(1000), first(lambda some: 7 in some, seen), [(3,), (7,)]) == (7,)
-    assert seen == [(), (3,), (7,)]
-
-
 def test_parts_are_halves_again_after_one_that_suffices_and_as_small_after_one_that_does_not():
     """Delta debugging as of Zeller and Hildebrandt (2002): these sizes keep the number of trials small."""
     sizes = []
