@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NoReturn
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
 from crashhunt.base.exceptions import blamed
@@ -22,6 +23,8 @@ from crashhunt.samplers._protocol import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     import numpy as np
 
     from crashhunt.samplers._protocol import Sampler, Space
@@ -50,13 +53,8 @@ class NamedSampler:
         self._keys = space.keys()
         make = _maker(name)
         more = {"hunt": hunt} if isinstance(make, ReceivesHuntFacts) and make.wants_hunt else {}
-        try:
-            with exits_refused():
-                self._sampler: Sampler = make(space, points=points, **more)
-        except (CrashhuntError, KeyboardInterrupt):
-            raise
-        except BaseException as error:  # of a user's sampler; SystemExit too, or the command ends as if it were done
-            self._blame("cannot be made", error)
+        with self._blamed("cannot be made"):
+            self._sampler: Sampler = make(space, points=points, **more)
         missing = [member for member in ("learns", "ask", "tell") if not hasattr(self._sampler, member)]
         if missing:
             raise PluginError(
@@ -95,13 +93,8 @@ class NamedSampler:
         Raises:
             PluginError: the sampler failed, or did not return a valid proposal.
         """
-        try:
-            with exits_refused():
-                answer = self._sampler.ask(number, rng)
-        except (CrashhuntError, KeyboardInterrupt):
-            raise
-        except BaseException as error:
-            self._blame(f"fails when it is asked for trial {number}", error)
+        with self._blamed(f"fails when it is asked for trial {number}"):
+            answer = self._sampler.ask(number, rng)
         if answer is None and self.learns:
             return None
         proposal = answer if isinstance(answer, Proposal) else Proposal(answer or {})
@@ -118,13 +111,8 @@ class NamedSampler:
         Raises:
             PluginError: the sampler failed.
         """
-        try:
-            with exits_refused():
-                self._sampler.tell(result)
-        except (CrashhuntError, KeyboardInterrupt):
-            raise
-        except BaseException as error:
-            self._blame(f"fails on the result of trial {result.spec.number}", error)
+        with self._blamed(f"fails on the result of trial {result.spec.number}"):
+            self._sampler.tell(result)
 
     def _wrong_with(self, proposal: Proposal) -> str:
         arguments = proposal.arguments
@@ -147,8 +135,16 @@ class NamedSampler:
             return f"the origin {proposal.origin!r}, not a word"
         return ""
 
-    def _blame(self, what: str, error: BaseException) -> NoReturn:
-        raise blamed(f"the sampler {self._name!r} {what}", error) from error
+    @contextmanager
+    def _blamed(self, what: str) -> Iterator[None]:
+        """Turn a failure of a user's sampler into one clear line."""
+        try:
+            with exits_refused():
+                yield
+        except (CrashhuntError, KeyboardInterrupt):
+            raise
+        except BaseException as error:  # SystemExit too, or the command ends as if it were done
+            raise blamed(f"the sampler {self._name!r} {what}", error) from error
 
 
 def varies_only_asked(name: str) -> bool:
