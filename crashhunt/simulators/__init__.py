@@ -103,6 +103,7 @@ if TYPE_CHECKING:
     )
     from ._scene_parts import (
         ActorNumbers as ActorNumbers,
+        NearActor as NearActor,
         RayCaster as RayCaster,
         center_of as center_of,
         covariances_of as covariances_of,
