@@ -9,15 +9,12 @@ import math
 import sys
 import time
 from collections import Counter, deque
-from dataclasses import replace
 from heapq import heappop, heappush
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.episode import WorkerSettings
 from crashhunt.hunts._trial_seeds import propose_trial, spec_of
 from crashhunt.ledger import Turn
-from crashhunt.plans import reused_agents, with_settings
 from crashhunt.results import trials_of_running
 from crashhunt.trial import KILLED, TrialSpec
 
@@ -30,7 +27,6 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Facts, Ledger
     from crashhunt.plans import HuntSettings, RunSettings
     from crashhunt.samplers import NamedSampler
-    from crashhunt.snapshots import Snapshot
     from crashhunt.statistics import Forcings
     from crashhunt.trial import TrialResult
 
@@ -295,47 +291,6 @@ class Pace:
         if not is_limited and now - self._looked >= _LOOK_EVERY_S:
             self._looked, self._finished = now, trials_of_running(self._other)
         return sys.maxsize if self._finished is None else max(0, self._finished + lead - upcoming)
-
-
-# What the workers of a hunt need to know.
-
-
-def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
-    """Return the settings for the workers of a hunt.
-
-    Trials run from the snapshot, so the saved code is the code that ran, even if the user edits the original files.
-    """
-    run = settings.run
-    return replace(
-        _settings(settings, snapshot, scratch),
-        keep_trials=run.keep_trials,
-        warm_copies=run.warm_copies if settings.seeds else 0,
-        audit=run.audit,
-        hunt_seed=settings.seed,
-        probe_s=settings.probe_s,
-        branch=tuple(settings.disturb) if settings.branch else (),
-        force=tuple(settings.disturb) if settings.rare else (),
-        reuses=reused_agents(settings) if run.reuse else (),
-    )
-
-
-def settings_again(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
-    """Return the settings for processes that run single trials of a hunt again to record them."""
-    return replace(_settings(settings, snapshot, scratch), keep_trials=True)
-
-
-def _settings(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
-    """Return the settings that are common to `settings_of_workers` and `settings_again`."""
-    return WorkerSettings(
-        scenario=with_settings(snapshot.scenario(), settings),
-        oracles=settings.oracles,
-        crash_on=settings.crash_on,
-        scratch=scratch,
-        code=snapshot.code,
-        argument_files=snapshot.argument_files,
-        timeout_s=settings.run.timeout_s,
-        step_timeout_s=settings.run.step_timeout_s,
-    )
 
 
 # Trials that a resumed hunt runs again: something outside of them, such as a kill, kept answers from it.

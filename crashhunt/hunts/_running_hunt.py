@@ -6,7 +6,7 @@ import math
 import sys
 import time
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,12 +17,12 @@ from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
 from crashhunt.executors import make_executor, read_map
 from crashhunt.hunts._fork_results import ForkCrashes, keep_near_misses, verify_fork_results, verify_rare
-from crashhunt.hunts._next_trials import Pace, Trials, Unanswered, result_lag, trials_under_way
+from crashhunt.hunts._next_trials import Trials, Unanswered, result_lag, trials_under_way
 from crashhunt.hunts._preflight import Preflight, WorkerNotices, is_hopeless, unusable_value, why_invalid
 from crashhunt.hunts._progress import PhaseClock, Progress, RemainingTime
 from crashhunt.hunts._reports import HuntReport
 from crashhunt.hunts._verification import Audit, Confirmation, PendingAudits, TrialReruns, VerificationRuns, is_settled
-from crashhunt.plans import core_of, disturber_apart, parallel_here, sampler_of
+from crashhunt.plans import core_of, disturber_apart, sampler_of
 from crashhunt.reruns import SharedReruns
 from crashhunt.results import (
     HEARTBEAT_S,
@@ -49,17 +49,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from crashhunt.base.plugins import ImportedModules
-    from crashhunt.episode import WorkerSettings
-    from crashhunt.executors import HostConditions
+    from crashhunt.hunts._hunt_setup import HuntSetup
     from crashhunt.hunts._progress import HuntStatus, PhaseStatus
     from crashhunt.hunts._reports import StoppedBecause
     from crashhunt.ledger import Ledger, Noted
-    from crashhunt.plans import HuntSettings
     from crashhunt.recording import BlackBoxHeader
-    from crashhunt.results import CodeVersions, HuntDirectory
-    from crashhunt.scenario import Scenario
-    from crashhunt.snapshots import Snapshot
     from crashhunt.trial import TrialResult
 
 QUIET_WAIT_S, _MAX_WAIT_S = 3.0, 600.0  # for another program that locks the ledger
@@ -81,44 +75,6 @@ def refuse_long_wait(waited_s: float, stops: Sequence[int], directory: Path) -> 
             fix="close the program that has it open, and run the same command again",
             where=str(directory / layout.LEDGER),
         )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HuntSetup:
-    """The parts of a hunt that do not change while it runs.
-
-    Args:
-        place: directory of the hunt, which is locked.
-        scenario: scenario of the trials.
-        settings: settings of the hunt.
-        workers: settings of the processes that run its trials.
-        snapshot: snapshot of the code that runs.
-        code: the versions of the code of all its trials.
-        is_new_code: whether the code differs from that of the latest trials.
-        imported: the modules that trials import; None if they are unknown.
-        pace: limit on how far the hunt is ahead of its partner; None without a partner.
-        stops: the signals that request the hunt to stop, as they arrive.
-        conditions: the conditions under which trials can run on this machine.
-        notes: notices for the user.
-    """
-
-    place: HuntDirectory
-    scenario: Scenario
-    settings: HuntSettings
-    workers: WorkerSettings
-    snapshot: Snapshot
-    code: CodeVersions
-    is_new_code: bool
-    imported: ImportedModules | None
-    pace: Pace | None
-    stops: Sequence[int]
-    conditions: HostConditions
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def parallel_here(self) -> int:
-        """The number of trials that this machine can run again at a time, independently of the executor."""
-        return parallel_here(self.settings.run.executor, self.settings.run.parallel)
 
 
 class RunningHunt:

@@ -18,7 +18,7 @@ from crashhunt.base.text import command_line
 from crashhunt.crashes import changing, is_bundle_made_here, is_snapshot_trusted, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
-from crashhunt.hunts._next_trials import settings_again
+from crashhunt.hunts._hunt_setup import settings_again
 from crashhunt.hunts._reports import AuditReport, Difference
 from crashhunt.recording import Divergence, Recording, first_divergence, read_black_box
 from crashhunt.replays import ReplayOptions, confirm
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.executors import Executor
+    from crashhunt.hunts._hunt_setup import HuntSetup
     from crashhunt.hunts._progress import PhaseClock, PhaseName, Progress
-    from crashhunt.hunts._running_hunt import HuntSetup
     from crashhunt.ledger import Facts, Ledger
     from crashhunt.reruns import EndedRun, SharedReruns
     from crashhunt.trial import TrialResult, TrialSpec

@@ -203,6 +203,7 @@ _TESTS_ELSEWHERE = {
         "hunts/test_whole_hunts.py",
         "e2e/test_hunt.py",
     ),
+    "hunts/_hunt_setup.py": ("hunts/test_next_trials.py", "hunts/test_hunt_loop.py"),
     "hunts/_next_trials.py": (
         "hunts/test_next_trials.py",
         "hunts/test_verified_runs.py",

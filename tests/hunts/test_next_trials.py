@@ -18,7 +18,8 @@ from hypothesis import given, settings as how, strategies as st
 from crashhunt.disturbances import FIRST_STEP
 from crashhunt.errors import HuntDirectoryError, PluginError
 from crashhunt.hunts import Trials, _next_trials, spec_of
-from crashhunt.hunts._next_trials import growing_lag, settings_again, settings_of_workers
+from crashhunt.hunts._hunt_setup import settings_again, settings_of_workers
+from crashhunt.hunts._next_trials import growing_lag
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
 from crashhunt.samplers import NamedSampler, RandomSampler, Sampler

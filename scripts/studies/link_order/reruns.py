@@ -19,7 +19,7 @@ from xml.etree import ElementTree as ET
 from heap_orders import build_allocator
 
 from crashhunt.base import layout
-from crashhunt.hunts._next_trials import settings_again
+from crashhunt.hunts._hunt_setup import settings_again
 from crashhunt.ledger import Ledger
 from crashhunt.recording import first_divergence
 from crashhunt.reruns import SharedReruns, run_alone
