@@ -534,7 +534,7 @@ def test_trial_that_is_another_one_when_it_runs_again_does_not_end_the_hunt(run)
     assert [spec.number for spec in again.executor.submitted] == [1]
     assert again.report.stopped_because == "all_trials"
     (note,) = [note for note in again.report.notes if note != "a note"]
-    assert note.startswith("trial 1 was run again for the answers of its copies, and is another one")
+    assert note.startswith("trial 1 was run again for the answers of its copies, and differs")
     assert ("remark", note) in again.events
 
 
