@@ -32,12 +32,10 @@ if TYPE_CHECKING:
     from ._probes import BUDGET as BUDGET, BUDGET_BESIDE as BUDGET_BESIDE, Prober as Prober
     from ._run_episode import (
         Parts as Parts,
-        generators as generators,
         require_origin as require_origin,
         run_episode as run_episode,
         seal as seal,
         seed_everything as seed_everything,
-        set_generators as set_generators,
         stage_of as stage_of,
     )
     from ._trial_signals import INFO_KEY as INFO_KEY, SIGNALS as SIGNALS, TrialSignals as TrialSignals

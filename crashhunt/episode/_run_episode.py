@@ -134,21 +134,6 @@ def seed_everything(seed: int) -> None:
         torch.manual_seed(seed)
 
 
-def generators() -> tuple[Any, ...]:
-    """Return the state of the process's random generators."""
-    torch = sys.modules.get("torch")
-    ours = np.random.get_state()  # noqa: NPY002 - agents may use the global generator
-    return random.getstate(), ours, torch.get_rng_state() if torch is not None else None
-
-
-def set_generators(state: tuple[Any, ...]) -> None:
-    """Restore the state of the process's random generators."""
-    random.setstate(state[0])
-    np.random.set_state(state[1])  # noqa: NPY002
-    if state[2] is not None:
-        sys.modules["torch"].set_rng_state(state[2])
-
-
 _CONSTRUCTOR_BOUNDARY: Final = Boundary(Party.AGENT, "constructor")
 
 

@@ -8,19 +8,23 @@ from __future__ import annotations
 
 import json
 import os
+import random
+import sys
 import time
 from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
+
+import numpy as np
 
 from crashhunt.base import forks
 from crashhunt.base.capabilities import supports
 from crashhunt.base.processes import adopt_orphans, children_of, end_descendants, kill
 from crashhunt.base.resources import FREE, free_memory
 from crashhunt.base.text import format_percent
-from crashhunt.episode import generators, options_of, seed_everything, set_generators
+from crashhunt.episode import options_of, seed_everything
 from crashhunt.simulators import CountsSetUp
 from crashhunt.trial import TrialSpec
 
@@ -247,6 +251,21 @@ def _be_suspended(requests: int, answers: int, trial: TrialProcess, simulator: S
             if supports(simulator, CountsSetUp):
                 simulator.setup_steps = 0  # they have been counted, with the first trial
             _report(answers, {"pid": pid, "ended": code})
+
+
+def generators() -> tuple[Any, ...]:
+    """Return the state of the process's random generators."""
+    torch = sys.modules.get("torch")
+    ours = np.random.get_state()  # noqa: NPY002 - agents may use the global generator
+    return random.getstate(), ours, torch.get_rng_state() if torch is not None else None
+
+
+def set_generators(state: tuple[Any, ...]) -> None:
+    """Restore the state of the process's random generators."""
+    random.setstate(state[0])
+    np.random.set_state(state[1])  # noqa: NPY002
+    if state[2] is not None:
+        sys.modules["torch"].set_rng_state(state[2])
 
 
 def _run(trial: TrialProcess, line: bytes, again: Callable[..., tuple[Observations, Info]]) -> None:

@@ -178,7 +178,11 @@ _TESTS_ELSEWHERE = {
         "executors/test_trial_processes.py",
         "executors/test_warm_traffics.py",
     ),
-    "executors/_warm_traffics.py": ("executors/test_warm_traffics.py", "executors/test_zygotes.py"),
+    "executors/_warm_traffics.py": (
+        "episode/test_generators.py",
+        "executors/test_warm_traffics.py",
+        "executors/test_zygotes.py",
+    ),
     "executors/ray": (
         "executors/test_ray_address.py",
         "executors/test_ray_bridge.py",

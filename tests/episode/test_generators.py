@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from crashhunt.episode import generators, seed_everything, set_generators
+from crashhunt.episode import seed_everything
+from crashhunt.executors._warm_traffics import generators, set_generators
 
 
 def drawn():
