@@ -11,12 +11,8 @@ if TYPE_CHECKING:
         CrashSummary as CrashSummary,
         authenticate_bundle as authenticate_bundle,
         changing as changing,
-        crash_folders as crash_folders,
         files_of as files_of,
-        find_bundle as find_bundle,
         is_bundle_made_here as is_bundle_made_here,
-        list_bundles as list_bundles,
-        list_near_misses as list_near_misses,
         names_of_actions as names_of_actions,
         read_bundle as read_bundle,
         read_lights as read_lights,
@@ -107,6 +103,12 @@ if TYPE_CHECKING:
         remove_note as remove_note,
         subject_of as subject_of,
         unreadable_notes as unreadable_notes,
+    )
+    from ._saved_crashes import (
+        crash_folders as crash_folders,
+        find_bundle as find_bundle,
+        list_bundles as list_bundles,
+        list_near_misses as list_near_misses,
     )
     from ._types import (
         SIGNATURE_VERSION as SIGNATURE_VERSION,

@@ -120,6 +120,7 @@ _TESTS_ELSEWHERE = {
     "corpus": ("corpus/test_*.py", "e2e/test_corpus.py"),
     "corpus/_bisection.py": ("corpus/test_bisection.py", "e2e/test_bisect.py"),
     "crashes/_bundle_trust.py": ("crashes/test_trust.py", "e2e/test_foreign_hunts.py"),
+    "crashes/_saved_crashes.py": ("crashes/test_archive.py", "crashes/test_bundle.py"),
     "crashes/_encounter.py": (
         "crashes/test_danger_course.py",
         "crashes/test_encounter.py",
