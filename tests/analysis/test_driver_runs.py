@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import pytest
+from hypothesis import assume, given, strategies as st
 from scenes import scene
 
 from crashhunt.analysis import _driver_runs
 
+angles = st.floats(-math.pi, math.pi)
 FOLLOWS = {"is_disputed": False, "same_way": True, "follower": "ego", "changers": ()}
 
 
@@ -18,7 +21,7 @@ FOLLOWS = {"is_disputed": False, "same_way": True, "follower": "ego", "changers"
         ("car", {}, 0.0, "", False),
         ("car", {"changers": ("car",)}, 3.0, "", True),
         ("car", {"changers": ("car",), "follower": "third"}, 3.0, "", True),
-        ("car", {"changers": ("car",)}, 1.9, "", False),  # it has never been outside the agent's path
+        ("car", {"changers": ("car",)}, 2.0, "", False),  # it has never been outside the agent's path
         ("car", {}, 3.0, "", False),  # it was there, but the agent drove behind it
         ("person 1", {}, 0.0, "person 1 is a person", False),
         ("car", None, 0.0, "the scenes do not show the contact", False),
@@ -34,7 +37,6 @@ def test_models_decide_rear_end_collisions_and_cut_ins(monkeypatch, other, conta
     words = FOLLOWS | (contact or {})
     changers = words.pop("changers")
     record = SimpleNamespace(**words, lane_changers=lambda seconds: changers) if contact is not None else None
-    monkeypatch.setattr(_driver_runs, "contact_record", lambda bundle, recording: record)
     places = [aside] * 5 + [0.0] * 5
     recording = SimpleNamespace(
         scenes=lambda: [scene(("ego", k, 0, 0, 10), (other, k + 20, y, 0, 10)) for k, y in enumerate(places)],
@@ -42,22 +44,30 @@ def test_models_decide_rear_end_collisions_and_cut_ins(monkeypatch, other, conta
     )
     hit = SimpleNamespace(collision=SimpleNamespace(agent="ego", other=other))
     rerun = SimpleNamespace(bundle=SimpleNamespace(result=hit), recorded=recording)
+    records = {(id(rerun.bundle), id(recording)): record}
+    monkeypatch.setattr(_driver_runs, "contact_record", lambda bundle, of: records[id(bundle), id(of)])
     found, cut_in = _driver_runs._applies(rerun)
     assert found.startswith(why)
     assert bool(found) is bool(why)
     assert cut_in is is_cut_in
 
 
-@pytest.mark.parametrize(
-    ("x", "y", "heading", "outside"),
-    [(20, 2.1, 0, True), (20, -2.1, 0, True), (20, 1.9, 0, False), (20, 4, 0.4, False), (20, -4, 0.4, True)],
-)
-def test_vehicle_is_outside_the_path_beyond_half_of_both_widths_also_in_a_bend(x, y, heading, outside):
-    def was(steps_ago, step_s=0.1):
-        elsewhere = [scene(("ego", 0, 0, 0, 10), ("car", 20, 0, 0, 10)), scene(("ego", 0, 0, 0, 10))]
-        scenes = [*elsewhere, scene(("ego", 0, 0, 0, 10), ("car", x, y, heading, 10)), *elsewhere * (steps_ago // 2)]
-        recording = SimpleNamespace(scenes=lambda: scenes, prologue=SimpleNamespace(step_length_s=step_s))
+@given(angles, st.floats(20, 200), st.floats(-1, 1), st.floats(-4, 4), st.floats(-1e3, 1e3))
+def test_vehicle_is_outside_the_path_beyond_half_of_both_widths_on_any_circle(angle, radius, arc, aside, x):
+    """Across the heading halfway, a point of a circle is aside * cos(arc / 2) from one on a circle around it."""
+    assume(abs(abs(aside) * math.cos(arc / 2) - 2.0) > 1e-6)
+
+    def on_circle(name, at, of_radius):
+        heading = at + math.pi / 2
+        front = (of_radius * math.cos(at) + 2.5 * math.cos(heading), of_radius * math.sin(at) + 2.5 * math.sin(heading))
+        return name, x + front[0], front[1], math.remainder(heading, math.tau), 10
+
+    def was(steps_ago):
+        meets = scene(on_circle("ego", angle, radius), on_circle("car", angle + arc, radius + aside))
+        behind = scene(on_circle("ego", angle, radius), on_circle("car", angle + 0.1, radius))
+        scenes = [behind, meets, *[behind, scene(on_circle("ego", angle, radius))] * (steps_ago // 2)]
+        recording = SimpleNamespace(scenes=lambda: scenes, prologue=SimpleNamespace(step_length_s=1.0))
         return _driver_runs._was_in_other_lane(recording, "ego", "car")
 
-    assert was(98) is outside
-    assert not was(100)  # more than 10 s ago
+    assert was(8) is (abs(aside) * math.cos(arc / 2) > 2.0)
+    assert not was(10)  # more than 10 s ago
