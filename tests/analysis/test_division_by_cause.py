@@ -11,6 +11,7 @@ from crashhunt.analysis import _types_by_cause
 from crashhunt.analysis._types_by_cause import divide_by_cause, find_cause
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.crashes import INTERRUPTED, Judgement, Reference, Why
+from crashhunt.replays import ReplayOptions
 from crashhunt.trial import Outcome
 
 
@@ -70,24 +71,35 @@ def test_only_missing_runs_are_made_and_factors_are_removed_only_without_an_omis
     monkeypatch, known, omission, runs, cause
 ):
     made = []
+    crash = SimpleNamespace(result=SimpleNamespace(outcome=Outcome.COLLISION), is_near_miss=False)
+
+    def prepare(bundle, options):
+        assert (bundle, options) == (crash, ReplayOptions())
+        return "rerun"
 
     def find_omission(rerun, **words):
+        assert rerun == "rerun"
         made.append("omission")
         return Reference(omission=omission)
 
     def judge(bundle, options, **words):
+        assert (bundle, options, words["runs"]) == (crash, None, 1)
         made.append("why")
-        assert words["why"] > 0
         return Judgement(why="found")
 
-    for name, function in {
-        "find_omission": find_omission, "judge": judge, "prepare": lambda *_: None,
-        "judgement_of": lambda _: known, "with_judgement": lambda bundle, found: found,
-        "cause_of": lambda bundle, found: (found.why, found.reference.omission),
-    }.items():  # fmt: skip
-        monkeypatch.setattr(_types_by_cause, name, function)
-    collision = SimpleNamespace(result=SimpleNamespace(outcome=Outcome.COLLISION), is_near_miss=False)
-    assert find_cause(collision)[0] == cause
+    def cause_of(bundle, found):
+        assert bundle is crash
+        return found and (found.why, found.reference.omission)
+
+    monkeypatch.setattr(_types_by_cause, "with_judgement", lambda bundle, found: (bundle, cause_of(bundle, found)))
+    monkeypatch.setattr(_types_by_cause, "judgement_of", lambda _: known)
+    for function in (prepare, find_omission, judge, cause_of):
+        monkeypatch.setattr(_types_by_cause, function.__name__, function)
+    assert find_cause(crash) == (cause, (crash, cause))
+    assert made == runs
+    for outcome, is_near_miss in ((Outcome.AGENT_ERROR, False), (Outcome.HANG, False), (Outcome.SURVIVED, True)):
+        crash = SimpleNamespace(result=SimpleNamespace(outcome=outcome), is_near_miss=is_near_miss)
+        assert find_cause(crash) == (None, crash)  # of which no run tells the cause
     assert made == runs
 
 
