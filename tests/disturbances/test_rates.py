@@ -325,6 +325,7 @@ def test_foreign_model_draws_in_its_own_process_as_it_would_here():
     assert apart.log_likelihood(Drawn("ahead", 1e9, 1.0)) == -math.inf
     assert apart.what == own.what
     apart.close()
+    ModelApart("brake", timeout_s=60).close()  # which has not started
     gone = ModelApart(f"{__name__}:Gone", timeout_s=60)
     sampler = DisturbanceSampler(models={"gone": gone}, rates={"gone": 1.0}, agents=("ego",), step_length_s=1.0)
     with pytest.raises(PluginError) as caught:
