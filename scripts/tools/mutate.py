@@ -262,6 +262,11 @@ _TESTS_ELSEWHERE = {
     "render": ("render/test_*.py",),
     "report": ("report/test_*.py",),
     "scenario": ("scenario/test_*.py",),
+    "plans/_argument_owners.py": (
+        "agents/test_programs.py",
+        "plans/test_argument_names.py",
+        "plans/test_what_is_resolved.py",
+    ),
     "replays/_debugger.py": ("replays/test_debugged_process.py", "e2e/test_debugger.py"),
     "replays/_prepare.py": ("replays/test_prepare.py", "e2e/test_foreign_hunts.py", "e2e/test_replay.py"),
     "replays/_replaying.py": (

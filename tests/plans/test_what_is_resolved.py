@@ -26,6 +26,7 @@ from crashhunt.plans import (
     with_settings,
     write_settings,
 )  # fmt: skip
+from crashhunt.plans._code import notes_on_programs
 from crashhunt.plans._plan import _spec
 from crashhunt.plans._settings import executor_of, parallel_here, sizes_itself
 from crashhunt.scenario import copy_shipped_scenario
@@ -315,6 +316,30 @@ def test_range_of_the_scenario_comes_before_that_of_the_agents_own_code():
     for known, declared, spec in ((its, own, "8.0:14.0"), (None, own, "1.0:2.0"), (its, None, "8.0:14.0")):
         assert _spec("speed", declared, known, None, hunted=True).spec == spec
         assert _spec("speed", declared, known, None, hunted=False) is None
+
+
+@pytest.mark.parametrize(
+    ("agents", "options", "says"),
+    [
+        (("a:B", "exec:./p"), {"step_timeout_s": 0.5}, ["--step-timeout does not limit ego"]),
+        (("exec:./p", "exec:./p"), {"step_timeout_s": 0.5}, []),
+        (("a:B", "exec:./p"), {"probe": 1.0}, ["each fork of --probe starts the program of other again"]),
+        (("a:B", "a:B"), {"probe": 1.0, "branch": True}, []),
+        (("a:B", "exec:./p"), {"reuse": True, "audit": 0.05}, ["the program of other drives in one trial after"]),
+        (("a:B", "a:B"), {"reuse": True}, ["--reuse has no effect"]),
+    ],
+    ids=str,
+)
+def test_notes_state_what_programs_cost_and_which_agents_no_step_timeout_limits(folder, agents, options, says):
+    settings = plan(asked())[1]
+    own = {name: options[name] for name in options.keys() & {"probe", "branch"}}
+    run = {name: value for name, value in options.items() if name not in own}
+    chosen = {
+        name: replace(settings.agents["ego"], agent=agent) for name, agent in zip(("ego", "other"), agents, strict=True)
+    }
+    settings = replace(settings, agents=chosen, run=replace(settings.run, **run), **own)
+    notes = list(notes_on_programs(settings))
+    assert [note.startswith(start) for note, start in zip(notes, says, strict=True)] == [True] * len(says)
 
 
 def test_unused_statistics_next_to_a_policy_are_a_note(folder, tmp_path):

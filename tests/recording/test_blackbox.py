@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from crashhunt.base.errors import BundleError, RecorderError
-from crashhunt.recording import BlackBox, Phase, Tag, read_black_box, read_header
+from crashhunt.recording import BlackBox, BlackBoxFile, Phase, Tag, read_black_box, read_header
 from crashhunt.recording._blackbox import Record, Records
 from crashhunt.world import Actor, Roster, Scene
 
@@ -210,6 +210,12 @@ def test_a_full_disk_is_an_error_that_states_so(tmp_path, monkeypatch):
     box.close()
     with pytest.raises(OSError, match="Bad file"):
         box.close()
+
+
+def test_file_of_a_black_box_is_always_a_new_one(box, tmp_path):
+    with pytest.raises(FileExistsError):
+        BlackBoxFile(tmp_path / "box")
+    assert BlackBoxFile(tmp_path / "another").reserved > 0
 
 
 def test_a_copy_of_the_process_writes_to_nowhere(box, tmp_path):
