@@ -451,7 +451,7 @@ def saved(tmp_path, monkeypatch):
         found = []
         for name, ones in groups.items():
             shortest, count = min(ones, key=lambda one: one.steps), len(ones) + dropped.get(name, 0)
-            found.append(SimpleNamespace(signature=name, count=count, shortest=shortest))
+            found.append(SimpleNamespace(signature=name, count=count, first=ones[0], shortest=shortest))
         return SimpleNamespace(groups=found)
 
     monkeypatch.setattr(_crashes, "group_crashes", grouped)
@@ -467,6 +467,7 @@ def test_crashes_without_a_ledger_are_those_with_a_bundle(saved):
     assert (found.tally.found, found.saved, found.untyped) == (5, 5, 0)
     assert list(found.types.items()) == [("rear-end", 3), ("own", 2)]
     assert found.shortest == {"rear-end": "000004-collision", "own": "000003-collision"}
+    assert found.first == {"rear-end": 1, "own": 3}
     assert numbers(found) == [4, 2, 3]  # one of each type, then the shortest
     assert numbers(find_crashes(saved.path, 1)) == [4]
     assert numbers(find_crashes(saved.path, 9)) == [4, 2, 1, 3, 9]
@@ -496,6 +497,7 @@ def test_crashes_of_a_hunt_are_those_of_its_ledger(saved):
     found = find_crashes(saved.path, 2)
     assert (found.types, found.untyped) == ({"rear-end": 5, "own": 2, "gone": 1}, 0)
     assert found.shortest["own"] == "000003-collision"
+    assert found.first == {"rear-end": 1, "own": 3, "gone": 8}
     with closing(Ledger(saved.path / "ledger.sqlite", writable=True)) as ledger:
         ledger.note(kinds=kinds, kinds_version=_crashes.SIGNATURE_VERSION + 1)
     assert find_crashes(saved.path, 2).types == {"rear-end": 5, "own": 2, "gone": 1}
