@@ -24,7 +24,9 @@ Borders: TypeAlias = "tuple[NDArray[np.float64], NDArray[np.float64]]"
 _NEAR_M = 60.0  # around where it happens; a town has thousands of lanes further away
 _MAX_DRIVING_ANGLE_RAD = math.radians(30)  # a vehicle within so much of a lane's direction drives along it
 _OPPOSITE_RAD = math.radians(150)  # a vehicle at a larger angle to a lane drives against the lane's direction
-_MIN_CROSSING_ANGLE_RAD = math.radians(30)  # lanes that differ by more cross each other, where they lie over each other
+_MIN_CROSSING_ANGLE_RAD = math.radians(
+    30
+)  # lines that differ by more cross each other, where lanes lie over each other
 _MOVED_M = 0.4  # sideways; less is drifting within a lane
 _OVER_M = 0.1
 _MOVES_M = 0.01  # sideways in a step; who moves less does not change lanes yet
@@ -100,7 +102,7 @@ class LaneMap:
         return bool(self._lanes)
 
     def cross(self, point: tuple[float, float]) -> bool:
-        """Return whether lanes of different directions overlap at a point; coordinates are in m."""
+        """Return whether lanes cross at a point; coordinates are in m. A lane that is used both ways does not cross."""
         spot = np.array(point)
         headings = [
             place.heading
@@ -108,7 +110,7 @@ class LaneMap:
             if lane.may_hold(spot) and abs((place := lane.place(spot)).aside_m) < lane.half_width and place.inside
         ]
         return any(
-            abs(math.remainder(one - two, math.tau)) > _MIN_CROSSING_ANGLE_RAD
+            abs(math.remainder(one - two, math.pi)) > _MIN_CROSSING_ANGLE_RAD
             for number, one in enumerate(headings)
             for two in headings[:number]
         )

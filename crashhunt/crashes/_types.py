@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # The signature of a crash: the properties by which two crashes count as the same crash type.
 
 
-SIGNATURE_VERSION = 4
+SIGNATURE_VERSION = 5
 """Version of these rules. Raise it with each change by which a crash gets another type: types that an earlier version
 has noted in a ledger are then determined again."""
 
