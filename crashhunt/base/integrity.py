@@ -59,6 +59,11 @@ def digest_of_data(data: Plain) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
+def open_at_once(path: str | Path, flags: int) -> int:
+    """Open a file for `open`. A pipe in place of the file is empty: O_NONBLOCK does not wait for its writer."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
 def digest_of_content(content: bytes) -> str:
     """Return the digest of the content of a file, in hexadecimal."""
     return hashlib.blake2b(content, digest_size=16).hexdigest()
@@ -70,7 +75,8 @@ def digest_of_file(path: Path) -> str:
     Raises:
         OSError: the file cannot be read.
     """
-    with open(path, "rb", buffering=0) as file:  # hundreds at a time, and a Path takes twice as long
+    # Hundreds at a time, and a Path takes twice as long.
+    with open(path, "rb", buffering=0, opener=open_at_once) as file:
         return _digest_of_opened(file, os.fstat(file.fileno()).st_size)
 
 
@@ -96,8 +102,8 @@ def describe_files(folder: Path) -> dict[str, FileEntry]:
 def changed_file(path: str | Path, entry: FileEntry) -> str:
     """Return how a file differs from its recorded size and digest; empty if it is unchanged."""
     try:
-        # Hundreds of files at a time, so open each once. O_NONBLOCK does not wait for the writer of a pipe.
-        opened = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        # Hundreds of files at a time, so open each once.
+        opened = open_at_once(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
         try:
             status = os.fstat(opened)
             if not stat.S_ISREG(status.st_mode):
@@ -149,7 +155,7 @@ def read_bounded(path: Path) -> bytes:
         ValueError: the file is larger than files of its name may be.
     """
     most = _MAX_BYTES.get(path.name, _MAX_BYTES_OF_OTHERS)
-    with path.open("rb") as file:
+    with open(path, "rb", opener=open_at_once) as file:
         content = file.read(most + 1) if (size := os.fstat(file.fileno()).st_size) <= most else b""
     if size > most or len(content) > most:
         raise ValueError(f"the file has {max(size, len(content)):,} bytes (allowed: {most:,})")

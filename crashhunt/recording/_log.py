@@ -19,6 +19,7 @@ from mcap.writer import Writer
 from crashhunt.base.codec import known_values
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
+from crashhunt.base.integrity import open_at_once
 from crashhunt.recording._blackbox import Record
 from crashhunt.recording._foxglove import MESSAGES, NAMESPACE, LogWriter, messages_of, to_ns, write_views
 from crashhunt.recording._reading import Prologue
@@ -88,7 +89,7 @@ def read_log(path: Path) -> Recording:
         return BundleError(message, fix=fix, where=str(path))
 
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=open_at_once) as file:
             reader = SeekingReader(file, validate_crcs=True)
             entries = [entry.metadata for entry in reader.iter_metadata()]
             version = next((found for one in entries if (found := one.get("crashhunt_log_schema")) is not None), None)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.base.integrity import changed_file
+from crashhunt.base.integrity import changed_file, open_at_once
 from crashhunt.crashes import files_of
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.results._hunt_state import hunt_state, is_hunt
@@ -77,7 +77,7 @@ class LogReader:
             if kind not in self._kinds:
                 continue
             try:
-                with path.open("rb") as file:
+                with open(path, "rb", opener=open_at_once) as file:
                     size = file.seek(0, os.SEEK_END)
                     begin = self._read.get(path, max(0, size - _MAX_LOG_BYTES))
                     if size <= begin:

@@ -83,6 +83,12 @@ def test_only_a_regular_file_is_the_recorded_one(tmp_path, monkeypatch):
     assert changed_file(file, entry) == ""
 
 
+def test_a_pipe_in_place_of_a_file_is_empty(tmp_path):
+    os.mkfifo(tmp_path / "crash.json")
+    assert read_bounded(tmp_path / "crash.json") == b""
+    assert digest_of_file(tmp_path / "crash.json") == digest_of_content(b"")
+
+
 def test_the_digest_of_data_does_not_depend_on_the_order_of_keys():
     assert digest_of_data({"a": 1, "b": [1, 2]}) == digest_of_data({"b": [1, 2], "a": 1})
     assert digest_of_data({"a": 1, "b": [1, 2]}) != digest_of_data({"a": 1, "b": [2, 1]})

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 import resource
 import shutil
 import signal
@@ -112,6 +113,10 @@ def test_what_is_no_log_is_refused(tmp_path):
     path = tmp_path / "log.mcap"
     with pytest.raises(BundleError, match="cannot be read"):
         read_log(path)
+    os.mkfifo(path)  # nobody writes into it
+    with pytest.raises(BundleError, match="incomplete MCAP file: "):
+        read_log(path)
+    path.unlink()
     for metadata, says in (
         ({}, "not written by crashhunt"),
         ({"crashhunt_log_schema": "99"}, "is 99; this crashhunt reads 1"),
