@@ -142,18 +142,11 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
         max_steps=request.max_steps,
         oracles=oracles,
         events=limits,
-        agents=_agents(request, scenario, signatures, hunted=hunted),
+        agents=_agents(request, scenario, signatures, acting, observations, hunted=hunted),
         scenario_arguments=_scenario_arguments(request, scenario, disturb, hunted=hunted),
         run=request.run,
     )
-    if acting:
-        chosen = {agent: replace(one, action=acting.get(agent)) for agent, one in settings.agents.items()}
-        settings = replace(settings, agents=chosen)
-    if observations:
-        agents = {
-            agent: replace(chosen, observation=observations.get(agent)) for agent, chosen in settings.agents.items()
-        }
-        settings, scenario = replace(settings, agents=agents), with_observations(scenario, observations)
+    scenario = with_observations(scenario, observations)
     settings = with_reuse(settings, scenario)
     scenario = _with_notes_on_crashes(_with_notes(scenario, request.run), settings, request, code.oracles)
     notes = (*code.notes, *_notes_on_statistics(settings, signatures), *notes_on_actions(scenario, signatures))
@@ -440,7 +433,13 @@ def _locators(request: Request, scenario: Scenario) -> dict[str, str]:
 
 
 def _agents(
-    request: Request, scenario: Scenario, signatures: Mapping[str, Signature], *, hunted: bool
+    request: Request,
+    scenario: Scenario,
+    signatures: Mapping[str, Signature],
+    actions: Mapping[str, str],
+    observations: Mapping[str, tuple[str, ...]],
+    *,
+    hunted: bool,
 ) -> dict[str, AgentSettings]:
     asked: dict[str, dict[str, str]] = {agent: {} for agent in scenario.agents}
     for name, spec in spec_words(request.arguments).items():
@@ -469,7 +468,9 @@ def _agents(
                 raise ArgumentError(
                     f"{setup.agent} needs the argument {name!r}", fix=f"give --arg {name}=SPEC", where=f"agent {agent}"
                 )
-        agents[agent] = AgentSettings(agent=setup.agent, arguments=specs)
+        agents[agent] = AgentSettings(
+            agent=setup.agent, arguments=specs, action=actions.get(agent), observation=observations.get(agent)
+        )
     return agents
 
 
