@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _TAIL_BYTES = 4000  # bytes
 _MAX_NATIVE_BYTES = 1 << 16
 _FRAME_LINE = re.compile(r'  File "(.*)", line (\d+) in (.*)')  # of a stack that faulthandler wrote
-_MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside
+MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside
 
 
 @dataclass(slots=True)
@@ -58,7 +58,7 @@ class TrialAttempt:
     @property
     def is_killed_from_outside(self) -> bool:
         """Whether every allowed attempt was killed at another step, so that the outcome of the trial is unknown."""
-        return len(self.ends) >= _MAX_ATTEMPTS and len(set(self.ends)) == len(self.ends)
+        return len(self.ends) >= MAX_ATTEMPTS and len(set(self.ends)) == len(self.ends)
 
     def again(self, scratch: Path, exit_code: int) -> str:
         """Return the reason why the trial must run again, as text; empty if its outcome is known."""
@@ -69,7 +69,7 @@ class TrialAttempt:
         has_begun = header is not None and header.phase != Phase.SETUP
         seen = end in self.ends and has_begun
         self.ends.append(end)
-        if seen or len(self.ends) >= _MAX_ATTEMPTS:
+        if seen or len(self.ends) >= MAX_ATTEMPTS:
             return ""
         return f"trial {self.spec.number} was ended by {signal_name(exit_code)} from outside, and is run again"
 

@@ -26,7 +26,7 @@ from crashhunt.base.processes import die_with, resume
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import internal_error, scratch_of
-from crashhunt.executors._postmortem import damaged, died, hung, read_map, read_tail
+from crashhunt.executors._postmortem import MAX_ATTEMPTS, damaged, died, hung, read_map, read_tail
 from crashhunt.executors._time_limits import START_UP_S, PauseMeter, has_hung
 from crashhunt.executors._trial_process import CHECKSUM_BYTES, checksum_of
 from crashhunt.recording import BlackBoxFile, Recording, Tag, digest_of, is_evidence, read_black_box
@@ -519,7 +519,6 @@ def _evidence_of(records: bytes) -> list[memoryview] | str:
 
 # Until when braking would have avoided a crash, found out by further trials in the same slot.
 
-_MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside
 _FIRST_EXTRA_NUMBER = 1 << 40  # beyond the numbers of a hunt's trials: each trial has a folder by its number
 
 
@@ -556,7 +555,7 @@ def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: EndedTr
                 return done, recording(number)
             except LostTrialError:
                 kills += 1
-                if kills == _MAX_ATTEMPTS or supervisor.retires:  # without a zygote, no attempt can succeed
+                if kills == MAX_ATTEMPTS or supervisor.retires:  # without a zygote, no attempt can succeed
                     raise
             finally:
                 shutil.rmtree(scratch_of(settings.scratch, number), ignore_errors=True)
