@@ -13,7 +13,7 @@ from crashhunt.trial._argument_space import (
     parse_spec as parse_spec,
     without_folder as without_folder,
 )
-from crashhunt.trial._signature import (
+from crashhunt.trial._call_signature import (
     FILLED_BY_NAME as FILLED_BY_NAME,
     Signature as Signature,
     signature_of as signature_of,

@@ -49,6 +49,17 @@ if TYPE_CHECKING:
         without_chance_lengths as without_chance_lengths,
     )
     from ._contact_record import ContactRecord as ContactRecord, contact_record as contact_record
+    from ._crash_types import (
+        SIGNATURE_VERSION as SIGNATURE_VERSION,
+        Group as Group,
+        Groups as Groups,
+        Signature as Signature,
+        group_crashes as group_crashes,
+        groups_of as groups_of,
+        own_frames as own_frames,
+        signature_of as signature_of,
+        signature_of_fault as signature_of_fault,
+    )
     from ._encounter import (
         DangerCourse as DangerCourse,
         Encounter as Encounter,
@@ -109,17 +120,6 @@ if TYPE_CHECKING:
         find_bundle as find_bundle,
         list_bundles as list_bundles,
         list_near_misses as list_near_misses,
-    )
-    from ._types import (
-        SIGNATURE_VERSION as SIGNATURE_VERSION,
-        Group as Group,
-        Groups as Groups,
-        Signature as Signature,
-        group_crashes as group_crashes,
-        groups_of as groups_of,
-        own_frames as own_frames,
-        signature_of as signature_of,
-        signature_of_fault as signature_of_fault,
     )
 
 offer_lazily(__name__)

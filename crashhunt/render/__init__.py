@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         write_gif as write_gif,
         write_video as write_video,
     )
-    from ._panel_drawing import (
+    from ._film_panels import (
         Action as Action,
         ActionDistribution as ActionDistribution,
         Bar as Bar,

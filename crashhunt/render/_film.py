@@ -14,7 +14,7 @@ from crashhunt.base.extras import install_command
 from crashhunt.base.files import cannot_write, whole_file
 from crashhunt.base.progress import watched
 from crashhunt.base.temporary import temporary_beside
-from crashhunt.render._panel_drawing import BuiltinPanels, builtin_labels
+from crashhunt.render._film_panels import BuiltinPanels, builtin_labels
 from crashhunt.render._scene_from_above import SceneView
 
 if TYPE_CHECKING:

@@ -17,6 +17,14 @@ if TYPE_CHECKING:
         parse_spec as parse_spec,
         without_folder as without_folder,
     )
+    from ._call_signature import (
+        FILLED_BY_NAME as FILLED_BY_NAME,
+        DeclaresArguments as DeclaresArguments,
+        PrefersAction as PrefersAction,
+        ReturnsActions as ReturnsActions,
+        Signature as Signature,
+        signature_of as signature_of,
+    )
     from ._disturbance import (
         CELLS as CELLS,
         HOLD_KINDS as HOLD_KINDS,
@@ -64,14 +72,6 @@ if TYPE_CHECKING:
         check_disturbances as check_disturbances,
         check_parts as check_parts,
         in_effect as in_effect,
-    )
-    from ._signature import (
-        FILLED_BY_NAME as FILLED_BY_NAME,
-        DeclaresArguments as DeclaresArguments,
-        PrefersAction as PrefersAction,
-        ReturnsActions as ReturnsActions,
-        Signature as Signature,
-        signature_of as signature_of,
     )
     from ._specification import (
         ALL_AGENTS as ALL_AGENTS,

@@ -15,7 +15,7 @@ from crashhunt.panels import Action, Curve
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.render import FilmOptions, Shot, frames
 from crashhunt.render._film import _steps, shown_steps
-from crashhunt.render._panel_drawing import BuiltinPanels, save_panels
+from crashhunt.render._film_panels import BuiltinPanels, save_panels
 from crashhunt.render._scene_from_above import SceneView
 from crashhunt.world import PERSON, Actor, Roster, Scene, corners
 
