@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import re
 import select
-import signal
 import stat
 import subprocess
 import tempfile
@@ -37,6 +36,7 @@ from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError, ProgramError
 from crashhunt.base.processes import descendants_of, kill
 from crashhunt.base.programs import command_of, is_path, library_path, words_of
+from crashhunt.base.signals import signal_name
 from crashhunt.base.text import one_line
 from crashhunt.simulators import NamesMetaActions, ObservesParts, ProvidesRoadMaps
 from crashhunt.trial import Argument, Signature, kind_of, parse_spec
@@ -516,7 +516,7 @@ class _Process:
                 f"the program has closed its end instead of answering {shown}{half}, and is still running"
             )
         code = process.returncode or 0
-        end = f"died of {_signal_name(-code)}" if code < 0 else f"exited with {code}"
+        end = f"died of {signal_name(code)}" if code < 0 else f"exited with {code}"
         return ProgramError(f"the program {end} instead of answering {shown}{half}{self._reason()}")
 
     def _reason(self) -> str:
@@ -723,13 +723,6 @@ def _shown(value: object) -> str:
     )
     text = one_line(text)
     return text if len(text) <= _MAX_SHOWN_CHARACTERS else f"{text[:_MAX_SHOWN_CHARACTERS]}…"
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 def _last_line(log: Any) -> str:

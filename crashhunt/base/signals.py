@@ -198,9 +198,16 @@ def describe_death(exit_code: int) -> str:
     Args:
         exit_code: exit code in the form of `subprocess`, negative for a signal.
     """
-    if exit_code >= 0:
-        return f"exited with {exit_code}"
+    return f"exited with {exit_code}" if exit_code >= 0 else f"was killed by {signal_name(exit_code)}"
+
+
+def signal_name(exit_code: int) -> str:
+    """Return the name of the signal that ended a process, such as ``SIGKILL``.
+
+    Args:
+        exit_code: exit code in the form of `subprocess`, negative for a signal.
+    """
     try:
-        return f"was killed by {signal.Signals(-exit_code).name}"
+        return signal.Signals(-exit_code).name
     except ValueError:  # a real-time signal
-        return f"was killed by signal {-exit_code}"
+        return f"signal {-exit_code}"

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.reaper import Kept
-from crashhunt.executors._postmortem import TrialAttempt, result_of_death, signal_name, where_it_is
+from crashhunt.base.signals import describe_death
+from crashhunt.executors._postmortem import TrialAttempt, result_of_death, where_it_is
 from crashhunt.executors._protocol import Notes, snapshot_environment, worker_environment
 from crashhunt.executors._time_limits import import_died
 from crashhunt.trial import TrialResult
@@ -139,7 +140,7 @@ class ForkServerLink:
             if self._importing:
                 raise import_died(self._importing, code, times=self.deaths + 1)
             lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            how = f"was killed by {signal_name(code)}" if code < 0 else f"exited with {code}"
+            how = describe_death(code)
             said = f": {lines[-1]}" if lines else ""
             again = f", {_MAX_CONSECUTIVE_DEATHS} times" if -code in _OUTSIDE_SIGNALS else ""
             raise CrashhuntError(

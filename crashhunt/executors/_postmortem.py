@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.exceptions import is_users
-from crashhunt.base.signals import is_sent_from_outside
+from crashhunt.base.signals import is_sent_from_outside, signal_name
 from crashhunt.episode import scratch_of
 from crashhunt.executors._native_stack import split_native_calls
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, read_black_box, read_header
@@ -300,11 +299,3 @@ def _read_stack(path: Path) -> str:
         return ""
     native, rest = split_native_calls(text)
     return f"{native}{rest[-_TAIL_BYTES:]}" if native else read_tail(path)
-
-
-def signal_name(exit_code: int) -> str:
-    """Return the name of a signal, such as ``SIGKILL``."""
-    try:
-        return signal.Signals(-exit_code).name
-    except ValueError:
-        return f"signal {-exit_code}"

@@ -168,10 +168,6 @@ class DecodedScenes(Sequence["Scene"]):
         """Return the number of scenes."""
         return len(self._numbers)
 
-    def __iter__(self) -> Iterator[Scene]:
-        """Yield all scenes in order."""
-        return (self[place] for place in range(len(self._numbers)))
-
     @overload
     def __getitem__(self, place: int) -> Scene: ...
     @overload
