@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 from compiled import needs_kernel
+from exact_values import exact
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.dynamics import BicycleVehicle
@@ -33,14 +34,6 @@ class Lorry(BicycleVehicle):
     LENGTH_A, LENGTH_B = 2, np.float64(1.5)
     FRICTION_FRONT = 11
     MAX_ANGULAR_SPEED = 0.25
-
-
-def exact(value):
-    if isinstance(value, np.ndarray):
-        return value.dtype.str, value.shape, value.tobytes()
-    if isinstance(value, dict):
-        return {key: exact(inner) for key, inner in value.items()}
-    return (type(value), value.hex()) if isinstance(value, float) else value
 
 
 def state(vehicle):

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from compiled import needs_kernel
 from conftest import examples, mostly_nightly
+from exact_values import exact
 from highway_env.envs.common import observation
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.road.lane import CircularLane, SineLane, StraightLane
@@ -82,35 +83,22 @@ CASES += [
 pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
 
 
-def plain(value):
-    """Anything as something whose equality means that all bits are equal."""
-    if isinstance(value, np.ndarray):
-        return value.shape, value.tobytes()
-    if isinstance(value, dict):
-        return {key: plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    if isinstance(value, float | np.floating):
-        return float(value).hex()
-    return str(value) if not isinstance(value, int | np.integer) else int(value)
-
-
 def state(env):
     """Everything that a simulation may change about the vehicles and the generator."""
     names = "position heading speed action crashed hit impact lane_index target_lane_index target_speed timer route"
     names += " speed_index is_yielding yield_timer lateral_speed yaw_rate"
     things = [*env.road.vehicles, *env.road.objects]
     vehicles = [
-        (type(thing).__name__, [plain(getattr(thing, name, None)) for name in names.split()]) for thing in things
+        (type(thing).__name__, [exact(getattr(thing, name, None)) for name in names.split()]) for thing in things
     ]
-    return vehicles, plain(env.np_random.bit_generator.state)
+    return vehicles, exact(env.np_random.bit_generator.state)
 
 
 def episode(name, config, seed, steps, *, idm):
     """The whole state after every sub-step, and what every step returns."""
     restore_classes()
     env = gymnasium.make(name, disable_env_checker=True).unwrapped
-    trace = [plain(env.reset(seed=seed, options={"config": config})[0]), state(env)]
+    trace = [exact(env.reset(seed=seed, options={"config": config})[0]), state(env)]
     if idm:
         driver = IDMVehicle.create_from(env.vehicle) if isinstance(env.vehicle, ControlledVehicle) else None
         if driver is not None:
@@ -125,7 +113,7 @@ def episode(name, config, seed, steps, *, idm):
     try:
         for _ in range(steps):
             shown, reward, terminated, truncated, info = env.step(env.action_space.sample())
-            trace.append(plain([shown, reward, terminated, truncated, info]))
+            trace.append(exact([shown, reward, terminated, truncated, info]))
             if np.any(terminated):
                 break
     except Exception as error:  # some rewards cannot do with some actions; that is to be the same as well
@@ -188,7 +176,7 @@ def test_neighbours_and_lanes_are_those_of_highway_env_wherever_vehicles_are(dat
             road.act()
             road.step(0.2)
             trace.append(
-                plain([[v.position, v.heading, v.speed, v.lane_index, v.action, v.impact] for v in road.vehicles])
+                exact([[v.position, v.heading, v.speed, v.lane_index, v.action, v.impact] for v in road.vehicles])
             )
         for vehicle, (position, _, _, attributes) in zip(road.vehicles, before, strict=True):
             vars(vehicle).clear()
@@ -242,7 +230,7 @@ def test_a_subclass_is_as_its_author_wrote_it(kind):
         for _ in range(20):
             road.act()
             road.step(0.1)
-        return plain([[v.position, v.heading, v.speed, v.action, len(getattr(v, "met", []))] for v in road.vehicles])
+        return exact([[v.position, v.heading, v.speed, v.action, len(getattr(v, "met", []))] for v in road.vehicles])
 
     slow = played()
     assert switch_on() == ""
@@ -266,7 +254,7 @@ def test_whole_speeds_out_of_a_list_are_known(speeds, known, monkeypatch):
             road.vehicles[1].act(["FASTER", "LANE_LEFT", None][number % 3])
             road.act()
             road.step(0.1)
-        return plain([[v.position, v.heading, v.speed, v.action, v.target_lane_index] for v in road.vehicles])
+        return exact([[v.position, v.heading, v.speed, v.action, v.target_lane_index] for v in road.vehicles])
 
     slow = played()
     assert switch_on() == ""
@@ -306,7 +294,7 @@ def test_a_goal_is_shown_without_data_frames_where_it_is_known(change, monkeypat
         except Exception as error:
             return repr(error)
         assert found["observation"] is not found["achieved_goal"]
-        return type(found), plain(found), [array.dtype for array in found.values()]
+        return type(found), exact(found), [array.dtype for array in found.values()]
 
     slow = shown()
     assert switch_on() == ""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from compiled import needs_kernel
 from conftest import mostly_nightly
+from exact_values import exact
 from highway_env.envs.common import observation
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.action import ActionType, DiscreteMetaAction
@@ -29,16 +30,6 @@ assert HighwaySimulator
 pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
 ACTIONS = (3, 4, 1, 0, 2, np.int64(4), np.int64(3), 1)
 CONFIG = {"vehicles_count": 6, "vehicles_density": 1.6, "simulation_frequency": 4}
-
-
-def exact(value):
-    if isinstance(value, np.ndarray):
-        return value.dtype.str, value.tobytes()
-    if isinstance(value, dict):
-        return {key: exact(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [exact(inner) for inner in value]
-    return (type(value).__name__, repr(value)) if isinstance(value, float | int | str | np.generic | None) else ""
 
 
 def trace(make, change, actions):

@@ -8,6 +8,7 @@ import highway_env
 import numpy as np
 import pytest
 from compiled import needs_kernel
+from exact_values import exact
 from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.road import road
 from highway_env.road.lane import StraightLane
@@ -23,19 +24,8 @@ NAMES = ["position", "heading", "speed", "crashed", "impact", "lane_index", "tar
 pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
 
 
-def plain(value):
-    """Anything with its type: NumPy's floats are not Python's to whoever multiplies them by a `float32`."""
-    if isinstance(value, np.ndarray):
-        return value.dtype.str, value.shape, value.tobytes()
-    if isinstance(value, dict):
-        return {key: plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [type(value), *map(plain, value)]
-    return type(value), float(value).hex() if isinstance(value, float | np.floating) else str(value)
-
-
 def state(place):
-    return [[len(vehicle.history), *(plain(vars(vehicle).get(name)) for name in NAMES)] for vehicle in place.vehicles]
+    return [[len(vehicle.history), *(exact(vars(vehicle).get(name)) for name in NAMES)] for vehicle in place.vehicles]
 
 
 def two_roads(count=5):
@@ -192,7 +182,7 @@ def shown(features, change=lambda env: None):
             assert switch_on() == ""
         change(env)
         try:
-            found.append(plain(env.observation_type.observe()))
+            found.append(exact(env.observation_type.observe()))
         except Exception as error:
             found.append(repr(error))
     return found

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from compiled import needs_kernel
 from conftest import mostly_nightly
+from exact_values import exact
 from highway_env import utils
 from highway_env.envs.common import observation
 from highway_env.road import lane, regulation, road
@@ -53,16 +54,6 @@ def _slower(name, value):
 
 
 pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
-
-
-def plain(value):
-    if isinstance(value, np.ndarray):
-        return value.shape, value.tobytes()
-    if isinstance(value, dict):
-        return {key: plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    return float(value).hex() if isinstance(value, float | np.floating) else str(value)
 
 
 def altered(function, calls):
@@ -261,8 +252,8 @@ STATE = [
 
 def state(env):
     return [
-        [plain(vars(thing).get(name)) for name in STATE] for thing in [*env.road.vehicles, *env.road.objects]
-    ], plain(env.np_random.bit_generator.state)
+        [exact(vars(thing).get(name)) for name in STATE] for thing in [*env.road.vehicles, *env.road.objects]
+    ], exact(env.np_random.bit_generator.state)
 
 
 def played(number, *, fast, alone=False):
@@ -283,7 +274,7 @@ def played(number, *, fast, alone=False):
         env = gymnasium.make(name, disable_env_checker=True).unwrapped
         changes.calls.clear()  # making one plays an episode of no seed
         config = {**ENVIRONMENTS[name], "simulation_frequency": 5}
-        trace.append(plain(env.reset(seed=number, options={"config": config})[0]))
+        trace.append(exact(env.reset(seed=number, options={"config": config})[0]))
         if when == "reset":
             change(rng, env, changes)
         count = 0
@@ -305,7 +296,7 @@ def played(number, *, fast, alone=False):
         env.action_space.seed(number)
         for _ in range(3):
             found = env.step(env.action_space.sample())
-            trace.append(plain(list(found)))
+            trace.append(exact(list(found)))
     except Exception as error:  # what somebody's change breaks is to break in the same way
         trace.append(f"{type(error).__name__}: {error}"[:60])
     finally:
@@ -356,7 +347,7 @@ def driven(make, change=lambda place: None, steps=12):
                     change(place) if not hasattr(change, "patches") else change(place, patch)
                 place.act()
                 place.step(0.2)
-                trace.append([plain([vars(v).get(name) for name in STATE]) for v in place.vehicles])
+                trace.append([exact([vars(v).get(name) for name in STATE]) for v in place.vehicles])
             found.append(trace)
     return found
 
