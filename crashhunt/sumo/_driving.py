@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from itertools import islice
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import libsumo
@@ -12,9 +12,11 @@ from libsumo import _libsumo as sumo
 from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import META_ACTIONS
 from crashhunt.sumo._free_motion import DrivableArea, FreeMotion
+from crashhunt.sumo.maps import is_left_hand
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
+    from pathlib import Path
 
     import numpy as np
     from numpy.typing import NDArray
@@ -38,14 +40,14 @@ class Driving:
     Args:
         setups: The setups of all agents of a scenario, by agent.
         step_length_s: Step length, in s.
+        net: Path of the network file.
     """
 
-    def __init__(self, setups: Mapping[str, AgentSetup], step_length_s: float) -> None:
-        self._setups, self._step_length_s = setups, step_length_s
+    def __init__(self, setups: Mapping[str, AgentSetup], step_length_s: float, net: Path) -> None:
+        self._setups, self._step_length_s, self._net = setups, step_length_s, net
         self._edges: dict[str, list[float]] = {}
         self._closed_lanes: dict[tuple[str, str], bool] = {}
         self._targets: dict[str, int] = {}
-        self._is_left_hand: bool | None = None
         self._durations = {
             agent: float(setup.action_settings.get("lane_change_duration_s", 0.0)) for agent, setup in setups.items()
         }
@@ -253,13 +255,10 @@ class Driving:
             found = self._edges[edge] = [sumo.lane_getWidth(f"{edge}_{lane}") for lane in range(lanes)]
         return found
 
-    @property
+    @cached_property
     def left_hand(self) -> bool:
         """Whether traffic drives on the left: SUMO then mirrors the network and numbers lanes from the left."""
-        if self._is_left_hand is None:
-            wide = (edge for edge in sumo.edge_getIDList() if edge[0] != ":" and sumo.edge_getLaneNumber(edge) > 1)
-            self._is_left_hand = any(_is_right_of(f"{edge}_1", f"{edge}_0") for edge in islice(wide, 1))
-        return self._is_left_hand
+        return is_left_hand(self._net)
 
     def from_left(self, edge: str, lane: int) -> float:
         """Return the distance in m from the centre line of an edge's leftmost lane to that of the given lane."""
@@ -283,13 +282,6 @@ class Driving:
             found = bool(allowed) and vehicle_class not in allowed and vehicle_class != "ignoring"
             self._closed_lanes[lane, vehicle_class] = found
         return found
-
-
-def _is_right_of(lane: str, other: str) -> bool:
-    """Return whether a lane lies to the right of another lane of the same edge."""
-    (x, y, *_), (to_x, to_y, *_) = sumo.lane_getShape(other)[:2]
-    at_x, at_y = sumo.lane_getShape(lane)[0][:2]
-    return bool((to_x - x) * (at_y - y) < (to_y - y) * (at_x - x))
 
 
 # Holds for counterfactual runs: keep a vehicle's speed or lane, or remove the vehicle.

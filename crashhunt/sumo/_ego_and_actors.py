@@ -20,7 +20,7 @@ from crashhunt.simulators import (
     kind_number,
     wrapped,
 )
-from crashhunt.sumo._reader_protocol import Reader
+from crashhunt.sumo._reader_protocol import NO_VALUE, Reader
 from crashhunt.world import PERSON, VehicleData, is_person
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Actor
 
 _BRAKE_LIGHT, _RIGHT, _LEFT, _HAZARD = 8, 1, 2, 4  # bits of SUMO's signals
-_NO_VALUE = -1073741824.0  # of SUMO's getters, as in `libsumo.INVALID_DOUBLE_VALUE`
 _UNKNOWN = ("", 0.0, 0.0, 0)  # lane, offset, acceleration and signals of an actor that SUMO does not have
 
 
@@ -59,7 +58,7 @@ def vehicle_data_of(vehicle: str) -> VehicleData:
 
 
 def _known(value: float) -> float:
-    return 0.0 if value == _NO_VALUE else value
+    return 0.0 if value == NO_VALUE else value
 
 
 class EgoReader(Reader):
@@ -98,7 +97,7 @@ class EgoReader(Reader):
             x, y, wrapped(heading), speed,
             acceleration, yaw_rate, steering, actor.length, actor.width,
             float(moment.lane.rpartition("_")[2] or 0),
-            _known(sumo.vehicle_getLateralLanePosition(agent)),
+            setup.offset_of(agent),
             distance, scene.time_s - setup.start_s,
         )  # fmt: skip
 
@@ -126,7 +125,8 @@ class ActorsReader(Reader):
         if actors is not self._actors:
             self._who = [kind_number(actor.kind) for actor in actors], tuple([actor.id for actor in actors])
         found = None
-        if scene.columns is not None and not (scene.heights or moment.hidden):
+        is_usual = not (scene.heights or moment.hidden or self._setup.graph.is_left_hand)
+        if scene.columns is not None and is_usual:
             path = self._path.update(moment.lane).facts
             found = draft.actors(place, scene.columns, moment.row, self._who, self._limits, self._speeds, path)
         if found is None:
@@ -147,7 +147,7 @@ class ActorsReader(Reader):
         near = self._actors_near(moment)
         for _, other, x, y in near:
             actor, heading, speed = actors[other], headings[other], speeds[other]
-            lane, offset, acceleration, signals = _state_of(actor.id)
+            lane, offset, acceleration, signals = _state_of(actor.id, self._setup)
             if (last := last_speeds.get(actor.id)) is not None:
                 acceleration = (speed - last) / self._setup.step_length_s
             self._speeds[actor.id] = speed
@@ -168,14 +168,13 @@ class ActorsReader(Reader):
         return rows
 
 
-def _state_of(actor: str) -> tuple[str, float, float, int]:
+def _state_of(actor: str, setup: ReaderSetup) -> tuple[str, float, float, int]:
     """Return the lane, the lateral offset, the acceleration and the signals of an actor."""
     try:
         if is_person(actor):
             return sumo.person_getLaneID(actor.removeprefix(PERSON)), 0.0, 0.0, 0
         lane = sumo.vehicle_getLaneID(actor)
-        offset = _known(sumo.vehicle_getLateralLanePosition(actor))
-        return lane, offset, _known(sumo.vehicle_getAcceleration(actor)), sumo.vehicle_getSignals(actor)
+        return lane, setup.offset_of(actor), _known(sumo.vehicle_getAcceleration(actor)), sumo.vehicle_getSignals(actor)
     except libsumo.TraCIException:  # an actor of a recording that is played back
         return _UNKNOWN
 

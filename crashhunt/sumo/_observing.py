@@ -147,6 +147,7 @@ class ObservedParts:
                         core=self.core,
                         reference_share=layout.reference_share,
                         near=self._near,
+                        moving=frozenset(known),
                     )
                 )
                 for name, request in layout.parts.items()

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from crashhunt.sumo._lane_paths import NearLanesOf
     from crashhunt.world import RoadMap, Scene
 
+NO_VALUE = -1073741824.0
+"""The value of SUMO's getters without a value, as in `libsumo.INVALID_DOUBLE_VALUE`."""
+
 
 @dataclass(frozen=True, slots=True)
 class ReaderSetup:
@@ -41,6 +44,7 @@ class ReaderSetup:
         core: The compiled core; None if it is not used.
         reference_share: How far the reference point is ahead of the centre, as a share of a vehicle's length.
         near: The lanes near each square, by sampling and vehicle class, shared like the lanes.
+        moving: Identifiers of the vehicles that move freely.
     """
 
     agent: str
@@ -55,6 +59,7 @@ class ReaderSetup:
     core: Core | None = None
     reference_share: float = 0.0
     near: NearLanesOf = field(default_factory=dict)
+    moving: frozenset[str] = frozenset()
 
     @property
     def settings(self) -> Mapping[str, float]:
@@ -65,6 +70,14 @@ class ReaderSetup:
     def limit(self) -> int:
         """The number of rows of a part with one row per actor."""
         return int(self.request.settings["rows"])
+
+    def offset_of(self, vehicle: str) -> float:
+        """Return the distance of a vehicle from the centre line of its lane, in m, positive to the left."""
+        offset = float(sumo.vehicle_getLateralLanePosition(vehicle))
+        if offset == NO_VALUE:
+            return 0.0
+        # In left-hand traffic, SUMO mirrors the offsets of all vehicles but those that it has moved to a position.
+        return -offset if offset and self.graph.is_left_hand and vehicle not in self.moving else offset
 
     @property
     def shape(self) -> tuple[int, ...]:

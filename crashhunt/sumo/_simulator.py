@@ -120,7 +120,8 @@ class SumoSimulator:
         self._drifts = "speed_and_lateral" in self._forms.values() or any(durations)
         moves = not set(FREE_FORMS).isdisjoint(self._forms.values())
         self._lateral = self._drifts or moves or "lateral-resolution" in options or "lanechange.duration" in options
-        self._driving = Driving(scenario.agents, scenario.step_length_s)
+        net = scenario.folder / scenario.table(SumoSetup).net
+        self._driving = Driving(scenario.agents, scenario.step_length_s, net)
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s, self._driving)
         self._loading = Loading(fix_link_order=scenario.table(SumoSetup).fix_link_order is not False)
         self._sight = Sight(

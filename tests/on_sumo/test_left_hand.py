@@ -101,3 +101,60 @@ def test_who_cuts_in_from_the_left_is_there(tmp_path, who, lane, side):
         scene = simulator.scene()
         after = dict(zip([actor.id for actor in scene.roster.actors], [y for _, y in scene.points], strict=True))
         assert after[lane] == after["ego"]
+
+
+DRIVERS = """
+schema = 1
+simulator = "sumo"
+step_length_s = 0.1
+
+[sumo]
+net = "{net}"
+routes = ["r.rou.xml"]
+
+[agents.ego]
+edges = ["{edge}"]
+depart_pos = "20"
+depart_speed = "10"
+observation = ["ego", "actors"]
+action = "{action}"
+
+[agents.ahead]
+edges = ["{edge}"]
+depart_pos = "50"
+depart_speed = "10"
+observation = ["ego"]
+action = "{action}"
+"""
+
+
+@pytest.mark.parametrize(
+    ("action", "answers"),
+    [("speed_and_lateral", [(10.0, 0.5), (10.0, -0.4)]), ("acceleration_steering", [(0.0, 0.01), (0.0, -0.008)])],
+)
+@pytest.mark.parametrize(("net", "edge"), [("left.net.xml", "st"), ("left-street.net.xml", "ab")])
+def test_left_is_left_in_offsets_and_drifts_also_of_a_road_with_one_lane(tmp_path, net, edge, action, answers):
+    shutil.copy(NET.with_name(net), tmp_path)
+    (tmp_path / "r.rou.xml").write_text("<routes/>")
+    (tmp_path / "scenario.toml").write_text(DRIVERS.format(net=net, edge=edge, action=action))
+    with closing(SumoSimulator(load_scenario(str(tmp_path)), tmp_path)) as simulator:
+        simulator.reset(seed=1, options={})
+
+        def places():
+            scene = simulator.scene()
+            return [scene.points[scene.roster.index[agent]][1] for agent in ("ego", "ahead")]
+
+        begins = places()
+        for _ in range(8):
+            actions = {
+                agent: simulator.actions[agent].encode(answer)
+                for agent, answer in zip(("ego", "ahead"), answers, strict=True)
+            }
+            observations, *_ = simulator.step(actions)
+        moved = [y - begin for y, begin in zip(places(), begins, strict=True)]  # both drive towards x
+        assert moved[0] > 0.1
+        assert moved[1] < -0.1
+        shown = simulator.restore_observation("ego", observations["ego"])
+        columns = simulator.observation_layouts["ego"].columns
+        offsets = shown["ego"][columns["ego"]["lane_offset"]], shown["actors"][0, columns["actors"]["lane_offset"]]
+        assert offsets == pytest.approx(moved, abs=1e-6)

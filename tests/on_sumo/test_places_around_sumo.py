@@ -160,10 +160,10 @@ def test_vehicle_in_a_neighbouring_lane_is_the_nearest_there(monkeypatch, left_h
         (("bus",), "ignoring", False),
     ],
 )
-def test_lane_is_closed_to_classes_that_it_does_not_name(monkeypatch, allowed, vehicle_class, closed):
+def test_lane_is_closed_to_classes_that_it_does_not_name(monkeypatch, allowed, vehicle_class, closed, tmp_path):
     """No lane is closed to the class that ignores permissions."""
     asked = []
     monkeypatch.setattr(_driving.sumo, "lane_getAllowed", lambda lane: asked.append(lane) or allowed)
-    driving = _driving.Driving({}, 0.1)
+    driving = _driving.Driving({}, 0.1, tmp_path)
     assert [driving._is_closed("e_0", vehicle_class) for _ in range(2)] == [closed] * 2
     assert asked == ["e_0"]

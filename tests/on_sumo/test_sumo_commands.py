@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import libsumo
@@ -17,6 +18,8 @@ from crashhunt.sumo._disturbances import JunctionLanes, SteppingOut, SumoDisturb
 from crashhunt.sumo._driving import Driving
 from crashhunt.trial import Disturbance
 from crashhunt.world import Actor, Roster, Scene
+
+NETS = Path(__file__).with_name("nets")
 
 
 @pytest.fixture
@@ -468,9 +471,9 @@ def test_lanes_of_junctions_are_those_for_pedestrians_and_read_once(person, sumo
 
 
 def driving(sumo, **setup):
-    made = Driving({"ego": AgentSetup(route="r", **setup)}, 0.5)
+    made = Driving({"ego": AgentSetup(route="r", **setup)}, 0.5, NETS / "lights.net.xml")
     made.begin(["ego"])
-    made._is_left_hand = False
+    made.left_hand = False
     sumo.answers |= {"edge_getLaneNumber": 3, "lane_getWidth": 3.0, "lane_getAllowed": (),
                      "vehicle_getVehicleClass": "passenger"}  # fmt: skip
     return made
@@ -528,7 +531,7 @@ def test_meta_actions_select_the_next_target_speed_and_lane(sumo):
 )  # fmt: skip
 def test_neighbouring_lane_is_on_the_named_side(sumo, left_hand, change, lane, closed, expected):
     made = driving(sumo)
-    made._is_left_hand = left_hand
+    made.left_hand = left_hand
     sumo.answers |= {"vehicle_getLaneIndex": lane, "lane_getAllowed": closed}
     assert made.neighboring_lane("ego", change) == expected
     sumo.answers["vehicle_getRoadID"] = ":j_0"
@@ -543,37 +546,24 @@ def test_distance_from_the_leftmost_lane_is_between_centre_lines(sumo):
     assert [made.from_left("f", lane) for lane in (2, 1, 0)] == [0.0, 3.2, 6.4]
     assert (made.lanes("e"), made.lanes("f")) == (3, 3)
     sumo.answers["lane_getWidth"] = 99.0  # each edge is read once
-    made._is_left_hand = True
+    made.left_hand = True
     assert [made.from_left("e", lane) for lane in (0, 1, 2)] == [0.0, 2.5, 6.0]
 
 
 @pytest.mark.parametrize(("left_hand", "sign"), [(False, -1.0), (True, 1.0)])
 def test_offset_to_the_right_has_the_sign_of_the_traffic(sumo, left_hand, sign):
     made = driving(sumo)
-    made._is_left_hand = left_hand
+    made.left_hand = left_hand
     sumo.answers |= {"vehicle_getLateralLanePosition": 0.5, "vehicle_getLateralSpeed": 0.25}
     assert made.aside("ego") == (sign * 0.5, sign * 0.25)
 
 
-@pytest.mark.parametrize("turn", [0.0, 1.0, 2.5, -2.0])
-def test_traffic_drives_on_the_left_where_lane_1_is_right_of_lane_0(sumo, turn):
-    c, s = math.cos(turn), math.sin(turn)
-
-    def shape(y):
-        return ((-y * s, y * c), (100.0 * c - y * s, 100.0 * s + y * c), (300.0, 300.0))
-
-    for left_hand in (False, True):
-        made = Driving({}, 0.5)
-        lanes = {"e_0": shape(0.0), "e_1": shape(-3.2 if left_hand else 3.2)}
-        asked = []
-        sumo.answers |= {
-            "edge_getIDList": lambda asked=asked: asked.append(1) or (":j_0", "narrow", "e", "other"),
-            "edge_getLaneNumber": lambda edge: {"narrow": 1}.get(edge, 2), "lane_getShape": lanes.__getitem__,
-        }  # fmt: skip
-        assert [made.left_hand, made.left_hand] == [left_hand, left_hand]
-        assert asked == [1]
-        sumo.answers["edge_getIDList"] = (":j_0", "narrow")
-        assert Driving({}, 0.5).left_hand is False
+@pytest.mark.parametrize(
+    ("net", "left_hand"),
+    [("left.net.xml", True), ("left-street.net.xml", True), ("left-grid.net.xml.gz", True), ("rand.net.xml.gz", False)],
+)
+def test_the_side_of_traffic_is_that_of_the_network_file(net, left_hand):
+    assert Driving({}, 0.5, NETS / net).left_hand is left_hand
 
 
 def test_holds_are_commands_that_end(sumo, monkeypatch):

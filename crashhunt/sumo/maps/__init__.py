@@ -16,7 +16,12 @@ if TYPE_CHECKING:
         describe_place as describe_place,
         make_scenario as make_scenario,
     )
-    from ._road_network import NetworkLane as NetworkLane, RoadNetwork as RoadNetwork, read_network as read_network
+    from ._road_network import (
+        NetworkLane as NetworkLane,
+        RoadNetwork as RoadNetwork,
+        is_left_hand as is_left_hand,
+        read_network as read_network,
+    )
     from ._source import (
         MapSource as MapSource,
         check_source as check_source,

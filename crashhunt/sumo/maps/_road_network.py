@@ -6,7 +6,7 @@ import gzip
 import xml.etree.ElementTree as ET
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO, cast
 
 from crashhunt.base.errors import ScenarioError
 
@@ -165,14 +165,25 @@ def read_network(path: Path, *, with_junctions: bool = False) -> RoadNetwork:
     """
     found = RoadNetwork()
     try:
-        with path.open("rb") as file:
-            packed = file.read(2) == b"\x1f\x8b"
-        with gzip.open(path) if packed else path.open("rb") as file:
+        with _open(path) as file:
             _read(ET.iterparse(file, events=("start", "end")), found, with_junctions=with_junctions)
     except (ET.ParseError, UnicodeDecodeError, LookupError, ValueError) as error:
         fix = "make the network again with netconvert"
         raise ScenarioError(f"not a valid network: {error}", fix=fix, where=str(path)) from None
     return found
+
+
+def is_left_hand(path: Path) -> bool:
+    """Return whether traffic drives on the left in a network file, which may be compressed."""
+    with _open(path) as file:
+        _, root = next(iter(ET.iterparse(file, events=("start",))))
+    return bool(root.get("lefthand") == "true")
+
+
+def _open(path: Path) -> BinaryIO:
+    with path.open("rb") as file:
+        packed = file.read(2) == b"\x1f\x8b"
+    return cast("BinaryIO", gzip.open(path)) if packed else path.open("rb")
 
 
 def _read(events: Iterator[tuple[str, ET.Element]], found: RoadNetwork, *, with_junctions: bool) -> None:
