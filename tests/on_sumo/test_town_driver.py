@@ -17,6 +17,8 @@ from crashhunt.scenario import load_scenario  # noqa: E402
 
 NETS = Path(__file__).parent / "nets"
 VEHICLES = 60
+JAMMED = {"left-grid"}
+"""Towns in which vehicles that turn back block each other for ever: with 11 of 24 seeds of SUMO also without ego."""
 PAGE = Path(crashhunt.guide.__file__).parent / "tutorials" / "connect-your-planner.md"
 SCENARIO = """schema = 1
 simulator = "sumo"
@@ -40,20 +42,21 @@ def page_driver():
     return made["TownDriver"]
 
 
-def walk(net, draw, length, begin=None):
-    route = [begin or draw.choice(sorted(net.getEdges(withInternal=False), key=lambda one: one.getID()))]
+def walk(net, draw, length, *, turns_back):
+    route = [draw.choice(sorted(net.getEdges(withInternal=False), key=lambda one: one.getID()))]
     while len(route) < length and (after := sorted(route[-1].getOutgoing(), key=lambda one: one.getID())):
-        route.append(draw.choice(after))
+        onward = [one for one in after if one.getToNode() != route[-1].getFromNode()]
+        route.append(draw.choice(after if turns_back or not onward else onward))
     return [one.getID() for one in route]
 
 
 def town(name, folder, parts, seed):
     path = NETS / f"{name}.net.xml.gz"
     net, draw = sumolib.net.readNet(str(path)), random.Random(seed)
-    rows = [f'<route id="ego" edges="{" ".join(walk(net, draw, 40))}"/>']
+    rows = [f'<route id="ego" edges="{" ".join(walk(net, draw, 40, turns_back=True))}"/>']
     for number in range(VEHICLES):
         rows.append(f'<vehicle id="v{number}" depart="{number * 2}" departLane="best" departSpeed="max">')
-        rows.append(f'<route edges="{" ".join(walk(net, draw, 30))}"/></vehicle>')
+        rows.append(f'<route edges="{" ".join(walk(net, draw, 30, turns_back=name not in JAMMED))}"/></vehicle>')
     (folder / "r.rou.xml").write_text(f"<routes>{''.join(rows)}</routes>")
     (folder / path.name).write_bytes(path.read_bytes())
     (folder / "scenario.toml").write_text(SCENARIO.format(net=path.name, parts=list(parts)))
@@ -136,22 +139,20 @@ def test_the_driver_of_the_guide_leaves_a_u_turn(tmp_path):
     assert found.offences == []
 
 
-HITS = {("grid-lights", 1), ("stops", 2), ("left-grid", 3), ("left-grid", 7)}
+HITS = {("grid-lights", 1), ("stops", 2), ("left-grid", 5)}
 """Town and seed of drives that end at another vehicle in a junction: the driver is an example, and no good one."""
-STANDS = {("left-grid", 0), ("left-grid", 1)}
-"""Those that end where the vehicles wait for each other."""
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("name", ["grid-lights", "rand", "stops", "left-grid"])
-def test_the_driver_of_the_guide_obeys_lights_and_stop_signs_in_any_town_and_mostly_arrives(name, seed, tmp_path):
-    """150 km in all, with 357 traffic lights and 81 stop signs."""
+def test_the_driver_of_the_guide_obeys_lights_and_stop_signs_in_any_town_and_arrives(name, seed, tmp_path):
+    """More than 150 km in all, with 357 traffic lights and 81 stop signs."""
     found = drive(name, tmp_path, seed)
     assert [one for one in found.offences if not one[1].startswith("hit ")] == []
     assert bool(found.offences) == ((name, seed) in HITS)
-    assert found.has_arrived == ((name, seed) not in STANDS)
-    if (name, seed) in HITS | STANDS:
+    assert found.has_arrived
+    if (name, seed) in HITS:
         return
     assert found.driven_m > 0.98 * found.route_m
     assert found.lights > 3 or name not in ("grid-lights", "rand")
