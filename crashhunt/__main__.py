@@ -19,6 +19,9 @@ def main() -> NoReturn:
 
 
 if __name__ == "__main__":
+    if sys.version_info < (3, 11):  # noqa: UP036 - pip refuses an older Python, and a clone runs with any
+        sys.stderr.write("crashhunt needs Python 3.11 or later; in a clone, run scripts/crashhunt\n")
+        sys.exit(2)
     if not sys.flags.safe_path:
         del sys.path[0]  # the current folder, which may be a stranger's, and whose modules only the user may name
     main()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import runpy
 import shlex
 import subprocess
 import sys
@@ -52,3 +53,11 @@ def test_nothing_is_asked_without_a_terminal_in_ci_or_with_json(answered):
     assert answered("y\n", "replay", "h", terminal=False) == []
     assert answered("y\n", "replay", "h", ci="true") == []
     assert answered("y\n", "replay", "h", "--json") == []
+
+
+def test_an_older_python_is_named_in_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "version_info", (3, 10, 13))
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(cli.__file__.replace("cli/__init__", "__main__"), run_name="__main__")
+    said = "crashhunt needs Python 3.11 or later; in a clone, run scripts/crashhunt\n"
+    assert (ended.value.code, capsys.readouterr().err) == (2, said)
