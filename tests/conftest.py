@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 import tomllib
 import warnings
 from dataclasses import dataclass
@@ -343,6 +344,22 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.path.parent.name in ("native", "simulators") and _OUTDATED():
         what = f"compiled from other sources than those tested: {', '.join(_OUTDATED())}"
         pytest.fail(f"{what}. Fix: {HOW_TO_REBUILD}", pytrace=False)
+
+
+def wait_for(
+    condition: Callable[[], Any],
+    *,
+    timeout_s: float = 300.0,
+    every_s: float = 0.02,
+    process: Begun | subprocess.Popen[str] | None = None,
+) -> Any:
+    """Wait until a condition holds, and return its value. A process that is given must not end before."""
+    deadline = time.monotonic() + timeout_s
+    while not (found := condition()):
+        assert process is None or process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(every_s)
+    return found
 
 
 @pytest.fixture

@@ -6,12 +6,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from conftest import _commands, add_toy
+from conftest import _commands, add_toy, wait_for
 from dashboard_hunts import hunted
 from served import served
 
@@ -23,14 +22,6 @@ OURS = {"Host": "localhost", "X-Crashhunt": "1"}
 @pytest.fixture
 def hunt(shell, made_once):
     return made_once(hunted, shell).folder / "runs"
-
-
-def wait_until(condition, seconds: float = 240.0):
-    deadline = time.monotonic() + seconds
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "it did not come to that"
-        time.sleep(0.1)
-    return found
 
 
 def test_nothing_is_controlled_unless_it_is_allowed(hunt):
@@ -97,11 +88,12 @@ def test_commands_are_started_from_the_page_and_run(toy, page, names, monkeypatc
         for name in sorted(names):
             page.run("document.querySelector(`[data-job=${arguments[0]}]`).click()", name)
         jobs = f"/api{one}/crashes/{crash['id']}/jobs"
-        ended = wait_until(
+        ended = wait_for(
             lambda: (
                 len(found := [job for job in dashboard.get(jobs)["jobs"] if job["state"] == "ended"]) == len(names)
                 and found
-            )
+            ),
+            every_s=0.1,
         )
         assert {job["name"]: job["exit_code"] for job in ended} == dict.fromkeys(names, 0), ended
         output = {job["name"]: job["output"] for job in ended}
@@ -131,10 +123,10 @@ def test_a_running_hunt_is_stopped_as_by_ctrl_c(shell):
     process = add_toy(shell).begin("run", "runs/one", "1", "3000", "99", *words)
     try:
         with served(root, control=True) as dashboard:
-            wait_until(lambda: any(row["trials_run"] for row in dashboard.hunts().values()))
+            wait_for(lambda: any(row["trials_run"] for row in dashboard.hunts().values()), every_s=0.1)
             row = dashboard.hunts()["one"]
             assert row["state"] == "running"
-            workers = wait_until(lambda: dashboard.get(f"/api/hunts/{row['id']}")["workers"])
+            workers = wait_for(lambda: dashboard.get(f"/api/hunts/{row['id']}")["workers"], every_s=0.1)
             assert 0 <= workers[0]["since_s"] < 3600
             assert dashboard.ask(f"/api/hunts/{row['id']}/stop", OURS, method="POST").status == 200
             process.communicate(timeout=240)

@@ -6,12 +6,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 import tomllib
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from conftest import wait_for
 
 from crashhunt.corpus import add_case, find_cases, read_case, run_cases
 from crashhunt.crashes import find_bundle
@@ -175,10 +175,7 @@ def test_ctrl_c_ends_all_and_reports_what_has_ended(kept):
     begun = kept.folder / "begun"
     drive(kept, DRIVER.replace("return", f"import time; open({str(begun)!r}, 'w'); time.sleep(60); return"))
     running = kept.begin("corpus", "run", "kept crashes", "--parallel", "1")
-    deadline = time.monotonic() + 300
-    while not begun.exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_for(begun.exists)
     running.send_signal(signal.SIGINT)
     out, err = running.communicate(timeout=300)
     assert running.returncode == 130, err

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
-import time
 from contextlib import closing
 
 import pytest
+from conftest import wait_for
 
 
 def results(folder):
@@ -151,11 +151,7 @@ def test_killed_hunt_decides_as_one_that_was_never_killed(toy):
     slow = ("--set", "step_wall_s=0.002")
     whole = until(toy, "whole", "2", "0", "0.02/trial", *slow, expect=1)["rate"]
     process = toy.begin("run", "parts", "2", "0", *HUNT, "--until-rate", "0.02/trial", *slow)
-    deadline = time.monotonic() + 300
-    while not _has_trials(toy.folder / "parts"):
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for(lambda: _has_trials(toy.folder / "parts"), every_s=0.01, process=process)
     process.kill()
     process.communicate(300)
     assert until(toy, "parts", "2", "0", "0.02/trial", *slow, expect=1)["rate"] == {**whole, "dir": "parts"}

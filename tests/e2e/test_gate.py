@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import signal
 import sqlite3
-import time
 import xml.etree.ElementTree as ET
 from contextlib import closing
 
 import pytest
-from conftest import one_in
+from conftest import one_in, wait_for
 from repositories import git
 
 DRIVERS = """
@@ -231,12 +230,8 @@ def begun(shell, *words):
     """Begin a gate of slow trials, and wait for pairs."""
     slow = ("--set", "step_wall_s=0.002", "--margin", "0", "--keep", "kept", *SEED)
     process = shell.begin("gate", CALM, TWIN, *TOY, *slow, "--json", *words)
-    deadline = time.monotonic() + 300
-    folder = shell.folder / "kept"
-    while min(trials_of(folder / "base"), trials_of(folder / "head")) < 3:
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    sides = [shell.folder / "kept" / side for side in ("base", "head")]
+    wait_for(lambda: min(map(trials_of, sides)) >= 3, every_s=0.05, process=process)
     return process
 
 
@@ -260,10 +255,7 @@ def test_killed_gate_leaves_nothing_running_and_resumes_to_the_same_verdict(repo
     words = (*IN_REPOSITORY, "--set", "step_wall_s=0.004", "--json")
     whole = repository.crashhunt("gate", "calm", "wild", *words, "--keep", "../whole", expect=1).json
     process = repository.start("gate", "calm", "wild", *words, "--keep", "../kept")
-    head, deadline = repository.folder.parent / "kept" / "head", time.monotonic() + 300
-    while trials_of(head) < 2:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for(lambda: trials_of(repository.folder.parent / "kept" / "head") >= 2, every_s=0.01)
     process.kill()
     process.communicate(300)
     found = repository.crashhunt("gate", "calm", "wild", *words, "--keep", "../kept", expect=1).json

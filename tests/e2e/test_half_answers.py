@@ -14,6 +14,7 @@ import time
 from contextlib import closing, contextmanager, suppress
 
 import pytest
+from conftest import wait_for
 
 from crashhunt.base.processes import children_of
 
@@ -127,10 +128,7 @@ def test_margin_of_a_trial_whose_copies_are_killed_is_open_until_they_are_asked_
 
     # Resumed, and killed before the copies have answered: the ledger has what it had.
     process = shell.start("run", "h", *probed)
-    deadline = time.monotonic() + 300
-    while not is_running(folder, 0):
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+    wait_for(lambda: is_running(folder, 0), every_s=0.005)
     process.kill()
     process.communicate()
     assert table(shell, "h") == (rows, copies)
@@ -150,11 +148,8 @@ def test_trial_that_is_killed_at_different_steps_is_invalid_until_it_is_run_agai
     steps, waits = ["3", "12", "21", ""], folder / "waits"
     (folder / "wait-at").write_text(steps[0])
     process = shell.start(*words)
-    deadline = time.monotonic() + 300
     for following in steps[1:]:
-        while not waits.exists():
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
+        wait_for(waits.exists, every_s=0.002)
         killed = int(waits.read_text())
         waits.unlink()
         (folder / "wait-at").write_text(following)

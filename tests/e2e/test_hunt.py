@@ -6,12 +6,11 @@ import json
 import os
 import signal
 import sqlite3
-import time
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from conftest import mostly_nightly
+from conftest import mostly_nightly, wait_for
 from test_stops import left_in
 
 FINE = ("--scenario", "toy", "--agent", "faulty:Fine", "--seed", "5", "--set", "step_wall_s=0.0005")
@@ -25,13 +24,6 @@ def ledger(folder: Path) -> dict[int, str]:
         return dict(database.execute("SELECT number, result FROM trials"))
     finally:
         database.close()
-
-
-def wait_for(condition, timeout_s=300.0):
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.02)
 
 
 def count(folder: Path) -> int:

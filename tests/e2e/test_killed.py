@@ -21,7 +21,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from conftest import keeps_going, mostly_nightly
+from conftest import keeps_going, mostly_nightly, wait_for
 from repositories import git
 from test_corpus import DRIVER, MENDED
 
@@ -388,19 +388,11 @@ def test_a_signal_ends_a_command_after_it_has_removed_everything(toy, made_once,
     made_once(keeps_going, toy)
     toy.environment["TMPDIR"] = str(temporary_files)
     process = toy.begin("replay", "h")
-    wait_for(lambda: [*temporary_files.glob("crashhunt-temporary-*/*/rerun-1/*")])
+    wait_for(lambda: [*temporary_files.glob("crashhunt-temporary-*/*/rerun-1/*")], every_s=0.01)
     process.terminate()
     process.communicate(timeout=300)
     assert process.returncode == -signal.SIGTERM
     assert left_in(toy.folder) == []
-
-
-def wait_for(condition, timeout_s: float = 300.0):
-    deadline = time.monotonic() + timeout_s
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "it did not come to that"
-        time.sleep(0.01)
-    return found
 
 
 LEAVES_MEMORY = """
@@ -426,7 +418,7 @@ def test_a_hunt_that_was_killed_leaves_nothing_for_long_not_even_shared_memory(t
     created = toy.folder / "created.txt"
     wait_for(lambda: not all(Path("/dev/shm", name).exists() for name in created.read_text().split()))
     assert process.poll() is None  # what a trial left does not stay until the end of a long hunt
-    wait_for(lambda: [*toy.folder.glob("h/.scratch-*/shared-memory-*.txt")])
+    wait_for(lambda: [*toy.folder.glob("h/.scratch-*/shared-memory-*.txt")], every_s=0.01)
     process.kill()
     process.communicate(timeout=300)
     wait_for(lambda: not processes_of(toy.folder), timeout_s=10.0)

@@ -27,10 +27,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import FAULTY, Shell, add_toy
+from conftest import FAULTY, Shell, add_toy, wait_for
 from repositories import git
 from test_corpus import DRIVER, MENDED
-from test_killed import AGENT, SUITE, facts, processes_of, rows_by_digest, wait_for
+from test_killed import AGENT, SUITE, facts, processes_of, rows_by_digest
 
 from crashhunt.base.processes import children_of
 from crashhunt.base.temporary import owner_in, remove_tree

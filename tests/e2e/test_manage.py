@@ -12,7 +12,7 @@ import time
 from contextlib import closing
 
 import pytest
-from conftest import CRASHHUNT, keeps_going
+from conftest import CRASHHUNT, keeps_going, wait_for
 
 from crashhunt.statistics import RateTest
 
@@ -26,10 +26,8 @@ def state(shell, hunt: str = "h") -> dict:
 
 def started(shell, *words: str):
     process = shell.begin("run", "h", "2", "50000", "50", *KEEP, "--set", "step_wall_s=0.001", *words)
-    deadline = time.monotonic() + 300
-    while not (shell.folder / "h/ledger.sqlite").exists() or state(shell)["trials_run"] < 5:
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    ledger = shell.folder / "h/ledger.sqlite"
+    wait_for(lambda: ledger.exists() and state(shell)["trials_run"] >= 5, every_s=0.05)
     return process
 
 

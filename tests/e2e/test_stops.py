@@ -11,26 +11,15 @@ import sys
 import time
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
-from conftest import mostly_nightly
+from conftest import mostly_nightly, wait_for
 
 from crashhunt.base.processes import children_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 FINE = ("--scenario", "toy", "--arg", "speed=5", "--seed", "3")
 SLOW = ("--set", "step_wall_s=0.02")
-
-
-def wait_for(condition: Callable[[], object], timeout_s: float = 300.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come to that"
-        time.sleep(0.02)
 
 
 def rows(hunt: Path) -> dict[int, str]:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import signal
-import time
 import tomllib
 
 import pytest
+from conftest import wait_for
 
 SUITE = """
 [defaults]
@@ -71,13 +71,6 @@ def states(shell, directory: str = "out") -> dict[str, str]:
 
 def numbers(shell, hunt: str) -> list[int]:
     return [int(line.partition(",")[0]) for line in shell.crashhunt("trials", hunt).out.splitlines()[1:]]
-
-
-def wait_for(condition, timeout_s: float = 300.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.05)
 
 
 @pytest.mark.nightly

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from conftest import wait_for
 
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import Executor, FreshProcessExecutor, PoolExecutor
@@ -132,10 +133,8 @@ def test_harm_costs_its_own_trial_only_and_nothing_of_it_stays(start, settings):
     between = [found[2 * number + 1] for number in range(len(names))]
     assert {str(result.outcome) for result in between} == {"survived"}
     assert len({result.digest for result in between}) == 1
-    deadline = time.monotonic() + 300
-    while programs():  # the template ends what a worker has left behind after it has told of its end
-        assert time.monotonic() < deadline, programs()
-        time.sleep(0.05)
+    # The template ends what a worker has left behind after it has told of its end.
+    wait_for(lambda: not programs(), every_s=0.05)
     for result in found.values():
         assert TrialResult.from_json(result.to_json()) == result
         str(result.to_json()).encode()  # can be written anywhere

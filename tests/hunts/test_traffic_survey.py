@@ -11,7 +11,7 @@ import time
 import tomllib
 
 import pytest
-from conftest import mostly_nightly
+from conftest import mostly_nightly, wait_for
 
 from crashhunt.base.processes import children_of
 from crashhunt.base.reaper import Kept
@@ -261,11 +261,7 @@ def test_ctrl_c_ends_the_survey_and_leaves_nothing_behind(shell):
     temporary.mkdir()
     shell.environment["TMPDIR"] = str(temporary)
     process = shell.start("run", "h", "1", "4", "20", *WORDS)
-    deadline = time.monotonic() + 300
-    while not list(temporary.glob("crashhunt-temporary-*/*/survey-*/stage")):
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_for(lambda: list(temporary.glob("crashhunt-temporary-*/*/survey-*/stage")), process=process)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=300)
     assert process.returncode == 130, err

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import shlex
-import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from conftest import wait_for
 
 from crashhunt.base import layout
 from crashhunt.crashes import list_bundles
@@ -40,16 +40,9 @@ def hunt(shell, made_once):
     return made_once(hunted, shell)
 
 
-def wait_until(condition, seconds: float = 60.0):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "the page did not get there"
-        time.sleep(0.02)
-
-
 def opened(browser, path: Path) -> None:
     browser.get(path.as_uri())
-    wait_until(lambda: browser.execute_script("return crashhuntView.crash !== null"))
+    wait_for(lambda: browser.execute_script("return crashhuntView.crash !== null"))
 
 
 def report_of(hunt, browser) -> dict[str, Any]:
@@ -100,7 +93,7 @@ def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
     # The scene on the canvas is the one of the log.
     for number, crash in enumerate(done["crashes"][:2]):
         listed[number].click()
-        wait_until(lambda crash=crash: text(browser, "summary").startswith(crash))
+        wait_for(lambda crash=crash: text(browser, "summary").startswith(crash))
         bundle = next(bundle for bundle in bundles if bundle.id == crash)
         recording = bundle.recording()
         assert browser.execute_script("return crashhuntView.crash.steps") == recording.steps + 1
@@ -166,7 +159,7 @@ def test_last_avoidable_step_is_one_click_away_and_shows_where_braking_leads(hun
     assert avoidable is not None
     browser.find_elements(By.CSS_SELECTOR, "#list button")[avoidable].click()
     crash = page_data(browser)["crashes"][avoidable]
-    wait_until(lambda: text(browser, "summary").startswith(crash["id"]))
+    wait_for(lambda: text(browser, "summary").startswith(crash["id"]))
     bundle = next(one for one in list_bundles(hunt.folder / "<b>bold&") if one.id == crash["id"])
     from_step, how, braking = crash["avoidable"]
     assert (from_step, how, braking) == (bundle.result.escape.step, "brakes", bundle.result.escape.braking)
@@ -194,7 +187,7 @@ def test_keys_lead_to_the_next_crash_and_show_all_names(hunt, browser):
     done = report_of(hunt, browser)
     for key, number in (("]", 1), ("]", 0), ("[", 1)):
         browser.find_element(By.TAG_NAME, "body").send_keys(key)
-        wait_until(lambda number=number: text(browser, "summary") == done["crashes"][number])
+        wait_for(lambda number=number: text(browser, "summary") == done["crashes"][number])
     assert browser.find_element(By.ID, "ids").get_attribute("aria-pressed") == "false"
     browser.find_element(By.TAG_NAME, "body").send_keys("i")
     assert browser.find_element(By.ID, "ids").get_attribute("aria-pressed") == "true"
@@ -209,7 +202,7 @@ def test_observed_matrix_of_a_step_is_that_of_the_recording(hunt, browser):
     shown = browser.execute_script("return crashhuntView.crash.id")
     recording = next(one for one in list_bundles(hunt.folder / "<b>bold&") if one.id == shown).recording()
     browser.execute_script("document.getElementById('seen-box').open = true; go(crashhuntView.crash.steps - 4)")
-    wait_until(lambda: text(browser, "seen"))
+    wait_for(lambda: text(browser, "seen"))
     names, *rows = (line.split() for line in text(browser, "seen").splitlines())
     seen = recording.all_steps[step(browser) + 1].observations["ego"]  # with which the next step was decided
     assert names == ["row", "presence", "x", "y", "vx", "vy", "cos_h", "sin_h"]
@@ -237,7 +230,7 @@ def test_it_is_driven_by_keyboard_and_plays(hunt, browser):
     body.send_keys(Keys.HOME)
     browser.execute_script("document.getElementById('rate').value = '20'")
     body.send_keys(" ")
-    wait_until(lambda: step(browser) == last and not browser.execute_script("return crashhuntView.playing"))
+    wait_for(lambda: step(browser) == last and not browser.execute_script("return crashhuntView.playing"))
     before = browser.execute_script("return crashhuntView.scale")
     body.send_keys("+")
     assert browser.execute_script("return crashhuntView.scale") > before
@@ -274,7 +267,7 @@ def test_dots_say_which_trial_they_are_and_lead_to_it(hunt, browser):
     highest = max(trials.values(), key=lambda trial: trial["values"][names[0][0]])
     assert text(browser, "tip").startswith(f"trial {highest['number']}:")
     canvas.send_keys(Keys.ENTER)
-    wait_until(lambda: text(browser, "summary").startswith(f"{highest['number']:06d}-"))
+    wait_for(lambda: text(browser, "summary").startswith(f"{highest['number']:06d}-"))
     assert not browser.find_element(By.ID, "tip").is_displayed()
 
     # By pointer: over the dot, and beside it.

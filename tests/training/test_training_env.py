@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 import warnings
 from contextlib import suppress
 from dataclasses import replace
@@ -20,7 +19,7 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
-from conftest import Shell
+from conftest import Shell, wait_for
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
@@ -506,10 +505,7 @@ def test_no_process_outlives_a_training(crashes, tmp_path, attack):
     if attack == "killed environment":
         expected = "SimulatorError: the process of the environment ended by signal 9; make a new environment"
         assert said.splitlines()[-1].endswith(expected)
-    deadline = time.monotonic() + 60
-    while processes_with(mark):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
+    wait_for(lambda: not processes_with(mark), timeout_s=60, every_s=0.1)
     assert json.loads((tmp_path / "policy" / "trained_on.json").read_text())["seeds"]
     assert [file.name for file in (tmp_path / "policy").iterdir()] == ["trained_on.json"]
 
