@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from crashhunt.analysis._causes import Manoeuvre, manoeuvres_of, relevant_actors
-from crashhunt.crashes import LaneMap
+from crashhunt.analysis import _causes
+from crashhunt.analysis._causes import Manoeuvre, find_why, lanes_around_crash, manoeuvres_of, relevant_actors
+from crashhunt.base.errors import CrashhuntError, RecorderError
+from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why
+from crashhunt.reruns import StoppedError
 from crashhunt.world import Actor, Roster, Scene
 
 DT = 0.1
@@ -99,6 +103,76 @@ def test_agent_changed_lanes_from_the_scene_in_which_it_began_to_move_there(asid
     assert manoeuvres_of(recording(way, 21), "ego", lanes, 20) == changed
     other = manoeuvres_of(recording(way, 21, agents=("x",)), "ego", lanes, 20)
     assert other == (changed if began == 10 else [])  # of another vehicle, the scene after the collision does not count
+
+
+@pytest.mark.parametrize(("hit", "near"), [((500.0, 0.0), True), ((0.0, 0.0), False), (None, True)])
+def test_lanes_are_those_around_the_collision_or_else_where_the_agent_was_last(monkeypatch, hit, near):
+    lane = [np.array([(x, y) for x in (480.0, 520.0)]) for y in (-1.6, 1.6)]
+    monkeypatch.setattr(_causes, "read_lanes", lambda log: [lane])
+    collision = None if hit is None else SimpleNamespace(x=hit[0], y=hit[1])
+    bundle = SimpleNamespace(result=SimpleNamespace(collision=collision), driver="ego", path=Path("bundle"))
+    ways = {"ego": lambda time_s: (460 + 20 * time_s, 0.0, 20.0) if time_s < 2.05 else None, "other": stands(0.0)}
+    assert bool(lanes_around_crash(SimpleNamespace(bundle=bundle, recorded=recording(ways, 30)))) is near
+
+
+class Twice:
+    """A search for causes with two candidates, of which the second is suppressed within the episode."""
+
+    steps = 50
+
+    def __init__(self, rerun):
+        self.candidates = [
+            _causes._Candidate(Factor("seed", "seed", "drawn"), [(number, f"seed {number}") for number in range(3)]),
+            _causes._Candidate(Factor("other", "car", "braked", 4), [(4, "held")], inside=True),
+        ]
+
+    def asked(self):
+        return self.candidates
+
+    def ending(self, asked, place, ended):
+        return LeftOut(asked.runs[place][0], "none")
+
+
+@pytest.mark.parametrize(
+    ("most", "fails", "left", "runs", "factors", "why_not"),
+    [
+        (9, {}, 0, ["seed 0", "seed 1", "seed 2", "held"], {"seed": [0, 1, 2], "car": [4]}, ""),
+        (3, {}, 1, ["seed 0", "seed 1", "held"], {"seed": [0, 1], "car": [4]}, ""),  # in turns
+        (9, {"held": CrashhuntError("no holds")}, 0, ["seed 0", "seed 1", "seed 2"], {"seed": [0, 1, 2]}, "no holds"),
+        (9, {"seed 1": StoppedError()}, 0, ["seed 0"], {"seed": [0]}, INTERRUPTED),
+        (9, {"seed 1": CrashhuntError("x")}, None, ["seed 0"], None, "x"),
+        (9, {"held": RecorderError("full")}, None, ["seed 0", "seed 1", "seed 2"], None, "full"),
+    ],
+)
+def test_causes_are_searched_within_the_limit_and_errors_end_no_more_than_they_must(
+    monkeypatch, most, fails, left, runs, factors, why_not
+):
+    monkeypatch.setattr(_causes, "_Search", Twice)
+    ran, told = [], []
+
+    def run(specs, *, recorded):
+        for place, spec in enumerate(specs):
+            if spec in fails:
+                raise fails[spec]
+            ran.append(spec)
+            assert recorded is (spec == "held")
+            yield SimpleNamespace(place=place, result=SimpleNamespace(digest="as recorded"))
+
+    def why(digest):
+        bundle = SimpleNamespace(result=SimpleNamespace(digest=digest))
+        return find_why(
+            SimpleNamespace(spec="same", bundle=bundle), SimpleNamespace(run=run), most=most, tell=told.append
+        )
+
+    if factors is None:
+        with pytest.raises(CrashhuntError, match=why_not):
+            why("as recorded")
+    else:
+        found = why("as recorded")
+        assert {one.name: [run.given for run in one.runs] for one in found.factors} == factors
+        assert (found.steps, found.left, found.why_not) == (50, left, why_not)
+    assert (ran, told) == (["same", *runs], [*range(1, len(runs) + 1)])
+    assert why("another") == Why(steps=50, left=4, why_not="the trial was not the same when it was run again")
 
 
 def stands(x, y=0.0, *, since=0.0, until=99.0):
