@@ -255,7 +255,11 @@ _TESTS_ELSEWHERE = {
         "hunts/test_whole_hunts.py",
         "e2e/test_audit.py",
     ),
-    "oracles/_requirement_oracle.py": ("episode/test_trial_signals.py", "native/test_usual_steps.py"),
+    "oracles/_requirement_oracle.py": (
+        "episode/test_trial_signals.py",
+        "native/test_usual_steps.py",
+        "oracles/test_choice.py",
+    ),
     # These are fast, and their tests lie by what a user does, not by module.
     "sumo/maps": ("on_sumo/maps/test_*.py",),
     "recording": ("recording/test_*.py",),

@@ -7,15 +7,18 @@ import sys
 
 import pytest
 
-from crashhunt.errors import CrashhuntError
+from crashhunt.errors import CrashhuntError, FormulaError, UsageError
 from crashhunt.oracles import (
     DEFAULT_ORACLES,
     TooClose,
     chosen_oracles,
+    modules_of,
     oracle_name,
     outcomes_brought,
     parse_oracle,
+    requirement_oracles,
 )
+from crashhunt.requirements import TRAFFIC_RULES
 from crashhunt.trial import CRASHES, Outcome, in_order
 from crashhunt.world import Actor, Roster, Scene
 
@@ -138,3 +141,21 @@ def test_the_one_that_creeps_up_in_a_queue_has_no_near_miss():
     assert [bool(TooClose(speed=0.0).check(scene(gap, speed=5.5), ["ego"])) for gap in (0.4, 0.6)] == [True, False]
     assert TooClose(gap_m=0.5, speed=0.0).check(scene(0.3, speed=5.5), ["ego"]) != []
     assert TooClose(gap_m=0.5, speed=0.0).check(scene(0.3, speed=0.0), ["ego"]) == []  # it has not come near
+
+
+def test_modules_of_oracles_are_known_without_an_import():
+    assert modules_of(["a.b:C:label=x:y", "collision", "requirement:calm=speed < 5", "c:D"]) == ["a.b", "c"]
+
+
+def test_requirements_become_oracles_under_their_names():
+    name, rule = next(iter(TRAFFIC_RULES.items()))
+    formula = " ".join(rule.formula.split())
+    assert requirement_oracles([f" {name} ", f"mine = {name}", "calm=always  (x > 1)", "x == 1", "x > 2"]) == [
+        f"requirement:{name.replace('-', '_')}={formula}", f"requirement:mine={formula}",
+        "requirement:calm=always (x > 1)", "requirement:requirement=x == 1", "requirement:requirement_5=x > 2",
+    ]  # fmt: skip
+    with pytest.raises(UsageError, match="--require: 'calm' is given twice"):
+        requirement_oracles(["calm=x > 1", "calm=x > 2"])
+    with pytest.raises(FormulaError) as refused:
+        requirement_oracles(["calm=always (x >"])
+    assert refused.value.where == "--require calm"
