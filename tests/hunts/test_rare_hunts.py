@@ -226,6 +226,7 @@ def test_too_many_invalid_plain_trials_leave_no_estimate():
     rule = RareWatch(settings(), rows, SAMPLER)
     rule.read()
     assert rule.estimate().estimate > 0
+    assert rule.estimate().plain_crashes == 0  # also of the root that was not answered
 
 
 def test_plain_trials_that_contradict_the_copies_withhold_the_interval():
