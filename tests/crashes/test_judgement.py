@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.crashes import Attempt, Factor, Judgement, Why, judgement_of, with_judgement
+from crashhunt.crashes import INTERRUPTED, Attempt, Factor, Judgement, LeftOut, Why, judgement_of, with_judgement
 
 BRAKE = Attempt("brake", 10, {3: "avoided", 4: "avoided", 5: "hit", 6: "hit", 7: "other", 8: "hit", 9: "hit"}, 6.5)
 LEFT = Attempt("left", 10, {0: "avoided", 9: "hit"})
@@ -82,3 +82,12 @@ def test_it_is_kept_in_a_bundle_next_to_what_others_have_added():
 ])  # fmt: skip
 def test_what_cannot_be_read_is_no_judgement(damage):
     assert judgement_of(Bundle({"judged": damage} if damage is not None else {})) is None
+
+
+def test_search_is_interrupted_if_any_part_of_it_is_and_runs_of_all_factors_count():
+    runs = tuple(LeftOut(seed, "none") for seed in range(3))
+    why = Why((Factor("seed", "seed", "drawn", runs=runs), Factor("argument", "speed", "drawn", runs=runs[:1])))
+    assert why.runs == 4
+    assert not Judgement(why=why).is_interrupted
+    assert Judgement(why=replace(why, why_not=INTERRUPTED)).is_interrupted
+    assert Judgement(why_not=INTERRUPTED).is_interrupted

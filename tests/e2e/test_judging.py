@@ -30,7 +30,6 @@ def test_slips(toy, words, said):
     assert said in toy.crashhunt("judge", "h", *words, expect=2).err
 
 
-@pytest.mark.nightly
 def test_what_a_failure_hangs_on_is_run_and_reported(toy):
     words = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=2|30", "--seed", "1")
     toy.crashhunt("run", "h", "1", "9", "9", *words)
