@@ -243,7 +243,7 @@ class RayCaster:
         ray_cos, ray_sin = self._cos[ray], self._sin[ray]
         towards = first_cos * ray_cos - first_sin * ray_sin, first_sin * ray_cos + first_cos * ray_sin
         enters, leaves = np.zeros(len(ray)), np.full(len(ray), self.reach_m)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             for offset, step, half in ((along, towards[0], half_length), (across, towards[1], half_width)):
                 one, two = (-half - offset) / step, (half - offset) / step
                 # A ray along an edge gives 0 / 0, which is within the rectangle for every distance.

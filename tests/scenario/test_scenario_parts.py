@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from crashhunt.base import integrity
 from crashhunt.base.errors import HuntDirectoryError, ScenarioError, UsageError
 from crashhunt.gym._descriptor import BACKEND as GYM, CrashRule, GymSetup
 from crashhunt.highway._descriptor import BACKEND as HIGHWAY, HighwaySetup
@@ -196,12 +197,12 @@ def test_scenario_file_that_cannot_be_read_is_one_line(tmp_path):
 
 
 def test_scenario_file_that_the_system_refuses_is_one_line(tmp_path, monkeypatch):
-    def refused(path, mode):
+    def refused(path, flags):
         raise PermissionError(13, "Permission denied")
 
     file = tmp_path / "scenario.toml"
     file.touch()
-    monkeypatch.setattr(Path, "open", refused)
+    monkeypatch.setattr(integrity, "open_at_once", refused)
     said, _, where = refusal(load_scenario, file)
     assert (said, where) == ("cannot be read: Permission denied", str(file))
 
