@@ -85,7 +85,9 @@ class FmuFactory(ForeignFactory):
         self._model: _Model | None = None
         self._folder: Path | None = None
 
-    def declared_signature(self, agent: str = "", simulator: Simulator | None = None) -> Signature:
+    def declared_signature(
+        self, agent: str = "", simulator: Simulator | None = None, *, limit_s: float = 0.0
+    ) -> Signature:
         """Return the parameters of the FMU as arguments, which are the same for every vehicle.
 
         Options may choose other observations and actions than the scenario, so the simulator is not used.

@@ -92,7 +92,9 @@ class LibraryFactory(ForeignFactory):
         self._library: ctypes.CDLL | None = None
         self._defaults: dict[str, Value] = {}
 
-    def declared_signature(self, agent: str = "", simulator: Simulator | None = None) -> Signature:
+    def declared_signature(
+        self, agent: str = "", simulator: Simulator | None = None, *, limit_s: float = 0.0
+    ) -> Signature:
         """Return the arguments that the library declares for every vehicle; another process loads it for this."""
         return self._signature(describe_library(self._locator, path_of(self._locator)).declaration)
 

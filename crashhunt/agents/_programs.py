@@ -98,7 +98,9 @@ class ProgramFactory(ForeignFactory):
         self._locator = locator
         words_of(locator)  # refuses what is not a command line
 
-    def declared_signature(self, agent: str = "", simulator: Simulator | None = None) -> Signature:
+    def declared_signature(
+        self, agent: str = "", simulator: Simulator | None = None, *, limit_s: float = 0.0
+    ) -> Signature:
         """Run the program once, and return the arguments that it declares in its first answer.
 
         The program receives ``hello`` without arguments, and then ``close``. Without a simulator, ``hello`` has no
@@ -109,7 +111,8 @@ class ProgramFactory(ForeignFactory):
             program = _Process(command, Path(folder), log.fileno())
             try:
                 program.start()
-                return _signature_in(program.ask(_hello(agent, simulator, {}), "hello", _DESCRIPTION_S))
+                limit = max(limit_s, _DESCRIPTION_S)
+                return _signature_in(program.ask(_hello(agent, simulator, {}), "hello", limit))
             except ProgramError as error:
                 raise ProgramError(f"{error.message}{_last_line(log)}", fix=error.fix) from None
             finally:

@@ -47,12 +47,15 @@ class Agent(Protocol):
 class ForeignFactory(Protocol):
     """Creates the agents of one locator that names no Python code, such as ``exec:./planner``."""
 
-    def declared_signature(self, agent: str = "", simulator: Simulator | None = None) -> Signature:
+    def declared_signature(
+        self, agent: str = "", simulator: Simulator | None = None, *, limit_s: float = 0.0
+    ) -> Signature:
         """Return the arguments that the program, library or FMU declares.
 
         Args:
             agent: the vehicle that it drives.
             simulator: the simulator, which need not have been reset.
+            limit_s: time in s for a program to answer; at least 60 s.
 
         Raises:
             PluginError: it cannot be used.

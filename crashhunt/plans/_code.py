@@ -102,7 +102,7 @@ def describe_code(
 
     if not (foreign or chosen or models or machinery or any(map(is_foreign_module, modules))):
         return CodeFacts({locator: signature_of(locate("agents", locator)) for locator in locators})
-    declared, notes = _declared(programs, scenario, IMPORT_S + timeout_s) if programs else ({}, [])
+    declared, notes = _declared(programs, scenario, timeout_s) if programs else ({}, [])
     data: Any = work_apart(described, task="what it names cannot be imported", timeout_s=IMPORT_S + timeout_s)
     signatures = {locator: Signature.from_json(found) for locator, found in data["signatures"].items()} | declared
     revisions = {locator: one.revision for locator, one in declared.items() if one.revision}
@@ -112,7 +112,7 @@ def describe_code(
     )  # fmt: skip
 
 
-def _declared(locators: Sequence[str], scenario: Scenario, timeout_s: float) -> tuple[dict[str, Signature], list[str]]:
+def _declared(locators: Sequence[str], scenario: Scenario, limit_s: float) -> tuple[dict[str, Signature], list[str]]:
     """Return the arguments that programs declare, and a note for each program that has failed.
 
     A program that fails takes any argument. The trials report the failure, each as an error of the agent. The
@@ -127,14 +127,14 @@ def _declared(locators: Sequence[str], scenario: Scenario, timeout_s: float) -> 
                 agent = next(name for name, setup in scenario.agents.items() if setup.agent == locator)
                 simulator = locate("simulators", scenario.simulator)(scenario, stage)
                 try:
-                    signature = locate("agents", locator).declared_signature(agent, simulator)
+                    signature = locate("agents", locator).declared_signature(agent, simulator, limit_s=limit_s)
                 except ProgramError as error:
                     found["notes"].append(f"{locator} has not declared its arguments: {error}")
                     signature = Signature({}, open=True, given=())
                 found["signatures"][locator] = signature.to_json()
         return found
 
-    data: Any = work_apart(described, task="the programs cannot be described", timeout_s=timeout_s)
+    data: Any = work_apart(described, task="the programs cannot be described", timeout_s=IMPORT_S + limit_s)
     return {locator: Signature.from_json(found) for locator, found in data["signatures"].items()}, data["notes"]
 
 

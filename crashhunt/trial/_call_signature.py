@@ -134,12 +134,13 @@ class ReturnsActions(Protocol):
 class DeclaresArguments(typing.Protocol):
     """A factory that reports its arguments itself, such as that of a program."""
 
-    def declared_signature(self, agent: str = "", simulator: Any = None) -> Signature:
+    def declared_signature(self, agent: str = "", simulator: Any = None, *, limit_s: float = 0.0) -> Signature:
         """Return the arguments of the factory.
 
         Args:
             agent: the vehicle that the agent drives; empty if it is unknown.
             simulator: the `Simulator`; None if there is none.
+            limit_s: time in s for a program to answer; at least 60 s.
         """
 
 

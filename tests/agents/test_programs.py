@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import time
+from contextlib import nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import ClassVar
@@ -525,6 +526,17 @@ def test_the_error_of_a_program_that_does_not_answer_shows_its_last_output(tmp_p
     program.chmod(0o755)
     with pytest.raises(ProgramError, match=r"exited with 4 instead of .*\(its last output: no planner.yaml here\)"):
         ProgramFactory(f"exec:{program}").declared_signature()
+
+
+@pytest.mark.parametrize("limit_s", [0.0, 60.0])
+def test_a_slow_program_may_declare_its_arguments_for_as_long_as_a_trial_may_take(tmp_path, monkeypatch, limit_s):
+    program = tmp_path / "imports"
+    ready = '{"type": "ready", "arguments": {"gap": {"range": "1:2"}}}'
+    program.write_text(f"#!/bin/sh\nread hello\nsleep 0.5\necho '{ready}'\nread close\n", encoding="utf-8")
+    program.chmod(0o755)
+    monkeypatch.setattr("crashhunt.agents._programs._DESCRIPTION_S", 0.1)
+    with nullcontext() if limit_s else pytest.raises(ProgramError, match="not answered hello"):
+        assert "gap" in ProgramFactory(f"exec:{program}").declared_signature(limit_s=limit_s).arguments
 
 
 def test_what_is_no_program_is_refused_with_the_fix(tmp_path, monkeypatch):
