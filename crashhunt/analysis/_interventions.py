@@ -18,7 +18,7 @@ from crashhunt.plans import Owners, agent_of, takes_of
 from crashhunt.trial import SENSOR_KINDS, Constant, Handover, Manoeuvre, Overruled, in_turn, parse_spec
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from crashhunt.crashes import Bundle
     from crashhunt.replays import Rerun
@@ -143,19 +143,22 @@ class LeaveOut:
         """Return the run unchanged; the engine excludes the actors after it has determined which actors enter."""
         return rerun
 
-    def taking_part(self, entered: tuple[str, ...]) -> tuple[str, ...]:
+    def taking_part(self, entered: tuple[str, ...], agents: Collection[str]) -> tuple[str, ...]:
         """Return the actors that remain.
 
         Args:
             entered: all actors that entered in the recorded trial.
+            agents: the agents, which always take part.
 
         Raises:
-            UsageError: an actor to exclude is not among the actors that entered.
+            UsageError: an actor to exclude is not among the actors that entered, or is an agent.
         """
+        others = [name for name in entered if name not in agents]
         for actor in self.actors:
-            if actor not in entered:
-                fix = one_of(actor, entered) if entered else "omit --leave-out, which the simulator does not support"
-                raise UsageError(f"--leave-out {actor!r}: there is no such actor", fix=fix)
+            if actor not in others:
+                fix = one_of(actor, others) if others else "omit --leave-out, because no actor can be excluded"
+                why = "agents always take part" if actor in agents else "there is no such actor"
+                raise UsageError(f"--leave-out {actor!r}: {why}", fix=fix)
         return tuple(name for name in entered if name not in self.actors)
 
     def __str__(self) -> str:

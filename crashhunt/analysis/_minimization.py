@@ -46,7 +46,7 @@ class Shrunk(Serializable):
         small: the minimized crash; None if nothing was removed.
         why: the reason for the end, as text.
         actors: number of actors in the scenes before and after the minimization, including agents.
-        agents: number of agents in the scenes.
+        agents: number of agents in the scenes before and after the minimization.
         trials: number of runs.
         steps: total number of simulated steps in these runs.
         removed: the removed actors and disturbances.
@@ -61,7 +61,7 @@ class Shrunk(Serializable):
     small: Bundle | None = None
     why: str = ""
     actors: tuple[int, int] = (0, 0)
-    agents: int = 0
+    agents: tuple[int, int] = (0, 0)
     trials: int = 0
     steps: int = 0
     removed: tuple[str, ...] = ()
@@ -79,8 +79,8 @@ class Shrunk(Serializable):
     @property
     def others(self) -> tuple[int, int]:
         """The number of actors other than the agents, before and after the minimization."""
-        before, after = self.actors
-        return before - self.agents, after - self.agents
+        (before, after), (agents_before, agents_after) = self.actors, self.agents
+        return before - agents_before, after - agents_after
 
     @property
     def scripted(self) -> tuple[str, ...] | None:
@@ -173,7 +173,7 @@ def shrink(
         ended=ended,
         why=why,
         actors=search.actors(None),
-        agents=search.agents,
+        agents=search.agents(None),
         trials=runs.count,
         steps=runs.steps,
         notes=(*rerun.warnings, *search.notes),
@@ -186,7 +186,8 @@ def shrink(
         found,
         verdict="shrunk",
         small=small,
-        actors=search.actors(small.recording()),
+        actors=search.actors(after := small.recording()),
+        agents=search.agents(after),
         removed=search.removed(),
         changed=search.changed(),
         steps_cut=search.steps_cut,

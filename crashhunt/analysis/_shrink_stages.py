@@ -450,10 +450,10 @@ class Minimizer:
         before = _actors(self._rerun.recorded)
         return len(before), len(before if after is None else _actors(after))
 
-    @property
-    def agents(self) -> int:
-        """The number of agents in the scenes."""
-        return len(_actors(self._rerun.recorded) & set(self._rerun.recorded.agents))
+    def agents(self, after: Recording | None) -> tuple[int, int]:
+        """Return the number of agents in the scenes before and after, because an agent may be removed like others."""
+        agents, before = {*self._rerun.recorded.agents}, _actors(self._rerun.recorded)
+        return len(before & agents), len((before if after is None else _actors(after)) & agents)
 
     @property
     def steps_cut(self) -> int:

@@ -197,7 +197,7 @@ class _Runs:
         same = ended.result.digest == self._rerun.bundle.result.digest
         entered = ended.entered if same else ()
         for one in interventions:
-            entered = one.taking_part(entered)
+            entered = one.taking_part(entered, self._rerun.worker.scenario.agents)
         self._spec = replace(self._spec, only=entered)
 
     def run_alike(self) -> None:

@@ -102,11 +102,12 @@ def _summary_of(found: Shrunk) -> str:
         lines.append(f"  {what}: {why}" if why else f"  {what}")
         lines += [f"  note: {note}" for note in found.notes]
         return in_lines(lines)
-    (before, after), result = found.others, small.result
+    (before, after), (agents, agents_left), result = found.others, found.agents, small.result
     moved = "" if found.scripted is None else _replaced_words(found.scripted)
     lines += [
         f"{small.id}: {result.summary}",
         f"  other actors: {before} before, {after} now; steps: {was.steps} before, {result.steps} now",
+        *([f"  agents: {agents} before, {agents_left} now"] if agents_left < agents else []),
         *([f"  {moved}"] if moved else []),
         *([f"  the first {found.steps_cut} steps are removed"] if found.steps_cut else []),
         *(f"  {name} was {left} and is {right}" for name, (left, right) in found.changed.items()),

@@ -84,8 +84,8 @@ def test_what_is_left_is_written_next_to_it_and_confirmed(crash):
     assert told["trials_run"] == found.trials > 3
     assert told["steps_run"] == found.steps > 52
     assert any("cannot exclude actors" in note for note in told["notes"])
-    fewer = replace(found, actors=(5, 2)).to_json()
-    assert (fewer["actors_before"], fewer["actors_after"]) == (5, 2)
+    fewer = replace(found, actors=(5, 2), agents=(3, 1))
+    assert (fewer.to_json()["actors_before"], fewer.to_json()["actors_after"], fewer.others) == (5, 2, (2, 1))
 
 
 class AskedError(Exception):

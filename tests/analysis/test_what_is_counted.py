@@ -137,9 +137,12 @@ def test_recorded_prefix_ends_where_the_first_change_begins():
 
 
 def test_excluded_actors_must_have_entered():
-    assert LeaveOut(actors=("b",)).taking_part(("a", "b", "c")) == ("a", "c")
+    assert LeaveOut(actors=("b",)).taking_part(("a", "b", "c"), {"c"}) == ("a", "c")
     with pytest.raises(UsageError, match="--leave-out 'd': there is no such actor"):
-        LeaveOut(actors=("d",)).taking_part(("a", "b"))
+        LeaveOut(actors=("d",)).taking_part(("a", "b"), ())
+    with pytest.raises(UsageError, match="--leave-out 'b': agents always take part") as refused:
+        LeaveOut(actors=("b",)).taking_part(("a", "b"), {"b"})
+    assert refused.value.fix == "give a"
 
 
 def test_overrule_writes_the_manoeuvre_into_the_specification():

@@ -471,6 +471,7 @@ def test_where_no_one_can_be_excluded_that_is_reported():
     alone = Minimizer(crash(names=("a", "ego"), agents=("a", "ego")), Takes(entered=()), "traffic")
     assert alone.run(lambda: False)[0] == "done"
     assert alone.notes == []  # there is nobody else
+    assert (alone.agents(None), alone.agents(Recorded([scene(12.0, ("ego", "b"))]))) == ((2, 2), (2, 1))
 
 
 def test_the_others_of_a_crash_are_those_of_the_collision_or_of_the_event():

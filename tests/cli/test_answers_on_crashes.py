@@ -469,7 +469,8 @@ def test_options_out_of_range_are_named(words, message):
 def shrunk(**more):
     usual = {
         "bundle": crash(), "verdict": "minimized", "ended": "done", "small": None, "why": "", "others": (8, 1),
-        "trials": 40, "steps_cut": 0, "notes": (), "scripted": None, "changed": {}, "to_json": lambda: {"trials": 40},
+        "agents": (2, 2), "trials": 40, "steps_cut": 0, "notes": (), "scripted": None, "changed": {},
+        "to_json": lambda: {"trials": 40},
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **more})
 
@@ -523,12 +524,15 @@ def test_crash_that_stays_as_it_is_is_described(found, line):
 
 def test_minimized_crash_is_described():
     small = crash(steps=20, id="000003-collision.small", confirmed=True, why_unconfirmed="")
-    found = shrunk(small=small, scripted=("a", "b"), steps_cut=5, changed={"speed": (9.5, 10)}, notes=("n",))
+    found = shrunk(
+        small=small, agents=(2, 1), scripted=("a", "b"), steps_cut=5, changed={"speed": (9.5, 10)}, notes=("n",)
+    )
     lines = [line.strip() for line in _shrink._summary_of(found).splitlines()]
     assert lines == [
         "000003-collision: it crashed",
         "000003-collision.small: it crashed",
         "other actors: 8 before, 1 now; steps: 50 before, 20 now",
+        "agents: 2 before, 1 now",
         "a, b are moved as recorded, independent of the agent",
         "the first 5 steps are removed",
         "speed was 9.5 and is 10",
