@@ -82,3 +82,19 @@ def test_frenetix_brakes_although_its_costs_prefer_to_drive_through_the_vehicle_
     plan = Frenetix(vehicle, 19.0).act(seen)
     assert plan[5, 4] < 4.0
     assert (np.diff(plan[:10, 4]) < 0).all()
+
+
+def test_mpc_keeps_its_distance_from_the_side_of_a_truck_that_crosses():
+    """Half of the truck's length is not in the way along the route, and far more than its width is across it."""
+    module = pytest.importorskip("crashhunt.agents.planners.mpc_agent", exc_type=ImportError)
+    path = np.column_stack([np.arange(0.0, 100.0, 1.0), np.zeros(100)])
+    vehicle = SimpleNamespace(length=5.0, width=1.8, wheelbase=2.8)
+    agent = module.Mpc(SimpleNamespace(reference_path=path), vehicle, gap=4.0)
+    agent.reset(1)
+    actors = np.zeros((2, 9))
+    actors[0] = [1.0, 8.0, -5.0, np.pi / 2, 0.0, 0.0, 0.0, 12.0, 2.5]  # its front is 1 m across the route
+    paths = np.tile([8.0, -5.0, np.pi / 2, 0.0], (2, module.STEPS, 1))
+    room = agent.room(actors, paths)
+    assert room == pytest.approx(np.full(module.STEPS, 8.0 - 2.5 / 2 - 5.0 / 2 - 4.0))
+    paths[0, :, 1] = -8.0  # it stands 2 m beside the route
+    assert (agent.room(actors, paths) > 900.0).all()

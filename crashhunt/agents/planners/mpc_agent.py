@@ -52,7 +52,11 @@ class Mpc:
         ahead, room = self.path[self.at : self.at + 60], np.full(STEPS, 1e3)
         for number in np.flatnonzero(actors[:, 0]):
             away = np.hypot(*(paths[number][:, None, :2] - ahead).transpose(2, 0, 1))
-            length, width = actors[number, 7:9] + (self.vehicle.length, self.vehicle.width)
-            front = self.s[self.at + away.argmin(1)] - self.s[self.at] - length / 2 - self.gap
-            room = np.where((away.min(1) < width / 2 + 0.3) & (front > -self.gap), np.minimum(room, front), room)
+            nearest, (length, width) = self.at + away.argmin(1), actors[number, 7:9]
+            turn = paths[number][:, 2] - self.heading[nearest]
+            along, across = np.abs(np.cos(turn)), np.abs(np.sin(turn))  # a truck that crosses is wide, and not long
+            center = self.s[nearest] - self.s[self.at]
+            front = center - (length * along + width * across + self.vehicle.length) / 2 - self.gap
+            side = (length * across + width * along + self.vehicle.width) / 2 + 0.3
+            room = np.where((away.min(1) < side) & (center > 0), np.minimum(room, front), room)
         return room
