@@ -77,7 +77,7 @@ NOT_DECIDED = "not decided"
 
 def fault_words(fault: str) -> str:
     """Return a verdict on the vehicle at fault as text."""
-    return NOT_DECIDED if fault == "nobody can tell" else fault
+    return {"nobody can tell": NOT_DECIDED, "ego": "the agent"}.get(fault, fault)  # an agent may have another name
 
 
 COLUMNS = ("criticality", "rear")

@@ -17,6 +17,7 @@ from crashhunt.recording import Phase
 from crashhunt.report import describe_hunt, describe_replay
 from crashhunt.report._listing import describe
 from crashhunt.report._status_screen import _workers
+from crashhunt.report._words import fault_words
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 
 SETTINGS = HuntSettings(scenario="loop", scenario_digest="0", trials=30, max_steps=90, seed=7, run=RunSettings())
@@ -261,3 +262,8 @@ def test_states_of_workers_fit_into_the_lines_that_there_are(count, width, rows)
         hidden = re.search(r"and (\d+) more", text)
         assert len(there) + (int(hidden[1]) if hidden else 0) == count
         assert bool(hidden) == (count == 60)
+
+
+def test_verdict_on_the_vehicle_at_fault_names_no_agent_because_a_hunt_may_have_several():
+    verdicts = ("ego", "the other", "both", "nobody can tell", "mixed")
+    assert [fault_words(one) for one in verdicts] == ["the agent", "the other", "both", "not decided", "mixed"]
