@@ -42,7 +42,7 @@ _MIN_WARM_UP_S = 0.02  # a fork of a fork costs some ten milliseconds, half of t
 _TRIALS_UNTIL_STALE = 8  # a copy makes room after this many trials per copy without one in its traffic
 
 # Bound here, before any agent is imported that could replace them.
-_dumps, _loads, _write = json.dumps, json.loads, os.write
+_dumps, _loads = json.dumps, json.loads
 
 
 class _Answer(TypedDict, total=False):
@@ -188,8 +188,7 @@ class _Suspended:
     def ask(self, text: bytes, wait: Wait) -> _Answer | None:
         """Send a request to the process, and return its answer; None if the process has ended."""
         try:
-            while text:
-                text = text[_write(self.requests, text) :]
+            forks.write_all(self.requests, text)
         except BrokenPipeError:
             return None
         received = bytearray()
@@ -229,7 +228,7 @@ def _be_suspended(requests: int, answers: int, trial: TrialProcess, simulator: S
     try:
         seed_everything(spec.seed)
         begun = simulator.reset(seed=spec.seed, options=options_of(spec, simulator))
-    except BaseException:  # the trial itself will report it
+    except BaseException:  # the trial resets again in a fork of the zygote, and reports what it raises
         _report(answers, {})
         return
     _report(answers, {"took_s": time.monotonic() - began})
@@ -273,10 +272,8 @@ def _run(trial: TrialProcess, line: bytes, again: Callable[..., tuple[Observatio
 
 
 def _report(answers: int, said: _Answer) -> None:
-    text = _dumps(said).encode() + b"\n"
     with suppress(BrokenPipeError):
-        while text:
-            text = text[_write(answers, text) :]
+        forks.write_all(answers, _dumps(said).encode() + b"\n")
 
 
 def _traffic_key(spec: TrialSpec) -> str:

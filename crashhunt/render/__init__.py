@@ -9,6 +9,21 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
+    from crashhunt.panels import (
+        Action as Action,
+        ActionDistribution as ActionDistribution,
+        Bar as Bar,
+        Contour as Contour,
+        Curve as Curve,
+        Curve3D as Curve3D,
+        Heatmap as Heatmap,
+        Panel as Panel,
+        Picture as Picture,
+        Text as Text,
+        labelled as labelled,
+        scope as scope,
+    )
+
     from ._film import (
         FilmOptions as FilmOptions,
         Layout as Layout,
@@ -21,23 +36,11 @@ if TYPE_CHECKING:
         write_video as write_video,
     )
     from ._film_panels import (
-        Action as Action,
-        ActionDistribution as ActionDistribution,
-        Bar as Bar,
-        Contour as Contour,
-        Curve as Curve,
-        Curve3D as Curve3D,
-        Heatmap as Heatmap,
-        Panel as Panel,
-        Picture as Picture,
-        Text as Text,
         explanation as explanation,
-        labelled as labelled,
         load_meanings as load_meanings,
         load_panels as load_panels,
         save_meanings as save_meanings,
         save_panels as save_panels,
-        scope as scope,
     )
     from ._scene_from_above import SceneView as SceneView
 

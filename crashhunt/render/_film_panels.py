@@ -1,7 +1,4 @@
-"""Panels in a film: the built-in curves, and the pictures of an agent's own panels on their way into the film.
-
-Agents import panels under the name of this package: ``from crashhunt.render import Bar``.
-"""
+"""Panels in a film: the built-in curves, and the pictures of an agent's own panels on their way into the film."""
 
 from __future__ import annotations
 
@@ -12,20 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.crashes import Encounter, danger_course
-from crashhunt.panels import (
-    Action as Action,
-    ActionDistribution as ActionDistribution,
-    Bar as Bar,
-    Contour as Contour,
-    Curve as Curve,
-    Curve3D as Curve3D,
-    Heatmap as Heatmap,
-    Panel as Panel,
-    Picture as Picture,
-    Text as Text,
-    labelled as labelled,
-    scope as scope,
-)
+from crashhunt.panels import Action, Curve, Panel, Text
 from crashhunt.recording import is_opaque
 from crashhunt.world import approaches
 

@@ -52,7 +52,7 @@ def test_a_full_disk_is_reported_and_what_came_of_the_trials_is_remembered(hunt,
 
     def full_later(small, **_):
         assert "shrunk" in small.added
-        assert small.path.name.startswith(".")  # whoever kills it now leaves no bundle under its final name
+        assert small.path.name.startswith(".")  # a kill at this moment leaves no bundle under the final name
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patched:

@@ -113,7 +113,7 @@ def test_what_is_no_log_is_refused(tmp_path):
     path = tmp_path / "log.mcap"
     with pytest.raises(BundleError, match="cannot be read"):
         read_log(path)
-    os.mkfifo(path)  # nobody writes into it
+    os.mkfifo(path)  # no process writes into it
     with pytest.raises(BundleError, match="incomplete MCAP file: "):
         read_log(path)
     path.unlink()
