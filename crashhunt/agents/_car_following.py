@@ -157,7 +157,7 @@ def idm_acceleration(
 
 
 class SpeedAgent:
-    """The parts that agents share which choose an acceleration from an observation in the default layout."""
+    """The common part of agents that choose an acceleration, from an observation in the default layout."""
 
     actions = SPEED_OR_META
 
