@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
@@ -245,9 +246,11 @@ def judge(
     _require_judgeable(bundle, of_two=of_two, why=why)
     rerun = prepare(bundle, options or ReplayOptions())
 
-    def tell(done: int) -> None:
+    finished = itertools.count(1)
+
+    def tell() -> None:
         if watch is not None:
-            watch(done, runs + why + reference + (PREVENTABILITY_RUNS if drivers and of_two else 0))
+            watch(next(finished), runs + why + reference + (PREVENTABILITY_RUNS if drivers and of_two else 0))
 
     with closing(reruns_of(rerun, parallel=parallel, stopped=stopped)) as reruns:
         lanes = lanes_around_crash(rerun)
@@ -258,21 +261,15 @@ def judge(
             if of_two:
                 search.all()
             if why > 0:
-                found = find_why(rerun, reruns, most=why, tell=lambda done: tell(trials.done + done))
+                found = find_why(rerun, reruns, most=why, tell=tell)
         except StoppedError:
             search.why_not = INTERRUPTED
-    before = trials.done + (found.runs if found is not None else 0)
     omitted = None
     if reference > 0 and result.outcome in (Outcome.COLLISION, Outcome.OFF_ROAD) and search.why_not != INTERRUPTED:
-        omitted = find_omission(
-            rerun, most=reference, parallel=parallel, stopped=stopped, tell=lambda done: tell(before + done)
-        )
+        omitted = find_omission(rerun, most=reference, parallel=parallel, stopped=stopped, tell=tell)
     prevented = None
     if drivers and of_two and search.why_not != INTERRUPTED:
-        before += len(omitted.runs) if omitted is not None else 0
-        prevented = find_preventability(
-            rerun, parallel=parallel, stopped=stopped, tell=lambda done: tell(before + done)
-        )
+        prevented = find_preventability(rerun, parallel=parallel, stopped=stopped, tell=tell)
     visible = visible_from(rerun.recorded, hit.agent, hit.other) if of_two and hit is not None else None
     return replace(search.judgement(), why=found, visible_step=visible, reference=omitted, drivers=prevented)
 
@@ -382,8 +379,7 @@ class _Trials:
     recorded: Recording
     reruns: Reruns
     lanes: LaneMap
-    tell: Callable[[int], None]
-    done: int = 0
+    tell: Callable[[], None]
 
     def run(self, manoeuvre: str, steps: list[int]) -> Iterator[Tried]:
         """Yield the result of a manoeuvre after each of some steps, in the order in which the runs end.
@@ -409,8 +405,7 @@ class _Trials:
         result, recording = ended.result, ended.recording
         if result.outcome is Outcome.INVALID:
             raise CannotError(result.failure.message if result.failure else "its trial could not be set up")
-        self.done += 1
-        self.tell(self.done)
+        self.tell()
         assert self.result.collision is not None
         if recording is None:
             return Tried(step, "unclear")

@@ -184,14 +184,14 @@ class _Candidate:
         return replace(self.factor, runs=tuple(self.endings[place] for place in sorted(self.endings)))
 
 
-def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], None]) -> Why:
+def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[], None]) -> Why:
     """Return the causes of a crash.
 
     Args:
         rerun: the crash to analyse.
         runs: object that runs trials of the crash.
         most: maximum number of trials to run, not counting the unchanged trial.
-        tell: function called with the number of finished runs.
+        tell: function called after each finished run.
 
     Raises:
         CrashhuntError: no trial can be run.
@@ -200,7 +200,7 @@ def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], Non
     asked = search.asked()
     turns = [(one, place) for place in range(_DRAWS) for one in asked if place < len(one.runs)]
     chosen, left = turns[:most], len(turns[most:])
-    why_not, done = "", 0
+    why_not = ""
     try:
         (same,) = runs.run([rerun.spec], recorded=False)
         if same.result.digest != rerun.bundle.result.digest:
@@ -212,8 +212,7 @@ def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], Non
                 for ended in runs.run([one.runs[place][1] for one, place in batch], recorded=inside):
                     one, place = batch[ended.place]
                     one.endings[place] = search.ending(one, place, ended)
-                    done += 1
-                    tell(done)
+                    tell()
             except RecorderError:
                 raise
             except CrashhuntError as error:

@@ -61,7 +61,7 @@ _UNDECIDED = {
 
 
 def find_preventability(
-    rerun: Rerun, *, parallel: int, stopped: Callable[[], bool], tell: Callable[[int], None]
+    rerun: Rerun, *, parallel: int, stopped: Callable[[], bool], tell: Callable[[], None]
 ) -> Preventability:
     """Return which models of a competent driver would have prevented a collision of two actors.
 
@@ -69,7 +69,7 @@ def find_preventability(
         rerun: the collision to analyse.
         parallel: number of runs at a time.
         stopped: function that returns whether to stop.
-        tell: function called with the number of finished runs.
+        tell: function called after each finished run.
     """
     result, recording = rerun.bundle.result, rerun.recorded
     hit = result.collision
@@ -88,10 +88,10 @@ def find_preventability(
 
     with closing(reruns_of(rerun, parallel=parallel, stopped=stopped, todays=True)) as reruns:
         try:
-            for done, ended in enumerate(reruns.run([trial(model) for model in models]), start=1):
+            for ended in reruns.run([trial(model) for model in models]):
                 model = models[ended.place]
                 runs[model] = _answer(rerun, model, since, ended)
-                tell(done)
+                tell()
         except StoppedError:
             return Preventability(since_step=since, runs=_in_order(runs), why_not=INTERRUPTED)
         except RecorderError:
@@ -118,7 +118,7 @@ def judge_preventability(bundle: Bundle, *, parallel: int = 1) -> bool | None:
     if bundle.result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
         return None
     rerun = prepare(bundle, ReplayOptions(force=True, trusted=True))
-    return find_preventability(rerun, parallel=parallel, stopped=lambda: False, tell=lambda _: None).by_any
+    return find_preventability(rerun, parallel=parallel, stopped=lambda: False, tell=lambda: None).by_any
 
 
 def _in_order(runs: dict[str, DriverRun]) -> tuple[DriverRun, ...]:

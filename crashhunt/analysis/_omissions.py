@@ -63,7 +63,7 @@ def find_omission(
     most: int,
     parallel: int,
     stopped: Callable[[], bool],
-    tell: Callable[[int], None],
+    tell: Callable[[], None],
 ) -> Reference:
     """Return what the agent omitted, according to runs with a reference driver.
 
@@ -75,7 +75,7 @@ def find_omission(
         most: maximum number of runs.
         parallel: number of runs at a time.
         stopped: function that returns whether to stop.
-        tell: function called with the number of finished runs.
+        tell: function called after each finished run.
 
     Raises:
         CrashhuntError: no trial can be run.
@@ -101,10 +101,10 @@ def find_omission(
 class _Search:
     """The search for what one agent omitted."""
 
-    def __init__(self, rerun: Rerun, reruns: Reruns, most: int, tell: Callable[[int], None]) -> None:
+    def __init__(self, rerun: Rerun, reruns: Reruns, most: int, tell: Callable[[], None]) -> None:
         self.runs: list[ReferenceRun] = []
         self._rerun, self._reruns, self._tell = rerun, reruns, tell
-        self._left, self._done = most, 0
+        self._left = most
         self._result, self._recording = rerun.bundle.result, rerun.recorded
         self._agent, self._other = rerun.bundle.driver, partner(self._result)
         self._dt = self._recording.prologue.step_length_s
@@ -181,8 +181,7 @@ class _Search:
         for ended in self._reruns.run(made):
             found[ended.place] = ended
             self._left -= 1
-            self._done += 1
-            self._tell(self._done)
+            self._tell()
         return [found[place] for place in range(len(made))]
 
     def _judged(self, faculty: str, step: int, ended: EndedRun) -> ReferenceRun:

@@ -62,7 +62,7 @@ def find_cause(
         found = Judgement()
     if found.reference is None and result.outcome in (Outcome.COLLISION, Outcome.OFF_ROAD):
         rerun = prepare(bundle, options or ReplayOptions())
-        reference = find_omission(rerun, most=_REFERENCE_RUNS, parallel=parallel, stopped=stopped, tell=lambda _: None)
+        reference = find_omission(rerun, most=_REFERENCE_RUNS, parallel=parallel, stopped=stopped, tell=lambda: None)
         found = replace(found, reference=reference)
     if found.why is None and (found.reference is None or found.reference.omission is None):
         new = judge(bundle, options, runs=1, why=_WHY_RUNS, parallel=parallel, stopped=stopped)
