@@ -9,7 +9,6 @@ import pytest
 
 from crashhunt.analysis import (
     Counts,
-    Disturb,
     LeaveOut,
     Overrule,
     Reseed,
@@ -22,7 +21,7 @@ from crashhunt.analysis._whatif_runs import _from_step, _Runs, future_seed
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.crashes import wilson
 from crashhunt.episode import HandedOver, _action_override
-from crashhunt.trial import KILLED, Disturbance, Failure, Handover, Outcome, Reseeding, TrialResult, TrialSpec
+from crashhunt.trial import KILLED, Failure, Handover, Outcome, Reseeding, TrialResult, TrialSpec
 
 
 def run(number, *, outcome=Outcome.COLLISION, steps=10, digest=None, excluded=""):
@@ -127,13 +126,10 @@ def test_run_that_cannot_be_set_up_is_an_error():
 
 
 def test_recorded_prefix_ends_where_the_first_change_begins():
-    late, seen = Disturbance(9, "ahead", "brake", 1.0, 1.0, "ego"), Disturbance(9, "ahead", "blind", 1.0, 1.0, "ego")
     assert _from_step([Reseed(from_step=7), Overrule(from_step=5)]) == 5
     assert _from_step([Reseed(from_step=7), SetArguments(changes={})]) is None
     assert _from_step([LeaveOut(actors=("a",))]) is None
     assert _from_step([]) is None
-    assert _from_step([Disturb(disturbances=(late,))]) == 8
-    assert _from_step([Disturb(disturbances=(seen,))]) in (7, 8)
 
 
 def test_excluded_actors_must_have_entered():
