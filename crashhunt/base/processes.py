@@ -88,30 +88,24 @@ def descendants_of(pid: int) -> list[int]:
     return [*found, *(below for child in found for below in descendants_of(child))]
 
 
-def end_descendants(spared: frozenset[int] = frozenset()) -> bool:
+def end_descendants(spared: frozenset[int] = frozenset()) -> None:
     """Kill and reap every process below this process, which must have called `adopt_orphans`.
 
     Args:
         spared: process ids of children that are not killed, nor the processes below them.
-
-    Returns:
-        Whether at least one process was killed.
     """
-    found = False
     deadline = time.monotonic() + _PATIENCE_S
     while time.monotonic() < deadline:
         if not spared and not has_child():
-            return found
+            return
         doomed = [pid for pid in children_of(os.getpid()) if pid not in spared]
         if not doomed:
-            return found
+            return
         for pid in doomed:
             with suppress(ChildProcessError):  # its parent code has reaped it in the meantime
                 if os.waitpid(pid, os.WNOHANG)[0] == 0:
-                    found = True
                     _kill_below(pid)
         time.sleep(0.001)
-    return found
 
 
 def kill(pid: int) -> None:

@@ -141,6 +141,13 @@ def test_what_a_killed_process_leaves_goes_with_the_next_look(place, tmp_path):
     assert everything(tmp_path) == {"temporary files", "there"}
 
 
+def test_temporary_name_is_shortened_no_more_than_the_system_needs():
+    assert temporary_name(Path("a.csv")) == f".a.{this_process().token}.csv"
+    assert temporary_name(Path("a.csv"), ".x") == f".a.csv.{this_process().token}.x"
+    assert len(temporary_name(Path(f"{'a' * 250}.csv"))) == 255
+    assert len(os.fsencode(temporary_name(Path(f"{'ä' * 124}.csv")))) in (254, 255)
+
+
 def test_the_first_thing_of_a_process_removes_leftovers_too(place):
     assert in_child(lambda: (KEPT.append(TemporaryFolder("replay")), die())) == -signal.SIGKILL
 
