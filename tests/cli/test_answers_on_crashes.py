@@ -16,6 +16,8 @@ from crashhunt.cli import _check, _guide, _judge, _replay, _shrink, _trust, _wha
 from crashhunt.corpus import KnownType
 from crashhunt.crashes import Cause, TrustedOrigin
 from crashhunt.errors import BundleError, HuntDirectoryError, UsageError
+from crashhunt.render import FilmOptions
+from crashhunt.replays import ReplayOptions
 from crashhunt.trial import Outcome
 
 
@@ -222,6 +224,21 @@ def test_new_crash_fails_where_that_is_asked_for(grouped, monkeypatch, capsys, t
 
 
 # crashhunt replay
+
+
+@pytest.mark.parametrize(
+    ("near_miss", "last_s", "panels"),
+    [(False, 0.0, 0), (False, 2.0, 29), (False, 9.0, 0), (True, 0.0, 0), (True, 2.0, 19)],
+)
+def test_panels_are_drawn_from_the_step_before_the_first_that_a_film_shows(monkeypatch, near_miss, last_s, panels):
+    monkeypatch.setattr("crashhunt.crashes.most_dangerous", lambda recording: SimpleNamespace(step=30))
+    found = crash(is_near_miss=near_miss)
+    with _replay.filmed(ReplayOptions(), found, FilmOptions(last_s=last_s)) as options:
+        first, folder = options.look.panels
+        assert (first, folder.is_dir(), options.look.until, options.look.quiet) == (panels, True, 90, True)
+    assert not folder.exists()
+    with _replay.filmed(chosen := ReplayOptions(), found, FilmOptions(last_s=last_s, panels=False)) as options:
+        assert options is chosen
 
 
 @pytest.mark.parametrize(
