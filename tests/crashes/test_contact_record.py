@@ -229,6 +229,9 @@ def test_red_light_ends_where_the_vehicle_has_left_the_junction():
     assert case.is_past(red, -1.0)  # 10 m further, and it is 5 m long
     assert not case.is_past(red, 0.0)
     assert not case.is_past(inside, -1.0)
+    in_lane = {lane: replace(case, lane=lane).is_past(inside, 0.0) for lane in (":c_3_0", "after_0", ":d_0_0")}
+    assert in_lane == {":c_3_0": False, "after_0": False, ":d_0_0": True}  # it is in the next junction
+    assert not replace(case, lane=":d_0_0").is_past(replace(inside, agent="other"), 0.0)
 
 
 def collision(collider, *speeds):
@@ -422,8 +425,10 @@ def test_record_of_a_bundle_has_the_time_of_the_touch():
     assert (found.agent, found.other, found.collider) == ("ego", "leader", "ego")
     assert found.time_s == hit.time_s < scenes[-1].time_s  # within the last step
     assert (found.began_s, len(found.scenes), found.swept) == (scenes[0].time_s, len(scenes), True)
-    late = replace(bundle, result=replace(bundle.result, collision=replace(hit, time_s=hit.time_s + 9)))
-    assert contact_record(late).time_s == scenes[-1].time_s  # no time of the last step
+    end_s, step_s = scenes[-1].time_s, bundle.recording().prologue.step_length_s
+    for time_s, known in ((end_s + 9, False), (end_s, True), (end_s - step_s, True), (end_s - 1.5 * step_s, False)):
+        touched = replace(bundle, result=replace(bundle.result, collision=replace(hit, time_s=time_s)))
+        assert contact_record(touched).time_s == (time_s if known else end_s)
     alone = replace(bundle, result=replace(bundle.result, collision=replace(hit, victim="", role="alone")))
     assert contact_record(alone) is None
     assert contact_record(replace(bundle, result=replace(bundle.result, collision=None))) is None
