@@ -132,6 +132,7 @@ _TESTS_ELSEWHERE = {
         "episode/test_reference_driver.py",
         "analysis/test_what_is_counted.py",
     ),
+    "episode/_episode.py": ("episode/test_episode*.py", "episode/test_fork.py"),
     "episode/_fast_path.py": ("native/test_usual_steps.py", "episode/test_episode*.py"),
     "episode/_branches.py": ("episode/test_branches_asked.py", "episode/test_branching.py"),
     "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),

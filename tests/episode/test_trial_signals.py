@@ -8,14 +8,16 @@ import gymnasium
 import numpy as np
 import pytest
 
+from crashhunt.base.errors import UnusableValueError
 from crashhunt.episode import Episode, TrialSignals
+from crashhunt.episode._trial_signals import _SURROUNDINGS as SURROUNDINGS
 from crashhunt.gym import GymSimulator
 from crashhunt.gym._descriptor import GymSetup
 from crashhunt.oracles import parse_oracle, requirement_oracles
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.simulators.toy import ToySimulator
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
-from crashhunt.world import outlines
+from crashhunt.world import Crossing, Neighbor, Surroundings, outlines
 
 STEP_S = 0.5
 HUNTED = (*CRASHES, Outcome("requirement"))
@@ -248,3 +250,90 @@ def test_signals_are_listed_with_their_units(tmp_path):
     assert {"reward", "observation[0]"} <= known.keys()
     assert signals.meaning("observation[8]") == "x in row 1 of the observation"
     assert all(signals.meaning(name) for name in known)
+
+
+class Surrounded(ToySimulator):
+    """The toy, whose surroundings are those of a list, by step."""
+
+    given: tuple[Surroundings, ...] = ()
+
+    def surroundings(self, agent):
+        return self.given[self._step]
+
+    def speed_limit(self, agent):
+        return 13.5
+
+
+def surrounded(*, ahead=(), crossing=()):
+    neighbors = [
+        Neighbor(actor=actor, gap_m=gap_m, speed_mps=speed, braking_mps2=5.0, kind=kind)
+        for actor, gap_m, speed, kind in ahead
+    ]
+    names = ("distance_m", "exit_m", "actor_distance_m", "actor_exit_m", "speed_mps", "has_right_of_way")
+    crossings = [
+        Crossing(actor="crosses", braking_mps2=5.0, **dict(zip(names, each, strict=True))) for each in crossing
+    ]
+    return Surroundings(
+        speed_mps=10.0, acceleration_mps2=3.0, braking_mps2=8.0, ahead=tuple(neighbors), crossing=tuple(crossings)
+    )
+
+
+def signals_at(tmp_path, *given, speed=10.0):
+    """The signals of the surroundings in each step, of an agent that drives at 10 m/s."""
+    simulator = Surrounded(Scenario(simulator="toy", agents={"ego": AgentSetup()}, step_length_s=STEP_S), tmp_path)
+    simulator.given = given
+    names = (*SURROUNDINGS, "speed_limit")
+    with episode_of(simulator, agent=lambda: Scripted([speed] * 20), arguments={"gap_m": 500.0}) as episode:
+        episode.start()
+        read = TrialSignals(episode).reader(names, "ego")
+        rows = [read()]
+        for _ in given[1:]:
+            episode.step()
+            rows.append(read())
+    return {name: list(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
+
+
+def test_signals_of_vehicles_ahead_are_those_of_the_nearest(tmp_path):
+    far, red = ("far", 90.0, 5.0, "vehicle"), ("", 40.0, 0.0, "red light")
+    found = signals_at(
+        tmp_path,
+        surrounded(ahead=[far, ("near", 20.0, 8.0, "vehicle"), red, ("", 30.0, 0.0, "red light")]),
+        surrounded(ahead=[far, ("near", 19.0, 6.0, "vehicle"), ("", 5.0, 0.0, "crossing")]),
+        surrounded(ahead=[far, red]),
+        surrounded(),
+        surrounded(ahead=[("next", -1.0, 4.0, "vehicle")]),
+    )
+    assert found["gap_m"] == [20.0, 19.0, 90.0, math.inf, -1.0]
+    assert found["leader_speed"] == [8.0, 6.0, 5.0, math.inf, 4.0]
+    assert found["headway_s"] == [2.0, 1.9, 9.0, math.inf, -0.1]
+    assert found["ttc_s"] == [10.0, 4.75, 18.0, math.inf, 0.0]
+    assert found["leader_acceleration"] == [0.0, -4.0, 0.0, 0.0, 0.0]
+    assert found["leader_changed"] == [False, False, True, False, True]
+    assert found["red_light_m"] == [30.0, math.inf, 40.0, math.inf, math.inf]
+    assert found["priority_m"] == found["priority_arrival_s"] == [math.inf] * 5
+    assert found["speed_limit"] == [13.5] * 5
+
+
+def test_standing_agent_has_no_headway_and_closes_in_on_nothing(tmp_path):
+    found = signals_at(tmp_path, *[surrounded(ahead=[("near", 20.0, 8.0, "vehicle")])] * 9, speed=0.0)
+    assert (found["headway_s"][-1], found["ttc_s"][-1], found["gap_m"][-1]) == (math.inf, math.inf, 20.0)
+
+
+def test_signals_of_priority_are_those_of_actors_to_whom_the_agent_must_yield(tmp_path):
+    inside = (-1.0, 4.0, 12.0, 20.0, 6.0, True)
+    found = signals_at(
+        tmp_path,
+        surrounded(crossing=[(30.0, 38.0, 9.0, 15.0, 9.0, True), (20.0, 28.0, 9.0, 15.0, 9.0, True)]),
+        surrounded(crossing=[(20.0, 28.0, 9.0, 15.0, 9.0, False)]),
+        surrounded(crossing=[inside, (-1.0, 4.0, 12.0, 20.0, 3.0, True), (9.0, 14.0, 1.0, 9.0, 9.0, True)]),
+        surrounded(crossing=[(-1.0, 4.0, -2.0, 3.0, 6.0, True)]),
+        surrounded(crossing=[(-1.0, 4.0, 12.0, 20.0, 0.0, True)]),
+        surrounded(crossing=[(-9.0, -4.0, 12.0, 20.0, 6.0, True), (-1.0, 4.0, -9.0, -1.0, 6.0, True)]),
+    )
+    assert found["priority_m"] == [20.0, math.inf, 0.0, 0.0, 0.0, 0.0]
+    assert found["priority_arrival_s"] == [math.inf, math.inf, 2.0, 0.0, math.inf, math.inf]
+
+
+def test_signal_that_is_nan_before_the_first_step_is_unusable(tmp_path):
+    with pytest.raises(UnusableValueError, match="the signal 'gap_m' is NaN"):
+        signals_at(tmp_path, surrounded(ahead=[("near", math.nan, 8.0, "vehicle")]))
