@@ -81,6 +81,6 @@ def test_right_arguments_reach_the_function():
 def test_progress_is_reported_after_each_item():
     told = []
     for item in watched("ab", 5, lambda *now: told.append(now)):
-        told += [item]
+        told.extend(item)
     assert told == ["a", (1, 5), "b", (2, 5)]
     assert [*watched("ab", 5, None)] == ["a", "b"]
