@@ -76,7 +76,7 @@ def asked_by_name(file: Path) -> list[str]:
 
 
 def test_optional_faculties_are_protocols():
-    """Of simulators and agents see their ``_protocol.py``, and `crashhunt.base.capabilities`."""
+    """Of simulators and agents see their ``_protocol.py``, and `crashhunt.base.foreign_code`."""
     files = [file for file in ROOT.rglob("*.py") if not str(file.relative_to(ROOT)).startswith(_OTHERS)]
     assert [line for file in files for line in asked_by_name(file)] == []
 

@@ -23,7 +23,7 @@ import numpy as np
 from crashhunt.agents._library_agents import Action, Parts
 from crashhunt.agents._protocol import ForeignFactory
 from crashhunt.base.errors import PluginError, ProgramError
-from crashhunt.base.fmus import places_of
+from crashhunt.base.programs import fmu_files
 from crashhunt.base.text import listed, one_line
 from crashhunt.simulators import PARTS
 from crashhunt.trial import Argument, Signature, parse_spec
@@ -139,7 +139,7 @@ class FmuFactory(ForeignFactory):
         return made
 
     def _read(self, files: Mapping[str, str]) -> _Model:
-        path, table = places_of(self._locator, files)
+        path, table = fmu_files(self._locator, files)
         try:
             return _Model(path, table)
         except _UnusableError as error:

@@ -13,10 +13,10 @@ import numpy as np
 
 from crashhunt.agents._programs import _signature_in, write_road_map
 from crashhunt.agents._protocol import ForeignFactory, shown_space
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, PluginError, ProgramError
-from crashhunt.base.libraries import describe_library, load_order, path_of
+from crashhunt.base.foreign_code import supports
 from crashhunt.base.library_probe import declaration_of, loaded_files, missing_symbols
+from crashhunt.base.programs import describe_library, library_file, load_order
 from crashhunt.base.text import one_line
 from crashhunt.simulators import ObservesParts
 
@@ -96,7 +96,7 @@ class LibraryFactory(ForeignFactory):
         self, agent: str = "", simulator: Simulator | None = None, *, limit_s: float = 0.0
     ) -> Signature:
         """Return the arguments that the library declares for every vehicle; another process loads it for this."""
-        return self._signature(describe_library(self._locator, path_of(self._locator)).declaration)
+        return self._signature(describe_library(self._locator, library_file(self._locator)).declaration)
 
     def load(self, files: Mapping[str, str], scratch: Path) -> None:
         """Load the library into this process, unless it is loaded.

@@ -32,8 +32,8 @@ from crashhunt.agents._program_processes import (
 )
 from crashhunt.agents._protocol import ForeignFactory, shown_space
 from crashhunt.base import forks
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError, ProgramError
+from crashhunt.base.foreign_code import supports
 from crashhunt.base.processes import descendants_of, kill
 from crashhunt.base.programs import command_of, is_path, library_path, words_of
 from crashhunt.base.signals import signal_name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from crashhunt.base.capabilities import supports
+from crashhunt.base.foreign_code import supports
 from crashhunt.simulators import FlattensObservations, NamesMetaActions, NamesObservations
 
 if TYPE_CHECKING:

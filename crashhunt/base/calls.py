@@ -8,7 +8,7 @@ from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
 
 from crashhunt.base.errors import CallError
-from crashhunt.base.removed import removed_fix
+from crashhunt.base.older_versions import removed_fix
 from crashhunt.base.text import one_of
 
 if TYPE_CHECKING:

@@ -1,31 +1,40 @@
 """Locators of agents that are not Python: programs (``exec:PROGRAM [WORD…]``), libraries (``lib:FILE.so``), FMUs.
 
-The command line of a program is split as a shell would, without a shell.
+The command line of a program is split as a shell would, without a shell. An FMU may have a table of its variables next
+to it, in ``FILE.toml``.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+import platform
 import re
 import shlex
 import shutil
 import sys
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crashhunt.base import fmus, libraries
-from crashhunt.base.binaries import own_libraries
+from crashhunt.base import library_probe
+from crashhunt.base.binaries import is_of_system, machine_of, own_libraries
 from crashhunt.base.errors import PluginError
+from crashhunt.base.signals import describe_death
+from crashhunt.base.text import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-PREFIX: Final = "exec:"
+PROGRAM_PREFIX: Final = "exec:"
+LIBRARY_PREFIX: Final = "lib:"
+FMU_PREFIX: Final = "fmu:"
 FACTORIES: Final = {
-    PREFIX: "crashhunt.agents:ProgramFactory",
-    libraries.PREFIX: "crashhunt.agents:LibraryFactory",
-    fmus.PREFIX: "crashhunt.agents:FmuFactory",
+    PROGRAM_PREFIX: "crashhunt.agents:ProgramFactory",
+    LIBRARY_PREFIX: "crashhunt.agents:LibraryFactory",
+    FMU_PREFIX: "crashhunt.agents:FmuFactory",
 }
 """The class that creates the agents of each kind of locator."""
 _INTERPRETERS = re.compile(r"(python|pypy|perl|ruby|node|java|julia|lua|env|sh|bash|dash|zsh)[\d.]*")
@@ -40,7 +49,7 @@ def is_program(locator: str) -> bool:
 
 def can_fork(locator: str) -> bool:
     """Return whether an agent lives in the process of the trial, so that a fork of the trial contains the agent."""
-    return not locator.startswith(PREFIX)
+    return not locator.startswith(PROGRAM_PREFIX)
 
 
 def is_native(locator: str) -> bool:
@@ -60,7 +69,7 @@ def words_of(locator: str) -> tuple[str, ...]:
         PluginError: the command line is empty, or a quotation has no end.
     """
     try:
-        words = tuple(shlex.split(locator.removeprefix(PREFIX)))
+        words = tuple(shlex.split(locator.removeprefix(PROGRAM_PREFIX)))
     except ValueError as error:
         fix = "close the quotation, or write \\ before the character"
         raise PluginError(f"{locator!r} is not a command line: {error}", fix=fix) from None
@@ -90,7 +99,7 @@ def anchored(locator: str, folder: Path) -> str:
     Raises:
         PluginError: the locator is not a command line.
     """
-    for prefix in (libraries.PREFIX, fmus.PREFIX):
+    for prefix in (LIBRARY_PREFIX, FMU_PREFIX):
         if locator.startswith(prefix):
             path = locator.removeprefix(prefix)
             return f"{prefix}{folder / path}" if path else locator
@@ -108,7 +117,7 @@ def relative_to(folder: Path, words: Sequence[str]) -> str:
         name = _value_in(word)
         is_there = is_path(name) and os.path.exists(folder / name)  # noqa: PTH110
         found.append(f"{word[: len(word) - len(name)]}{folder / name}" if is_there else word)
-    return f"{PREFIX}{shlex.join(found)}"
+    return f"{PROGRAM_PREFIX}{shlex.join(found)}"
 
 
 def files_of(locator: str) -> dict[str, Path]:
@@ -119,10 +128,10 @@ def files_of(locator: str) -> dict[str, Path]:
     Raises:
         PluginError: the program or library cannot be used.
     """
-    if locator.startswith(libraries.PREFIX):
-        return libraries.files_of(locator)
-    if fmus.is_fmu(locator):
-        return fmus.files_of(locator)
+    if locator.startswith(LIBRARY_PREFIX):
+        return _files_of_library(locator)
+    if is_fmu(locator):
+        return _files_of_fmu(locator)
     first, *rest = words_of(locator)
     program = _program(first, locator)
     found = {} if _is_of_system(program) else {first: program}
@@ -228,3 +237,171 @@ def _is_of_system(program: Path) -> bool:
         or program.parent in homes
         or any(program.resolve().is_relative_to(folder) for folder in _SYSTEM_FOLDERS)
     )
+
+
+# Shared libraries: what such a file contains and needs.
+
+_LIBRARY_FIX = "give the path of a shared library, such as lib:./libplanner.so"
+_INTERFACE_FIX = "include crashhunt_agent.h, which crashhunt agent-header prints, and export all four functions"
+_PROBE_S: Final = 60.0  # as long as a module may take to import
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """The contents of a shared library with the C interface of agents.
+
+    Args:
+        declaration: the text of its ``CRASHHUNT_AGENT(...)``, which is JSON.
+        dependencies: the libraries that it needs and that do not belong to the operating system. Each one follows those
+            that it needs itself.
+    """
+
+    declaration: str
+    dependencies: tuple[Path, ...]
+
+
+def library_file(locator: str) -> Path:
+    """Return the absolute path of the library that an agent's locator names.
+
+    Raises:
+        PluginError: the file does not exist, or is no library for this machine.
+    """
+    word = locator.removeprefix(LIBRARY_PREFIX)
+    if not word:
+        raise PluginError(f"{locator!r} names no library", fix=_LIBRARY_FIX)
+    path = Path(word).absolute()
+    if not path.is_file():
+        raise PluginError(f"{locator!r}: {word!r} is not a file", fix=_LIBRARY_FIX)
+    return path
+
+
+def _files_of_library(locator: str) -> dict[str, Path]:
+    """Return the files that must travel with a library, by the text that names them, in the order to load them.
+
+    The text for a library that the agent's library needs is ``lib:`` and its path.
+
+    Raises:
+        PluginError: the library cannot be used.
+    """
+    path = library_file(locator)
+    found = {f"{LIBRARY_PREFIX}{one}": one for one in describe_library(locator, path).dependencies}
+    return {**found, locator.removeprefix(LIBRARY_PREFIX): path}
+
+
+def describe_library(locator: str, path: Path) -> Library:
+    """Return the contents of a library; another process loads it for this.
+
+    Args:
+        locator: locator of the agent, for errors.
+        path: path of the library.
+
+    Raises:
+        PluginError: the library cannot be used.
+    """
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise PluginError(f"{locator!r}: it cannot be read: {error.strerror}", fix=_LIBRARY_FIX) from None
+    machine, own = machine_of(path), platform.machine()
+    if machine != own:
+        what = f"is built for {machine} (allowed: {own})" if machine else "is not a shared library (an ELF file)"
+        raise PluginError(f"{locator!r}: it {what}", fix="build the library on this machine, with -shared")
+    try:
+        return _probed(path, status.st_mtime_ns, status.st_size, status.st_ino)
+    except PluginError as error:
+        raise PluginError(f"{locator!r}: {error.message}", fix=error.fix) from None
+
+
+def load_order(locator: str, files: Mapping[str, str]) -> list[Path]:
+    """Return the libraries to load for an agent, the agent's own last.
+
+    Args:
+        locator: locator of the agent.
+        files: file of the snapshot by the text that names the original file; empty if there is no snapshot.
+
+    Raises:
+        PluginError: the library does not exist.
+    """
+    word = locator.removeprefix(LIBRARY_PREFIX)
+    if word not in files:
+        return [library_file(locator)]
+    return [Path(copy) for name, copy in files.items() if name.startswith(LIBRARY_PREFIX)] + [Path(files[word])]
+
+
+@cache
+def _probed(path: Path, *_version: int) -> Library:
+    """Return the contents of a library.
+
+    Args:
+        path: path of the library.
+        _version: numbers that change with the file.
+
+    Raises:
+        PluginError: the library cannot be used.
+    """
+    import subprocess
+
+    command = [sys.executable, "-P", "-I", "-S", library_probe.__file__, str(path)]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_PROBE_S, check=False)
+    except subprocess.TimeoutExpired:
+        raise PluginError(f"it is still loading after {_PROBE_S:g} s", fix="see what its constructors do") from None
+    if not done.stdout:
+        lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        last = f" (its last output: {one_line(lines[-1])[:300]})" if lines else ""
+        raise PluginError(
+            f"the process that loaded it {describe_death(done.returncode)}{last}", fix="see what its constructors do"
+        )
+    found = json.loads(done.stdout)
+    if "error" in found:
+        raise PluginError(
+            f"it cannot be loaded: {one_line(found['error'])}", fix="install what is missing, or link with -Wl,-rpath"
+        )
+    if "missing" in found:
+        raise PluginError(f"it does not export {', '.join(found['missing'])}", fix=_INTERFACE_FIX)
+    dependencies = tuple(Path(one).absolute() for one in found["libraries"] if not is_of_system(Path(one)))
+    return Library(found["declaration"], dependencies)
+
+
+# FMUs, each with a table of its variables.
+
+_FMU_FIX = "give the path of an FMU, such as fmu:./planner.fmu"
+
+
+def is_fmu(locator: str) -> bool:
+    """Return whether the locator of an agent names an FMU."""
+    return locator.startswith(FMU_PREFIX)
+
+
+def _files_of_fmu(locator: str) -> dict[str, Path]:
+    """Return the FMU and its table of variables, by the text that names them.
+
+    Raises:
+        PluginError: the FMU does not exist.
+    """
+    word = locator.removeprefix(FMU_PREFIX)
+    path = Path(word).absolute()
+    if not word or not path.is_file():
+        raise PluginError(f"{locator!r}: {word!r} is not a file", fix=_FMU_FIX)
+    table = path.with_suffix(".toml")
+    return {word: path, **({_table_word(word): table} if table.is_file() else {})}
+
+
+def fmu_files(locator: str, files: Mapping[str, str]) -> tuple[Path, Path | None]:
+    """Return the FMU to run, and its table of variables; None if it has none.
+
+    Args:
+        locator: locator of the agent.
+        files: file of the snapshot by the text that names the original file; empty if there is no snapshot.
+
+    Raises:
+        PluginError: the FMU does not exist.
+    """
+    word = locator.removeprefix(FMU_PREFIX)
+    found = files if word in files else {name: str(path) for name, path in _files_of_fmu(locator).items()}
+    table = found.get(_table_word(word))
+    return Path(found[word]), None if table is None else Path(table)
+
+
+def _table_word(word: str) -> str:
+    return str(Path(word).with_suffix(".toml"))

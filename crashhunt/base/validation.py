@@ -14,7 +14,7 @@ from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from crashhunt.base.removed import removed_fix
+from crashhunt.base.older_versions import removed_fix
 from crashhunt.base.text import any_of, did_you_mean
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import DISK, CrashhuntError, InternalError, UsageError, remedy
 from crashhunt.base.extras import installation_in
-from crashhunt.base.removed import refuse_removed_words
+from crashhunt.base.older_versions import refuse_removed_words
 from crashhunt.base.resources import error_of_next_thread, is_no_thread, limit_behind
 from crashhunt.base.signals import ended_by_signals, is_interrupt
 from crashhunt.base.temporary import remove_leftovers

@@ -17,8 +17,8 @@ from crashhunt.base import layout
 from crashhunt.base.errors import FULL, CrashhuntError, UntrustedError, UsageError
 from crashhunt.base.files import cannot_write
 from crashhunt.base.integrity import MAX_INTEGER
+from crashhunt.base.older_versions import removed_fix
 from crashhunt.base.programs import is_program
-from crashhunt.base.removed import removed_fix
 from crashhunt.base.text import command_line, did_you_mean, one_line, one_of, visible
 from crashhunt.plans import hunt_options
 

@@ -11,10 +11,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.builds import BuildError, clean_tree, files_outside, run_build
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError, UsageError
-from crashhunt.base.git import checked_out, commit_of, git, import_environment, run_to_end, top_of
+from crashhunt.base.git import (
+    BuildError,
+    checked_out,
+    clean_tree,
+    commit_of,
+    files_outside,
+    git,
+    import_environment,
+    run_build,
+    run_to_end,
+    top_of,
+)
 from crashhunt.base.programs import is_program
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.corpus._case_runs import Got

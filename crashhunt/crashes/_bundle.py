@@ -26,7 +26,7 @@ from crashhunt.base.integrity import (
     read_object,
     typed,
 )
-from crashhunt.base.older_formats import HOW_TO_READ
+from crashhunt.base.older_versions import HOW_TO_READ
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.text import command_line
 from crashhunt.recording import Recording, read_black_box

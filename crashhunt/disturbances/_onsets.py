@@ -49,7 +49,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crashhunt.base.capabilities import supports
+from crashhunt.base.foreign_code import supports
 from crashhunt.disturbances._protocol import Drawn, Enumerates
 from crashhunt.trial import KINDS, SENSOR_KINDS, Disturbance, Forcing, in_turn
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.agents import REFERENCE_MODELS, Closes, Recorded
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.base.foreign_code import supports
 from crashhunt.episode._competent_driver import CompetentDriver
 from crashhunt.scenario import ACTIONS, OVERRIDES_ONLY
 from crashhunt.simulators import (

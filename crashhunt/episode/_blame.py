@@ -11,12 +11,19 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crashhunt.base import layout
-from crashhunt.base.boundaries import Boundary, ForeignError, Party, is_ours
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, InternalError
 from crashhunt.base.exceptions import format_error, in_words, is_users
+from crashhunt.base.foreign_code import (
+    Boundary,
+    ForeignError,
+    Party,
+    describe_value,
+    is_ours,
+    number_of,
+    supports,
+    truth_of,
+)
 from crashhunt.base.resources import limit_behind
-from crashhunt.base.scalars import describe_value, number_of, truth_of
 from crashhunt.base.text import count_of
 from crashhunt.oracles import Finding
 from crashhunt.simulators import RunsForeignCode

@@ -18,8 +18,8 @@ from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, cast
 
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.foreign_code import supports
 from crashhunt.base.forks import NoAnswer, NoProcessError
 from crashhunt.base.json_types import finite
 from crashhunt.base.resources import FREE, free_memory

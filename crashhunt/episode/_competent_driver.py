@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.agents import REFERENCE_MODELS, Closes, Situation
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.base.foreign_code import supports
 from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import MAX_ACCELERATION, ReportsSurroundings, TranslatesMotion
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.base.foreign_code import supports
 from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import NamesMetaActions, NamesObservations, ObservesParts, SupportsDisturbances, SupportsHolds
 from crashhunt.trial import HOLD_KINDS, SENSOR_KINDS, Disturbance, InputSignal, fold_signals, in_effect, steps_of

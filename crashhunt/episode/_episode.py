@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from crashhunt.base.boundaries import Boundary, ForeignError, Party, is_at_boundary, is_ours
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InternalError, InvalidEpisodeError
+from crashhunt.base.foreign_code import Boundary, ForeignError, Party, is_at_boundary, is_ours, supports
 from crashhunt.base.forks import Copy, Held, SuspendedFork, held, shared_memory
 from crashhunt.episode._blame import guarded_check, guarded_reset, guarded_scene, guarded_step
 from crashhunt.episode._disturbance_injection import DisturbanceInjector

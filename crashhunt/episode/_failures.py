@@ -11,8 +11,6 @@ from types import FunctionType, ModuleType
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.agents import Closes
-from crashhunt.base.boundaries import ForeignError, Party
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import (
     ActionError,
     EpisodeError,
@@ -23,6 +21,7 @@ from crashhunt.base.errors import (
     UnusableValueError,
 )
 from crashhunt.base.exceptions import class_name, format_error, is_users, message_of
+from crashhunt.base.foreign_code import ForeignError, Party, supports
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import blocked_signals
 from crashhunt.episode._blame import Blame, blame, internal_error, party_of_simulator

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from crashhunt.base.capabilities import supports
+from crashhunt.base.foreign_code import supports
 from crashhunt.episode._episode import ASK_ALL, Episode
 from crashhunt.episode._observers import Nearness, Recorder, overrides_hook
 from crashhunt.native import ANSWERED, ASK, DONE, REFUSED, SIMULATED

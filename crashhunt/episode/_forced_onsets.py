@@ -21,8 +21,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, cast
 
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.foreign_code import supports
 from crashhunt.base.forks import NoAnswer
 from crashhunt.disturbances import SECONDS_PER_COPY, FirstOnsets, disturber_of, parse_rates
 from crashhunt.episode._forks import ForkRunner

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.base.foreign_code import supports
 from crashhunt.recording import (
     AgentChannel,
     BlackBox,

@@ -10,8 +10,8 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal, cast
 
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.foreign_code import supports
 from crashhunt.episode._forks import ForkRunner
 from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import KINDS, SENSOR_KINDS, Disturbance, Outcome, Stress, steps_of

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crashhunt.agents import FmuFactory, LibraryFactory, NeedsLibraries, ProgramFactory
-from crashhunt.base.boundaries import Boundary, Party, is_ours
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.foreign_code import Boundary, Party, is_ours, supports
 from crashhunt.base.plugins import add_current_folder, import_module, locate
 from crashhunt.base.sandbox import confine
 from crashhunt.base.temporary import record_shared_memory

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import UnusableValueError
-from crashhunt.base.scalars import number_of
+from crashhunt.base.foreign_code import number_of, supports
 from crashhunt.base.text import did_you_mean, listed
 from crashhunt.simulators import (
     HasMap,

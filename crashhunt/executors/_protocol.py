@@ -13,7 +13,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.json_types import ErrorData, ErrorWords
-from crashhunt.base.removed import removed_fix_in
+from crashhunt.base.older_versions import removed_fix_in
 from crashhunt.base.text import NOTICE_TOPIC
 from crashhunt.plans import ChoosesParallelism as ChoosesParallelism, executor_of
 

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, NotRequired, TypedDict
 
 from crashhunt.base import layout
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
 from crashhunt.base.exceptions import INSTALLED_FOLDERS, is_users
+from crashhunt.base.foreign_code import supports
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.opened_files import OpenedFiles
 from crashhunt.base.programs import is_native

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 
 from crashhunt.base import forks
-from crashhunt.base.capabilities import supports
+from crashhunt.base.foreign_code import supports
 from crashhunt.base.processes import adopt_orphans, children_of, end_descendants, kill
 from crashhunt.base.resources import FREE, free_memory
 from crashhunt.base.text import format_percent

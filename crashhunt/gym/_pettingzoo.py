@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeGuard
 import gymnasium
 import numpy as np
 
-from crashhunt.base.capabilities import members, supports
-from crashhunt.base.scalars import truth_of
+from crashhunt.base.foreign_code import members, supports, truth_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from crashhunt.base.boundaries import Boundary, ForeignError, Party
 from crashhunt.base.errors import InvalidEpisodeError, PluginError, ScenarioError
 from crashhunt.base.exceptions import in_words, place_of
+from crashhunt.base.foreign_code import Boundary, ForeignError, Party, number_of, truth_of
 from crashhunt.base.plugins import load_object
-from crashhunt.base.scalars import number_of, truth_of
 from crashhunt.base.signals import InterruptedCodeError, interrupted_after
 from crashhunt.base.text import (
     ABSENT_WORDS,

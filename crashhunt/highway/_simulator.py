@@ -27,10 +27,9 @@ from highway_env.envs.common.observation import MultiAgentObservation
 from highway_env.envs.parking_env import ParkingEnv
 from highway_env.vehicle.objects import Obstacle, RoadObject
 
-from crashhunt.base.boundaries import Boundary, Party
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
+from crashhunt.base.foreign_code import Boundary, Party, number_of, truth_of
 from crashhunt.base.plugins import describe_unused_clone
-from crashhunt.base.scalars import number_of, truth_of
 from crashhunt.highway._config import configured, mistake, restore_classes
 from crashhunt.highway._descriptor import BACKEND, HighwaySetup
 from crashhunt.highway._disturbances import HighwayDisturbances

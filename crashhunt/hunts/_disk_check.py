@@ -13,7 +13,7 @@ from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError, remedy
 from crashhunt.base.files import cannot_write, is_empty_folder, sync_folder, sync_tree
-from crashhunt.base.older_formats import HOW_TO_READ
+from crashhunt.base.older_versions import HOW_TO_READ
 from crashhunt.base.resources import error_of_next_files, limit_behind
 from crashhunt.base.temporary import has_ended, new_folder, owner_in
 from crashhunt.crashes import Bundle, read_bundle, read_params, unreadable_notes

@@ -9,8 +9,8 @@ from collections import Counter, deque
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeVar
 
-from crashhunt.base.capabilities import supports
 from crashhunt.base.codec import Serializable
+from crashhunt.base.foreign_code import supports
 from crashhunt.crashes import (
     SIGNATURE_VERSION,
     Group,

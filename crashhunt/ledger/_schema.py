@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from crashhunt.base.errors import HuntDirectoryError, remedy
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.base.older_formats import HOW_TO_READ
+from crashhunt.base.older_versions import HOW_TO_READ
 from crashhunt.base.resources import error_of_next_files, limit_behind
 from crashhunt.base.text import command_line
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError, CrashhuntError, UsageError
 from crashhunt.base.exceptions import blamed
+from crashhunt.base.foreign_code import supports
 from crashhunt.base.plugins import locate
 from crashhunt.trial import Constant, Outcome, parse_spec, signature_of
 

@@ -22,8 +22,8 @@ import numpy as np
 
 from crashhunt.agents import DrawsPanels
 from crashhunt.base import layout
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.foreign_code import supports
 from crashhunt.base.forks import threads
 from crashhunt.base.processes import die_with
 from crashhunt.base.reaper import Kept

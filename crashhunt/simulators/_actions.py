@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crashhunt.base.boundaries import Boundary, Party
 from crashhunt.base.errors import ActionError
-from crashhunt.base.scalars import describe_value, is_masked
+from crashhunt.base.foreign_code import Boundary, Party, describe_value, is_masked
 from crashhunt.scenario import ACTIONS
 
 if TYPE_CHECKING:

@@ -11,9 +11,8 @@ import numpy as np
 from gymnasium import Env, Space, Wrapper, spaces
 from gymnasium.wrappers import TimeLimit
 
-from crashhunt.base.boundaries import Boundary, Party
 from crashhunt.base.errors import ActionError
-from crashhunt.base.scalars import describe_value, is_masked
+from crashhunt.base.foreign_code import Boundary, Party, describe_value, is_masked
 from crashhunt.recording import OPAQUE_SHAPE, decode_value, encode_value
 from crashhunt.simulators._actions import SpaceAction, cast
 

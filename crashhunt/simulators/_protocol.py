@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from gymnasium import Space
 
-    from crashhunt.base.boundaries import Party
+    from crashhunt.base.foreign_code import Party
     from crashhunt.native import UsualSteps, Vehicles
     from crashhunt.simulators._observation_parts import ObservationLayout
     from crashhunt.trial import Disturbance, Value
@@ -520,7 +520,7 @@ class RunsForeignCode(Protocol):
     foreign_packages: Sequence[str]
     """Top-level packages of that code; an exception that has come through them is no fault of crashhunt.
 
-    Empty if the simulator calls that code inside boundaries only (`crashhunt.base.boundaries`).
+    Empty if the simulator calls that code inside boundaries only (`crashhunt.base.foreign_code`).
     """
 
 

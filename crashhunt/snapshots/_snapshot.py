@@ -27,7 +27,7 @@ from crashhunt.base.integrity import (
     read_object,
     typed,
 )
-from crashhunt.base.older_formats import HOW_TO_READ
+from crashhunt.base.older_versions import HOW_TO_READ
 from crashhunt.plans import HuntSettings, read_settings
 from crashhunt.scenario import Scenario, digest_of_described, load_scenario
 from crashhunt.snapshots._environment import Environment, environment_of_simulation

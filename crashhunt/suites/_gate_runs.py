@@ -26,10 +26,20 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crashhunt.base import layout
-from crashhunt.base.builds import copy_built, files_outside, run_build, track_built
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, NoValidTrialError, UsageError
 from crashhunt.base.files import whole_file
-from crashhunt.base.git import checked_out, commit_of, git, import_environment, run_to_end, top_of
+from crashhunt.base.git import (
+    checked_out,
+    commit_of,
+    copy_built,
+    files_outside,
+    git,
+    import_environment,
+    run_build,
+    run_to_end,
+    top_of,
+    track_built,
+)
 from crashhunt.base.plugins import registered
 from crashhunt.base.programs import is_program
 from crashhunt.base.temporary import temporary_beside, temporary_folder

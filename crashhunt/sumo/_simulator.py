@@ -14,8 +14,8 @@ import numpy as np
 # some two hundred values.
 from libsumo import _libsumo as sumo
 
-from crashhunt.base.boundaries import Party
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
+from crashhunt.base.foreign_code import Party
 from crashhunt.native import core_for, reseed_generators, why_no_reseeding
 from crashhunt.scenario import ObservationSetup
 from crashhunt.simulators import (

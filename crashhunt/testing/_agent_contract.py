@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from crashhunt.agents import Agent, Closes, DrawsPanels, NeedsLibraries
-from crashhunt.base.capabilities import supports
+from crashhunt.base.foreign_code import supports
 from crashhunt.panels import labelled
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from crashhunt.base import layout
-from crashhunt.base.capabilities import supports
+from crashhunt.base.foreign_code import supports
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import Executor, HasNodes
 from crashhunt.recording import Recording, read_black_box

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from crashhunt.base.capabilities import supports
+from crashhunt.base.foreign_code import supports
 from crashhunt.crashes import partner
 from crashhunt.recording import read_log
 from crashhunt.replays import ReplayOptions, prepare

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from crashhunt.base.capabilities import members, supports
 from crashhunt.base.errors import ActionError
+from crashhunt.base.foreign_code import members, supports
 from crashhunt.simulators import (
     FACULTIES,
     CountsSetUp,

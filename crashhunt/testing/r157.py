@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.files import whole_file
-from crashhunt.base.scalars import describe_value
+from crashhunt.base.foreign_code import describe_value
 from crashhunt.base.text import listed, one_line, one_of
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.base import layout
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import SimulatorError, UsageError
+from crashhunt.base.foreign_code import supports
 from crashhunt.base.plugins import locate
 from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.base.text import one_of

@@ -10,8 +10,8 @@ import typing
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
-from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import ArgumentError
+from crashhunt.base.foreign_code import supports
 from crashhunt.base.text import one_of
 from crashhunt.trial._argument_space import Argument, Kind, kind_of, parse_spec
 

@@ -20,7 +20,7 @@ from programs import COMPILER, DRIVER
 
 from crashhunt.agents import FmuFactory, LibraryFactory, ProgramFactory
 from crashhunt.base.errors import ActionError, CrashhuntError, PluginError, ProgramError
-from crashhunt.base.libraries import files_of
+from crashhunt.base.programs import files_of
 from crashhunt.simulators import MetaAction, SpaceAction, SpeedAndLaneChange
 from crashhunt.trial import Range, signature_of
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.base import builds
-from crashhunt.base.builds import BuildError, clean_tree, copy_built, files_outside, run_build, track_built
+import crashhunt.base.git
+from crashhunt.base.git import BuildError, clean_tree, copy_built, files_outside, run_build, track_built
 from crashhunt.snapshots import _take
 
 
@@ -47,7 +47,7 @@ def test_long_build_is_announced_once(tmp_path, monkeypatch):
     said = []
     build("true", tmp_path, tell=said.append)
     assert said == []
-    monkeypatch.setattr(builds, "_QUIET_S", 0.0)
+    monkeypatch.setattr(crashhunt.base.git, "_QUIET_S", 0.0)
     build("sleep 0.2", tmp_path, tell=said.append)
     assert said == ["building HEAD (abc): sleep 0.2"]
 
@@ -65,7 +65,7 @@ def test_build_that_is_ended_leaves_no_process(tmp_path, temporary, monkeypatch,
             raise KeyboardInterrupt
         raise subprocess.TimeoutExpired("sleep", timeout)
 
-    monkeypatch.setattr(builds, "_QUIET_S", 9.0)
+    monkeypatch.setattr(crashhunt.base.git, "_QUIET_S", 9.0)
     monkeypatch.setattr(subprocess.Popen, "wait", interrupted)
     error = KeyboardInterrupt if why == "interrupted" else BuildError
     with pytest.raises(error, match="^$" if why == "interrupted" else "still ran after 9 s: begun"):

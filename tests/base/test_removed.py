@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import crashhunt
-from crashhunt.base.removed import refuse_removed_words, removed_fix
+from crashhunt.base.older_versions import refuse_removed_words, removed_fix
 from crashhunt.cli import make_parser
 from crashhunt.errors import PluginError, UsageError
 from crashhunt.executors import PoolExecutor, _protocol

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from crashhunt.base.scalars import number_of, truth_of
+from crashhunt.base.foreign_code import number_of, truth_of
 from crashhunt.errors import UnusableValueError
 
 

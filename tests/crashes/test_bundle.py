@@ -16,7 +16,7 @@ from crashhunt.analysis import _avoidability
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.integrity import digest_of_data
-from crashhunt.base.older_formats import HOW_TO_READ
+from crashhunt.base.older_versions import HOW_TO_READ
 from crashhunt.crashes import (
     Attempt,
     Judgement,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from crashhunt.base import layout
-from crashhunt.base.boundaries import ForeignError
+from crashhunt.base.foreign_code import ForeignError
 from crashhunt.episode import Episode, Nearness, Parts, Recorder, WorkerSettings, _failures, run_episode
 from crashhunt.episode._blame import guarded_check, guarded_step
 from crashhunt.episode._fast_path import FastPath
@@ -473,7 +473,7 @@ def test_failure_of_crashhunt_itself_in_compiled_steps_is_no_trials_outcome(modu
 @pytest.mark.parametrize("party", ["agent", "environment"])
 def test_exception_of_crashhunts_own_classes_forges_no_label(modules, tmp_path, monkeypatch, party):
     """Whoever raises what crashhunt raises is named all the same."""
-    from crashhunt.base.boundaries import ForeignError, Party
+    from crashhunt.base.foreign_code import ForeignError, Party
 
     simulator = gym(tmp_path)
     forgeries = (

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.base.capabilities import members
+from crashhunt.base.foreign_code import members
 from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
 from crashhunt.episode import BUDGET_BESIDE, Prober, _forks
 from crashhunt.simulators import SupportsDisturbances

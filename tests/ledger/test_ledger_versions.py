@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.base.older_formats import LAST_REVISION
+from crashhunt.base.older_versions import LAST_REVISION
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger, Turn
 from crashhunt.trial import Branches, Outcome, Stress, TrialResult, TrialSpec

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from crashhunt.base.boundaries import ForeignError
+from crashhunt.base.foreign_code import ForeignError
 from crashhunt.episode import Episode
 from crashhunt.gym import GymSimulator
 from crashhunt.highway import HighwaySimulator

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from crashhunt.base.boundaries import ForeignError
+from crashhunt.base.foreign_code import ForeignError
 from crashhunt.base.text import ABSENT_WORDS, NOTICE_TOPIC, PRESENT_WORDS
 from crashhunt.episode import Nearness
 from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError

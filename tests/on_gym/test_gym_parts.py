@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from crashhunt.base.boundaries import ForeignError
 from crashhunt.base.errors import ActionError, InvalidEpisodeError, UnusableValueError
-from crashhunt.base.scalars import number_of
+from crashhunt.base.foreign_code import ForeignError, number_of
 from crashhunt.gym import GymSimulator, _simulator as gym
 from crashhunt.gym._descriptor import CrashRule, GymSetup
 from crashhunt.gym._simulator import crash_cell

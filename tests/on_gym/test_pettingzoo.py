@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from crashhunt.base.boundaries import ForeignError
+from crashhunt.base.foreign_code import ForeignError
 from crashhunt.errors import ScenarioError
 from crashhunt.gym import GymSimulator
 from crashhunt.gym._descriptor import CrashRule, GymSetup

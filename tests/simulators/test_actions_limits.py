@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from crashhunt.base.scalars import describe_value
+from crashhunt.base.foreign_code import describe_value
 from crashhunt.errors import ActionError
 from crashhunt.simulators import MetaAction
 from crashhunt.simulators._actions import cast

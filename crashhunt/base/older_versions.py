@@ -1,4 +1,7 @@
-"""Options of earlier versions, each with an instruction: what to do instead.
+"""What earlier versions of crashhunt knew, and what to do instead: files from before version 1, removed options.
+
+The formats of crashhunt were numbered again when they became version 1, and every later version reads version 1. Files
+from before are read only by `LAST_REVISION`, and `HOW_TO_READ` says so wherever such a file is refused.
 
 `removed_fix` is consulted wherever an unknown option, key or argument is refused. A name is written once, as on the
 command line; the keys of Python and TOML follow from it (``--recycle-after``, ``recycle_after``).
@@ -15,6 +18,13 @@ from crashhunt.base.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+LAST_REVISION = "40b50271"
+"""Git revision of crashhunt that reads every file from before format version 1."""
+HOW_TO_READ = (
+    f"read it with crashhunt of git revision {LAST_REVISION} (pip install "
+    f"'git+https://github.com/crashhunt/crashhunt@{LAST_REVISION}'), or hunt again"
+)
+"""The fix of the error that refuses such a file."""
 _RARE = "use --rare with --disturb and rates, such as --disturb brake=0.001: crashhunt no longer splits paths"
 _REMOVED = {
     "--splitting": _RARE,
