@@ -345,6 +345,7 @@ _TESTS_ELSEWHERE = {
         "e2e/test_judging.py",
     ),
     "analysis/_causes.py": (
+        "analysis/test_leaving_out.py",
         "analysis/test_recorded_manoeuvres.py",
         "analysis/test_judged_crash.py",
         "e2e/test_judging.py",

@@ -1,4 +1,4 @@
-"""An omission is found although the agent then crashes in another way, with its other faculty."""
+"""Which periods and runs decide what an agent omitted."""
 
 from __future__ import annotations
 
@@ -55,3 +55,47 @@ def test_another_crash_by_the_other_faculty_hides_no_omission(longitudinal, both
     if faculty is not None:
         assert {run.ending for run in found.deciding} == {"none"}
         assert found.omission.kind == "vehicle"
+
+
+def period(faculty="longitudinal", actor="x", first=10, last=40, **more):
+    return {"faculty": faculty, "actor": actor, "first": first, "last": last, **more}
+
+
+@pytest.mark.parametrize(
+    ("periods", "first"),
+    [
+        ([period(first=1), period("lateral", first=2), period(first=3, last=45)], [2, 3, 1]),
+        ([period(first=1, actor="y"), period(first=2, actor=""), period(first=3)], [2, 3]),
+        ([period(first=number, last=number + 30) for number in range(9)], [8, 7, 6, 5]),
+        ([period(first=1, last=19), period(first=2, last=20)], [2]),  # it ended more than 10 s before the crash
+    ],
+)
+def test_lane_changes_and_then_the_latest_periods_with_the_collision_partner_are_examined(periods, first):
+    search = object.__new__(_Search)
+    search._end, search._dt, search._other = 60, 0.25, "x"
+    assert [one["first"] for one in search._candidates(tuple(periods))] == first
+
+
+@pytest.mark.parametrize(
+    ("was", "outcome", "now", "ending"),
+    [
+        (("ego", "x"), Outcome.SURVIVED, None, "none"),
+        (("ego", "x"), Outcome.FINISHED, None, "none"),
+        (("ego", "x"), Outcome.COLLISION, ("ego", "x"), "same"),
+        (("ego", "x"), Outcome.COLLISION, ("x", "ego"), "same"),
+        (("ego", "x"), Outcome.COLLISION, ("ego", "y"), "other"),
+        (("ego", "x"), Outcome.OFF_ROAD, None, "other"),
+        (None, Outcome.OFF_ROAD, None, "same"),
+        (None, Outcome.COLLISION, ("ego", "x"), "other"),
+        (("ego", "x"), Outcome.HANG, None, "unclear"),
+        (("ego", "x"), Outcome.PROCESS_DIED, None, "unclear"),
+    ],
+)
+def test_ending_of_a_run_with_the_reference_driver_is_that_of_its_crash(was, outcome, now, ending):
+    def result(outcome, hit):
+        collision = hit and SimpleNamespace(collider=hit[0], victim=hit[1])
+        return SimpleNamespace(outcome=outcome, collision=collision)
+
+    search = object.__new__(_Search)
+    search._result = result(Outcome.COLLISION if was else Outcome.OFF_ROAD, was)
+    assert search._ending(result(outcome, now)) == ending
