@@ -17,7 +17,15 @@ import numpy as np
 from crashhunt.base import layout
 from crashhunt.base.text import format_time
 from crashhunt.crashes._lanes import LaneMap
-from crashhunt.world import MAX_CONTACT_GAP_M, STANDS_MPS, contact_at, is_person, lane_jump, poses_between
+from crashhunt.world import (
+    MAX_CONTACT_GAP_M,
+    OBSTACLE_KINDS,
+    STANDS_MPS,
+    contact_at,
+    is_person,
+    lane_jump,
+    poses_between,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,6 +46,7 @@ _MIN_BEND_TURN_RAD = math.radians(20)  # between two vehicles that touch in one 
 _OPPOSITE_RAD = math.radians(135)
 _UNSWEPT_CONTACT = "crashed"  # highway-env's collisions: its vehicles drive through several collision checks in a step
 _LATELY_S = 1.5
+_STOOD_S = 1.0  # an actor that stood for less time may only have paused
 _BEFORE_S = 1.0  # as long as the first half of a lane change takes
 _SIDEWAYS_M = 0.3  # less is drifting
 _MAX_STRAIGHT_TURN_RAD = math.radians(10)
@@ -277,11 +286,28 @@ class ContactRecord:
             return "pedestrian"
         if self.is_disputed:
             return ""
+        if self.has_obstacle:
+            return "obstacle"
         if self.same_way:
             return "rear end" if self.follower else "side swipe"
         if self.is_oncoming:
-            return "head-on"
+            return "standing vehicle" if self.standing else "head-on"
         return "crossing from the right" if self.touch.turn > 0 else "crossing from the left"
+
+    @property
+    def has_obstacle(self) -> bool:
+        """Whether one of the actors is an obstacle, which has neither a front nor a direction."""
+        roster = self.before[-1].roster
+        return any(roster.actors[roster.index[one]].kind in OBSTACLE_KINDS for one in (self.agent, self.other))
+
+    @cached_property
+    def standing(self) -> str:
+        """The actor that had stood still for at least 1 s before the contact; empty if both or none had.
+
+        A vehicle that stands is not an oncoming vehicle: German accident statistics count the two apart.
+        """
+        stood = [one for one in (self.agent, self.other) if self.stood_s(one) >= _STOOD_S]
+        return stood[0] if len(stood) == 1 else ""
 
     @property
     def turn(self) -> float:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # The signature of a crash: the properties by which two crashes count as the same crash type.
 
 
-SIGNATURE_VERSION = 5
+SIGNATURE_VERSION = 6
 """Version of these rules. Raise it with each change by which a crash gets another type: types that an earlier version
 has noted in a ledger are then determined again."""
 
@@ -102,10 +102,12 @@ class Signature(Serializable):
     Args:
         outcome: outcome of the trial.
         role: role of the agent: ``collider``, ``victim`` or ``alone``; empty if the crash is not a collision.
-        manner: The manner of a collision: ``rear end``, ``side swipe``, ``crossing from the left`` (the side of the
-            collision partner), ``crossing from the right``, ``head-on``, ``pedestrian`` or ``off road``. For a
-            Gymnasium environment, the crash type that it reports, or its crash rule. For a traffic event, the type of
-            the event, and the name of a violated requirement. For a software fault, the exception, signal or exit code.
+        manner: The manner of a collision: ``rear end``, ``side swipe``, ``crossing from the left``, ``crossing from the
+            right``, ``head-on``, ``standing vehicle``, ``obstacle``, ``pedestrian`` or ``off road``. A crossing names
+            the side of the collision partner. With ``standing vehicle``, one of two vehicles that face each other had
+            stood. For a Gymnasium environment, the crash type that it reports, or its crash rule. For a traffic event,
+            the type of the event, and the name of a violated requirement. For a software fault, the exception, signal
+            or exit code.
         lane_change: which of the two actors were changing lanes: ``agent``, ``other``, ``both`` or empty.
         place: the text ``crossing`` where lanes of different directions overlap, ``road`` elsewhere; empty if the map
             is unknown, or if the place does not matter.

@@ -127,6 +127,11 @@ def _what_touched(contact: ContactRecord) -> str:
         own, its = contact.speed_at_contact(follower), contact.speed_at_contact(leader)
         speeds = f" at {own:.1f} m/s against {its:.1f} m/s" if own > its else ""
         return f"{follower} drove into the back of {leader}{speeds}"
+    stood = contact.standing
+    if stood and manner not in ("side swipe", "pedestrian", "obstacle"):
+        return f"{contact.partner(stood)} drove into {stood}, which stood still"
+    if manner == "obstacle":
+        return f"{mover} drove into {met}"
     if manner == "head-on":
         return f"{agent} and {contact.other} collided head-on"
     if manner == "pedestrian":

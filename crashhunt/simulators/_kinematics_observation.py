@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from crashhunt.world import on_one_level
+from crashhunt.world import OBSTACLE_KINDS, on_one_level
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,7 +34,7 @@ _KIND_NUMBERS = {
     **dict.fromkeys(("bicycle", "motorcycle", "moped", "scooter"), _TWO_WHEELS),
     **dict.fromkeys(("pedestrian", "wheelchair"), _PERSON),
     **dict.fromkeys(("rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"), _RAIL),
-    **dict.fromkeys(("Obstacle", "Landmark"), _OBSTACLE),
+    **dict.fromkeys(OBSTACLE_KINDS, _OBSTACLE),
 }
 
 

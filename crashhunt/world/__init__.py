@@ -74,6 +74,7 @@ if TYPE_CHECKING:
         time_to_drive as time_to_drive,
     )
     from ._scene import (
+        OBSTACLE_KINDS as OBSTACLE_KINDS,
         PERSON as PERSON,
         Actor as Actor,
         Contact as Contact,

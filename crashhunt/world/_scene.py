@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 PERSON = "person "
 """What an id of a person begins with: vehicles and persons may have the same name, and no name has a blank."""
 
+OBSTACLE_KINDS = ("Obstacle", "Landmark")
+"""The simulators' names of actors that never move."""
+
 Spine = tuple[tuple[float, float, float], ...]
 """The centre line of a long vehicle in a bend, as (x, y, z) in m, from the front bumper to the back."""
 

@@ -222,6 +222,29 @@ def test_crossing_names_the_side_from_which_the_other_comes():
     assert record(drives(12.0), lambda t: (5.0 - 9 * t, 0.3, math.pi, 9.0), step_s=0.1).manner == "head-on"
 
 
+def stood(since_s):
+    """Faces the traffic along the x axis; it has stood for some time before the contact."""
+    return lambda t: (5.0 - 9.0 * min(0.0, t + since_s), 0.3, math.pi, 9.0 if t < -since_s else 0.0)
+
+
+@pytest.mark.parametrize(("since_s", "manner"), [(0.5, "head-on"), (1.5, "standing vehicle"), (99, "standing vehicle")])
+def test_vehicle_that_has_stood_is_not_met_head_on(since_s, manner):
+    case = record(drives(12.0), stood(since_s), step_s=0.1)
+    assert (case.manner, case.standing) == (manner, "other" if manner != "head-on" else "")
+    swapped = record(stood(since_s), drives(12.0), step_s=0.1)
+    assert (swapped.manner, swapped.standing) == (manner, "ego" if manner != "head-on" else "")
+
+
+@pytest.mark.parametrize("heading", [0.0, math.pi / 2, math.pi])
+def test_obstacle_has_no_direction(heading):
+    """highway-env's obstacles have a heading, by which they were a rear end, a crossing or head-on."""
+    case = record(drives(12.0), lambda _t: (5.0, 0.0, heading, 0.0), step_s=0.1)
+    other = replace(ROSTER.actors[1], kind="Obstacle")
+    roster = Roster((ROSTER.actors[0], other))
+    scenes = [Scene(one.time_s, roster, one.points, one.headings, one.speeds) for one in case.scenes]
+    assert replace(case, scenes=scenes).manner == "obstacle"
+
+
 def test_red_light_ends_where_the_vehicle_has_left_the_junction():
     case = record(drives(10.0), drives(5.0, x=5.0), lanes=LaneMap((), (0.0, 0.0)))
     red = Event("red_light", "ego", "ego ran a red light", lane="after_0")

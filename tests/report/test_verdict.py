@@ -77,6 +77,18 @@ def jump(side, ahead_m, *, own=10.0, its=20.0, mover=0):
             lambda time_s: [(10 * time_s, 0.0, 0.0, 10.0), (0.9, 2.0 + time_s, math.pi / 2, 1.0)],
             "ego drove into x, which came from the right",
         ),
+        (
+            lambda time_s: [(10 * time_s, 0.0, 0.0, 10.0), (-0.1, 0.0, math.pi, 0.0)],
+            "ego drove into x, which stood still",
+        ),
+        (
+            lambda time_s: [(-0.1, 0.0, math.pi, 0.0), (10 * time_s, 0.0, 0.0, 10.0)],
+            "x drove into ego, which stood still",
+        ),
+        (
+            lambda time_s: [(10 * time_s, 0.0, 0.0, 10.0), (3.4, 0.0, math.pi / 2, 0.0)],
+            "ego drove into x, which stood still",
+        ),
     ],
 )
 def test_contact_in_one_clause(poses, words, turn):
