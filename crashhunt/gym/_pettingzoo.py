@@ -52,6 +52,15 @@ def is_parallel(made: Any) -> TypeGuard[Parallel]:
     return all(found is not None for found in needed) and callable(made.observation_space) and not takes_turns(made)
 
 
+def generates_agents(made: Any) -> bool:
+    """Return whether only ``possible_agents`` is missing of the interface of PettingZoo's ``ParallelEnv``.
+
+    PettingZoo omits this list if an environment generates its agents during an episode.
+    """
+    needed = (getattr(made, name, None) for name in members(Parallel) if name not in ("agents", "possible_agents"))
+    return all(callable(found) for found in needed)
+
+
 def takes_turns(made: Any) -> bool:
     """Return whether an object is a PettingZoo environment whose agents act one after the other."""
     return supports(made, TakesTurns)

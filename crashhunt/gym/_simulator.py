@@ -31,7 +31,7 @@ from crashhunt.base.text import (
     one_of,
 )
 from crashhunt.gym._descriptor import GymSetup
-from crashhunt.gym._pettingzoo import OneLearner, is_parallel, takes_turns
+from crashhunt.gym._pettingzoo import OneLearner, generates_agents, is_parallel, takes_turns
 from crashhunt.scenario import argument_values
 from crashhunt.simulators import (
     ObservationForm,
@@ -394,6 +394,9 @@ class GymSimulator:
             )
             if takes_turns(made):
                 fix, what = "name the function parallel_env of the environment", "whose agents act in turns"
+            elif generates_agents(made):
+                fix = "set it to the list of the agents that may take part, at least the one that gym.learner names"
+                what = "a parallel environment without possible_agents"
             raise self._mistake(f"this factory returned a {type(made).__name__}, {what}", fix=fix)
         return made
 

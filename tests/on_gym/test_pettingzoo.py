@@ -68,6 +68,18 @@ class Chase:
         pass
 
 
+class Generated(Chase):
+    """Has no list of its agents, as PettingZoo allows if they are generated."""
+
+    def __init__(self):
+        pass
+
+    def __getattribute__(self, name):
+        if name == "possible_agents":
+            raise AttributeError(name)
+        return super().__getattribute__(name)
+
+
 class InTurns(Chase):
     def agent_iter(self):
         return iter(self.agents)
@@ -141,6 +153,11 @@ def test_episode_ends_with_the_learner(tmp_path, leaves_at):
     ("name", "options", "says"),
     [
         ("Chase", {"learner": "runer"}, "gym.learner = 'runer' is not an agent; did you mean 'runner'?"),
+        (
+            "Generated",
+            {},
+            "this factory returned a Generated, a parallel environment without possible_agents; set it to",
+        ),
         ("InTurns", {}, "this factory returned a InTurns, whose agents act in turns; name the function parallel_env"),
     ],
 )
