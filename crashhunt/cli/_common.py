@@ -111,6 +111,30 @@ class GivenOnce(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
+def crash_id(text: str) -> str:
+    """Return the value of ``--crash``, which is one or several ids of crashes.
+
+    Raises:
+        UsageError: an id is empty, for which a command would select a crash itself.
+    """
+    if not all(one.strip() for one in text.split(",")):
+        fix = "give the id of a crash or the number of its trial, or omit the option"
+        raise UsageError(f"--crash {text!r} has an empty id", fix=fix)
+    return text
+
+
+class CrashId(GivenOnce):
+    """The option for the id of a crash, which must not be empty."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        """Store the value.
+
+        Raises:
+            UsageError: the value is empty, or the option has another value already.
+        """
+        super().__call__(parser, namespace, crash_id(values), option)
+
+
 class WordsWithCommas(argparse.Action):
     """An option whose value is a list with commas; if it is given several times, all its values count."""
 
@@ -138,7 +162,7 @@ def add_crash(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--crash",
         metavar="ID",
-        action=GivenOnce,
+        action=CrashId,
         default="",
         help="the id of a crash, or the number of its trial; default: the crash with the fewest steps",
     )

@@ -16,6 +16,7 @@ from crashhunt.cli._common import (
     add_parallel,
     add_trust,
     check_trust,
+    crash_id,
     opened_crash,
     refuse_below,
     run_trusted,
@@ -61,7 +62,7 @@ def _add_add(commands: Commands) -> None:
         help="the folder of a crash or of a hunt, or a file that crashhunt export wrote",
     )  # fmt: skip
     add.add_argument(
-        "--crash", metavar="ID", action="append", default=[],
+        "--crash", metavar="ID", type=crash_id, action="append", default=[],
         help="of a hunt: the crash to add; the option may be given several times; default: the shortest crash",
     )  # fmt: skip
     add.add_argument("--to", metavar="CORPUS", type=Path, required=True, help="the folder of the corpus")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.text import count_of, listed
-from crashhunt.cli._common import add_json, integer, opened_hunt, say
+from crashhunt.cli._common import CrashId, add_json, integer, opened_hunt, say
 from crashhunt.cli._exit_codes import DONE
 
 if TYPE_CHECKING:
@@ -38,7 +38,11 @@ def add_note_command(commands: Commands) -> None:
     )  # fmt: skip
     note.add_argument("text", metavar="TEXT", nargs="*", default=[], help="text of the note")
     note.add_argument(
-        "--crash", metavar="ID", default="", help="the id of a crash or near miss, or the number of its trial"
+        "--crash",
+        metavar="ID",
+        action=CrashId,
+        default="",
+        help="the id of a crash or near miss, or the number of its trial",
     )
     note.add_argument(
         "--tag", metavar="TAG", action="append", default=[], dest="tags",

@@ -279,6 +279,16 @@ def test_option_of_which_a_user_expects_both_values_to_count_is_refused_twice(wo
     assert str(caught.value).startswith(message)
 
 
+@pytest.mark.parametrize("text", ["", " ", "3,", ",3", "3,,4"])
+@pytest.mark.parametrize(
+    "words", [("replay", "h"), ("show", "h"), ("note", "h", "text"), ("corpus", "add", "h", "--to", "c")]
+)
+def test_empty_id_of_a_crash_is_refused(words, text):
+    with pytest.raises(UsageError) as caught:
+        make_parser().parse_args([*words, "--crash", text])
+    assert str(caught.value).startswith(f"--crash {text!r} has an empty id; give the id of a crash or the number of")
+
+
 def test_options_of_the_machine_count_only_where_they_are_given():
     made = Parser(prog="crashhunt suite run")
     _common.add_options_of_machine(made)
