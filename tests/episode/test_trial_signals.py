@@ -319,7 +319,7 @@ def test_standing_agent_has_no_headway_and_closes_in_on_nothing(tmp_path):
     assert (found["headway_s"][-1], found["ttc_s"][-1], found["gap_m"][-1]) == (math.inf, math.inf, 20.0)
 
 
-def test_signals_of_priority_are_those_of_actors_to_whom_the_agent_must_yield(tmp_path):
+def test_signals_of_priority_describe_actors_with_the_right_of_way(tmp_path):
     inside = (-1.0, 4.0, 12.0, 20.0, 6.0, True)
     found = signals_at(
         tmp_path,
