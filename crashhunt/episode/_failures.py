@@ -547,6 +547,8 @@ class Ending:
         """
         blamed = blame(error, self.simulator, place)
         found = self._attribute(blamed.error)
+        if found is None and type(blamed.error) is ActionError:  # a refused call, whose error the agent has hidden
+            found = Attribution(self.names[0] if len(self.names) == 1 else "")
         if found is None and blamed.party is Party.AGENT:
             found = Attribution("")
         # A user's environment or oracle that raises it has not recorded anything.

@@ -2,7 +2,8 @@
 
 An agent runs in the process of the simulation, so it can import libsumo. It may read everything. A call that changes
 something, such as ``vehicle.setSpeed`` of another vehicle, ``simulationStep`` or ``close``, would reach round the
-agent's action. Such a call raises an `ActionError` in the agent, and SUMO does not receive it.
+agent's action. Such a call raises an `ActionError` in the agent, and SUMO does not receive it. If the agent
+hides the error, the next step raises it again.
 
 Calls of crashhunt, of a user's simulator, oracle or disturbance, and of a program that uses the environment of
 Gymnasium, are not restricted. The nearest function of crashhunt on the stack shows whether an agent calls. Only
@@ -34,6 +35,14 @@ _CALLERS_OF_AGENTS = {
     "crashhunt.episode._failures": ("close_agent",),
 }
 """The functions that call agents, by module."""
+_STEP = "simulation.step"
+_refused: list[ActionError] = []
+"""The error of the first call of an agent that was refused, until the next step or episode."""
+
+
+def forget_calls() -> None:
+    """Forget the calls of the last episode."""
+    _refused.clear()
 
 
 def guard_against_agents() -> None:
@@ -52,9 +61,13 @@ def _guarded(name: str, function: Callable[..., object]) -> Callable[..., object
     def call(*given: object, **named: object) -> object:
         caller = sys._getframe(1)
         if not caller.f_globals.get("__name__", "").startswith("crashhunt.sumo.") and _is_by_agent(caller):
-            shown = name.replace("simulation.step", "simulationStep").replace("simulation.close", "close")
+            shown = name.replace(_STEP, "simulationStep").replace("simulation.close", "close")
             message = f"the agent called libsumo's {shown}, which changes the simulation"
-            raise ActionError(message, fix="return an action; agents may only read the simulation")
+            error = ActionError(message, fix="return an action; agents may only read the simulation")
+            _refused[:] = _refused or [error]
+            raise error
+        if _refused and name == _STEP:
+            raise _refused.pop()
         return function(*given, **named)
 
     return call

@@ -31,7 +31,7 @@ from crashhunt.simulators import (
     TrajectoryAction,
     Unseen,
 )
-from crashhunt.sumo._agent_calls import guard_against_agents
+from crashhunt.sumo._agent_calls import forget_calls, guard_against_agents
 from crashhunt.sumo._descriptor import BACKEND
 from crashhunt.sumo._disturbances import SumoDisturbances
 from crashhunt.sumo._driving import FREE_FORMS, Driving, hold_vehicle
@@ -185,6 +185,7 @@ class SumoSimulator:
         """Load the scenario, warm up the traffic, and put the controlled vehicles on the road."""
         global _current
         self._stop_fast_path()
+        forget_calls()
         options = options or {}
         arguments = options.get("arguments", {})
         self.setup_steps = 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import shutil
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -123,6 +124,21 @@ def test_an_episode_is_the_same_bit_by_bit(street, how):
     street.both(ANSWERS[how])
     street.both(ANSWERS[how], crash_on=[*CRASHES, Outcome("not_moving"), Outcome("hard_braking")], oracles=[RedLight()])
     assert street.comes[DONE] + street.comes[ANSWERED] > 20 or how == "raises at once"
+
+
+def test_call_that_an_agent_must_not_make_is_its_error_even_if_it_hides_the_refusal(street):
+    import libsumo
+
+    def answer(step, _):
+        if step == 30:
+            with suppress(Exception):
+                libsumo.vehicle.setSpeed("behind", 0.0)
+        return 8.0, 0
+
+    result, *_ = street.both(answer)
+    assert "agent_error" in result
+    assert "vehicle.setSpeed" in result
+    assert "agent='ego'" in result
 
 
 def test_most_steps_are_taken_at_once(street):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import libsumo
 import pytest
 
@@ -91,12 +93,21 @@ def test_reading_is_allowed_and_changes_nothing(simulator):
     assert ended[0] == ended[1]
 
 
-def test_agent_that_hides_the_error_has_changed_nothing(simulator):
-    def swallow():
-        with pytest.raises(Exception, match="changes the simulation"):
-            libsumo.vehicle.setSpeed(other(), 0.0)
+def test_call_of_an_agent_that_hides_the_error_ends_the_trial_and_has_changed_nothing(simulator):
+    speeds = []
 
-    assert driven(simulator, swallow).outcome is Outcome.SURVIVED
+    def swallow():
+        speeds.append(libsumo.vehicle.getSpeed(other()))
+        for call in (lambda: libsumo.vehicle.setSpeed(other(), 0.0), libsumo.simulationStep):
+            with suppress(Exception):
+                call()
+        speeds.append(libsumo.vehicle.getSpeed(other()))
+
+    result = driven(simulator, swallow)
+    assert (result.outcome, result.steps, result.failure.agent) == (Outcome.AGENT_ERROR, 2, "ego")
+    assert "the agent called libsumo's vehicle.setSpeed, which changes the simulation" in str(result.failure)
+    assert speeds[0] == speeds[1]
+    assert driven(simulator, lambda: None).outcome is Outcome.SURVIVED
 
 
 def test_oracle_of_a_user_and_a_program_may_command_sumo(simulator):
