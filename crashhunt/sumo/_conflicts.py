@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _UPSTREAM_M = 150.0  # actors further away are out of sight
 _CLOSE_SHARE = 0.8  # of the mean width of two lanes, which lets neighbouring lanes pass
-_STEP_M = 0.25  # resolution of conflict areas
+_STEP_M = 0.25  # between two points of a path; areas end between points
 
 
 class Conflict(NamedTuple):
@@ -129,11 +129,13 @@ class Conflicts:
         for neighbor in graph.edges[source.edge]:
             if neighbor is source or not any(graph.lanes[one.target].edge == edges[1] for one in neighbor.links):
                 yield neighbor.id, Approach(conflict, -neighbor.data.length_m, edges, 0)
-        # Edges further upstream, each with the shortest distance.
+        # Edges further upstream, each with the shortest distance. An actor may still change lanes before the junction.
         waiting, known = [(source, -source.data.length_m, 0)], {source.edge}
         while waiting:
             current, offset, back = waiting.pop(0)
-            for name, entry in current.entries if offset > -_UPSTREAM_M else ():
+            if offset <= -_UPSTREAM_M:
+                continue
+            for name, entry in (one for lane in graph.edges[current.edge] for one in lane.entries):
                 before = graph.lanes[name]
                 place = offset
                 for inside in reversed(entry.inside):
@@ -150,15 +152,19 @@ class Conflicts:
         graph = self._graph
         mine, theirs = (_sampled([graph.lines(graph.lanes[lane]).center for lane in path]) for path in (own, other))
         limit = _CLOSE_SHARE * (graph.lanes[own[-1]].data.width_m + graph.lanes[other[-1]].data.width_m) / 2
-        squared = ((mine[0][:, None] - theirs[0][None]) ** 2).sum(axis=2)
-        close = squared < limit * limit
-        if not close.any():
-            return None
+        apart = np.sqrt(((mine[0][:, None] - theirs[0][None]) ** 2).sum(axis=2))
         found = []
-        for (_, along), rows, path in ((mine, close.any(axis=1), own), (theirs, close.any(axis=0), other)):
+        for (_, along), distances, path in ((mine, apart.min(axis=1), own), (theirs, apart.min(axis=0), other)):
+            close = np.flatnonzero(distances < limit)
+            if not len(close):
+                return None
             scale = sum(graph.length(lane) for lane in path) / float(along[-1])
-            where = along[np.flatnonzero(rows)[[0, -1]]] * scale
-            found += where.tolist()
+            for inside, outside in ((close[0], close[0] - 1), (close[-1], close[-1] + 1)):
+                place = along[inside]
+                if 0 <= outside < len(along):  # the paths are as far apart as the limit between these two points
+                    share = (limit - distances[inside]) / (distances[outside] - distances[inside])
+                    place += share * (along[outside] - place)
+                found.append(float(place * scale))
         begin, end, other_begin, other_end = found
         return begin, end, other_begin, other_end
 
