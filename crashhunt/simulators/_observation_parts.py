@@ -347,7 +347,11 @@ PARTS: Mapping[str, Part] = {
             axes=("rows",),
             columns=(
                 _PRESENT,
-                _flag("must_yield", "1 if the controlled vehicle must yield to the actor"),
+                _flag(
+                    "must_yield",
+                    "1 if the rules of the junction make the controlled vehicle yield to the actor, which has no red "
+                    "light; at an allway stop, to an actor that has waited longer",
+                ),
                 _distance("stop_line_distance", "distance of the front bumper to the stop line of the junction"),
                 _distance(
                     "conflict_distance",
