@@ -162,6 +162,7 @@ _MAX_LINKS_PER_STEP = 6  # most links that a vehicle can cross in one long step
 _DIRECTION_INTERVAL_STEPS = 10  # steps between two checks of the driving direction on the same lane
 _WRONG_WAY_COSINE = -0.5  # cosine of the angle between course and lane below which a vehicle drives the wrong way
 _NEAR_M = 150.0  # events further from every agent are not reported
+_LINE_TOLERANCE_M = 1.0  # of the place where a vehicle that moves freely has crossed a stop line
 _CONSEQUENCE_S = 5.0  # a collision within this time after hard braking may be its consequence
 
 
@@ -296,6 +297,8 @@ class SumoEvents:
             return  # the vehicle has changed lanes
         if agent in sumo.simulation_getStartingTeleportIDList() or agent in sumo.simulation_getEndingTeleportIDList():
             return
+        if agent in self._routes and not self._is_behind_line(agent, before, scene):
+            return  # it has crossed over to a lane that a turnaround connects with its last lane
         ways = _ways_between(before, edge)
         if ways and all(any(state in _RED_STATES for state in states) for states in ways):
             speed = scene.speeds[scene.roster.index[agent]]
@@ -305,6 +308,13 @@ class SumoEvents:
             speed = scene.speeds[scene.roster.index[agent]]
             what = f"{agent} ran a stop sign at {speed:.1f} m/s, coming from lane {before}"
             found.append(self._of(scene, agent, "stop_sign", what))
+
+    def _is_behind_line(self, agent: str, before: str, scene: Scene) -> bool:
+        """Return whether an agent is as near to the end of its last lane as after a step across the stop line."""
+        row = scene.roster.index[agent]
+        away = math.dist(scene.points[row], sumo.lane_getShape(before)[-1][:2])
+        most = scene.speeds[row] * self._dt + float(sumo.lane_getWidth(before)) / 2 + _LINE_TOLERANCE_M
+        return away <= most
 
     def _watch_stop(self, agent: str, before: str, lane: str) -> None:
         """Note whether a stop sign stands at the end of an agent's new lane."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import math
 import shutil
+from pathlib import Path
 
 import libsumo
 import numpy as np
@@ -535,3 +537,37 @@ def test_kerb_is_driven_over_where_a_side_leaves_the_road_while_the_centre_stays
     assert len(over) >= 2
     assert all("drove over the kerb with its" in what and "right" in what for _, what in said)
     assert simulator.agents == ["ego"]
+
+
+TOWN = """schema = 1
+simulator = "sumo"
+step_length_s = 0.1
+[sumo]
+net = "town.net.xml"
+routes = ["r.rou.xml"]
+[agents.ego]
+route = "ego"
+depart_speed = "8"
+"""
+
+
+def test_lane_of_the_other_direction_is_entered_without_running_the_red_light_of_the_turnaround(start, tmp_path):
+    town = tmp_path / "town"
+    town.mkdir()
+    network = (Path(__file__).parent / "nets" / "grid-walks.net.xml.gz").read_bytes()
+    (town / "town.net.xml").write_bytes(gzip.decompress(network))
+    (town / "r.rou.xml").write_text('<routes><route id="ego" edges="A1B1 B1C1"/></routes>')
+    (town / "scenario.toml").write_text(TOWN)
+    simulator, step = start("target_pose", str(town))
+    assert {"B1A1_2"} <= {link[0] for link in libsumo.lane.getLinks("A1B1_2")}
+    lights = libsumo.trafficlight.getRedYellowGreenState("B1")
+    libsumo.trafficlight.setRedYellowGreenState("B1", "r" * len(lights))
+    kinds = []
+    for lane in ("A1B1_2", "B1A1_2", "A1B1_2", "A1B1_2"):
+        y = libsumo.lane.getShape(lane)[0][1]
+        for _ in range(40 if len(kinds) else 20):
+            x, *_ = centre()
+            step((x + 16.0, y, 0.0, 2.0))
+            kinds += [(event.kind, libsumo.vehicle.getLaneID("ego")) for event in simulator.scene().events]
+    assert [kind for kind, _ in kinds] == ["wrong_way", "red_light"]
+    assert kinds[1][1].startswith(":B1_")
