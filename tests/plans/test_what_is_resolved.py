@@ -498,3 +498,15 @@ def test_foreign_disturbances_of_a_hunt_are_drawn_elsewhere(folder):
     assert not isinstance(found.models["stop"], ModelApart)
     assert "errs" not in sys.modules
     found.close()
+
+
+def test_argument_that_only_one_of_two_hunts_has_is_one_difference():
+    _, settings = plan(Request(trials=1, max_steps=10, seed=1))
+    name = next(iter(settings.scenario_arguments))
+    fewer = {key: value for key, value in settings.scenario_arguments.items() if key != name}
+    other = replace(settings, scenario_arguments=fewer, seed=2)
+    value = settings.scenario_arguments[name].spec
+    assert settings.differences(other) == [
+        "seed was 1 and is now 2", f"scenario_arguments.{name} was {value} and is now (not there)",
+    ]  # fmt: skip
+    assert other.differences(settings)[1] == f"scenario_arguments.{name} was (not there) and is now {value}"
