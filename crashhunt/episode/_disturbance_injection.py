@@ -65,6 +65,7 @@ class _OngoingDisturbance:
         what: The kind of the disturbance.
         active: The simulator's disturbance of a vehicle; None if the agent itself is disturbed.
         filters: Object that changes the agent's observations or actions; None if a vehicle is disturbed.
+        after: Number of steps after the last one in which observations still contain disturbed ones.
     """
 
     last: int
@@ -72,6 +73,7 @@ class _OngoingDisturbance:
     what: str
     active: ActiveDisturbance | None = None
     filters: _Filter | None = None
+    after: int = 0
 
 
 class DisturbanceInjector:
@@ -171,9 +173,9 @@ class DisturbanceInjector:
         return bool((traffic and traffic[-1].step <= step) or (agents and agents[-1].step <= step + 1))
 
     def _end_before(self, step: int) -> None:
-        over = [going for going in self._active if going.last < step]
+        over = [going for going in self._active if going.last + going.after < step]
         if over:
-            self._active = [going for going in self._active if going.last >= step]
+            self._active = [going for going in self._active if going.last + going.after >= step]
             for going in over:
                 if going.active is not None:
                     going.active.end()
@@ -228,7 +230,7 @@ class DisturbanceInjector:
         while self._agent_waits and self._agent_waits[-1].step <= step:
             self._begin_of_agent(self._agent_waits.pop(), found)
         for going in self._active:
-            if going.filters is None or going.what == "late_action" or going.last < step:
+            if going.filters is None or going.what == "late_action" or going.last + going.after < step:
                 continue
             if going.vehicle in found:
                 found[going.vehicle] = going.filters(found[going.vehicle])
@@ -244,7 +246,8 @@ class DisturbanceInjector:
             self._notify_observers(planned)
             return
         last = planned.step + self._steps(planned.how_long) - 1
-        self._active.append(_OngoingDisturbance(last, agent, planned.what, filters=made))
+        after = made.after if isinstance(made, _NoisyParts) else 0
+        self._active.append(_OngoingDisturbance(last, agent, planned.what, filters=made, after=after))
         self._notify_observers(planned.took_place(agent, planned.how_strong, self._dt))
 
     def _filter(self, planned: Disturbance) -> _Filter | None:
@@ -263,7 +266,8 @@ class DisturbanceInjector:
             np.random.SeedSequence(self._seed, spawn_key=(_NOISE_STREAM, planned.step, *agent.encode()))
         )
         if layout is not None:
-            return _NoisyParts(planned.how_strong, layout, partial(_center_of, simulator, agent), rng)
+            center, steps = partial(_center_of, simulator, agent), self._steps(planned.how_long)
+            return _NoisyParts(planned.how_strong, layout, center, rng, steps=steps, is_first=self._step == 0)
         return _Noisy(planned.how_strong, names, space.low, space.high, rng)
 
 
@@ -313,11 +317,18 @@ class _Held:
 class _NoisyParts:
     """Adds to every measured number of an observation with parts an error of up to a share of the number.
 
+    If the observation stacks earlier ones, these stay as the agent received them.
+
     Args:
         share: The largest relative error.
         layout: The layout of the observation.
         center: Function that returns the centre of the agent's vehicle, in m; None if it has left.
         rng: The random generator of the disturbance.
+        steps: Number of steps with errors.
+        is_first: Whether the first observation is that of the start of the episode.
+
+    Attributes:
+        after: Number of steps after these in which the observation still stacks observations with errors.
     """
 
     def __init__(
@@ -326,10 +337,27 @@ class _NoisyParts:
         layout: ObservationLayout,
         center: Callable[[], tuple[float, float] | None],
         rng: np.random.Generator,
+        *,
+        steps: int,
+        is_first: bool,
     ) -> None:
         self._share, self._layout, self._center, self._rng = share, layout, center, rng
+        self._left, self._is_first = steps, is_first
+        self._received: Array | None = None
+        self.after = max(0, layout.history - 1)
 
     def __call__(self, array: Array) -> Array:
+        found = self._with_errors(array) if self._left else array
+        self._left = max(0, self._left - 1)
+        if self.after:
+            if self._received is not None:
+                found = self._layout.with_earlier(found, self._received, steps_before=1)
+            else:
+                found = self._layout.with_earlier(found, None if self._is_first else array, steps_before=0)
+            self._received = found
+        return found
+
+    def _with_errors(self, array: Array) -> Array:
         factors = 1.0 + self._share * self._rng.uniform(-1.0, 1.0, array.shape)
         center = self._center()
         return array if center is None else self._layout.with_errors(array, factors, center)

@@ -715,6 +715,22 @@ class ObservationLayout:
         found.flags.writeable = False
         return found
 
+    def with_earlier(self, array: NDArray[Any], other: NDArray[Any] | None, *, steps_before: int) -> NDArray[Any]:
+        """Return a recorded array of a layout with a history, with the earlier observations of another array.
+
+        Args:
+            array: The recorded array.
+            other: The other recorded array; None to repeat the last observation, as at the start of an episode.
+            steps_before: How many steps the other array is before this one, 0 or 1.
+        """
+        found = array.copy()
+        for _, place, shape, _ in self._places:
+            stack, begin = found[place].reshape(shape), steps_before
+            earlier = stack[-1:] if other is None else other[place].reshape(shape)[begin : len(stack) - 1 + begin]
+            stack[:-1] = earlier
+        found.flags.writeable = False
+        return found
+
     def describe(self) -> dict[str, SpaceDescription]:
         """Return the shape, the columns and their units of every part as JSON-compatible data."""
         return {

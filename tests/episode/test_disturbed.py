@@ -12,6 +12,7 @@ from crashhunt.episode._disturbance_injection import DisturbanceInjector
 from crashhunt.oracles import Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, first_divergence, read_black_box
 from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.simulators import PARTS, layouts_of
 from crashhunt.simulators.toy import ToySimulator
 from crashhunt.trial import Disturbance, Outcome, TrialResult, TrialSpec
 
@@ -161,6 +162,28 @@ def test_noise_is_within_its_share_and_leaves_directions_alone(run):
     assert (shown[10:20, :2, 1] != true[10:20, :2, 1]).all()  # x of itself and of the leader
     assert (abs(shown - true) <= 0.1001 * abs(true)).all()
     assert (shown[:, :, [0, 5, 6]] == true[:, :, [0, 5, 6]]).all()
+
+
+@pytest.mark.parametrize("begin", [1, 11])
+def test_history_stacks_the_observations_as_they_were_received(run, begin):
+    parts = ("ego", "actors:rows=3", "lidar2d:rays=12")
+    plain = Scenario(simulator="toy", agents={"ego": AgentSetup(observation=parts)})
+    stacking = Scenario(simulator="toy", agents={"ego": AgentSetup(observation=(*parts, "history:steps=4"))})
+    layout = layouts_of(stacking.agents, PARTS)["ego"]
+    noise = (
+        planned(begin, "noisy_observation", "itself", 0.2, 0.8),
+        planned(20, "noisy_observation", "itself", 0.2, 0.5),
+    )
+    _, recording = run(*noise, scenario=stacking, steps=30)
+    stacks = [layout.restore(array) for array in recording.observations("ego")]
+    true = layouts_of(plain.agents, PARTS)["ego"]
+    shown = [true.restore(array) for array in run(scenario=plain, steps=30)[1].observations("ego")]
+    noisy = {*range(begin - 1, begin + 7), *range(19, 24)}
+    for step, stack in enumerate(stacks):
+        for name, array in stack.items():
+            assert (array[-1].tobytes() == shown[step][name].tobytes()) == (step not in noisy), (step, name)
+            for back in range(1, 4):
+                assert array[-1 - back].tobytes() == stacks[max(0, step - back)][name][-1].tobytes(), (step, name, back)
 
 
 def test_a_late_action_is_recorded_when_it_is_decided_and_done_later(run):
