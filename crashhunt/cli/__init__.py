@@ -27,13 +27,12 @@ from crashhunt.base.version import __version__
 from crashhunt.cli._agent_header import add_agent_header
 from crashhunt.cli._bisect import add_bisect
 from crashhunt.cli._check import add_check
-from crashhunt.cli._common import Parser, unwritable_output
+from crashhunt.cli._common import INTERRUPTED, OUTPUT_CLOSED, Parser, unwritable_output
 from crashhunt.cli._compare import add_compare
 from crashhunt.cli._completion import add_completion, complete
 from crashhunt.cli._corpus import add_corpus
 from crashhunt.cli._crashes import add_crashes
 from crashhunt.cli._dashboard import add_dashboard
-from crashhunt.cli._exit_codes import INTERRUPTED, OUTPUT_CLOSED
 from crashhunt.cli._export import add_export
 from crashhunt.cli._gate import add_gate
 from crashhunt.cli._guide import add_guide

@@ -1,4 +1,4 @@
-"""Functions that several commands share."""
+"""Functions that several commands share, and the exit codes of all commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import sys
 from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar
 
 from crashhunt.base import layout
 from crashhunt.base.errors import FULL, CrashhuntError, UntrustedError, UsageError
@@ -31,6 +31,17 @@ if TYPE_CHECKING:
     from crashhunt.base.progress import Watch
     from crashhunt.crashes import Archive, Bundle
     from crashhunt.plans import Given, HuntOption
+
+
+DONE: Final = 0
+THE_ANSWER_IS_NO: Final = 1
+BAD_INPUT: Final = 2
+NO_VALID_TRIAL: Final = 3
+NO_ANSWER: Final = 3
+INTERRUPTED: Final = 130
+"""As a shell says it after Ctrl-C."""
+OUTPUT_CLOSED: Final = 141
+"""As a shell says it after SIGPIPE: neither 0 nor 1, because the reader of the output has not seen the answer."""
 
 
 T = TypeVar("T")

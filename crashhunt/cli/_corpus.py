@@ -11,6 +11,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line, count_of, in_lines
 from crashhunt.cli._common import (
+    INTERRUPTED,
     add_ci_options,
     add_json,
     add_parallel,
@@ -24,7 +25,6 @@ from crashhunt.cli._common import (
     shown_progress,
     tell,
 )
-from crashhunt.cli._exit_codes import INTERRUPTED
 
 if TYPE_CHECKING:
     import argparse

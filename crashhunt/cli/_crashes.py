@@ -10,8 +10,19 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import count_of
-from crashhunt.cli._common import add_ci_options, add_json, add_trust, check_trust, integer, refuse_below, say, tell
-from crashhunt.cli._exit_codes import DONE, INTERRUPTED, THE_ANSWER_IS_NO
+from crashhunt.cli._common import (
+    DONE,
+    INTERRUPTED,
+    THE_ANSWER_IS_NO,
+    add_ci_options,
+    add_json,
+    add_trust,
+    check_trust,
+    integer,
+    refuse_below,
+    say,
+    tell,
+)
 
 if TYPE_CHECKING:
     import argparse

@@ -8,8 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.cli._common import add_json, integer, say
-from crashhunt.cli._exit_codes import DONE
+from crashhunt.cli._common import DONE, add_json, integer, say
 
 if TYPE_CHECKING:
     import argparse

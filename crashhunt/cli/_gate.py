@@ -14,6 +14,10 @@ from crashhunt.base.errors import UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.text import format_number
 from crashhunt.cli._common import (
+    DONE,
+    INTERRUPTED,
+    NO_ANSWER,
+    THE_ANSWER_IS_NO,
     add_build,
     add_ci_options,
     add_json,
@@ -29,7 +33,6 @@ from crashhunt.cli._common import (
     say,
     tell,
 )
-from crashhunt.cli._exit_codes import DONE, INTERRUPTED, NO_ANSWER, THE_ANSWER_IS_NO
 
 if TYPE_CHECKING:
     import argparse

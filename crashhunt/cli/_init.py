@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import add_json, answer
-from crashhunt.cli._exit_codes import DONE
+from crashhunt.cli._common import DONE, add_json, answer
 
 if TYPE_CHECKING:
     import argparse

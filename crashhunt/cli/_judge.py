@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import (
+    DONE,
+    INTERRUPTED,
     add_crash,
     add_json,
     add_parallel,
@@ -19,7 +21,6 @@ from crashhunt.cli._common import (
     say,
     shown_progress,
 )
-from crashhunt.cli._exit_codes import DONE, INTERRUPTED
 
 if TYPE_CHECKING:
     import argparse

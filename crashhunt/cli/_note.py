@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.text import count_of, listed
-from crashhunt.cli._common import CrashId, add_json, integer, opened_hunt, say
-from crashhunt.cli._exit_codes import DONE
+from crashhunt.cli._common import DONE, CrashId, add_json, integer, opened_hunt, say
 
 if TYPE_CHECKING:
     import argparse

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import GivenOnce, add_json, number, say
-from crashhunt.cli._exit_codes import DONE, NO_ANSWER, THE_ANSWER_IS_NO
+from crashhunt.cli._common import DONE, NO_ANSWER, THE_ANSWER_IS_NO, GivenOnce, add_json, number, say
 from crashhunt.plans import RATE_PERS
 
 if TYPE_CHECKING:

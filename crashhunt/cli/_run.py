@@ -16,8 +16,19 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import OWN_THREAD
 from crashhunt.base.resources import error_of_next_thread, limit_behind
-from crashhunt.cli._common import add_json, add_options, chosen_options, integer, make_console, unwritable_output
-from crashhunt.cli._exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_VALID_TRIAL, THE_ANSWER_IS_NO
+from crashhunt.cli._common import (
+    BAD_INPUT,
+    DONE,
+    INTERRUPTED,
+    NO_VALID_TRIAL,
+    THE_ANSWER_IS_NO,
+    add_json,
+    add_options,
+    chosen_options,
+    integer,
+    make_console,
+    unwritable_output,
+)
 from crashhunt.cli._rate import exit_code_of
 from crashhunt.plans import hunt_options
 

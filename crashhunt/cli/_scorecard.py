@@ -12,6 +12,8 @@ from crashhunt.base.errors import UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.text import command_line
 from crashhunt.cli._common import (
+    DONE,
+    NO_ANSWER,
     WordsWithCommas,
     add_json,
     add_options,
@@ -21,7 +23,6 @@ from crashhunt.cli._common import (
     chosen_options,
     say,
 )
-from crashhunt.cli._exit_codes import DONE, NO_ANSWER
 from crashhunt.cli._suite import run_with_trust, states_watcher
 
 if TYPE_CHECKING:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line, in_lines
 from crashhunt.cli._common import (
+    INTERRUPTED,
     add_crash,
     add_json,
     add_parallel,
@@ -19,7 +20,6 @@ from crashhunt.cli._common import (
     run_trusted,
     shown_progress,
 )
-from crashhunt.cli._exit_codes import INTERRUPTED
 
 if TYPE_CHECKING:
     import argparse

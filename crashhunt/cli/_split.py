@@ -6,8 +6,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.cli._common import add_json, say
-from crashhunt.cli._exit_codes import DONE
+from crashhunt.cli._common import DONE, add_json, say
 
 if TYPE_CHECKING:
     import argparse

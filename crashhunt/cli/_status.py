@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import count_of, one_line, out_of
-from crashhunt.cli._common import add_json, make_console
-from crashhunt.cli._exit_codes import BAD_INPUT, DONE
+from crashhunt.cli._common import BAD_INPUT, DONE, add_json, make_console
 
 if TYPE_CHECKING:
     import argparse

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, TypeVar
 from crashhunt.base.errors import UntrustedError
 from crashhunt.base.text import command_line
 from crashhunt.cli._common import (
+    DONE,
+    THE_ANSWER_IS_NO,
     add_json,
     add_options_of_machine,
     add_parallel,
@@ -21,7 +23,6 @@ from crashhunt.cli._common import (
     say,
 )
 from crashhunt.cli._crashes import add_known, checked_cases, compare_with_corpus
-from crashhunt.cli._exit_codes import DONE, THE_ANSWER_IS_NO
 from crashhunt.cli._status import show_states, state_words, states_console, states_table
 
 if TYPE_CHECKING:

@@ -6,6 +6,8 @@ import os
 from typing import TYPE_CHECKING, get_args
 
 from crashhunt.cli._common import (
+    DONE,
+    INTERRUPTED,
     GivenOnce,
     WordsWithCommas,
     add_crash,
@@ -22,7 +24,6 @@ from crashhunt.cli._common import (
     run_trusted,
     shown_progress,
 )
-from crashhunt.cli._exit_codes import DONE, INTERRUPTED
 from crashhunt.trial import Manoeuvre
 
 if TYPE_CHECKING:

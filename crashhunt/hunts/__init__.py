@@ -7,11 +7,15 @@ from crashhunt.base.doors import offer_lazily
 if TYPE_CHECKING:
     from ._disk_check import Checked as Checked, check as check, salvage as salvage
     from ._hunt import Hunt as Hunt
-    from ._next_trials import GREATEST_LAG as GREATEST_LAG, Trials as Trials, growing_lag as growing_lag
+    from ._next_trials import (
+        GREATEST_LAG as GREATEST_LAG,
+        Trials as Trials,
+        growing_lag as growing_lag,
+        spec_of as spec_of,
+    )
     from ._preflight import Preflight as Preflight, TrafficSurveyor as TrafficSurveyor
     from ._progress import HuntStatus as HuntStatus, PhaseStatus as PhaseStatus, SearchStatus as SearchStatus
     from ._reports import AuditReport as AuditReport, HuntReport as HuntReport, StoppedBecause as StoppedBecause
     from ._signal_list import SignalList as SignalList, list_signals as list_signals
-    from ._trial_seeds import spec_of as spec_of
 
 offer_lazily(__name__)

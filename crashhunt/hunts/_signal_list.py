@@ -8,7 +8,7 @@ from crashhunt.base.errors import CrashhuntError, FormulaError, ScenarioError
 from crashhunt.base.isolation import work_apart
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.episode import INFO_KEY, SIGNALS, Episode, Parts, TrialSignals, WorkerSettings
-from crashhunt.hunts._trial_seeds import spec_of
+from crashhunt.hunts._next_trials import spec_of
 from crashhunt.oracles import REQUIREMENT
 from crashhunt.plans import sampler_of
 from crashhunt.requirements import parse

@@ -7,9 +7,10 @@ from crashhunt.base.doors import offer_lazily
 if TYPE_CHECKING:
     from ._argument_owners import Owners as Owners, Takes as Takes, agent_of as agent_of, takes_of as takes_of
     from ._code import imported_by as imported_by, reused_agents as reused_agents
-    from ._declaration import Given as Given, HuntOption as HuntOption
-    from ._durations_and_rates import (
+    from ._declaration import (
         RATE_PERS as RATE_PERS,
+        Given as Given,
+        HuntOption as HuntOption,
         RatePer as RatePer,
         check_duration as check_duration,
         check_rate as check_rate,

@@ -21,12 +21,15 @@ from crashhunt.plans._declaration import (
     HuntOption,
     above_zero,
     at_least,
+    check_duration,
+    check_probe,
+    check_rate,
+    check_share,
     declared,
     declared_options,
     option,
     within,
 )
-from crashhunt.plans._durations_and_rates import check_duration, check_probe, check_rate, check_share
 from crashhunt.trial import CRASHES
 
 Spec = str | int | float | bool

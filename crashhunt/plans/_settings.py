@@ -18,8 +18,7 @@ from crashhunt.base.integrity import read_bounded
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.text import command_line, near_path
 from crashhunt.oracles import DEFAULT_ORACLES
-from crashhunt.plans._declaration import at_least
-from crashhunt.plans._durations_and_rates import seconds_of
+from crashhunt.plans._declaration import at_least, seconds_of
 from crashhunt.plans._run_options import (
     Driver,
     HuntOptions,

@@ -29,18 +29,16 @@ if TYPE_CHECKING:
         Layout as Layout,
         Shot as Shot,
         check_places as check_places,
-        frames as frames,
-        shown_steps as shown_steps,
-        write_frames as write_frames,
-        write_gif as write_gif,
-        write_video as write_video,
-    )
-    from ._film_panels import (
         explanation as explanation,
+        frames as frames,
         load_meanings as load_meanings,
         load_panels as load_panels,
         save_meanings as save_meanings,
         save_panels as save_panels,
+        shown_steps as shown_steps,
+        write_frames as write_frames,
+        write_gif as write_gif,
+        write_video as write_video,
     )
     from ._scene_from_above import SceneView as SceneView
 

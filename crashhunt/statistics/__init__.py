@@ -35,8 +35,10 @@ if TYPE_CHECKING:
         root_of as root_of,
     )
     from ._rate_of_running_hunt import (
+        BarWatch as BarWatch,
         Forcings as Forcings,
         RareWatch as RareWatch,
+        RateWatch as RateWatch,
         bar_watch as bar_watch,
         crashed_copies as crashed_copies,
         forcings_of as forcings_of,
@@ -46,7 +48,6 @@ if TYPE_CHECKING:
         refuse_training_traffic as refuse_training_traffic,
     )
     from ._rate_report import CrashRate as CrashRate, RatePart as RatePart, check_confidence as check_confidence
-    from ._running import BarWatch as BarWatch, RateWatch as RateWatch
     from ._units import PER_WORDS as PER_WORDS, CountingRule as CountingRule, Per as Per, TrialFacts as TrialFacts
 
 offer_lazily(__name__)

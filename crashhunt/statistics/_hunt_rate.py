@@ -22,9 +22,8 @@ from crashhunt.base.text import one_of
 from crashhunt.crashes import fault_of, signature_of
 from crashhunt.ledger import Ledger
 from crashhunt.results import HuntResults
-from crashhunt.statistics._rate_of_running_hunt import counting_rule, why_no_interval
+from crashhunt.statistics._rate_of_running_hunt import WHY_NOT_UNTIL_RATE, counting_rule, why_no_interval
 from crashhunt.statistics._rate_report import RatePart, check_confidence, make_rate
-from crashhunt.statistics._running import WHY_NOT_UNTIL_RATE
 from crashhunt.statistics._units import PERS, RateCounter, UnitSequence, facts_of_plain
 from crashhunt.training import held_out_traffics
 from crashhunt.trial import Choice, Range

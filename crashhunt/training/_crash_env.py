@@ -18,8 +18,7 @@ from crashhunt.base.text import one_of
 from crashhunt.crashes import snapshot_of
 from crashhunt.envs import RemoteEpisodes
 from crashhunt.plans import read_settings
-from crashhunt.training._traffic_split import check_test_share, is_test_traffic, split_crashes
-from crashhunt.training._trained_on import TrainedOn
+from crashhunt.training._held_out_traffics import TrainedOn, check_test_share, is_test_traffic, split_crashes
 from crashhunt.training._training_episodes import CrashEpisodes
 
 if TYPE_CHECKING:

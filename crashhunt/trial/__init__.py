@@ -37,13 +37,6 @@ if TYPE_CHECKING:
         steps_of as steps_of,
         why_not as why_not,
     )
-    from ._evidence import (
-        KILLED as KILLED,
-        UNUSABLE_VALUE as UNUSABLE_VALUE,
-        Collision as Collision,
-        Escape as Escape,
-        Failure as Failure,
-    )
     from ._input_signal import (
         InputSignal as InputSignal,
         expand_signal as expand_signal,
@@ -62,9 +55,14 @@ if TYPE_CHECKING:
         outcome_of as outcome_of,
     )
     from ._result import (
+        KILLED as KILLED,
         MAX_ROBUSTNESS as MAX_ROBUSTNESS,
+        UNUSABLE_VALUE as UNUSABLE_VALUE,
         Branch as Branch,
         Branches as Branches,
+        Collision as Collision,
+        Escape as Escape,
+        Failure as Failure,
         Forced as Forced,
         ForcedCopy as ForcedCopy,
         Stress as Stress,

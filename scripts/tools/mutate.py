@@ -67,7 +67,7 @@ _TESTS_ELSEWHERE = {
         "cli/test_answers_on_crashes.py",
         "e2e/test_check.py",
     ),
-    "cli/_common.py": ("cli/test_common.py", "e2e/test_commands.py"),
+    "cli/_common.py": ("cli/test_answers.py", "cli/test_common.py", "e2e/test_commands.py"),
     "cli/_compare.py": (
         "cli/test_answers_on_crashes.py",
         "e2e/test_manage.py",
@@ -79,7 +79,6 @@ _TESTS_ELSEWHERE = {
         "e2e/test_types_by_cause.py",
     ),
     "cli/_dashboard.py": ("dashboard/test_command.py",),
-    "cli/_exit_codes.py": ("cli/test_answers.py",),
     "cli/_export.py": (
         "cli/test_answers_on_crashes.py",
         "e2e/test_export.py",
@@ -224,7 +223,6 @@ _TESTS_ELSEWHERE = {
         "hunts/test_verified_runs.py",
         "hunts/test_whole_hunts.py",
     ),
-    "hunts/_trial_seeds.py": ("hunts/test_next_trials.py", "hunts/test_whole_hunts.py"),
     "hunts/_preflight.py": (
         "hunts/test_hunt_parts.py",
         "hunts/test_preflight.py",
@@ -334,11 +332,10 @@ _TESTS_ELSEWHERE = {
     "testing/_last_avoidable_step_check.py": ("testing/test_broken_contracts.py", "e2e/test_escapes.py"),
     "testing/_survives.py": ("testing/test_assert_survives.py", "e2e/test_survives.py"),
     "training/_training_episodes.py": ("training/test_draws.py", "training/test_training_env.py"),
-    "training/_trained_on.py": ("training/test_draws.py", "training/test_held_out_traffics.py"),
     "executors/_rehearsal.py": ("executors/test_zygotes.py",),
     "dashboard/_control.py": ("dashboard/test_dashboard_parts.py", "dashboard/test_control.py"),
     "training/_crash_env.py": ("training/test_draws.py", "training/test_training_env.py"),
-    "training/_traffic_split.py": ("training/test_draws.py", "training/test_held_out_traffics.py"),
+    "training/_held_out_traffics.py": ("training/test_draws.py", "training/test_held_out_traffics.py"),
     "analysis/_avoidability.py": (
         "analysis/test_avoiding.py",
         "analysis/test_judged_crash.py",

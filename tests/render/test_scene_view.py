@@ -14,8 +14,7 @@ pytest.importorskip("PIL")
 from crashhunt.panels import Action, Curve
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.render import FilmOptions, Shot, frames
-from crashhunt.render._film import _steps, shown_steps
-from crashhunt.render._film_panels import BuiltinPanels, save_panels
+from crashhunt.render._film import BuiltinPanels, _steps, save_panels, shown_steps
 from crashhunt.render._scene_from_above import SceneView
 from crashhunt.world import PERSON, Actor, Roster, Scene, corners
 

@@ -15,7 +15,7 @@ from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, write_settings
 from crashhunt.report import describe_comparison
 from crashhunt.statistics import PairTest, _comparison
-from crashhunt.training import _trained_on
+from crashhunt.training import _held_out_traffics
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
 
@@ -289,8 +289,8 @@ def test_a_hunt_without_a_last_trial_that_was_to_stop_at_kinds_has_no_crash_rate
 
 def test_each_hunt_of_a_comparison_is_read_a_fixed_number_of_times(tmp_path, monkeypatch):
     read, opened = [], []
-    records, measured = _trained_on.Snapshot, _comparison.measure_rates
-    monkeypatch.setattr(_trained_on, "Snapshot", lambda path: read.append(path.parents[1].name) or records(path))
+    records, measured = _held_out_traffics.Snapshot, _comparison.measure_rates
+    monkeypatch.setattr(_held_out_traffics, "Snapshot", lambda path: read.append(path.parents[1].name) or records(path))
     monkeypatch.setattr(
         _comparison, "measure_rates", lambda hunt, **given: opened.append(hunt.name) or measured(hunt, **given)
     )

@@ -13,8 +13,8 @@ from hypothesis import given, strategies as st
 from crashhunt.plans import check_rate, rate_of
 from crashhunt.statistics import BarWatch, CountingRule, RateWatch, TrialFacts
 from crashhunt.statistics._anytime_interval import RateTest
+from crashhunt.statistics._rate_of_running_hunt import Paced
 from crashhunt.statistics._rate_report import make_rate
-from crashhunt.statistics._running import Paced
 from crashhunt.statistics._units import MAX_INVALID_SHARE, RateCounter, UnitSequence
 
 RULE = CountingRule(max_steps=100)

@@ -12,9 +12,15 @@ from crashhunt.crashes import COMPETENT_DRIVERS, wilson
 from crashhunt.errors import UsageError
 from crashhunt.report import describe_scorecard, scorecard_page, scorecard_table
 from crashhunt.results import HuntState
-from crashhunt.suites._reference_maps import ReferenceMaps
-from crashhunt.suites._scorecard_cases import Scorecard, ScorecardHunt, Share
-from crashhunt.suites._scorecard_groups import STEPS, entries_of, groups_of
+from crashhunt.suites._scorecard_cases import (
+    STEPS,
+    ReferenceMaps,
+    Scorecard,
+    ScorecardHunt,
+    Share,
+    entries_of,
+    groups_of,
+)
 from crashhunt.testing._kinematic_cases import solve
 
 

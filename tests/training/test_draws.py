@@ -13,8 +13,7 @@ import pytest
 from crashhunt.errors import HuntDirectoryError, SimulatorError, UsageError
 from crashhunt.training import CrashEnv, TrainedOn, _crash_env
 from crashhunt.training._crash_env import CrashReplay
-from crashhunt.training._traffic_split import is_test_traffic
-from crashhunt.training._trained_on import read_trained_on
+from crashhunt.training._held_out_traffics import is_test_traffic, read_trained_on
 from crashhunt.training._training_episodes import _seeded
 
 

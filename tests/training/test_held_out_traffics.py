@@ -24,8 +24,7 @@ from crashhunt.statistics import CountingRule, GateReport, PairedHunts, PairWatc
 from crashhunt.statistics._rate_report import make_rate
 from crashhunt.statistics._units import RateCounter, UnitSequence
 from crashhunt.training import CrashEnv, HeldOutTraffics, TrainedOn, split_crashes
-from crashhunt.training._traffic_split import is_test_traffic
-from crashhunt.training._trained_on import read_trained_on
+from crashhunt.training._held_out_traffics import is_test_traffic, read_trained_on
 
 TOY = """
 title = "A toy"

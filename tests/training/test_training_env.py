@@ -29,7 +29,7 @@ from crashhunt.errors import CrashhuntError, SimulatorError, UsageError
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.training import CrashEnv, _training_episodes as _episodes
 from crashhunt.training._crash_env import CrashReplay
-from crashhunt.training._traffic_split import is_test_traffic
+from crashhunt.training._held_out_traffics import is_test_traffic
 from crashhunt.training._training_episodes import _Start
 from crashhunt.trial import Outcome
 
