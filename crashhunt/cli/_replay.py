@@ -28,11 +28,12 @@ from crashhunt.cli._common import (
     say,
     shown_progress,
 )
+from crashhunt.cli._exit_codes import INTERRUPTED
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -328,6 +329,8 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
             fix="give one crash, or add --video, --gif or --frames for one film of them",
         )
     _refuse_what_would_be_ignored(options, film)
+    if chosen.times > 1:
+        return _replay_often(options, chosen)
     answers, shots, good = [], [], True
     for crash in crashes:
         with opened_crash(options.directory, crash) as (bundle, archive):
@@ -352,6 +355,31 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
         data: dict[str, object] = dict(answers[0]) if len(answers) == 1 else {"crashes": answers}
         print(json.dumps(data | ({"written": written} if film is not None else {})))
     return 0 if good else 1
+
+
+def _replay_often(options: argparse.Namespace, chosen: ReplayOptions) -> int:
+    """Replay one crash several times; after a Ctrl-C, report the replays that finished."""
+    from crashhunt.base.signals import stop_requests
+    from crashhunt.reruns import StoppedError
+
+    with opened_crash(options.directory, options.crash) as (bundle, archive), stop_requests() as stops:
+        chosen = replace(chosen, look=_view_of(options, bundle))
+
+        def run(trusted: bool | None) -> tuple[ReplayReport, JsonObject]:
+            return _replay_one(options, bundle, replace(chosen, trusted=trusted), lambda: bool(stops))
+
+        try:
+            report, answer = run_trusted(run, bundle, archive, options)
+        except StoppedError:
+            say(f"Interrupted: none of {chosen.times} replays finished.", as_json=options.json)
+            return INTERRUPTED
+    if report.times < chosen.times:
+        say(f"Interrupted: {report.times} of {chosen.times} replays finished.", as_json=options.json)
+    if options.json:
+        print(json.dumps(answer))
+    if report.times < chosen.times:
+        return INTERRUPTED
+    return 0 if set(report.verdicts) == {options.expect} else 1
 
 
 def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions | None) -> None:
@@ -386,7 +414,12 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
             )
 
 
-def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions) -> tuple[ReplayReport, JsonObject]:
+def _replay_one(
+    options: argparse.Namespace,
+    bundle: Bundle,
+    chosen: ReplayOptions,
+    stopped: Callable[[], bool] = lambda: False,
+) -> tuple[ReplayReport, JsonObject]:
     from crashhunt.crashes import most_dangerous, partner
     from crashhunt.replays import replay
     from crashhunt.report import check_fields, describe_replay, format_table, steps_table
@@ -394,7 +427,7 @@ def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptio
     fields = re.split(r",(?![^\[]*\])", options.fields)  # not at the comma of observation[ROW,NAME]
     if options.fields and chosen.code != "current":  # today's code may be shown other observations
         check_fields(bundle.recording(), fields, bundle.driver)
-    report = replay(bundle, chosen)
+    report = replay(bundle, chosen, stopped)
     answer = report.to_json()
     if options.fields:
         near = most_dangerous(bundle.recording()) if bundle.is_near_miss else None

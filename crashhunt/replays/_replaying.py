@@ -207,15 +207,24 @@ def up_to(recording: Recording, step: int) -> Recording:
     return recording if step >= len(ends) else recording.beginning(ends[step] + 1)
 
 
-def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport:
+def replay(
+    bundle: Bundle, options: ReplayOptions | None = None, stopped: Callable[[], bool] = lambda: False
+) -> ReplayReport:
     """Run a crash again from its bundle alone, and compare every step with the log.
 
     The scenario comes from the snapshot, even if the original has changed. So does the agent's code, unless the options
     choose other code. With recorded actions, no code of the bundle runs.
 
+    Args:
+        bundle: the crash to replay.
+        options: options of the replay.
+        stopped: function that returns whether to stop; called repeatedly. The report has the replays that finished
+            before.
+
     Raises:
         BundleError: the bundle is damaged.
         CrashhuntError: the replay could not be run.
+        StoppedError: it was stopped before a replay finished.
     """
     options = options or ReplayOptions()
     if options.times < 1:
@@ -223,7 +232,13 @@ def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport
     rerun = prepare(bundle, options)
     if options.look is not None:
         return _look_into(rerun, options.look)
-    reports = [_run(rerun) for _ in range(options.times)]
+    reports: list[ReplayReport] = []
+    try:
+        while len(reports) < options.times:
+            reports.append(_run(rerun, stopped))
+    except StoppedError:
+        if not reports:
+            raise
     shown = next((report for report in reports if report.verdict != "reproduced"), reports[0])
     return replace(shown, verdicts=Counter(report.verdict for report in reports))
 

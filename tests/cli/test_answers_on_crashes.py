@@ -18,6 +18,7 @@ from crashhunt.crashes import Cause, TrustedOrigin
 from crashhunt.errors import BundleError, HuntDirectoryError, UsageError
 from crashhunt.render import FilmOptions
 from crashhunt.replays import ReplayOptions
+from crashhunt.reruns import StoppedError
 from crashhunt.trial import Outcome
 
 
@@ -331,8 +332,8 @@ def test_replay_refuses_what_it_would_ignore(opened, words, message):
 )  # fmt: skip
 def test_replay_ends_with_1_without_the_expected_verdict(opened, monkeypatch, capsys, words, verdicts, code):
     asked = []
-    report = SimpleNamespace(verdicts=verdicts, to_json=lambda: {"verdict": verdicts[0]}, recording="recorded")
-    monkeypatch.setattr("crashhunt.replays.replay", lambda bundle, chosen: asked.append(chosen) or report)
+    report = SimpleNamespace(verdicts=verdicts, times=2, to_json=lambda: {"verdict": verdicts[0]}, recording="recorded")
+    monkeypatch.setattr("crashhunt.replays.replay", lambda bundle, chosen, stopped: asked.append(chosen) or report)
     monkeypatch.setattr("crashhunt.report.describe_replay", lambda report: "as it was")
     bundle = crash()
     calls = opened(bundle, _replay)
@@ -349,10 +350,33 @@ def test_replay_ends_with_1_without_the_expected_verdict(opened, monkeypatch, ca
     assert json.loads(capsys.readouterr().out) == {"verdict": verdicts[0]}
 
 
+@pytest.mark.parametrize("finished", [0, 3])
+def test_interrupted_replays_report_those_that_finished(opened, monkeypatch, capsys, finished):
+    def replay(bundle, chosen, stopped):
+        assert not stopped()
+        signal.raise_signal(signal.SIGINT)
+        assert stopped()
+        if not finished:
+            raise StoppedError
+        return SimpleNamespace(verdicts={"reproduced": finished}, times=finished, to_json=lambda: {"times": finished})
+
+    monkeypatch.setattr("crashhunt.replays.replay", replay)
+    monkeypatch.setattr("crashhunt.report.describe_replay", lambda report: f"of {report.times} runs")
+    opened(crash(), _replay)
+    assert run("replay", "h", "--times", "9", "--json") == 130
+    out, err = capsys.readouterr()
+    assert out == ('{"times": 3}\n' if finished else "")
+    assert err.splitlines() == (
+        ["of 3 runs", "Interrupted: 3 of 9 replays finished."]
+        if finished
+        else ["Interrupted: none of 9 replays finished."]
+    )
+
+
 def test_values_of_each_step_are_printed(opened, monkeypatch, capsys):
     report = SimpleNamespace(verdicts=["reproduced"], to_json=dict, recording="replayed")
     asked, checked = [], []
-    monkeypatch.setattr("crashhunt.replays.replay", lambda bundle, chosen: report)
+    monkeypatch.setattr("crashhunt.replays.replay", lambda bundle, chosen, stopped: report)
     monkeypatch.setattr("crashhunt.report.describe_replay", lambda report: "as it was")
     monkeypatch.setattr("crashhunt.report.check_fields", lambda *words: checked.append(words))
     monkeypatch.setattr("crashhunt.report.steps_table", lambda *words: asked.append(words) or ["table"])

@@ -191,6 +191,17 @@ def test_of_several_replays_the_first_that_deviates_is_shown(replays):
         _replay.replay(BUNDLE, ReplayOptions(times=0))
 
 
+def test_stopped_replays_are_those_that_finished(replays):
+    stop = lambda: False  # noqa: E731
+    replays.ends = [report("reproduced"), report("diverged"), StoppedError(), report("reproduced")]
+    shown = _replay.replay(BUNDLE, ReplayOptions(times=4), stop)
+    assert (shown.verdict, shown.times) == ("diverged", 2)
+    assert [run[1] for run in replays.runs] == [stop] * 3
+    replays.ends = [StoppedError()]
+    with pytest.raises(StoppedError):
+        _replay.replay(BUNDLE, ReplayOptions(times=4), stop)
+
+
 def test_confirmation_keeps_what_the_replay_shows(replays):
     braked = replace(CRASH, escape=12, why_no_escape="the search was killed")
     stopped, executors, failed = (lambda: False), object(), []
