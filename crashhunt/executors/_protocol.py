@@ -6,6 +6,7 @@ import os
 import shutil
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, Protocol, TypeAlias, TypedDict, final
 
@@ -14,6 +15,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.json_types import ErrorData, ErrorWords
 from crashhunt.base.older_versions import removed_fix_in
+from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.base.text import NOTICE_TOPIC
 from crashhunt.plans import ChoosesParallelism as ChoosesParallelism, executor_of
 
@@ -281,11 +283,28 @@ def snapshot_environment(settings: WorkerSettings) -> dict[str, str]:
     """
     if not settings.code:
         return {**os.environ, **worker_environment()}
-    paths = os.pathsep.join(filter(None, (*settings.code, os.environ.get("PYTHONPATH"))))
+    code = (_without_separator(folder) for folder in settings.code)
+    paths = os.pathsep.join(filter(None, (*code, os.environ.get("PYTHONPATH"))))
     ours = {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
     if settings.sealed is None and (compiled := _compiled(settings)) is not None:
         ours |= {"PYTHONPYCACHEPREFIX": str(compiled), "PYTHONDONTWRITEBYTECODE": ""}
     return {**os.environ, **worker_environment(), **ours}
+
+
+def _without_separator(folder: str) -> str:
+    """Return the path of a folder, through a link if PYTHONPATH cannot contain it, as below ``hunt-12:30``."""
+    if os.pathsep not in folder:
+        return folder
+    parent, name = os.path.split(folder)
+    return str(_folder_with_link(parent).path / "link" / name)
+
+
+@cache
+def _folder_with_link(target: str) -> TemporaryFolder:
+    """Return a folder with a link, for as long as this process runs."""
+    found = TemporaryFolder("code")
+    (found.path / "link").symlink_to(target)
+    return found
 
 
 def _compiled(settings: WorkerSettings) -> Path | None:

@@ -6,6 +6,8 @@ import json
 import os
 import signal
 import socket
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -274,6 +276,18 @@ def test_new_process_writes_its_answer_at_once_and_exits(monkeypatch, tmp_path):
     monkeypatch.setattr(_fresh, "_run", None)  # it fails
     with pytest.raises(Left, match="1"):
         _fresh.main()
+
+
+def test_code_below_a_folder_with_a_colon_is_imported_through_a_link(settings, monkeypatch, tmp_path):
+    """A hunt may be named by its time, such as 2026-11-29T12:30, but a colon separates the paths in PYTHONPATH."""
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    code = tmp_path / "hunt-12:30" / "snapshots" / "0f" / "code"
+    code.mkdir(parents=True)
+    (code / "twelve_thirty.py").write_text("print('imported')")
+    for _ in range(2):  # in the second process, the link exists
+        found = _protocol.snapshot_environment(replace(settings, code=(str(code),)))
+        ran = subprocess.run([sys.executable, "-m", "twelve_thirty"], env=found, capture_output=True, text=True)
+        assert (ran.stdout, ran.stderr) == ("imported\n", "")
 
 
 def test_code_of_a_snapshot_is_compiled_outside_of_it_and_few_are_kept(settings, monkeypatch, tmp_path):
