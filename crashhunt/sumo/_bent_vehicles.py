@@ -19,6 +19,7 @@ _RIGID_M = 15.0  # longest rigid bus in the EU (Directive 96/53/EC, Annex I); a 
 _JOINT_M = 6.0  # a shorter rail vehicle or trailer is treated as rigid
 _PIECE_M = 5.0  # longest straight piece of a bent vehicle: a car's length
 _STRAIGHT_M = 0.05  # a vehicle that deviates less from a straight line is treated as straight
+_MIRRORED_M = 0.01  # a line that begins further from the front bumper may be on the wrong side of its lane
 _MISPLACED_M = 1.0  # a vehicle further from its lane, as after moveToXY, is treated as straight
 
 Point = tuple[float, float]
@@ -69,7 +70,12 @@ class Bends:
         line = list(self._behind(vehicle, lane, sumo.vehicle_getLanePosition(vehicle), length))
         distances = [0.0, *accumulate(math.dist(a, b) for (a, *_), (b, *_) in pairwise(line))]
         if self._lateral:
-            line = _shifted(line, sumo.vehicle_getLateralLanePosition(vehicle))
+            left = sumo.vehicle_getLateralLanePosition(vehicle)
+            moved = _shifted(line, left)
+            # In left-hand traffic, SUMO mirrors the offsets of all vehicles but those that it has moved to a position.
+            if moved and math.dist(moved[0][0], front) > _MIRRORED_M:
+                moved = min(moved, _shifted(line, -left), key=lambda one: math.dist(one[0][0], front))
+            line = moved
         if len(line) < 2 or math.dist(line[0][0], front) > _MISPLACED_M:
             return None
         found = []

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from contextlib import closing
 from pathlib import Path
 
+import libsumo
 import pytest
 
 from crashhunt.scenario import load_scenario
 from crashhunt.sumo import SumoSimulator
+from crashhunt.sumo._bent_vehicles import Bends
 from crashhunt.trial import Disturbance
 
 OTHER = '<vehicle id="{0}" type="car" route="st" depart="0" departPos="70" departLane="{0}" departSpeed="10"/>'
+ROUND = "A0A1 A1B1 B1B0 B0A0 A0A1"
 NET = Path(__file__).with_name("nets") / "left.net.xml"
 SCENARIO = """
 schema = 1
@@ -158,3 +162,28 @@ def test_left_is_left_in_offsets_and_drifts_also_of_a_road_with_one_lane(tmp_pat
         columns = simulator.observation_layouts["ego"].columns
         offsets = shown["ego"][columns["ego"]["lane_offset"]], shown["actors"][0, columns["actors"]["lane_offset"]]
         assert offsets == pytest.approx(moved, abs=1e-6)
+
+
+def test_long_vehicle_beside_the_middle_of_its_lane_bends_from_its_front_on(tmp_path):
+    net = NET.parent / "left-grid.net.xml.gz"
+    kinds = "".join(f'<vType id="{one}" length="18" latAlignment="{one}" sigma="0"/>' for one in ("left", "right"))
+    vehicles = "".join(
+        f'<vehicle id="{one}" type="{one}" depart="{20 * at}"><route edges="{ROUND}"/></vehicle>'
+        for at, one in enumerate(("left", "right"))
+    )
+    (tmp_path / "r.rou.xml").write_text(f"<routes>{kinds}{vehicles}</routes>")
+    options = ("--lateral-resolution", "0.4", "--step-length", "0.5", "--no-step-log", "--no-warnings")
+    libsumo.start(["sumo", "-n", str(net), "-r", str(tmp_path / "r.rou.xml"), *options])
+    bends, sides = Bends(lateral=True), {"left": [], "right": []}
+    try:
+        for _ in range(120):
+            libsumo.simulationStep()
+            for one in libsumo.vehicle.getIDList():
+                front, heading = libsumo.vehicle.getPosition(one), math.radians(90 - libsumo.vehicle.getAngle(one))
+                spine = bends.spine(one, 18.0, front, heading, high=False)
+                if spine is not None:
+                    sides[one].append(libsumo.vehicle.getLateralLanePosition(one))
+                    assert math.dist(spine[0][:2], front) < 0.1
+    finally:
+        libsumo.close()
+    assert all(sum(abs(one) > 0.3 for one in found) > 5 for found in sides.values())

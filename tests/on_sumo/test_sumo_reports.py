@@ -318,7 +318,10 @@ def test_spine_is_moved_to_the_side_where_vehicles_may_leave_the_centre(corner):
     found = spine(lateral=True, front=(109.0, 20.0))
     assert found[0] == pytest.approx((109.0, 20.0, 0.0))  # left of the lane to the north
     assert found[-1][1] == pytest.approx(1.0)  # left of the lane to the east
-    assert spine(lateral=True, front=(111.5, 20.0)) is None  # on the other side
+    mirrored = spine(lateral=True, front=(111.0, 20.0))  # as SUMO reports it in left-hand traffic
+    assert mirrored[0] == pytest.approx((111.0, 20.0, 0.0))
+    assert mirrored[-1][1] == pytest.approx(-1.0)
+    assert spine(lateral=True, front=(112.5, 20.0)) is None  # on neither side
 
 
 def test_straight_and_misplaced_vehicles_have_no_spine(corner):
