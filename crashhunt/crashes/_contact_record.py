@@ -17,6 +17,7 @@ import numpy as np
 from crashhunt.base import layout
 from crashhunt.base.text import format_time
 from crashhunt.crashes._lanes import LaneMap
+from crashhunt.crashes._trails import BESIDE_M, TRAIL_STEP_M, SharedPath, Trail
 from crashhunt.world import (
     MAX_CONTACT_GAP_M,
     OBSTACLE_KINDS,
@@ -53,14 +54,8 @@ _MAX_STRAIGHT_TURN_RAD = math.radians(10)
 _DRIFTS_M = 0.1
 _ACROSS_M = 50.0  # from the line of a junction to where it ends; there are larger ones
 _BEND_M = 0.4  # with it, an actor on the neighbouring lane is still not in the way: its centre is more than 2 m away
-_BESIDE_M = 1.2  # of the path that another one drives; less is in its way
 _TRAIL_M = 40.0  # of the path before the contact; longer than any vehicle and the part that a follower must share
-_TRAIL_STEP_M = 0.25  # between two poses of a trail
 _MIN_LEG_M = 0.01  # a shorter leg of a trail has no direction
-_SHARED_M = 4.0  # of its path, a vehicle drives along the path of another one to count as on the same way
-_SHARED_ASIDE_M = 5.0  # a vehicle on a neighbouring lane drives the same way
-_MAX_SHARED_TURN_RAD = math.radians(35)  # between two paths at the same place
-_REAR_M = 1.5  # from the rear of a vehicle, along its path: further ahead, its side is touched
 _FRONTS_M = 2.0  # between two fronts that met, each with the middle or with a corner
 _MIN_COURSE_M = 0.5  # driven, to know in which direction the front of a vehicle moves
 
@@ -348,49 +343,22 @@ class ContactRecord:
         return math.atan2(dy, dx)
 
     @cached_property
-    def _shared_paths(self) -> dict[str, _SharedPath | None]:
+    def _shared_paths(self) -> dict[str, SharedPath | None]:
         """The part of each actor's path that leads along the path that the other actor had driven before."""
         pair = (self.agent, self.other)
         if any(is_person(actor) or self.reverses(actor) for actor in pair):
             return dict.fromkeys(pair)
-        return {actor: self._shared_path(self._trail(actor), self._trail(self.partner(actor))) for actor in pair}
+        return {actor: self._trail(actor).shared_with(self._trail(self.partner(actor)), self.lanes) for actor in pair}
 
-    def _shared_path(self, own: _Trail, its: _Trail) -> _SharedPath | None:
-        """Return how the end of a path leads along the path that another actor had driven before, or None.
-
-        Paths that cross, merge or part within the last metres do not count, nor do those of distant vehicles.
-        """
-        first = own.index(_SHARED_M)
-        if first is None:
-            return None
-        path = its.with_rear
-        reach_m = its.length * math.pi / 2 + _REAR_M  # in a bend, the front has driven further than the body is long
-        aside = behind = 0.0
-        for place in range(first, len(own.points)):
-            start = int(np.argmax(path.to_go <= reach_m + own.to_go[place]))  # on a ring, it came past here before
-            away = np.hypot(*(path.points[start:] - own.points[place]).T)
-            nearest = start + int(np.argmin(away))
-            aside, behind = float(away[nearest - start]), float(path.to_go[nearest])
-            if nearest < len(path.points) - len(its.points):
-                # The recording begins when the other actor was here, or it has always stood: the lane must decide.
-                ends = own.points[place], float(own.courses[place]), its.centers(0.0)[-1], float(its.headings[-1])
-                if not self.lanes.joins(*ends):
-                    return None
-                continue
-            turn = math.remainder(float(own.courses[place] - path.courses[nearest]), math.tau)
-            if aside > _SHARED_ASIDE_M or abs(turn) > _MAX_SHARED_TURN_RAD:
-                return None
-        return _SharedPath(aside, behind, its.length) if 0 < behind < reach_m else None
-
-    def _trail(self, actor: str) -> _Trail:
+    def _trail(self, actor: str) -> Trail:
         """Return the path of an actor's front up to the contact, for at most 40 m."""
         return self._trails[actor]
 
     @cached_property
-    def _trails(self) -> dict[str, _Trail]:
+    def _trails(self) -> dict[str, Trail]:
         return {actor: self._trail_of(actor) for actor in (self.agent, self.other)}
 
-    def _trail_of(self, actor: str) -> _Trail:
+    def _trail_of(self, actor: str) -> Trail:
         known = self.way(actor)
         size = known.length, known.width
         center, heading = self._at_contact(actor)
@@ -408,13 +376,13 @@ class ContactRecord:
             driven = math.dist(before[:2], after[:2])
             if driven < _MIN_LEG_M:
                 continue  # it stands: the direction of so short a leg is a rounding error
-            parts = max(1, math.ceil(driven / _TRAIL_STEP_M))
+            parts = max(1, math.ceil(driven / TRAIL_STEP_M))
             shares = [part / parts for part in range(parts)]
             poses.extend(pose[:3] for pose in reversed(poses_between(before, after, shares, bends=self.swept)))
             left -= driven
             after = before
         points = np.array(poses[::-1])
-        return _Trail(points[:, :2], points[:, 2], known.length)
+        return Trail(points[:, :2], points[:, 2], known.length)
 
     def turned(self, since_s: float) -> float:
         """Return the greatest angle between the headings of both actors in the seconds before the contact, in rad."""
@@ -466,7 +434,7 @@ class ContactRecord:
         if shared is not None and shared.meets_rear:  # where the road bends tightly, the leader shows the way
             ends.insert(1, self._trail(leader).centers(lead.length))
         path = np.vstack((follow.centers, *ends))
-        limit_m = _BESIDE_M + min(_BEND_M, self._bend_m / 2)
+        limit_m = BESIDE_M + min(_BEND_M, self._bend_m / 2)
         found = 0.0
         for back in range(len(self.times) - 1, -1, -1):
             if _distance(path[back:], lead.centers[back]) > limit_m:
@@ -489,7 +457,7 @@ class ContactRecord:
         if not straight or before >= _MAX_STRAIGHT_TURN_RAD or self.turn < _MAX_STRAIGHT_TURN_RAD:
             return None
         asides = [abs(self.aside_m(leader, back)) for back in range(len(self.times))]
-        left = next((back for back, aside in enumerate(asides) if aside > _BESIDE_M), len(asides))
+        left = next((back for back, aside in enumerate(asides) if aside > BESIDE_M), len(asides))
         parting = all(after > before - _DRIFTS_M for before, after in pairwise(asides[max(0, left - 1) :]))
         return float(self.times[left - 1]) if left > 0 and parting else None
 
@@ -578,7 +546,7 @@ class ContactRecord:
     def was_off_path(self, actor: str, back: int) -> bool:
         """Return whether an actor was off the path of the other actor just before the time with the index ``back``."""
         return any(
-            abs(self.aside_m(actor, place)) > _BESIDE_M
+            abs(self.aside_m(actor, place)) > BESIDE_M
             for place in range(back + 1)
             if self.times[place] - self.times[back] <= _BEFORE_S
         )
@@ -729,74 +697,6 @@ def contact_record(bundle: Bundle, recording: Recording | None = None) -> Contac
         # Earlier versions wrote the lane of SUMO's report, which may be the other actor's.
         lane=(last.lanes[last.roster.index[hit.agent]] if last.lanes else "") or hit.lane,
     )
-
-
-@dataclass(frozen=True)
-class _Trail:
-    """The path of an actor's front up to the contact, the earliest pose first.
-
-    Args:
-        points: x and y of the front bumper, shape (n, 2), in m.
-        headings: headings of the actor, shape (n,), in rad.
-        length: length of the actor, in m.
-    """
-
-    points: NDArray[np.float64]
-    headings: NDArray[np.float64]
-    length: float
-
-    @cached_property
-    def to_go(self) -> NDArray[np.float64]:
-        """How far the actor drove from each point to the last one, shape (n,), in m."""
-        legs = np.hypot(*np.diff(self.points, axis=0).T)
-        return np.append(np.cumsum(legs[::-1])[::-1], 0.0)
-
-    @cached_property
-    def courses(self) -> NDArray[np.float64]:
-        """The direction of motion at each point, shape (n,), in rad; an instantaneous lane change does not count."""
-        legs = np.diff(self.points, axis=0)
-        along: NDArray[np.float64] = np.arctan2(legs[:, 1], legs[:, 0])
-        jumps = np.hypot(*legs.T) > 2 * _TRAIL_STEP_M
-        along[jumps] = self.headings[1:][jumps]
-        return np.append(along, along[-1:])
-
-    @property
-    def with_rear(self) -> _Trail:
-        """The path with the place of the actor's rear at its beginning."""
-        rear = self.points[0] - self.length * np.array([math.cos(self.headings[0]), math.sin(self.headings[0])])
-        parts = np.linspace(0.0, 1.0, math.ceil(self.length / _TRAIL_STEP_M), endpoint=False)[:, None]
-        points = np.vstack((rear + parts * (self.points[0] - rear), self.points))
-        return _Trail(points, np.append(np.full(len(parts), self.headings[0]), self.headings), self.length)
-
-    def index(self, to_go_m: float) -> int | None:
-        """Return the index of the last point from which the actor drove at least so far; None if it did not."""
-        found = np.flatnonzero(self.to_go >= to_go_m)
-        return int(found[-1]) if len(found) else None
-
-    def centers(self, driven_m: float) -> NDArray[np.float64]:
-        """Return the centres of the actor on its last metres, shape (n, 2)."""
-        directions = np.stack((np.cos(self.headings), np.sin(self.headings)), axis=1)
-        return (self.points - self.length / 2 * directions)[self.to_go <= driven_m]
-
-
-@dataclass(frozen=True, slots=True)
-class _SharedPath:
-    """The end of an actor's path, which leads along the path that another actor had driven before.
-
-    Args:
-        aside_m: distance of the actor's front from the path of the other actor at the contact, in m.
-        behind_m: how far the front of the actor is behind the front of the other one, along the path, in m.
-        length: length of the other actor, in m.
-    """
-
-    aside_m: float
-    behind_m: float
-    length: float
-
-    @property
-    def meets_rear(self) -> bool:
-        """Whether the actor was on the other's path and reached its rear."""
-        return self.aside_m <= _BESIDE_M and self.behind_m >= self.length - _REAR_M
 
 
 def _distance(path: NDArray[np.float64], point: NDArray[np.float64]) -> float:
