@@ -16,6 +16,7 @@ from crashhunt.base.extras import install_command
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.text import command_line
 from crashhunt.cli._common import (
+    INTERRUPTED,
     WordsWithCommas,
     add_crash,
     add_json,
@@ -28,7 +29,6 @@ from crashhunt.cli._common import (
     say,
     shown_progress,
 )
-from crashhunt.cli._exit_codes import INTERRUPTED
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
