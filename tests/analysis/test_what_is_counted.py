@@ -21,7 +21,7 @@ from crashhunt.analysis._whatif_runs import _from_step, _Runs, future_seed
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.crashes import wilson
 from crashhunt.episode import HandedOver, _action_override
-from crashhunt.trial import KILLED, Failure, Handover, Outcome, Reseeding, TrialResult, TrialSpec
+from crashhunt.trial import ALL_AGENTS, KILLED, Failure, Handover, Outcome, Reseeding, TrialResult, TrialSpec
 
 
 def run(number, *, outcome=Outcome.COLLISION, steps=10, digest=None, excluded=""):
@@ -114,6 +114,80 @@ def test_runs_that_are_killed_or_differ_before_the_step_do_not_count(monkeypatch
     runs.run_alike()
     (found,) = runs.counted
     assert (found.excluded, found.crashed) == (why, ended.outcome is Outcome.COLLISION)
+
+
+class Futures:
+    """Runs futures without a simulator: a function of the seed and of the number of earlier runs gives the digest."""
+
+    def __init__(self, digest):
+        self.digest, self.asked = digest, []
+
+    def run(self, specs):
+        for place, spec in reversed([*enumerate(specs)]):  # they need not end in order
+            self.asked.append(spec.reseeding)
+            ended = TrialResult(spec, Outcome.COLLISION, steps=4, digest=str(self.digest(spec.reseeding.seed)))
+            yield SimpleNamespace(place=place, result=ended, recording=None)
+
+
+def futures(digest, times):
+    backend = SimpleNamespace(title="The toy")
+    worker = SimpleNamespace(crash_on=(Outcome.COLLISION,), scenario=SimpleNamespace(backend=backend))
+    reruns, told = Futures(digest), []
+    options = WhatIfOptions(watch=lambda *now: told.append(now))
+    runs = _Runs(_Rerun(TrialSpec(0, 7, {}, {}, 9), worker), reruns, None, options, times)
+    return runs, reruns, told
+
+
+@pytest.mark.parametrize("times", [1, 4, 6])
+def test_each_future_has_its_own_seed_and_the_first_runs_twice(times):
+    runs, reruns, told = futures(lambda seed: seed, times)
+    runs.run_futures(3)
+    assert [(one.number, one.digest) for one in runs.counted] == [(n, str(future_seed(7, n))) for n in range(times)]
+    assert {one.after for one in reruns.asked} == {3}
+    seeds = [future_seed(7, number) for number in (*range(max(4, times)), 0)]
+    assert sorted(one.seed for one in reruns.asked) == sorted(seeds)
+    assert told == [(done, times) for done in range(1, times + 1)]
+
+
+def test_futures_that_are_all_equal_are_refused_after_twenty():
+    runs, reruns, _ = futures(lambda seed: "same", 50)
+    with pytest.raises(UsageError, match="20 futures with different seeds are bit-identical: The toy draws no") as said:
+        runs.run_futures(3)
+    assert "after step 3 that changes the run" in said.value.message
+    assert len(reruns.asked) == 21
+    rare = {future_seed(7, 11)}
+    runs, reruns, _ = futures(lambda seed: seed in rare, 50)  # chance may be rare
+    runs.run_futures(3)
+    assert len(runs.counted) == 50
+    assert len(reruns.asked) == 51
+
+
+def test_futures_of_a_simulator_that_repeats_none_are_refused():
+    runs, reruns, _ = futures(lambda seed: len(reruns.asked), 50)
+    with pytest.raises(UsageError, match="The toy ran the same future twice with different results"):
+        runs.run_futures(3)
+    assert len(reruns.asked) == 5
+
+
+@pytest.mark.parametrize(("digest", "entered"), [("d", ("a", "b", "ego")), ("another", ())])
+def test_actors_are_excluded_from_those_that_entered_the_same_trial(digest, entered):
+    recorded = TrialSpec(0, 7, {}, {}, 9)
+    worker = SimpleNamespace(scenario=SimpleNamespace(agents={"ego": None}))
+    rerun = SimpleNamespace(spec=recorded, worker=worker, bundle=SimpleNamespace(result=SimpleNamespace(digest="d")))
+    asked = []
+
+    def run(specs):
+        asked.extend(specs)
+        return [SimpleNamespace(result=SimpleNamespace(digest=digest), entered=("a", "b", "ego"))]
+
+    runs = _Runs(rerun, SimpleNamespace(run=run), None, WhatIfOptions(), 1)
+    if not entered:
+        with pytest.raises(UsageError, match="--leave-out 'a': there is no such actor"):
+            runs.leave_out([LeaveOut(actors=("a",))], recorded)
+    else:
+        runs.leave_out([LeaveOut(actors=("a",)), LeaveOut(actors=("b",))], recorded)
+        assert runs._spec.only == ("ego",)
+    assert [one.only for one in asked] == [(ALL_AGENTS,)]
 
 
 def test_run_that_cannot_be_set_up_is_an_error():
