@@ -67,6 +67,10 @@ def test_other_files_have_no_facts_or_none_that_matter(tmp_path, content):
     assert (describe_binary(file) or {"build_id": ""})["build_id"] == ""
 
 
+def test_program_of_the_system_has_no_libraries_of_its_own():
+    assert own_libraries(Path(shutil.which("sh") or "").resolve()) == ({}, [])
+
+
 def test_programs_that_cannot_run_here_are_reported_in_one_line_each(program, tmp_path):
     file = program("--enable-new-dtags")
     copies = {"./main": str(file)}
