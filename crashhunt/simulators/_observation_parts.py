@@ -464,7 +464,8 @@ PARTS: Mapping[str, Part] = {
         Part(
             name="grid",
             meaning="cells around the controlled vehicle: layer 0 is 1 where an actor is, layer 1 is 1 where a lane "
-            "is. The vehicle is in the middle, its heading points to smaller row numbers",
+            "is. The vehicle is in the middle. Its heading points to smaller row numbers, and its left side to smaller "
+            "column numbers",
             axes=(2, "rows", "columns"),
             values=Column("cell", "", 0.0, 1.0, "1 if the centre of the cell is inside"),
             settings=(
@@ -476,7 +477,8 @@ PARTS: Mapping[str, Part] = {
         ),
         Part(
             name="image",
-            meaning="picture of the surroundings from above, as ``grid``: red, green and blue",
+            meaning="picture of the surroundings from above, as ``grid``: red, green and blue. The vehicle is "
+            "(224, 138, 0), actors are (125, 139, 156), lanes (228, 232, 237), all else (246, 247, 249)",
             axes=("rows", "columns", 3),
             values=Column("value", "", 0.0, 255.0, "brightness"),
             settings=(

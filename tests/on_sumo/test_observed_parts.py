@@ -198,30 +198,41 @@ def test_default_observation_keeps_its_fast_path_and_other_agents_keep_theirs(tm
 
 
 def test_grid_and_image_show_the_lanes_and_the_vehicles_of_the_network(tmp_path):
-    with closing(
-        simulator_of("intersection", tmp_path / "stage", "grid:resolution=2", "image:rows=64:columns=64")
-    ) as one:
-        *_, shown = episode(one, 3, 150, speed=12.0)
-        road = grid_of_lanes(one, 64, 2.0)
-        assert (shown["grid"][1] == road).mean() > 0.995  # the rest are cells on the border of a lane
-        scene = one.scene()
-        near = [row for row in range(len(scene.roster)) if np.abs(scene.centers[row] - center("ego")).max() < 40.0]
-        assert shown["grid"][0].any() == (len(near) > 1)
-        assert shown["image"][32, 32].tolist() == [224, 138, 0]
-        assert one.observation_layouts["ego"].space.contains(shown)
+    parts = ("grid:resolution=2", "image:rows=72:columns=40")
+    with closing(simulator_of("loop", tmp_path / "stage", *parts)) as one:
+        cars = 0
+        for step, shown in enumerate(episode(one, 3, 40, speed=8.0)):
+            if step % 8:
+                continue
+            others = [who for who in libsumo.vehicle.getIDList() if who != "ego"]
+            grid = cells_on_lanes(64, 64, 2.0), cells_of_vehicles(others, 64, 64, 2.0)
+            assert (shown["grid"][1] == grid[0]).all()
+            assert (shown["grid"][0] == grid[1]).all()
+            picture = np.full((72, 40, 3), (246, 247, 249), np.uint8)
+            picture[cells_on_lanes(72, 40, 0.5)] = (228, 232, 237)
+            picture[cells_of_vehicles(others, 72, 40, 0.5)] = (125, 139, 156)
+            picture[cells_of_vehicles(["ego"], 72, 40, 0.5)] = (224, 138, 0)
+            assert (shown["image"] == picture).all()
+            cars += (picture == (125, 139, 156)).all(axis=2).any()
+            assert one.observation_layouts["ego"].space.contains(shown)
+        assert cars
         # Only bytes are recorded as bytes.
         assert one.observation_spaces["ego"].dtype == np.uint8
 
 
-def grid_of_lanes(simulator, cells, resolution):
+def places_of_cells(rows, columns, resolution):
+    """Where the centres of the cells around ego are: the first row is ahead, the first column to the left."""
+    (x, y), heading = center("ego"), math.radians(90.0 - libsumo.vehicle.getAngle("ego"))
+    sides = [(count / 2 - np.arange(count) - 0.5) * resolution for count in (rows, columns)]
+    ahead, left = np.meshgrid(*sides, indexing="ij")
+    c, s = math.cos(heading), math.sin(heading)
+    return x + ahead * c - left * s, y + ahead * s + left * c
+
+
+def cells_on_lanes(rows, columns, resolution):
     """The cells on lanes that cars may use, from libsumo's shapes, cell by cell."""
-    x, y = center("ego")
-    heading = math.radians(90.0 - libsumo.vehicle.getAngle("ego"))
-    steps = (cells / 2 - np.arange(cells) - 0.5) * resolution
-    ahead, left = np.meshgrid(steps, steps, indexing="ij")
-    px = x + ahead * math.cos(heading) - left * math.sin(heading)
-    py = y + ahead * math.sin(heading) + left * math.cos(heading)
-    found = np.zeros((cells, cells), bool)
+    px, py = places_of_cells(rows, columns, resolution)
+    found = np.zeros((rows, columns), bool)
     for lane in libsumo.lane.getIDList():
         allowed = libsumo.lane.getAllowed(lane)
         if allowed and "passenger" not in allowed:
@@ -231,6 +242,19 @@ def grid_of_lanes(simulator, cells, resolution):
             dx, dy = bx - ax, by - ay
             share = np.clip(((px - ax) * dx + (py - ay) * dy) / max(dx * dx + dy * dy, 1e-12), 0, 1)
             found |= np.hypot(px - ax - share * dx, py - ay - share * dy) <= half
+    return found
+
+
+def cells_of_vehicles(vehicles, rows, columns, resolution):
+    """The cells in the rectangles of vehicles, from libsumo's positions of their front bumpers."""
+    px, py = places_of_cells(rows, columns, resolution)
+    found = np.zeros((rows, columns), bool)
+    for vehicle in vehicles:
+        (x, y), angle = libsumo.vehicle.getPosition(vehicle), math.radians(libsumo.vehicle.getAngle(vehicle))
+        behind = (x - px) * math.sin(angle) + (y - py) * math.cos(angle)
+        beside = (x - px) * math.cos(angle) - (y - py) * math.sin(angle)
+        inside = (behind >= 0) & (behind <= libsumo.vehicle.getLength(vehicle))
+        found |= inside & (np.abs(beside) <= libsumo.vehicle.getWidth(vehicle) / 2)
     return found
 
 
