@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 import crashhunt
-from crashhunt import analysis, api, crashes, replays
+from crashhunt import analysis, api, cli, crashes, replays
 from crashhunt.errors import UsageError
 from crashhunt.plans import HuntOptions
 
@@ -129,6 +129,14 @@ def test_nothing_is_overwritten_trusted_or_changed_by_default():
         assert parameters["trust"].default is False
     assert (replayed["times"].default, replayed["force"].default, replayed["accelerate"].default) == (1, False, True)
     assert (asked["times"].default, asked["parallel"].default, asked["futures"].default) == (0, 0, False)
+
+
+def test_judge_has_the_same_limits_in_python_and_as_a_command():
+    asked = cli.make_parser().parse_args(["judge", "h"])
+    for call in (crashhunt.judge, analysis.judge_bundle):
+        limits = {name: inspect.signature(call).parameters[name].default for name in ("runs", "why", "reference")}
+        assert limits == {"runs": asked.runs, "why": asked.why, "reference": asked.reference}
+    assert inspect.signature(analysis.judge).parameters["runs"].default == asked.runs
 
 
 @pytest.fixture

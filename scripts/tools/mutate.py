@@ -339,6 +339,7 @@ _TESTS_ELSEWHERE = {
     "analysis/_avoidability.py": (
         "analysis/test_avoiding.py",
         "analysis/test_judged_crash.py",
+        "test_python_calls.py",
         "e2e/test_judging.py",
     ),
     "analysis/_causes.py": (
