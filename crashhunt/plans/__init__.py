@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._argument_owners import Owners as Owners, Takes as Takes, agent_of as agent_of, takes_of as takes_of
+    from ._arguments import Owners as Owners, Takes as Takes, agent_of as agent_of, takes_of as takes_of
+    from ._choices import disturber as disturber, disturber_apart as disturber_apart
     from ._code import imported_by as imported_by, reused_agents as reused_agents
     from ._declaration import (
         RATE_PERS as RATE_PERS,
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     )
     from ._plan import (
         core_of as core_of,
-        disturber as disturber,
-        disturber_apart as disturber_apart,
         plan as plan,
         plan_with_code as plan_with_code,
         sampler_of as sampler_of,

@@ -1,26 +1,50 @@
-"""Chooses actions, observed parts, requirements and crash outcomes, from options, scenario and agent's class."""
+"""Chooses actions, observed parts, requirements, crash outcomes and disturbances for a hunt, and checks them."""
 
 from __future__ import annotations
 
 import math
 import re
+import sys
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
-from crashhunt.base.errors import ScenarioError, UsageError
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError, ScenarioError, UsageError
+from crashhunt.base.plugins import is_foreign, registered
 from crashhunt.base.text import one_of
-from crashhunt.oracles import REQUIREMENT, check_requirement, requirement_oracles
-from crashhunt.scenario import action_settings, canonical_action, check_action
+from crashhunt.disturbances import (
+    ModelApart,
+    disturber_of,
+    locate_model,
+    parse_fixed,
+    parse_rates,
+    signals_of_fixed,
+    word_of,
+)
+from crashhunt.oracles import (
+    ORACLES_OF_ACTORS,
+    REQUIREMENT,
+    check_requirement,
+    oracle_name,
+    outcomes_brought,
+    requirement_oracles,
+)
+from crashhunt.plans._code import IMPORT_S, CodeFacts
+from crashhunt.scenario import action_settings, backend_of, canonical_action, check_action
 from crashhunt.simulators import parse_parts
-from crashhunt.trial import CRASHES, EVENTS
+from crashhunt.trial import CRASHES, EVENTS, Outcome
 from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
-    from crashhunt.plans._settings import Request
+    from crashhunt.disturbances import DisturbanceModel, DisturbanceSampler
+    from crashhunt.plans._settings import HuntSettings, Request
+    from crashhunt.samplers import NamedSampler
     from crashhunt.scenario import Scenario
-    from crashhunt.trial import Outcome, Signature
+    from crashhunt.trial import Category, Signature
 
 
 def chosen_actions(
@@ -202,3 +226,182 @@ def _limit(name: str, text: str) -> float:
         fix = f"give {unit} above 0, such as {name}:{'30' if unit == 's' else '6'}"
         raise UsageError(f"--crash-on {name}:{text}: {text!r} is not a limit", fix=fix)
     return value
+
+
+# The disturbances.
+
+
+def disturber(
+    scenario: Scenario,
+    disturb: Sequence[str],
+    agents: Sequence[str],
+    *,
+    find: Callable[[str], DisturbanceModel] | None = None,
+) -> DisturbanceSampler | None:
+    """Return the object that draws the disturbances of trials; None if there are none.
+
+    Args:
+        scenario: scenario in which disturbances take place.
+        disturb: the disturbances as words: ``NAME=RATE`` for random disturbances, or the exact disturbances at given
+            steps.
+        agents: identifiers of the agents around which disturbances take place.
+        find: function that returns the disturbance model of a name; by default the model is imported in this process.
+
+    Raises:
+        CrashhuntError: the disturbance does not exist, or the simulator does not support it.
+    """
+    rates, fixed = parse_rates(disturb), parse_fixed(disturb, tuple(agents))
+    if not rates and not fixed:
+        return None
+    backend = scenario.backend
+    return disturber_of(
+        rates,
+        agents=tuple(agents),
+        step_length_s=backend.step_length_s(scenario),
+        known=backend.disturbances,
+        simulator=backend.title or "the simulator",
+        fixed=fixed,
+        find=find,
+    )
+
+
+def disturber_apart(scenario: Scenario, settings: HuntSettings) -> DisturbanceSampler | None:
+    """Return the object that draws the disturbances of a hunt; a user-defined model draws in a separate process.
+
+    Raises:
+        CrashhuntError: a disturbance does not exist, or the simulator does not support it.
+    """
+    find = partial(model_apart, None, settings.run.timeout_s)
+    return disturber(scenario, settings.disturb, tuple(settings.agents), find=find)
+
+
+def model_apart(code: CodeFacts | None, timeout_s: float, name: str) -> DisturbanceModel:
+    known = code.disturbances.get(name, "") if code is not None else ""
+    if known or is_foreign("disturbances", name):
+        return ModelApart(name, known, timeout_s=IMPORT_S + timeout_s)
+    return locate_model(name)
+
+
+@contextmanager
+def name_scenario_in_errors(request: Request, scenario: Scenario) -> Iterator[None]:
+    """Return a context that adds the scenario's name to errors of disturbances that the scenario defines."""
+    try:
+        yield
+    except CrashhuntError as error:
+        if request.disturb:
+            raise
+        message = error.message.replace("--disturb", "[disturbances]", 1)
+        raise type(error)(message, fix=error.fix, where=error.where or scenario.origin) from error
+
+
+def chosen_disturbances(request: Request, scenario: Scenario) -> tuple[str, ...]:
+    """Return the disturbances that the user requests, or else those of the scenario."""
+    words = request.disturb or tuple(f"{name}={rate}" for name, rate in scenario.disturbances.items())
+    agents = tuple(scenario.agents)
+    fixed = parse_fixed(words, agents)
+    late = next((one for one in fixed if one.step > request.max_steps), None) if request.disturb else None
+    if late is not None:
+        fix = f"give a step up to {request.max_steps}, or more MAX_STEPS"
+        raise UsageError(f"--disturb {late.what}@{late.step}: a trial has only {request.max_steps} steps", fix=fix)
+    begun = [one for one in fixed if one.step <= request.max_steps]  # a scenario is for trials of any length
+    signals = {name: signal for name, signal in signals_of_fixed(words, agents).items() if signal[0] in begun}
+    able = scenario.backend.varying_disturbances
+    for one, _, word in signals.values():
+        if one.what not in able:
+            message = f"--disturb {word}: the strength of {one.what} cannot vary over time in this scenario"
+            fix = f"give a number, or one of {', '.join(able)}" if able else "give a number"
+            raise UsageError(message, fix=fix)
+    return (
+        *(f"{name}={rate!r}" for name, rate in parse_rates(words).items()),
+        *(word for _, _, word in signals.values()),
+        *(word_of(one, agents) for one in begun if one.signal not in signals),
+    )
+
+
+_MAX_RARE_CHANCE = 0.2  # per step: above that a first onset is no rare event, and plain trials are cheaper
+
+
+def check_branch(settings: HuntSettings) -> None:
+    """Refuse `--branch` without disturbances at random steps."""
+    if settings.branch and not parse_rates(settings.disturb):
+        fix = "give rates, such as --disturb brake=0.02,cut_in=0.02"
+        raise UsageError("--branch needs disturbances, but the hunt has none", fix=fix)
+    if settings.branch and sys.platform != "linux":
+        raise UsageError("--branch forks processes, which needs Linux", fix="omit --branch")
+
+
+def check_rare(
+    settings: HuntSettings, scenario: Scenario, find: Callable[[str], DisturbanceModel], sampler: NamedSampler
+) -> None:
+    """Refuse disturbances for which `--rare` knows no probability law."""
+    run = settings.run
+    if not settings.rare:
+        if run.until_error:
+            raise UsageError(f"--until-error {run.until_error} needs --rare", fix="add --rare")
+        return
+    if not parse_rates(settings.disturb):
+        fix = "give rates, such as --disturb brake=0.02,cut_in=0.02"
+        raise UsageError("--rare needs disturbances with rates, but the hunt has none", fix=fix)
+    agents = tuple(settings.agents)
+    if fixed := parse_fixed(settings.disturb, agents):
+        begun = word_of(fixed[0], agents)
+        message = f"--rare needs disturbances with rates, but --disturb {begun} begins in every trial"
+        raise UsageError(message, fix="give only rates, such as --disturb brake=0.02")
+    if not sampler.independent:
+        message = f"--rare needs independent trials, but --sampler {settings.sampler} draws dependent trials"
+        raise UsageError(message, fix="use --sampler random")
+    excluded = {
+        "--seeds": settings.seeds, "--probe": settings.probe, "--branch": settings.branch, "--distinct": run.distinct,
+        "--only-at-fault": run.only_at_fault, "--until-rate": run.until_rate,
+    }  # fmt: skip
+    if given := next((flag for flag, value in excluded.items() if value), None):
+        raise UsageError(f"--rare and {given} exclude each other", fix=f"omit {given}")
+    drawn = disturber(scenario, settings.disturb, agents, find=find)
+    assert drawn is not None
+    for name, rate in drawn.rates.items():
+        if drawn.chance(name) > _MAX_RARE_CHANCE:
+            most = _MAX_RARE_CHANCE / drawn.step_length_s
+            message = (
+                f"--rare: --disturb {name}={rate:g} begins with the probability {drawn.chance(name):.2g} in each "
+                f"step, which is above {_MAX_RARE_CHANCE:g}"
+            )
+            raise UsageError(message, fix=f"give at most {most:g} a second, or omit --rare")
+    if sys.platform != "linux":
+        raise UsageError("--rare forks processes, which needs Linux", fix="omit --rare")
+
+
+def with_notes_on_crashes(
+    scenario: Scenario, settings: HuntSettings, request: Request, described: Mapping[str, Mapping[str, Category]]
+) -> Scenario:
+    """Add notes on oracles and outcomes that never occur with this simulator; refuse a hunt that looks only for them.
+
+    The user's own oracles may report these outcomes from other evidence.
+    """
+    backend = backend_of(scenario.simulator)
+    if backend is None:
+        return scenario
+    reported, crash_on = backend.reported_events, settings.crash_on
+    own = [text for text in settings.oracles if not _is_built_in(text)]
+    brought = outcomes_brought(own, described)
+    never = [kind for kind in crash_on if kind in EVENTS and reported is not None and kind not in (*reported, *brought)]
+    blind: list[str] = []
+    if not backend.shows_actors:
+        blind = [text for text in request.oracles if oracle_name(text) in ORACLES_OF_ACTORS]
+        if set(request.crash_on) != set(CRASHES) and not own:
+            without = {Outcome.OFF_ROAD, *outcomes_brought(blind, described)}
+            never += [kind for kind in crash_on if kind in without and kind not in never]
+    notes = [f"--oracle {text} detects nothing: {backend.title} shows no vehicles" for text in blind]
+    if never:
+        names = ",".join(never)
+        if len(never) == len(crash_on):
+            fix = f"it reports {', '.join(reported)}" if reported else "remove it"
+            raise UsageError(
+                f"--crash-on {names}: the simulator {scenario.simulator!r} cannot report these outcomes", fix=fix
+            )
+        notes.append(f"the simulator {scenario.simulator!r} never reports {names}")
+    return replace(scenario, notes=(*scenario.notes, *notes))
+
+
+def _is_built_in(oracle: str) -> bool:
+    point = registered("oracles").get(oracle_name(oracle))
+    return point is not None and point.value.startswith(f"{layout.PACKAGE.name}.")

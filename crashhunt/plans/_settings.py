@@ -19,15 +19,7 @@ from crashhunt.base.plugins import locate, registered
 from crashhunt.base.text import command_line, near_path
 from crashhunt.oracles import DEFAULT_ORACLES
 from crashhunt.plans._declaration import at_least, seconds_of
-from crashhunt.plans._run_options import (
-    Driver,
-    HuntOptions,
-    RunOptions,
-    Spec,
-    Subject,
-    TrialOptions,
-    hunt_options,
-)
+from crashhunt.plans._run_options import Driver, HuntOptions, RunOptions, Spec, Subject, TrialOptions, hunt_options
 from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
 
 if TYPE_CHECKING:

@@ -274,7 +274,7 @@ _TESTS_ELSEWHERE = {
     "render": ("render/test_*.py",),
     "report": ("report/test_*.py",),
     "scenario": ("scenario/test_*.py",),
-    "plans/_argument_owners.py": (
+    "plans/_arguments.py": (
         "agents/test_programs.py",
         "plans/test_argument_names.py",
         "plans/test_what_is_resolved.py",

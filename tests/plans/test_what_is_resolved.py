@@ -26,8 +26,8 @@ from crashhunt.plans import (
     with_settings,
     write_settings,
 )  # fmt: skip
+from crashhunt.plans._arguments import _spec
 from crashhunt.plans._code import notes_on_programs
-from crashhunt.plans._plan import _spec
 from crashhunt.plans._settings import executor_of, parallel_here, sizes_itself
 from crashhunt.scenario import copy_shipped_scenario
 from crashhunt.sumo._options import SumoSetup

@@ -1,4 +1,7 @@
-"""Finds the owner of an argument: ``NAME`` and ``AGENT.NAME`` are resolved in the same way in every option and file."""
+"""The arguments of a hunt: their owners, and the values that a request, the scenario or the agent's class gives them.
+
+``NAME`` and ``AGENT.NAME`` are resolved in the same way in every option and file.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +13,30 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.base.errors import ArgumentError, CrashhuntError
+from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.programs import is_program
-from crashhunt.base.text import did_you_mean, listed
-from crashhunt.trial import FILLED_BY_NAME, signature_of
+from crashhunt.base.text import did_you_mean, listed, one_of
+from crashhunt.disturbances import signals_of_fixed
+from crashhunt.plans._settings import AgentSettings, ArgumentSpec, spec_words
+from crashhunt.trial import (
+    FILLED_BY_NAME,
+    Argument,
+    Constant,
+    Signature,
+    expand_signal,
+    is_signal,
+    parse_spec,
+    signature_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
 
+    from crashhunt.plans._settings import Request
+    from crashhunt.scenario import Scenario
     from crashhunt.trial import Value
+
 
 SCENARIO = "scenario"  # before a name that is the scenario's, where an agent has it too
 _SIGNATURE_TIMEOUT_S = 60.0
@@ -193,3 +210,141 @@ def _takes_of_program(locator: str) -> Takes:
         return Takes(open=True)
     defaults = {name: one.default for name, one in signature.arguments.items() if one.default is not None}
     return Takes(tuple(signature.arguments), signature.open, defaults)
+
+
+# The values of the arguments.
+
+
+def settings_of_agents(
+    request: Request,
+    scenario: Scenario,
+    signatures: Mapping[str, Signature],
+    actions: Mapping[str, str],
+    observations: Mapping[str, tuple[str, ...]],
+    *,
+    hunted: bool,
+) -> dict[str, AgentSettings]:
+    asked: dict[str, dict[str, str]] = {agent: {} for agent in scenario.agents}
+    for name, spec in spec_words(request.arguments).items():
+        agent, argument = _owner(name, scenario, signatures)
+        asked[agent][argument] = spec
+    agents: dict[str, AgentSettings] = {}
+    duration_s = request.max_steps * scenario.backend.step_length_s(scenario)
+    for agent, setup in scenario.agents.items():
+        signature = signatures[agent]
+        known = scenario.agent_arguments(agent)
+        for name in known:
+            if name not in signature.arguments and not signature.open:
+                raise ScenarioError(
+                    f"agents.{agent}.arguments.{name}: {setup.agent} takes no such argument",
+                    fix=one_of(name, signature.arguments, give="it takes", none="no arguments"),
+                    where=scenario.origin,
+                )
+        specs: dict[str, ArgumentSpec] = {}
+        for name, spec in asked[agent].items():
+            specs |= _signal_specs(name, spec, duration_s, f"--arg {name}")
+        for name in sorted({*signature.arguments, *known, *asked[agent]} - specs.keys()):
+            found = _spec(name, signature.arguments.get(name), known.get(name), asked[agent].get(name), hunted=hunted)
+            if found is not None:
+                specs[name] = found
+            elif name in signature.required:
+                raise ArgumentError(
+                    f"{setup.agent} needs the argument {name!r}", fix=f"give --arg {name}=SPEC", where=f"agent {agent}"
+                )
+        agents[agent] = AgentSettings(
+            agent=setup.agent, arguments=specs, action=actions.get(agent), observation=observations.get(agent)
+        )
+    return agents
+
+
+def _owner(name: str, scenario: Scenario, signatures: Mapping[str, Signature]) -> tuple[str, str]:
+    """Return the agent and the name to which an ``--arg`` refers."""
+    takes = {agent: Takes(signature.arguments, signature.open) for agent, signature in signatures.items()}
+    owner = Owners(takes).of(name, option="--arg")
+    if owner is not None:
+        return owner
+    agent = agent_of(name, scenario.agents)
+    if agent:
+        where = f"--arg {name}: {scenario.agents[agent].agent}"
+        signatures[agent].check([name.removeprefix(f"{agent}.")], where=where)
+    if name in scenario.arguments:
+        raise ArgumentError(
+            f"--arg {name}: {name} is an argument of the scenario, not of an agent", fix=f"write --set {name}=SPEC"
+        )
+    first = next(iter(scenario.agents))
+    signatures[first].check([name], where=f"--arg: {scenario.agents[first].agent}")
+    raise AssertionError(name)  # the agent that accepts it is its owner
+
+
+def _spec(
+    name: str, declared: Argument | None, known: Argument | None, asked: str | None, *, hunted: bool
+) -> ArgumentSpec | None:
+    kind = (declared.kind if declared else None) or (known.kind if known else None)
+    if asked is not None:
+        distribution = parse_spec(asked, kind, where=f"--arg {name}")
+        # A program's 12 has no type, because JSON has one type of numbers.
+        if declared and kind is None and type(declared.default) is int and str in map(type, distribution.grid(1)):
+            raise ArgumentError(f"--arg {name}: {asked!r} is not a number", fix=f"give one, such as {declared.default}")
+        return ArgumentSpec(spec=str(distribution), kind=kind)
+    for argument in (known, declared) if hunted else ():
+        if argument is not None and argument.distribution is not None:
+            # The same text may mean whole numbers or not, depending on the agent's own type.
+            return ArgumentSpec(spec=str(parse_spec(str(argument.distribution), kind, where=name)), kind=kind)
+    for argument in (known, declared):
+        # The constructor's own default too: it may be another one by the time of a replay.
+        if argument is not None and argument.default is not None:
+            try:
+                constant = parse_spec(str(Constant(argument.default)), kind, where=name)
+            except ArgumentError:
+                if argument is known:
+                    raise
+                return None  # a default of another type than the annotation, such as `gap: float = "auto"`
+            # A text such as "a|b" would be read as a choice, and "7" as a number; so its owner keeps it as a default.
+            is_kept = isinstance(constant, Constant) and (argument is known or constant.value == argument.default)
+            return ArgumentSpec(spec=str(constant), kind=kind) if is_kept else None
+    return None
+
+
+def specs_of_scenario(
+    request: Request, scenario: Scenario, disturb: Sequence[str], *, hunted: bool
+) -> dict[str, ArgumentSpec]:
+    known = scenario.scenario_arguments()
+    wanted: dict[str, str] = {}
+    for name, spec in spec_words(request.scenario_arguments).items():
+        owner = Owners({}, known).of(name, option="--set")
+        if owner is None:
+            raise ArgumentError(f"--set: the scenario has no argument {name!r}", fix=one_of(name, known, give="it has"))
+        wanted[owner[1]] = spec
+    specs: dict[str, ArgumentSpec] = {}
+    duration_s = request.max_steps * scenario.backend.step_length_s(scenario)
+    for name, argument in known.items():
+        asked = wanted.get(name)
+        if asked is not None and is_signal(asked):
+            able = tuple(scenario.backend.signal_arguments(scenario))
+            if name not in able:
+                fix = f"give a range, or vary one of {', '.join(able)}" if able else "give a range"
+                raise ArgumentError(f"--set {name}: the argument cannot vary over time in this scenario", fix=fix)
+            specs |= _signal_specs(name, asked, duration_s, f"--set {name}")
+            continue
+        if asked is not None:
+            spec = str(parse_spec(asked, argument.kind, where=f"--set {name}"))
+        elif argument.distribution is not None and (hunted or argument.default is None):
+            spec = str(argument.distribution)
+        elif argument.default is not None:
+            spec = str(Constant(argument.default))
+        else:
+            raise ScenarioError(
+                f"arguments.{name} has neither a default nor a range",
+                fix="give it a default or a range",
+                where=scenario.origin,
+            )
+        specs[name] = ArgumentSpec(spec=spec, kind=argument.kind)
+    for name, (one, signal, word) in signals_of_fixed(disturb, tuple(scenario.agents)).items():
+        specs |= _signal_specs(name, signal, one.how_long, f"--disturb {word}")
+    return specs
+
+
+def _signal_specs(name: str, spec: str, duration_s: float, where: str) -> dict[str, ArgumentSpec]:
+    """Return the specifications of a signal and of its points; empty if the specification is no signal."""
+    found = expand_signal(name, spec, duration_s, where=where)
+    return {part: ArgumentSpec(spec=text, kind="str" if part == name else "float") for part, text in found.items()}
