@@ -13,9 +13,13 @@ if TYPE_CHECKING:
         growing_lag as growing_lag,
         spec_of as spec_of,
     )
-    from ._preflight import Preflight as Preflight, TrafficSurveyor as TrafficSurveyor
+    from ._preflight import (
+        Preflight as Preflight,
+        SignalList as SignalList,
+        TrafficSurveyor as TrafficSurveyor,
+        list_signals as list_signals,
+    )
     from ._progress import HuntStatus as HuntStatus, PhaseStatus as PhaseStatus, SearchStatus as SearchStatus
     from ._reports import AuditReport as AuditReport, HuntReport as HuntReport, StoppedBecause as StoppedBecause
-    from ._signal_list import SignalList as SignalList, list_signals as list_signals
 
 offer_lazily(__name__)

@@ -19,8 +19,8 @@ from crashhunt.episode import internal_error
 from crashhunt.executors import HostConditions
 from crashhunt.hunts._hunt_setup import HuntSetup, settings_of_workers
 from crashhunt.hunts._next_trials import Pace
+from crashhunt.hunts._preflight import require_known_signals
 from crashhunt.hunts._running_hunt import QUIET_WAIT_S, RunningHunt, refuse_long_wait
-from crashhunt.hunts._signal_list import require_known_signals
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.results import CodeVersions, HuntDirectory, resumed_versions
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot

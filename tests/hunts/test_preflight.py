@@ -14,8 +14,7 @@ from crashhunt.base.text import ABSENT_WORDS, PRESENT_WORDS
 from crashhunt.errors import ArgumentError, FormulaError, ScenarioError, UsageError
 from crashhunt.executors import EXCLUDED_WORDS
 from crashhunt.hunts import Preflight
-from crashhunt.hunts._preflight import WorkerNotices, _describe_end, unusable_value, why_invalid
-from crashhunt.hunts._signal_list import require_known_signals
+from crashhunt.hunts._preflight import WorkerNotices, _describe_end, require_known_signals, unusable_value, why_invalid
 from crashhunt.plans import Request, plan
 from crashhunt.trial import UNUSABLE_VALUE, Failure, Outcome, TrialResult, TrialSpec
 
