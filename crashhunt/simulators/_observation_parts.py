@@ -341,6 +341,14 @@ PARTS: Mapping[str, Part] = {
             settings=(Setting("rows", 3, 1, 50, "", "number of traffic lights"),),
         ),
         Part(
+            name="time_to_switch",
+            meaning="privileged, because no sensor measures it: time until each traffic light in the rows of "
+            "``signals`` changes its state; a lower bound if its program adapts, 1000 if it never changes",
+            axes=("rows",),
+            values=_time("time", "time until the state changes; 0 in rows without a traffic light"),
+            settings=(Setting("rows", 3, 1, 50, "", "number of traffic lights"),),
+        ),
+        Part(
             name="right_of_way",
             meaning="actors on the streams that conflict with the route at the next junction, the earliest arrival "
             "first",
@@ -534,7 +542,7 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
 
     Args:
         words: One word per part: its name, and its settings as ``:NAME=VALUE``, such as ``actors:rows=8:radius=50``;
-            or only `KINEMATICS`. The words of `MODIFIERS` are checked, but not returned.
+            or only `KINEMATICS`. The words of `MODIFIERS`, such as ``history=4``, are checked, but not returned.
         available: Names of the parts that the simulator has.
         where: The option or key that contains the words, for messages.
 
@@ -549,7 +557,7 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
             raise UsageError(f"{where} names {KINEMATICS} and parts: {','.join(given_words)}", fix=fix)
         return ()
     for word in given_words:
-        name, *given = word.split(":")
+        name, given = _split(word)
         if name not in known and name not in modifiers:
             fix = (
                 one_of(name, (*known, *modifiers, KINEMATICS))
@@ -574,11 +582,20 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
     return parts
 
 
+def _split(word: str) -> tuple[str, list[str]]:
+    """Return the name of a word and its settings; ``history=4`` is short for ``history:steps=4``."""
+    name, *given = word.split(":")
+    short, has_value, value = name.partition("=")
+    if has_value and short in MODIFIERS:
+        return short, [f"{MODIFIERS[short].settings[0].name}={value}", *given]
+    return name, given
+
+
 def modifiers_of(words: Iterable[str]) -> dict[str, float]:
     """Return the value of each word of `MODIFIERS` that checked words contain, by name."""
     found = {}
     for word in words:
-        name, *given = word.split(":")
+        name, given = _split(word)
         if name in MODIFIERS:
             part = MODIFIERS[name]
             found[name] = _parse_setting(part, given[-1], "")[1] if given else part.settings[0].default

@@ -23,6 +23,7 @@ from crashhunt.sumo._road_readers import (
     SignalsReader,
     SpeedLimitReader,
     StopLineReader,
+    SwitchTimesReader,
 )
 from crashhunt.sumo._scene_readers import (
     ActorIdsReader,
@@ -61,6 +62,7 @@ READERS: Mapping[str, type[Reader]] = {
     "signals": SignalsReader,
     "speed_limit": SpeedLimitReader,
     "stop_line": StopLineReader,
+    "time_to_switch": SwitchTimesReader,
 }
 """The reader of each part, by name of the part; these are the parts that SUMO has."""
 

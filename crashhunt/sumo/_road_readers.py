@@ -6,7 +6,7 @@ import math
 from functools import partial
 from itertools import repeat
 from math import cos, sin
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import libsumo
 import numpy as np
@@ -376,18 +376,50 @@ class SignalsReader(_RowsReader):
 
 def _time_in_state(light: str, link: int, state: float) -> float:
     """Return how long a traffic light shows a state at least, in s: exactly, if its program has fixed times."""
-    found = float(sumo.trafficlight_getSpentDuration(light))
+    found, phases, current = float(sumo.trafficlight_getSpentDuration(light)), *_phases(light)
+    for back in range(1, len(phases)):
+        phase = phases[(current - back) % len(phases)]
+        if SIGNAL_STATES.get(phase.state[link], _OFF) != state:
+            break
+        found += phase.duration
+    return found
+
+
+def _phases(light: str) -> tuple[Sequence[Any], int]:
+    """Return the phases of a traffic light and the index of the present one; none if its program adapts."""
     name = sumo.trafficlight_getProgram(light)
     for program in sumo.trafficlight_getAllProgramLogics(light):
-        if program.programID != name or program.type != _FIXED_TIMES:
-            continue
-        phases, current = program.phases, program.currentPhaseIndex
-        for back in range(1, len(phases)):
-            phase = phases[(current - back) % len(phases)]
-            if SIGNAL_STATES.get(phase.state[link], _OFF) != state:
-                break
-            found += phase.duration
-    return found
+        if program.programID == name and program.type == _FIXED_TIMES:
+            return program.phases, program.currentPhaseIndex
+    return (), 0
+
+
+class SwitchTimesReader(Reader):
+    """Reads when the next traffic lights on the route change their states."""
+
+    def observe(self, moment: Moment) -> Array:
+        """Return the values of ``time_to_switch``."""
+        found = np.zeros(self._setup.shape)
+        place = self._setup.places.find(moment)
+        if place is None or place.number < 0:
+            return found
+        lights = place.guide.signals(place.number, place.lane, self._setup.limit)
+        for row, (_, light, link) in enumerate(lights):
+            found[row] = _time_to_switch(light, link, moment.scene.time_s)
+        return found
+
+
+def _time_to_switch(light: str, link: int, time_s: float) -> float:
+    """Return the least time until a traffic light changes its state, in s: the exact one, if its program is fixed."""
+    phases, current = _phases(light)
+    left = max(0.0, float(sumo.trafficlight_getNextSwitch(light)) - time_s)
+    state = SIGNAL_STATES.get(sumo.trafficlight_getRedYellowGreenState(light)[link], _OFF)
+    for ahead in range(1, len(phases)):
+        phase = phases[(current + ahead) % len(phases)]
+        if SIGNAL_STATES.get(phase.state[link], _OFF) != state:
+            return left
+        left += phase.duration
+    return NEVER_S if phases else left
 
 
 class RightOfWayReader(_RowsReader):

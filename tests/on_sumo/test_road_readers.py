@@ -45,6 +45,7 @@ READERS = {
     "right_of_way": readers.RightOfWayReader,
     "speed_limit": readers.SpeedLimitReader,
     "stop_line": readers.StopLineReader,
+    "time_to_switch": readers.SwitchTimesReader,
 }
 
 
@@ -155,6 +156,27 @@ def test_signals_show_the_lights_that_traci_names_and_the_age_of_their_state(tmp
                 for row, (_, _, distance, _) in enumerate(wanted):
                     assert shown[row, 2] == pytest.approx(distance, abs=7 * row + 0.02)
         assert seen > 300
+
+
+def test_time_to_switch_is_when_the_next_light_then_changes(tmp_path):
+    with Town("grid-lights", tmp_path) as town:
+        expected, states, checked = [], [], 0
+        for vehicles in town.steps(140):
+            states.append(
+                {one: libsumo.trafficlight.getRedYellowGreenState(one) for one in libsumo.trafficlight.getIDList()}
+            )
+            for vehicle in vehicles if len(states) < 60 else ():
+                shown, wanted = town.read(vehicle, "time_to_switch"), libsumo.vehicle.getNextTLS(vehicle)[:3]
+                assert np.count_nonzero(shown[len(wanted) :]) == 0
+                expected += [(len(states) - 1, light, link, shown[0]) for light, link, *_ in wanted[:1]]
+        kinds = dict(zip("GgyYrRus", (0, 0, 1, 1, 2, 2, 2, 2), strict=True))
+        for now, light, link, time_s in expected:
+            seen = [kinds[one[light][link]] for one in states[now:]]
+            changed = next((number for number, kind in enumerate(seen) if kind != seen[0]), None)
+            if changed is not None:  # a scene shows the change one step after it
+                assert time_s == pytest.approx((changed - 1) * STEP_S), (light, link)
+                checked += 1
+        assert checked > 300
 
 
 def test_lane_changes_are_those_that_sumo_plans_and_distances_those_that_it_drives(town):

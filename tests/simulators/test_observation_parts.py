@@ -55,7 +55,7 @@ def test_columns_are_those_of_the_documented_table():
     assert {name: [column.name for column in PARTS[name].columns] for name in words} == {
         name: text.split() for name, text in words.items()
     }
-    assert set(PARTS) - set(words) == {"lidar2d", "grid", "image", "actor_ids"}
+    assert set(PARTS) - set(words) == {"lidar2d", "grid", "image", "actor_ids", "time_to_switch"}
 
 
 @given(
@@ -142,7 +142,8 @@ def test_errors_change_what_is_measured_and_nothing_else():
 
 
 def test_history_stacks_the_last_observations_with_the_present_one_last():
-    words = ["ego", "history:steps=3", "lidar2d:rays=2"]
+    words = ["ego", "history=3", "lidar2d:rays=2"]
+    assert modifiers_of(words) == modifiers_of(["history:steps=3"]) == {"history": 3}
     layout = ObservationLayout(parse_parts(words, where=""), modifiers_of(words))
     assert {name: box.shape for name, box in layout.space.spaces.items()} == {"ego": (3, 13), "lidar2d": (3, 2)}
     assert layout.describe()["ego"]["shape"] == [3, 13]
@@ -158,6 +159,8 @@ def test_history_stacks_the_last_observations_with_the_present_one_last():
     for wrong, message in (
         (["history"], "names history and no part"),
         (["ego", "history:steps=0"], "history:steps is '0'"),
+        (["ego", "history=0"], "history:steps is '0'"),
+        (["ego", "reference_point=nose"], "reference_point:at is 'nose'; give one of center, rear_axle, front_bumper"),
         (
             ["ego", "reference_point:at=nose"],
             "reference_point:at is 'nose'; give one of center, rear_axle, front_bumper",
