@@ -35,7 +35,7 @@ _REPOSITORY_VARIABLES = frozenset({
 })  # fmt: skip
 
 
-def environment_of_git() -> dict[str, str]:
+def _environment_of_git() -> dict[str, str]:
     """Return the environment variables of this process without those that name a repository."""
     return {name: value for name, value in os.environ.items() if name not in _REPOSITORY_VARIABLES}
 
@@ -89,7 +89,7 @@ def query(folder: Path, *words: str) -> bytes | None:
     try:
         done = subprocess.run(
             command, capture_output=True, stdin=subprocess.DEVNULL, check=False, timeout=_TIMEOUT_S,
-            env=environment_of_git(),
+            env=_environment_of_git(),
         )  # fmt: skip
     except (OSError, subprocess.TimeoutExpired):
         return None
@@ -154,7 +154,7 @@ def import_environment(folder: Path, tree: Path) -> dict[str, str]:
     """
     places = dict.fromkeys(map(str, (folder, tree, tree / "src")))
     paths = [*places, *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {**environment_of_git(), "PYTHONPATH": os.pathsep.join(paths), "PYTHONDONTWRITEBYTECODE": "1"}
+    return {**_environment_of_git(), "PYTHONPATH": os.pathsep.join(paths), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def run_to_end(
@@ -182,7 +182,7 @@ def git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str
     """
     command: Sequence[str] = ["git", "-C", str(folder), *words]
     try:
-        environment = {**environment_of_git(), "LC_ALL": "C"}
+        environment = {**_environment_of_git(), "LC_ALL": "C"}
         done = run_to_end(command, None, environment)
     except OSError as error:
         raise CrashhuntError(f"git cannot be run: {error.strerror}", fix="install git") from None
@@ -237,7 +237,7 @@ def run_build(
         kept = log
     with kept.open("wb") as output:
         process = subprocess.Popen(
-            command, shell=True, cwd=folder, env=environment_of_git(), stdin=subprocess.DEVNULL,
+            command, shell=True, cwd=folder, env=_environment_of_git(), stdin=subprocess.DEVNULL,
             stdout=output, stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=partial(die_with, os.getpid()),
         )  # fmt: skip
         how = ""

@@ -28,13 +28,13 @@ from crashhunt.base.text import one_line
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-PROGRAM_PREFIX: Final = "exec:"
-LIBRARY_PREFIX: Final = "lib:"
-FMU_PREFIX: Final = "fmu:"
-FACTORIES: Final = {
-    PROGRAM_PREFIX: "crashhunt.agents:ProgramFactory",
-    LIBRARY_PREFIX: "crashhunt.agents:LibraryFactory",
-    FMU_PREFIX: "crashhunt.agents:FmuFactory",
+_PROGRAM_PREFIX: Final = "exec:"
+_LIBRARY_PREFIX: Final = "lib:"
+_FMU_PREFIX: Final = "fmu:"
+_FACTORIES: Final = {
+    _PROGRAM_PREFIX: "crashhunt.agents:ProgramFactory",
+    _LIBRARY_PREFIX: "crashhunt.agents:LibraryFactory",
+    _FMU_PREFIX: "crashhunt.agents:FmuFactory",
 }
 """The class that creates the agents of each kind of locator."""
 _INTERPRETERS = re.compile(r"(python|pypy|perl|ruby|node|java|julia|lua|env|sh|bash|dash|zsh)[\d.]*")
@@ -44,12 +44,12 @@ _PROGRAM_FIX = "give the path of an executable file, such as exec:./planner"
 
 def is_program(locator: str) -> bool:
     """Return whether the locator of an agent names a program, a library or an FMU, and not Python code."""
-    return locator.startswith(tuple(FACTORIES))
+    return locator.startswith(tuple(_FACTORIES))
 
 
 def can_fork(locator: str) -> bool:
     """Return whether an agent lives in the process of the trial, so that a fork of the trial contains the agent."""
-    return not locator.startswith(PROGRAM_PREFIX)
+    return not locator.startswith(_PROGRAM_PREFIX)
 
 
 def is_native(locator: str) -> bool:
@@ -59,7 +59,7 @@ def is_native(locator: str) -> bool:
 
 def factory_of(locator: str) -> str:
     """Return the place of the class that creates the agents of a program or library, as ``module:class``."""
-    return next(place for prefix, place in FACTORIES.items() if locator.startswith(prefix))
+    return next(place for prefix, place in _FACTORIES.items() if locator.startswith(prefix))
 
 
 def words_of(locator: str) -> tuple[str, ...]:
@@ -69,7 +69,7 @@ def words_of(locator: str) -> tuple[str, ...]:
         PluginError: the command line is empty, or a quotation has no end.
     """
     try:
-        words = tuple(shlex.split(locator.removeprefix(PROGRAM_PREFIX)))
+        words = tuple(shlex.split(locator.removeprefix(_PROGRAM_PREFIX)))
     except ValueError as error:
         fix = "close the quotation, or write \\ before the character"
         raise PluginError(f"{locator!r} is not a command line: {error}", fix=fix) from None
@@ -99,7 +99,7 @@ def anchored(locator: str, folder: Path) -> str:
     Raises:
         PluginError: the locator is not a command line.
     """
-    for prefix in (LIBRARY_PREFIX, FMU_PREFIX):
+    for prefix in (_LIBRARY_PREFIX, _FMU_PREFIX):
         if locator.startswith(prefix):
             path = locator.removeprefix(prefix)
             return f"{prefix}{folder / path}" if path else locator
@@ -117,7 +117,7 @@ def relative_to(folder: Path, words: Sequence[str]) -> str:
         name = _value_in(word)
         is_there = is_path(name) and os.path.exists(folder / name)  # noqa: PTH110
         found.append(f"{word[: len(word) - len(name)]}{folder / name}" if is_there else word)
-    return f"{PROGRAM_PREFIX}{shlex.join(found)}"
+    return f"{_PROGRAM_PREFIX}{shlex.join(found)}"
 
 
 def files_of(locator: str) -> dict[str, Path]:
@@ -128,9 +128,9 @@ def files_of(locator: str) -> dict[str, Path]:
     Raises:
         PluginError: the program or library cannot be used.
     """
-    if locator.startswith(LIBRARY_PREFIX):
+    if locator.startswith(_LIBRARY_PREFIX):
         return _files_of_library(locator)
-    if is_fmu(locator):
+    if locator.startswith(_FMU_PREFIX):
         return _files_of_fmu(locator)
     first, *rest = words_of(locator)
     program = _program(first, locator)
@@ -266,7 +266,7 @@ def library_file(locator: str) -> Path:
     Raises:
         PluginError: the file does not exist, or is no library for this machine.
     """
-    word = locator.removeprefix(LIBRARY_PREFIX)
+    word = locator.removeprefix(_LIBRARY_PREFIX)
     if not word:
         raise PluginError(f"{locator!r} names no library", fix=_LIBRARY_FIX)
     path = Path(word).absolute()
@@ -284,8 +284,8 @@ def _files_of_library(locator: str) -> dict[str, Path]:
         PluginError: the library cannot be used.
     """
     path = library_file(locator)
-    found = {f"{LIBRARY_PREFIX}{one}": one for one in describe_library(locator, path).dependencies}
-    return {**found, locator.removeprefix(LIBRARY_PREFIX): path}
+    found = {f"{_LIBRARY_PREFIX}{one}": one for one in describe_library(locator, path).dependencies}
+    return {**found, locator.removeprefix(_LIBRARY_PREFIX): path}
 
 
 def describe_library(locator: str, path: Path) -> Library:
@@ -322,10 +322,10 @@ def load_order(locator: str, files: Mapping[str, str]) -> list[Path]:
     Raises:
         PluginError: the library does not exist.
     """
-    word = locator.removeprefix(LIBRARY_PREFIX)
+    word = locator.removeprefix(_LIBRARY_PREFIX)
     if word not in files:
         return [library_file(locator)]
-    return [Path(copy) for name, copy in files.items() if name.startswith(LIBRARY_PREFIX)] + [Path(files[word])]
+    return [Path(copy) for name, copy in files.items() if name.startswith(_LIBRARY_PREFIX)] + [Path(files[word])]
 
 
 @cache
@@ -368,18 +368,13 @@ def _probed(path: Path, *_version: int) -> Library:
 _FMU_FIX = "give the path of an FMU, such as fmu:./planner.fmu"
 
 
-def is_fmu(locator: str) -> bool:
-    """Return whether the locator of an agent names an FMU."""
-    return locator.startswith(FMU_PREFIX)
-
-
 def _files_of_fmu(locator: str) -> dict[str, Path]:
     """Return the FMU and its table of variables, by the text that names them.
 
     Raises:
         PluginError: the FMU does not exist.
     """
-    word = locator.removeprefix(FMU_PREFIX)
+    word = locator.removeprefix(_FMU_PREFIX)
     path = Path(word).absolute()
     if not word or not path.is_file():
         raise PluginError(f"{locator!r}: {word!r} is not a file", fix=_FMU_FIX)
@@ -397,7 +392,7 @@ def fmu_files(locator: str, files: Mapping[str, str]) -> tuple[Path, Path | None
     Raises:
         PluginError: the FMU does not exist.
     """
-    word = locator.removeprefix(FMU_PREFIX)
+    word = locator.removeprefix(_FMU_PREFIX)
     found = files if word in files else {name: str(path) for name, path in _files_of_fmu(locator).items()}
     table = found.get(_table_word(word))
     return Path(found[word]), None if table is None else Path(table)

@@ -56,12 +56,12 @@ def spec_of(
     Raises:
         CrashhuntError: the sampler failed.
     """
-    spec = propose_trial(number, settings, sampler, disturber, forcing)
+    spec = _propose_trial(number, settings, sampler, disturber, forcing)
     assert spec is not None  # only a sampler that learns may propose no trial, and not its first
     return spec
 
 
-def propose_trial(
+def _propose_trial(
     number: int,
     settings: HuntSettings,
     sampler: NamedSampler,
@@ -244,12 +244,12 @@ class Trials:
                     break
                 self._refuse_other_version()
                 self._told += self._report_to_sampler(self._next - self._lag_of(self._next))
-                spec = propose_trial(self._next, self._settings, self._sampler, self._disturber)
+                spec = _propose_trial(self._next, self._settings, self._sampler, self._disturber)
                 if spec is None and self._open:
                     break
                 if spec is None:
                     self._told += self._report_to_sampler(self._next)
-                    spec = propose_trial(self._next, self._settings, self._sampler, self._disturber)
+                    spec = _propose_trial(self._next, self._settings, self._sampler, self._disturber)
                 if spec is None:
                     self._next = None
                     break

@@ -169,7 +169,7 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
     labels: dict[str, None] = {}
     if options.panels:
         for shot in shots:
-            labels |= dict.fromkeys(builtin_labels(shot.recording, shot.other))
+            labels |= dict.fromkeys(_builtin_labels(shot.recording, shot.other))
         for shot in shots:
             for panels in shot.panels.values():
                 labels |= dict.fromkeys(panels)
@@ -330,7 +330,7 @@ _PLAN_COLUMNS = 5  # a trajectory: time, x, y, heading and speed of each point
 _PANELS_WITHOUT_SCENE = ("reward", "action")
 
 
-def builtin_labels(recording: Recording, other: str) -> tuple[str, ...]:
+def _builtin_labels(recording: Recording, other: str) -> tuple[str, ...]:
     """Return the labels of the panels that every film of a recording has.
 
     Args:
@@ -359,7 +359,7 @@ class BuiltinPanels:
 
     def __init__(self, recording: Recording, *, agent: str, other: str, meanings: Sequence[str] = ()) -> None:
         self._recording, self._agent, self._meanings = recording, agent, meanings
-        self._labels = builtin_labels(recording, other)
+        self._labels = _builtin_labels(recording, other)
         scenes = recording.scenes()
         self._dt = recording.prologue.step_length_s
         self._times, self._gaps, _ = approaches([scene.frame for scene in scenes], agent)

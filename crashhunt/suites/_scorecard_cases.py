@@ -119,7 +119,7 @@ _R157 = (
     ),
 )  # fmt: skip
 
-SCORECARD_SUITES: Mapping[str, tuple[Group, ...]] = {"r157": _R157}
+_SCORECARD_SUITES: Mapping[str, tuple[Group, ...]] = {"r157": _R157}
 """The groups of each suite of cases, by name."""
 
 
@@ -129,9 +129,9 @@ def groups_of(suite: str, names: Sequence[str] = ()) -> tuple[Group, ...]:
     Raises:
         UsageError: the suite or a group does not exist.
     """
-    if suite not in SCORECARD_SUITES:
-        raise UsageError(f"--suite is {suite!r}", fix=one_of(suite, SCORECARD_SUITES))
-    known = {group.id: group for group in SCORECARD_SUITES[suite]}
+    if suite not in _SCORECARD_SUITES:
+        raise UsageError(f"--suite is {suite!r}", fix=one_of(suite, _SCORECARD_SUITES))
+    known = {group.id: group for group in _SCORECARD_SUITES[suite]}
     for name in names:
         if name not in known:
             raise UsageError(f"--group {name!r} is no group of the suite {suite!r}", fix=one_of(name, known))
@@ -367,7 +367,7 @@ class Scorecard:
             "complete": self.is_complete,
             "cases": sum(hunt.cases for hunt in self.hunts),
             "ran": sum(len(hunt.ran) for hunt in self.hunts),
-            "preventable_by": shares_of(self.hunts),
+            "preventable_by": _shares_of(self.hunts),
             "groups": [
                 {
                     "id": name,
@@ -378,7 +378,7 @@ class Scorecard:
                     "invalid": sum(hunt.invalid for hunt in hunts),
                     "crashes": crashes_of(hunts, None),
                     "crashes_of_drivers": {model: crashes_of(hunts, model) for model in COMPETENT_DRIVERS},
-                    "preventable_by": shares_of(hunts),
+                    "preventable_by": _shares_of(hunts),
                     "why_not": hunts[0].group.why_not,
                     "hunts": [hunt.facts for hunt in hunts],
                     "maps": [one for hunt in hunts for one in hunt.maps()],
@@ -394,7 +394,7 @@ def crashes_of(hunts: Iterable[ScorecardHunt], model: str | None) -> int | None:
     return None if any(one is None for one in labels) else sum(int(one.sum()) for one in labels if one is not None)
 
 
-def shares_of(hunts: Iterable[ScorecardHunt]) -> JsonObject:
+def _shares_of(hunts: Iterable[ScorecardHunt]) -> JsonObject:
     """Return for each model the share of cases in which the agent crashes and the model does not.
 
     The share concerns the cases to which the model applies. It is None if there are none.

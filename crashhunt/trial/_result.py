@@ -160,7 +160,7 @@ class Failure(Serializable):
         return not lacks and (bool(self.agent) or self.party in _USERS)
 
 
-def summarize(
+def _summarize(
     outcome: Outcome, steps: int, *, collision: Collision | None, event: Event | None, failure: Failure | None
 ) -> str:
     """Return a sentence about the outcome of a trial, in one line."""
@@ -543,7 +543,7 @@ class TrialResult(Serializable):
     @property
     def summary(self) -> str:
         """A sentence that describes the outcome, in one line."""
-        return summarize(self.outcome, self.steps, collision=self.collision, event=self.event, failure=self.failure)
+        return _summarize(self.outcome, self.steps, collision=self.collision, event=self.event, failure=self.failure)
 
 
 def in_effect(result: TrialResult, reported: Iterable[Disturbance]) -> TrialResult:
