@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -101,6 +102,7 @@ MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 Reset = Callable[..., "tuple[Observations, Info]"]
 """What `Simulator.reset` is: called with ``seed`` and ``options``."""
 
+_RUNS_LATER = inspect.CO_GENERATOR | inspect.CO_COROUTINE | inspect.CO_ASYNC_GENERATOR  # flags of functions
 _ACTION_BOUNDARY = Boundary(Party.SIMULATOR, "action conversion")
 _MAP_BOUNDARY = Boundary(Party.ORACLE, "see_map")
 ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # never written to
@@ -504,13 +506,19 @@ class Episode(Forkable, Ending):
 
 
 def _refuse_without(agent: Agent, method: str, argument: str) -> None:
-    """Check that an agent has a method.
+    """Check that an agent has a method, and that a call runs it.
 
     Raises:
-        ValueError: the agent has no such method.
+        ValueError: the agent has no such method, or a call only returns a coroutine or a generator.
     """
-    if not callable(getattr(agent, method, None)):
+    found = getattr(agent, method, None)
+    if not callable(found):
         raise ValueError(f"it has no method {method}({argument})")
+    flags = getattr(getattr(found, "__code__", None), "co_flags", 0)
+    if flags & _RUNS_LATER:
+        what = "yields" if flags & inspect.CO_GENERATOR else "is async"
+        fix = "define it with def, without yield"
+        raise ValueError(f"its method {method}({argument}) {what}, so a call does not run it; {fix}")
 
 
 def _require_reseeding(simulator: Simulator) -> None:

@@ -272,6 +272,29 @@ class WithoutMethods:
         vars(self).update(methods)
 
 
+async def _waits(*_):
+    return 1.0, 0
+
+
+def _yields(*_):
+    yield 1.0, 0
+
+
+async def _waits_and_yields(*_):
+    yield 1.0, 0
+
+
+@pytest.mark.parametrize("method", ["reset", "act"])
+@pytest.mark.parametrize(("runs", "says"), [(_waits, "is async"), (_yields, "yields"), (_waits_and_yields, "is async")])
+def test_agent_whose_method_would_not_run_does_not_start(tmp_path, method, runs, says):
+    """A call of such a method returns an object; an asynchronous reset did nothing, without a word."""
+    methods = {"reset": lambda seed: None, "act": lambda observation: (1.0, 0), method: runs}
+    result = run(tmp_path, agent=WithoutMethods(**methods))
+    assert str(result.outcome) == "invalid"
+    assert result.failure.message.startswith(f"its method {method}(")
+    assert f") {says}, so a call does not run it; define it with def" in result.failure.message
+
+
 class FailingOracle:
     name = "failing"
 
