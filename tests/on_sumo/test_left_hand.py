@@ -164,7 +164,7 @@ def test_left_is_left_in_offsets_and_drifts_also_of_a_road_with_one_lane(tmp_pat
         assert offsets == pytest.approx(moved, abs=1e-6)
 
 
-def test_bend_of_a_long_vehicle_begins_at_its_front_also_beside_the_middle_of_its_lane(tmp_path):
+def test_long_vehicle_keeps_its_side_of_the_lane_in_a_bend(tmp_path):
     net = NET.parent / "left-grid.net.xml.gz"
     kinds = "".join(f'<vType id="{one}" length="18" latAlignment="{one}" sigma="0"/>' for one in ("left", "right"))
     vehicles = "".join(

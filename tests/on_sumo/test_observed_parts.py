@@ -199,10 +199,10 @@ def test_default_observation_keeps_its_fast_path_and_other_agents_keep_theirs(tm
 
 def test_grid_and_image_show_the_lanes_and_the_vehicles_of_the_network(tmp_path):
     parts = ("grid:resolution=2", "image:rows=72:columns=40")
-    with closing(simulator_of("loop", tmp_path / "stage", *parts)) as one:
+    with closing(simulator_of("merge", tmp_path / "stage", *parts)) as one:
         cars = 0
-        for step, shown in enumerate(episode(one, 3, 40, speed=8.0)):
-            if step % 8:
+        for step, shown in enumerate(episode(one, 3, 35, speed=13.0)):
+            if step % 5:
                 continue
             others = [who for who in libsumo.vehicle.getIDList() if who != "ego"]
             grid = cells_on_lanes(64, 64, 2.0), cells_of_vehicles(others, 64, 64, 2.0)
@@ -215,7 +215,7 @@ def test_grid_and_image_show_the_lanes_and_the_vehicles_of_the_network(tmp_path)
             assert (shown["image"] == picture).all()
             cars += (picture == (125, 139, 156)).all(axis=2).any()
             assert one.observation_layouts["ego"].space.contains(shown)
-        assert cars
+        assert cars >= 2
         # Only bytes are recorded as bytes.
         assert one.observation_spaces["ego"].dtype == np.uint8
 
