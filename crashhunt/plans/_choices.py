@@ -95,9 +95,15 @@ def refuse_late_plans(scenario: Scenario, kinds: Iterable[str]) -> None:
             raise UsageError(message, fix="omit late_action, or give --action acceleration_steering")
 
 
-def notes_on_actions(scenario: Scenario, signatures: Mapping[str, Signature]) -> Iterator[str]:
-    """Yield a note for each agent whose class names another form of actions than the hunt uses."""
+def notes_on_declarations(scenario: Scenario, signatures: Mapping[str, Signature]) -> Iterator[str]:
+    """Yield notes on the agents whose class names another form than the hunt uses, or names none as a hunt reads it."""
     for agent, setup in scenario.agents.items():
+        examples = {"action": '"acceleration"', "observation": '["ego", "actors"]'}
+        for name, kind in signatures[agent].unread.items():
+            yield (
+                f"the attribute {name} of {setup.agent} is ignored, because its type is {kind}; set it in the class, "
+                f"such as {name} = {examples[name]}"
+            )
         named = signatures[agent].action
         if scenario.backend.actions and named and canonical_action(named) != setup.action_form:
             yield f"the action of {agent} is {setup.action_form}, which takes precedence over {named} of {setup.agent}"

@@ -24,7 +24,7 @@ from crashhunt.plans._choices import (
     disturber,
     model_apart,
     name_scenario_in_errors,
-    notes_on_actions,
+    notes_on_declarations,
     parse_crash_on,
     refuse_late_plans,
     with_notes_on_crashes,
@@ -123,7 +123,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     scenario = with_observations(scenario, observations)
     settings = with_reuse(settings, scenario)
     scenario = with_notes_on_crashes(_with_notes(scenario, request.run), settings, request, code.oracles)
-    notes = (*code.notes, *_notes_on_statistics(settings, signatures), *notes_on_actions(scenario, signatures))
+    notes = (*code.notes, *_notes_on_statistics(settings, signatures), *notes_on_declarations(scenario, signatures))
     notes += (*notes_on_programs(settings),)
     scenario = replace(scenario, notes=(*scenario.notes, *notes))
     refuse_late_plans(

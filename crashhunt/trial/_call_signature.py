@@ -7,7 +7,7 @@ import inspect
 import math
 import types
 import typing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 from crashhunt.base.errors import ArgumentError
@@ -52,6 +52,8 @@ class Signature:
         actions: names of all forms of actions that the factory's agents can return; empty if it names none.
         observation: parts that the factory's agents observe, from its attribute ``observation``.
         revision: version of the sources of a program, as the program reports it.
+        unread: type of the attribute ``action`` or ``observation`` that is neither names nor a method, by the name of
+            the attribute.
     """
 
     arguments: dict[str, Argument]
@@ -62,6 +64,7 @@ class Signature:
     actions: tuple[str, ...] = ()
     observation: tuple[str, ...] = ()
     revision: str = ""
+    unread: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Signature:
@@ -81,7 +84,7 @@ class Signature:
         given, required, actions = (tuple(data[key]) for key in ("given", "required", "actions"))
         return cls(
             names, open=bool(data["open"]), given=given, required=required, action=data["action"], actions=actions,
-            observation=tuple(data["observation"]), revision=str(data["revision"]),
+            observation=tuple(data["observation"]), revision=str(data["revision"]), unread=data["unread"],
         )  # fmt: skip
 
     def to_json(self) -> dict[str, Any]:
@@ -96,7 +99,7 @@ class Signature:
         return {
             "arguments": arguments, "open": self.open, "given": self.given, "required": self.required,
             "action": self.action, "actions": self.actions,
-            "observation": self.observation, "revision": self.revision,
+            "observation": self.observation, "revision": self.revision, "unread": dict(self.unread),
         }  # fmt: skip
 
     def check(self, names: Iterable[str], *, where: str) -> None:
@@ -155,12 +158,16 @@ def signature_of(factory: Callable[..., object]) -> Signature:
     action = factory.action if supports(factory, PrefersAction) and isinstance(factory.action, str) else ""
     actions = _names_in(factory.actions) if supports(factory, ReturnsActions) else ()
     observation = _declared_parts(factory)
+    declared = replace(
+        Signature({}, open=False, given=()), action=action, actions=actions, observation=observation,
+        unread={name: kind for name in ("action", "observation") if (kind := _type_of_unread(factory, name))},
+    )  # fmt: skip
     if _takes_nothing(factory):
-        return Signature({}, open=False, given=(), action=action, actions=actions, observation=observation)
+        return declared
     try:
         parameters = inspect.signature(factory).parameters.values()
     except (TypeError, ValueError):
-        return Signature({}, open=True, given=(), action=action, actions=actions, observation=observation)
+        return replace(declared, open=True)
     names = _names_seen_by(factory)
     arguments: dict[str, Argument] = {}
     given: list[str] = []
@@ -177,16 +184,26 @@ def signature_of(factory: Callable[..., object]) -> Signature:
             arguments[parameter.name] = _argument(parameter, _annotation(parameter, names))
             if parameter.default is parameter.empty:
                 required.append(parameter.name)
-    return Signature(
-        arguments, open=is_open, given=tuple(given), required=tuple(required), action=action, actions=actions,
-        observation=observation,
-    )  # fmt: skip
+    return replace(declared, arguments=arguments, open=is_open, given=tuple(given), required=tuple(required))
 
 
 def _names_in(value: object) -> tuple[str, ...]:
     """Return the names in an attribute of a user's class; empty if the attribute serves another purpose."""
     is_names = isinstance(value, list | tuple) and all(isinstance(name, str) for name in value)
     return tuple(value) if is_names else ()  # type: ignore[arg-type]
+
+
+def _type_of_unread(factory: object, name: str) -> str:
+    """Return the type of an attribute of a factory that cannot name parts or a form; empty if it is usable or a method.
+
+    Such an attribute may serve another purpose, or its author expects that crashhunt reads a property or a set.
+    """
+    value = getattr(factory, name, None)
+    if value is None and getattr(factory, "__dataclass_fields__", {}).get(name) is not None:
+        return "dataclass field with default_factory"
+    names = value if isinstance(value, list | tuple) and name == "observation" else [value]
+    is_read = all(isinstance(one, str) for one in names)
+    return "" if value is None or is_read or callable(value) else type(value).__name__
 
 
 def _declared_parts(factory: object) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import pytest
 
 from crashhunt.base.errors import UsageError
 from crashhunt.plans import Request, plan, with_settings
-from crashhunt.plans._choices import chosen_actions, chosen_observations, notes_on_actions
+from crashhunt.plans._choices import chosen_actions, chosen_observations, notes_on_declarations
 from crashhunt.scenario import load_scenario, with_observations
 
 AGENTS = """
@@ -50,12 +50,12 @@ def test_class_chooses_the_form_that_nothing_else_chooses():
 def test_class_named_by_the_user_takes_precedence_over_the_scenario_and_the_scenario_over_its_own_agent():
     scenario, settings = plan(asked("Accelerates", "motorway"))
     assert scenario.agents["ego"].action_form == settings.agents["ego"].action == "acceleration"
-    signatures = {"ego": SimpleNamespace(action="acceleration", observation=("ego",), actions=None)}
+    signatures = {"ego": SimpleNamespace(action="acceleration", observation=("ego",), actions=None, unread={})}
     scenario = with_observations(load_scenario("motorway"), {"ego": ("actors",)})
     assert chosen_actions("", scenario, signatures) == {}
     assert chosen_observations((), scenario, signatures) == {"ego": ("actors",)}
     assert chosen_observations((), scenario, signatures, ("ego",)) == {"ego": ("ego",)}
-    (note,) = notes_on_actions(scenario, signatures)
+    (note,) = notes_on_declarations(scenario, signatures)
     assert "meta, which takes precedence over acceleration of crashhunt.agents:NumpyPolicy" in note
 
 

@@ -263,10 +263,30 @@ def test_parts_are_those_of_the_command_line_then_of_the_named_class_then_of_the
         assert str(refused.value).startswith(f"{where}: 'eg' is not a part of observations; did you mean 'ego'?")
 
 
-@pytest.mark.parametrize("text", ["None", "3", "property(lambda self: 1)", "()", "[1]"])
-def test_attribute_observation_that_names_no_parts_is_not_meant(folder, text):
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("None", ""), ("()", ""), ("lambda self: 1", ""), ("classmethod(lambda cls: ['ego'])", ""), ("3", "int"),
+        ("property(lambda self: ['ego'])", "property"), ("[1]", "list"), ("{'ego'}", "set"), ("b'ego'", "bytes"),
+    ],
+)  # fmt: skip
+def test_attribute_observation_that_names_no_parts_is_ignored_with_a_note(folder, text, kind):
     (folder / "drives.py").write_text(AGENT.replace("class Agent:", f"class Agent:\n    observation = {text}", 1))
-    assert plan(asked())[1].agents["ego"].observation is None
+    scenario, settings = plan(asked())
+    assert settings.agents["ego"].observation is None
+    notes = [note for note in scenario.notes if "attribute" in note]
+    ignored = f"the attribute observation of drives:Agent is ignored: it is a {kind}; set it in the class, such as obs"
+    assert [note.startswith(ignored) for note in notes] == ([True] if kind else [])
+
+
+def test_field_of_a_dataclass_that_is_made_with_each_object_is_ignored_with_a_note(folder):
+    made = "import dataclasses\n@dataclasses.dataclass\nclass Agent:\n"
+    made += "    action: str = 'meta'\n    observation: list = dataclasses.field(default_factory=list)\n"
+    (folder / "drives.py").write_text(AGENT.replace("class Agent:", made, 1))
+    notes = [note for note in plan(asked())[0].notes if "attribute" in note]
+    assert [note.partition(";")[0] for note in notes] == [
+        "the attribute observation of drives:Agent is ignored: it is a dataclass field without a value in the class"
+    ]
 
 
 def test_disturbances_are_those_that_are_asked_for_or_those_of_the_scenario(folder):
