@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.calls import called_with, clear_calls
+from crashhunt.base.plugins import refuse_while_importing
 from crashhunt.plans import Request, Spec, hunt_options
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ def prepare(asked: HuntCall) -> Hunt:
 
 
 def _prepared(asked: HuntCall) -> Hunt:
+    refuse_while_importing()
     # Refuse values out of range before large imports: the user waits at a terminal.
     request = asked.checked()
     from crashhunt.plans import plan_with_code

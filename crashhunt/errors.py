@@ -11,6 +11,7 @@ from crashhunt.base.errors import (
     FormulaError as FormulaError,
     HostError as HostError,
     HuntDirectoryError as HuntDirectoryError,
+    HuntWhileImportingError as HuntWhileImportingError,
     InternalError as InternalError,
     InvalidEpisodeError as InvalidEpisodeError,
     NoValidTrialError as NoValidTrialError,

@@ -11,7 +11,7 @@ import pytest
 
 import crashhunt
 from crashhunt import analysis, api, cli, crashes, replays
-from crashhunt.errors import UsageError
+from crashhunt.errors import HuntWhileImportingError, UsageError
 from crashhunt.plans import HuntOptions
 
 
@@ -210,3 +210,19 @@ def test_values_out_of_range_are_refused_before_anything_is_made(hunt):
             crashhunt.prepare("h", *words)
     assert made == []
     assert vars(api).keys() >= {"prepare", "run", "replay", "what_if", "judge", "shrink"}
+
+
+@pytest.mark.parametrize("threads", [False, True])
+def test_module_that_starts_a_hunt_when_it_is_imported_is_refused(tmp_path, monkeypatch, threads):
+    """A script without ``if __name__ == "__main__"`` that names its own class: each import would hunt again."""
+    (tmp_path / "hunts_again.py").write_text(
+        "import crashhunt\nclass Mine: ...\n"
+        "crashhunt.run('h', 1, 1, 9, scenario='loop', agents={'ego': 'hunts_again:Mine'})\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    if threads:  # then the module is imported in this process
+        monkeypatch.setattr("crashhunt.base.isolation._is_embedded", lambda: True)
+    message = r"^the module 'hunts_again' starts a hunt when it is imported; put the call below: if __name__ =="
+    with pytest.raises(HuntWhileImportingError, match=message):
+        crashhunt.run("h", 1, 1, 9, scenario="loop", agents={"ego": "hunts_again:Mine"})
+    assert not (tmp_path / "h").exists()

@@ -166,6 +166,10 @@ class PluginError(CrashhuntError):
     """A plugin name or ``module:attribute`` that cannot be found or imported."""
 
 
+class HuntWhileImportingError(PluginError):
+    """A module starts a hunt at its top level, so every process that imports it would start the hunt again."""
+
+
 class HuntDirectoryError(CrashhuntError):
     """The directory of a hunt is in use, belongs to something else, or cannot be written, or the disk is full."""
 

@@ -7,6 +7,7 @@ import os
 import pkgutil
 import re
 import sys
+import threading
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import metadata
@@ -14,7 +15,7 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from crashhunt.base.errors import PluginError
+from crashhunt.base.errors import HuntWhileImportingError, PluginError
 from crashhunt.base.exceptions import INSTALLED_FOLDERS, in_words, place_of
 from crashhunt.base.extras import install_command
 from crashhunt.base.programs import factory_of, is_program
@@ -246,12 +247,32 @@ def import_module(name: str, *, shown: str = "", installed: bool = False) -> typ
         )
     if not installed:
         add_current_folder().prefer(name)
+    outer = getattr(_importing, "name", "")
+    _importing.name = name
     try:
         return importlib.import_module(name)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, HuntWhileImportingError):
         raise
     except BaseException as error:  # such as SystemExit, and whatever a module derives from BaseException
         raise _not_imported(name, shown or name, error) from error
+    finally:
+        _importing.name = outer
+
+
+_importing = threading.local()  # `name`: the module that `import_module` imports in a thread
+
+
+def refuse_while_importing() -> None:
+    """Refuse to start a hunt while `import_module` imports a module in this thread.
+
+    Raises:
+        HuntWhileImportingError: a module is being imported.
+    """
+    if name := getattr(_importing, "name", ""):
+        raise HuntWhileImportingError(
+            f"the module {name!r} starts a hunt when it is imported",
+            fix='put the call below: if __name__ == "__main__":',
+        )
 
 
 _EXTRAS = {"crashhunt.agents.planners": "planners"}  # of our modules for the packages of others
