@@ -39,7 +39,7 @@ from crashhunt.base.programs import command_of, is_path, library_path, words_of
 from crashhunt.base.signals import signal_name
 from crashhunt.base.text import one_line
 from crashhunt.simulators import NamesMetaActions, ObservesParts, ProvidesRoadMaps
-from crashhunt.trial import Argument, Signature, kind_of, parse_spec
+from crashhunt.trial import Argument, Constant, Signature, kind_of, parse_spec
 from crashhunt.world import describe_road_map
 
 if TYPE_CHECKING:
@@ -652,6 +652,8 @@ def _argument(name: str, facts: object) -> Argument:
     kind: Kind | None = None if default is None or type(default) is int else kind_of(default)
     try:
         distribution = None if text is None else parse_spec(str(text), kind)
+        if isinstance(distribution, Constant) and ":" in str(distribution.value):
+            raise ArgumentError(f"{_shown(text)} is not a range", fix='write it as "5:40", "a|b|c" or "log:1e-3:1"')
     except ArgumentError as error:
         raise ProgramError(f"its argument {name}: {error.message}", fix=error.fix) from None
     return Argument(name=name, kind=kind, default=default, distribution=distribution, unit=unit)

@@ -248,9 +248,10 @@ def settings_of_agents(
             if found is not None:
                 specs[name] = found
             elif name in signature.required:
-                raise ArgumentError(
-                    f"{setup.agent} needs the argument {name!r}", fix=f"give --arg {name}=SPEC", where=f"agent {agent}"
-                )
+                fix = f"give --arg {name}=SPEC"
+                if name in ("observation", "obs", "state"):  # of a function that is a policy itself
+                    fix = "name a class with the methods reset and act, or a function that returns such an object"
+                raise ArgumentError(f"{setup.agent} needs the argument {name!r}", fix=fix, where=f"agent {agent}")
         agents[agent] = AgentSettings(
             agent=setup.agent, arguments=specs, action=actions.get(agent), observation=observations.get(agent)
         )

@@ -172,6 +172,8 @@ class TrajectoryAction:
             array = cast(action, np.dtype(np.float64))
         if array is None or array.ndim != 2 or array.shape[1] != _WIDTH or not 0 < array.shape[0] <= MAX_POINTS:
             shape = "" if array is None else f" of the shape {array.shape}"
+            if array is None and isinstance(action, np.ndarray):
+                shape = f" of the type {action.dtype}"
             fix = f"return an array (K, {_WIDTH}) of time, x, y, heading and speed, with 1 to {MAX_POINTS} rows"
             raise ActionError(f"the action {describe_value(action)}{shape} is not a trajectory", fix=fix)
         points = array.astype(np.float64, copy=False)

@@ -503,6 +503,10 @@ print(json.dumps({"type": "ready", "observation": ["ego"], "arguments": {"observ
     ("text", "message"),
     [
         ('{"type": "ready", "arguments": {"speed": {"range": "25:5"}}}', "begins above its end"),
+        (
+            '{"type": "ready", "arguments": {"speed": {"range": "a:b"}}}',
+            'its argument speed: "a:b" is not a range; write',
+        ),
         ('{"type": "ready", "arguments": {"speed": {"unit": 5}}}', "its argument speed has the default null and the"),
         ('{"type": "ready", "arguments": {"speed": {"low": 5}}}', "speed has low (allowed: range, unit, default)"),
         ('{"type": "ready", "arguments": {"speed": 5}}', "its argument speed has 5 (allowed: range, unit, default)"),

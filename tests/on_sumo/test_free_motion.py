@@ -226,6 +226,7 @@ def test_a_reported_collision_of_a_free_vehicle_counts_only_if_the_outlines_touc
         (lambda x, y, h, v: [[-0.1, x, y, h, v]], "time of point 0 of the trajectory is -0.1"),
         (lambda x, y, h, v: [[0.1, float("nan"), y, h, v]], "x of point 0 of the trajectory is nan"),
         (lambda x, y, h, v: [], "is not a trajectory"),
+        (lambda x, y, h, v: np.zeros((2, 5), complex), "of the type complex128 is not a trajectory"),
         (lambda x, y, h, v: np.zeros((65, 5)), "of the shape .65, 5. is not a trajectory"),
     ],
 )  # fmt: skip

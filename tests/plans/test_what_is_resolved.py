@@ -178,6 +178,9 @@ def test_what_an_agent_needs_has_to_be_given(folder):
     with pytest.raises(ArgumentError, match="drives:Needs needs the argument 'weights'") as refused:
         plan(asked(agents={"ego": "drives:Needs"}, arguments={"speed": "3"}))
     assert refused.value.fix == "give --arg weights=SPEC"
+    (folder / "policy.py").write_text("def act(observation): return (1.0, 0)\n")
+    with pytest.raises(ArgumentError, match="the argument 'observation'; name a class with the methods"):
+        plan(asked(agents={"ego": "policy:act"}))
     _, settings = plan(asked(agents={"": "drives:Needs"}, arguments={"weights": "w", "speed": "3"}))
     assert settings.agents["ego"].agent == "drives:Needs"
     (folder / "scenario.toml").write_text(SCENARIO.format(needed='unit = "m"'))
@@ -275,7 +278,7 @@ def test_attribute_observation_that_names_no_parts_is_ignored_with_a_note(folder
     scenario, settings = plan(asked())
     assert settings.agents["ego"].observation is None
     notes = [note for note in scenario.notes if "attribute" in note]
-    ignored = f"the attribute observation of drives:Agent is ignored: it is a {kind}; set it in the class, such as obs"
+    ignored = f"the attribute observation of drives:Agent is ignored, because its type is {kind}; set it in the class"
     assert [note.startswith(ignored) for note in notes] == ([True] if kind else [])
 
 
@@ -285,7 +288,7 @@ def test_field_of_a_dataclass_that_is_made_with_each_object_is_ignored_with_a_no
     (folder / "drives.py").write_text(AGENT.replace("class Agent:", made, 1))
     notes = [note for note in plan(asked())[0].notes if "attribute" in note]
     assert [note.partition(";")[0] for note in notes] == [
-        "the attribute observation of drives:Agent is ignored: it is a dataclass field without a value in the class"
+        "the attribute observation of drives:Agent is ignored, because its type is dataclass field with default_factory"
     ]
 
 
