@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         Draft as Draft,
         LaneBlock as LaneBlock,
         Part as Part,
+        Streams as Streams,
         UsualSteps as UsualSteps,
         Vehicles as Vehicles,
         core_for as core_for,

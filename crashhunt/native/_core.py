@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 13
+_INTERFACE = 14
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -106,17 +106,23 @@ class UsualSteps(Protocol):
 
     def perceive(
         self,
-        make: Callable[[Columns, float, int, str, int], NDArray[np.generic]],
+        make: Callable[[Columns, float, int, str], NDArray[np.generic]],
         restore: Callable[[NDArray[np.generic]], object],
+        draft: _Draft | None,
         /,
     ) -> None:
         """Set the functions for observations that consist of parts.
 
         Args:
-            make: function that returns the recorded array. It receives the columns of a scene, its time (s), the row
-                and the lane of the agent, and the number of the step.
+            make: function that returns the recorded array. It receives the columns of a scene, its time (s), and the
+                row and the lane of the agent.
             restore: function that returns what the agent receives, from the recorded array.
+            draft: what `make` writes into; None if it writes into none. The core then calls `make` only if it cannot
+                write the array from the draft again.
         """
+
+    def perceived(self, step: int, /) -> NDArray[np.generic] | None:
+        """Return the recorded array that was made after a step, even if the step is not complete; None without one."""
 
     def judge(self, overlaps: bool, hardest: float, always: bool, last: int, now_and_then: int, /) -> None:
         """Set the conditions under which oracles examine a step.
@@ -198,8 +204,33 @@ class LaneBlock(Protocol):
     """The candidates of the lanes around a vehicle."""
 
 
+class Streams(Protocol):
+    """The streams that conflict with a path across a junction, and the vehicles that were found on them."""
+
+
 class Draft(Protocol):
-    """An observation that is being written, part by part. A place is the index of a part's first value."""
+    """An observation that is being written, part by part. A place is the index of a part's first value.
+
+    The methods that are named like a part write it, and return whether they could; if not, the equivalent Python code
+    has to write it. `UsualSteps` writes the parts of such calls again in the steps that follow, as long as the vehicle
+    stays on its lane and its route. Python then writes the other parts, if there are any.
+    """
+
+    def begin(self, columns: Columns | None, row: int, lane: str, time_s: float, /) -> None:
+        """Begin the observation of a step, or continue the one whose other parts the core has written.
+
+        Args:
+            columns: The columns of the scene; None if there are none.
+            row: The row of the agent's vehicle in the scene.
+            lane: The lane of the vehicle.
+            time_s: The simulation time, in s.
+        """
+
+    def has(self, place: int, /) -> bool:
+        """Return whether the core has already written a part."""
+
+    def enter(self, vehicles: Vehicles, row: int, /) -> None:
+        """Set the vehicles in sight from now on, and the row of the agent's vehicle."""
 
     def put(self, place: int, values: tuple[float, ...], /) -> None:
         """Write numbers."""
@@ -207,66 +238,98 @@ class Draft(Protocol):
     def put_array(self, place: int, array: object, /) -> None:
         """Write an array of float64."""
 
-    def actors(
-        self,
-        place: int,
-        columns: Columns,
-        row: int,
-        who: tuple[list[float], tuple[str, ...]],
-        limits: tuple[float, int, float],
-        last_speeds: dict[str, float],
-        path: tuple[frozenset[str], dict[str, bool], Callable[[str], bool]],
-        /,
-    ) -> tuple[tuple[int, ...], dict[str, float]] | None:
-        """Write the part ``actors``; return the rows of the actors in the scene, and their speeds by id.
-
-        The result is None, and nothing is written, if only the equivalent Python code can read the scene.
+    def ego(self, place: int, last: list[float], facts: tuple[float, float, float, float], /) -> bool:
+        """Write the part ``ego``.
 
         Args:
             place: The place of the part.
-            columns: The columns of the scene.
-            row: The row of the agent's vehicle in the scene.
-            who: The value of ``kind`` and the id of each actor of the scene.
+            last: Heading and speed after the last step, which are replaced by those after this step; empty at first.
+            facts: The distance that the vehicle had driven at the start (m), the time then (s), the step length (s),
+                and the index of the lane.
+        """
+
+    def actors(
+        self,
+        place: int,
+        who: tuple[list[float], list[str]],
+        limits: tuple[float, int, float],
+        last: tuple[dict[str, float], list[int]],
+        path: tuple[frozenset[str], Callable[[str], bool]],
+        /,
+    ) -> bool:
+        """Write the part ``actors``.
+
+        Args:
+            place: The place of the part.
+            who: The value of ``kind`` and the id of each actor in sight; the caller changes both lists before `enter`.
             limits: The radius (m), the number of rows, and the step length (s).
-            last_speeds: The speeds after the last step, by id.
-            path: The lanes on the path of the vehicle; known results by lane; a function that returns whether a lane
-                leads into the lane of the vehicle.
+            last: The speeds after the last step, by id, and the rows of these actors in its scene; both are replaced
+                by those after this step.
+            path: The lanes on the path of the vehicle; a function that returns whether a lane leads into the lane of
+                the vehicle.
         """
 
     def lanes(
-        self, place: int, block: LaneBlock, x: float, y: float, limit: float, shape: tuple[int, int, int, int], /
-    ) -> None:
+        self, place: int, ask: Callable[[int, int], LaneBlock], shape: tuple[int, int, int, int, float, float], /
+    ) -> bool:
         """Write the part ``lanes``.
 
         Args:
             place: The place of the part.
-            block: The candidates.
-            x: x of the vehicle, in m.
-            y: y of the vehicle, in m.
-            limit: Largest squared distance, without the term that all points have in common, in m².
-            shape: The numbers of lanes and of points, the points behind, and the prepared points per point.
+            ask: Function that returns the candidates for a square, by its column and its row.
+            shape: The numbers of lanes and of points, the points behind, the prepared points per point, the largest
+                distance of a lane (m), and the size of a square (m).
         """
 
-    def route(
-        self, place: int, rows: object, window: tuple[int, int], x: float, y: float, shape: tuple[int, int], /
-    ) -> None:
+    def route(self, place: int, rows: object, window: tuple[int, int, int, int], /) -> bool:
         """Write the part ``route``.
 
         Args:
             place: The place of the part.
             rows: The points of a path.
-            window: The first and the last row that can be the nearest.
-            x: x of the vehicle, in m.
-            y: y of the vehicle, in m.
-            shape: The number of points, and the prepared points per point.
+            window: The first and the last row that can be the nearest, the number of points, and the prepared points
+                per point.
         """
 
+    def signals(self, place: int, lights: list[tuple[float, str, int, list[float]]], step_s: float, /) -> bool:
+        """Write the part ``signals``.
+
+        Args:
+            place: The place of the part.
+            lights: The distance from the start of the lane (m), the id and the index of the link of each traffic light.
+                Its state and the time when the state began (s) follow. The core replaces both if the state changes.
+            step_s: The step length, in s.
+        """
+
+    def right_of_way(self, place: int, streams: Streams, facts: tuple[float, float, int], /) -> bool:
+        """Write the part ``right_of_way``.
+
+        Args:
+            place: The place of the part.
+            streams: The streams that conflict with the path of the vehicle.
+            facts: The position of the stop line on the lane (m), the value of ``stop_sign``, and the number of rows.
+        """
+
+    def along(self, place: int, values: tuple[float, ...], moving: list[tuple[int, float, float, float]], /) -> bool:
+        """Write numbers, some of which depend on the position on the lane.
+
+        Args:
+            place: The place of the part.
+            values: The numbers.
+            moving: The index of each such number, and three numbers a, b and c. The number is a + (b - position), and
+                at least c.
+        """
+
+    def speed_limit(self, place: int, /) -> bool:
+        """Write the part ``speed_limit``."""
+
     def take(self) -> bytes:
-        """Return the values, all of which are 0 from then on."""
+        """Return the values."""
 
 
 _Draft = Draft
 _LaneBlock = LaneBlock
+_Streams = Streams
 _Vehicles = Vehicles  # `Core` has methods with the names of these classes
 _UsualSteps = UsualSteps
 
@@ -316,8 +379,8 @@ class Core(Protocol):
             start_m: The distance that the agent had driven at the start, in m.
         """
 
-    def Draft(self, size: int, /) -> _Draft:  # noqa: N802 - a class
-        """Return an observation of this number of values, all of which are 0."""
+    def Draft(self, agent: str, size: int, /) -> _Draft:  # noqa: N802 - a class
+        """Return an observation of an agent with this number of values."""
 
     def LaneBlock(  # noqa: N802 - a class
         self, paths: Sequence[tuple[object, int, int] | None], middle_x: float, middle_y: float, window: int, /,
@@ -331,12 +394,22 @@ class Core(Protocol):
             window: Number of rows among which the nearest row is, wherever in the square the vehicle is.
         """
 
-    def rows_on_lanes(
-        self, columns: Columns, lanes: Mapping[str, object], /
-    ) -> list[tuple[int, str, int, float, str]] | None:
-        """Return the vehicles on these lanes: row, lane, index on the route, position on the lane (m), route.
+    def Streams(  # noqa: N802 - a class
+        self, lanes: tuple[str, ...], ask: Callable[[str, str, int, str], Sequence[object]], /
+    ) -> _Streams:
+        """Return the streams that conflict with a path.
 
-        The result is None if the scene has other actors.
+        Args:
+            lanes: The lanes on which vehicles may take these streams.
+            ask: Function that returns a list of the streams that a vehicle takes. Its arguments are the id of the
+                vehicle, its lane, the index of the edge on its route, and its route.
+
+        A stream is a tuple of these values:
+
+        - whether the vehicle on the path must yield,
+        - begin and end of the conflict area on the path and on the stream, in m,
+        - the distance from the stop line of the stream to the lane, in m,
+        - the traffic light of the stream, empty without one, and the index of its link.
         """
 
     def vehicle_states(self, vehicles: _Vehicles, /) -> list[tuple[str, float, float, int, int, float, str]] | None:
@@ -344,6 +417,9 @@ class Core(Protocol):
 
         A state is lane, lateral position, acceleration, signals, index on the route, position on the lane, route.
         """
+
+    def light_state(self, light: str, /) -> str | None:
+        """Return the state of each link of a traffic light; None if libsumo fails."""
 
     def columns(
         self, vehicles: _Vehicles, points: Sequence[object], headings: Sequence[float], speeds: Sequence[float], /

@@ -18,7 +18,11 @@
 #include <cstring>
 #include <deque>
 #include <exception>
+#include <memory>
 #include <string>
+#include <tuple>
+#include <unordered_map>
+#include <unordered_set>
 #include <utility>
 #include <vector>
 
@@ -70,9 +74,9 @@ typedef const void *(*Singleton)();
 struct Sumo {
     PositionOf position;
     NumberOf angle, speed;
-    NumberOf driven, aside, aside_speed, along, decel, acceleration, min_gap;
+    NumberOf driven, aside, aside_speed, along, decel, acceleration, min_gap, speed_limit;
     WholeOf lane_index, stop_state, signals, route_index;
-    NameOf road, lane, route;
+    NameOf road, lane, route, light;
     NumberAt lane_angle;
     NeighborOf follower, leader;
     Command set_speed;
@@ -145,6 +149,8 @@ PyObject *bind(PyObject *, PyObject *path) {
                  find(library, "_ZN7libsumo7Vehicle9getLeaderE" STRING "d", found.leader) &&
                  find(library, "_ZN7libsumo7Vehicle9getMinGapE" STRING, found.min_gap) &&
                  find(library, "_ZN7libsumo7Vehicle8setSpeedE" STRING "d", found.set_speed) &&
+                 find(library, "_ZN7libsumo12TrafficLight22getRedYellowGreenStateE" STRING, found.light) &&
+                 find(library, "_ZN7libsumo4Lane11getMaxSpeedE" STRING, found.speed_limit) &&
                  find(library, "_ZN7libsumo4Lane8getAngleE" STRING "d", found.lane_angle) &&
                  find(library, "_ZN7libsumo6Helper10getVehicleE" STRING, found.vehicle) &&
                  find(library, "_ZN7libsumo7Vehicle9isVisibleEPK11SUMOVehicle", found.is_visible) &&
@@ -1544,8 +1550,8 @@ PyObject *write_step(PyObject *, PyObject *const *given, Py_ssize_t count) {
 
 #define FAST(function) reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function)), METH_FASTCALL
 
-#include "fast_step.hpp"
 #include "observed_parts.hpp"
+#include "fast_step.hpp"
 
 // ---------------------------------------------------------------------------------------------------------- the module
 
@@ -1587,8 +1593,8 @@ PyMethodDef functions[] = {
     {"is_coming_or_going", is_coming_or_going, METH_NOARGS, "Whether a vehicle has entered or left in the last step."},
     {"in_sight", FAST(in_sight), "Return who is near some vehicles, and where these are; None where libsumo refuses."},
     {"columns", FAST(columns), "Return lists as columns; None where they are none of numbers."},
-    {"rows_on_lanes", FAST(rows_on_lanes), "Return the vehicles on some lanes; None where Python has to do it."},
     {"vehicle_states", vehicle_states, METH_O, "Return what is read of vehicles for observations, to be compared."},
+    {"light_state", light_state, METH_O, "Return what the links of a traffic light show, to be compared."},
     {"observe", FAST(observe), "Return an observation as bytes."},
     {"within_reach", FAST(within_reach), "Return the rows of those that an actor may have touched."},
     {"least_change", FAST(least_change), "Return the least change of speed between two scenes."},
@@ -1600,7 +1606,8 @@ PyMethodDef functions[] = {
 };
 
 int fill(PyObject *module) {
-    for (PyType_Spec *spec : {&vehicles_spec, &columns_spec, &usual_spec, &draft_spec, &lane_block_spec}) {
+    for (PyType_Spec *spec : {&vehicles_spec, &columns_spec, &usual_spec, &draft_spec, &lane_block_spec,
+                              &streams_spec}) {
         PyObject *type = PyType_FromSpec(spec);
         if (!type || PyModule_AddObjectRef(module, strrchr(spec->name, '.') + 1, type) < 0) {
             Py_XDECREF(type);
@@ -1613,6 +1620,10 @@ int fill(PyObject *module) {
             columns_type = reinterpret_cast<PyTypeObject *>(type);
         } else if (spec == &lane_block_spec) {
             lane_block_type = reinterpret_cast<PyTypeObject *>(type);
+        } else if (spec == &streams_spec) {
+            streams_type = reinterpret_cast<PyTypeObject *>(type);
+        } else if (spec == &draft_spec) {
+            draft_type = reinterpret_cast<PyTypeObject *>(type);
         }
     }
     return PyModule_AddIntConstant(module, "INTERFACE", CRASHHUNT_INTERFACE);

@@ -33,7 +33,9 @@ struct Steps {
     std::string agent;
     PyObject *name = nullptr, *libsumo = nullptr, *array = nullptr, *shape = nullptr, *dtype = nullptr;
     PyObject *act = nullptr, *simulate = nullptr; // what these methods are called
-    PyObject *perceive = nullptr, *restore = nullptr; // of an observation that consists of parts
+    PyObject *perceive = nullptr, *restore = nullptr, *draft = nullptr; // of an observation that consists of parts
+    PyObject *perceived = nullptr; // what the agent would be shown after `perceived_step`
+    long long perceived_step = -1;
     Vehicles *eyes = nullptr;
     size_t others = 0;
     double step_s = 0, start_m = 0, hardest = 0, within = 0;
@@ -72,7 +74,8 @@ struct Steps {
     Steps() = default;
     Steps(const Steps &) = delete;
     ~Steps() {
-        for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, perceive, restore, reinterpret_cast<PyObject *>(eyes),
+        for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, perceive, restore, draft, perceived,
+                              reinterpret_cast<PyObject *>(eyes),
                               limits, stood, reinterpret_cast<PyObject *>(sight.vehicles), sight.ids,
                               reinterpret_cast<PyObject *>(entered.vehicles), entered.ids,
                               reinterpret_cast<PyObject *>(before_vehicles), enter, record_roster, observation, answer,
@@ -219,15 +222,12 @@ struct Steps {
     }
 
     // What the agent will be shown; null with or without an exception.
-    PyObject *shown(const Scene &present, const Sight &who) const {
+    PyObject *shown(const Scene &present, const Sight &who) {
         const size_t row = who.row;
         if (perceive) {
-            Columns *columns = new_columns(who.vehicles, std::vector<double>(next.values));
-            PyObject *made = columns ? PyObject_CallFunction(perceive, "OdnsL", columns, next.time_s,
-                                                             static_cast<Py_ssize_t>(row), lane.c_str(), step + 1)
-                                     : nullptr;
-            Py_XDECREF(reinterpret_cast<PyObject *>(columns));
-            return made;
+            perceived_step = step + 1;
+            Py_XSETREF(perceived, shown_parts(present, who));
+            return Py_XNewRef(perceived);
         }
         double right = from_left, drift = 0.0;
         const double distance = sumo.driven(agent) - start_m;
@@ -235,7 +235,31 @@ struct Steps {
             right -= sumo.aside(agent);
             drift = -sumo.aside_speed(agent);
         }
-        PyObject *bytes = observed(present, row, others, distance, right, drift);
+        return array_of(observed(present, row, others, distance, right, drift));
+    }
+
+    PyObject *shown_parts(const Scene &present, const Sight &who) const {
+        Observation *whole = draft ? &observation_of(draft) : nullptr;
+        const bool written = whole && whole->again(present, who.vehicles, who.row, lane, next.time_s);
+        if (PyErr_Occurred()) {
+            return nullptr;
+        }
+        if (written && !whole->rest) {
+            return array_of(whole->take());
+        }
+        Columns *columns = new_columns(who.vehicles, std::vector<double>(next.values));
+        if (written && columns) {
+            whole->go_on(columns);
+        }
+        PyObject *made = columns ? PyObject_CallFunction(perceive, "Odns", columns, next.time_s,
+                                                         static_cast<Py_ssize_t>(who.row), lane.c_str())
+                                 : nullptr;
+        Py_XDECREF(reinterpret_cast<PyObject *>(columns));
+        return made;
+    }
+
+    // Bytes as an array of NumPy's; null with an exception, as they then are.
+    PyObject *array_of(PyObject *bytes) const {
         PyObject *given[] = {shape, dtype, bytes};
         PyObject *found = bytes ? PyObject_Vectorcall(array, given, 3, nullptr) : nullptr;
         Py_XDECREF(bytes);
@@ -495,7 +519,6 @@ PyObject *usual_heed(PyObject *object, PyObject *arguments) {
 }
 
 // listen(enter, record_roster): who is called where others than before are in sight
-// perceive(make, restore): an observation is an array that the first makes, and the agent receives what the second returns
 template <PyObject *Steps::*first, PyObject *Steps::*second> PyObject *usual_keep(PyObject *object, PyObject *arguments) {
     PyObject *one, *other;
     if (!PyArg_ParseTuple(arguments, "OO", &one, &other)) {
@@ -504,6 +527,35 @@ template <PyObject *Steps::*first, PyObject *Steps::*second> PyObject *usual_kee
     keep(steps_of(object).*first, one);
     keep(steps_of(object).*second, other);
     Py_RETURN_NONE;
+}
+
+// perceive(make, restore, draft | None): an observation is an array that the first makes where it cannot be written from
+// the draft again, and the agent receives what the second returns
+PyObject *usual_perceive(PyObject *object, PyObject *arguments) {
+    Steps &steps = steps_of(object);
+    PyObject *make, *restore, *draft;
+    if (!PyArg_ParseTuple(arguments, "OOO", &make, &restore, &draft)) {
+        return nullptr;
+    }
+    if (draft != Py_None && Py_TYPE(draft) != draft_type) {
+        return PyErr_Format(PyExc_TypeError, "this is no draft of the core");
+    }
+    keep(steps.perceive, make);
+    keep(steps.restore, restore);
+    if (draft != Py_None) {
+        keep(steps.draft, draft);
+    }
+    Py_RETURN_NONE;
+}
+
+// perceived(step) -> what the agent would be shown after a step, if that has been made; None otherwise
+PyObject *usual_perceived(PyObject *object, PyObject *number) {
+    const Steps &steps = steps_of(object);
+    const long long step = PyLong_AsLongLong(number);
+    if (step == -1 && PyErr_Occurred()) {
+        return nullptr;
+    }
+    return Py_NewRef(steps.perceived && step == steps.perceived_step ? steps.perceived : Py_None);
 }
 
 // judge(overlaps, hardest, always_ask, last, now_and_then): when somebody has to be asked about a step
@@ -737,9 +789,9 @@ PyObject *usual_reads(PyObject *object, PyObject *given) {
         for (const std::string &id : vehicles->roster->ids) {
             lanes += sumo.lane(id) + '\n';
         }
-        return Py_BuildValue("(NiddddddNNidi)", text_of(sumo.road(steps.agent)), sumo.lane_index(steps.agent),
+        return Py_BuildValue("(NidddddddNNidi)", text_of(sumo.road(steps.agent)), sumo.lane_index(steps.agent),
                              sumo.driven(steps.agent), sumo.aside(steps.agent), sumo.aside_speed(steps.agent), along,
-                             angle, sumo.decel(steps.agent), text_of(lanes),
+                             angle, sumo.speed_limit(lane), sumo.decel(steps.agent), text_of(lanes),
                              text_of(sumo.follower(steps.agent, 0.0).first), sumo.stop_state(steps.agent), sumo.time(),
                              sumo.emergencies());
     } catch (...) {
@@ -764,8 +816,8 @@ PyMethodDef usual_methods[] = {
     {"heed", usual_heed, METH_VARARGS, "Take what is counted of braking and of standing."},
     {"listen", usual_keep<&Steps::enter, &Steps::record_roster>, METH_VARARGS,
      "Take who is called where others than before are in sight."},
-    {"perceive", usual_keep<&Steps::perceive, &Steps::restore>, METH_VARARGS,
-     "Take what makes and restores observations that consist of parts."},
+    {"perceive", usual_perceive, METH_VARARGS, "Take what makes and restores observations that consist of parts."},
+    {"perceived", usual_perceived, METH_O, "Return what has been made for a step; None if nothing has."},
     {"judge", usual_judge, METH_VARARGS, "Take when somebody has to be asked about a step."},
     {"resume", usual_resume, METH_VARARGS, "Go on from a step that is complete."},
     {"borrow", usual_borrow, METH_VARARGS, "Record into a buffer from now on."},

@@ -66,7 +66,7 @@ class EgoReader(Reader):
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
-        self._last: tuple[float, float] | None = None  # heading and speed
+        self._last: list[float] = []  # heading and speed, which the core may change
         self._place: tuple[float, float] | None = None
         self._driven_m = 0.0
 
@@ -76,6 +76,11 @@ class EgoReader(Reader):
 
     def write(self, draft: Draft, place: int, moment: Moment) -> None:
         """Write the columns of ``ego``."""
+        setup = self._setup
+        if setup.steering is None and not setup.graph.is_left_hand:
+            facts = setup.start_m, setup.start_s, setup.step_length_s, _lane_index(moment.lane)
+            if draft.ego(place, self._last, facts):
+                return
         draft.put(place, self._values(moment))
 
     def _values(self, moment: Moment) -> tuple[float, ...]:
@@ -83,10 +88,10 @@ class EgoReader(Reader):
         agent, actor = setup.agent, scene.roster.actors[row]
         heading, speed = scene.headings[row], scene.speeds[row]
         acceleration, yaw_rate = _known(sumo.vehicle_getAcceleration(agent)), 0.0
-        if self._last is not None:  # SUMO reports no acceleration of a vehicle that it has moved to a position
+        if self._last:  # SUMO reports no acceleration of a vehicle that it has moved to a position
             acceleration = (speed - self._last[1]) / setup.step_length_s
             yaw_rate = wrapped(heading - self._last[0]) / setup.step_length_s
-        self._last = heading, speed
+        self._last[:] = heading, speed
         steering = setup.steering() if setup.steering is not None else bicycle_steering(yaw_rate, speed, actor.length)
         x, y = center_of(scene, row)
         distance = sumo.vehicle_getDistance(agent) - setup.start_m
@@ -96,10 +101,14 @@ class EgoReader(Reader):
         return (
             x, y, wrapped(heading), speed,
             acceleration, yaw_rate, steering, actor.length, actor.width,
-            float(moment.lane.rpartition("_")[2] or 0),
+            _lane_index(moment.lane),
             setup.offset_of(agent),
             distance, scene.time_s - setup.start_s,
         )  # fmt: skip
+
+
+def _lane_index(lane: str) -> float:
+    return float(lane.rpartition("_")[2] or 0)
 
 
 class ActorsReader(Reader):
@@ -111,29 +120,29 @@ class ActorsReader(Reader):
         self._limits = setup.settings["radius"], setup.limit, setup.step_length_s
         self._speeds: dict[str, float] = {}
         self._actors: tuple[Actor, ...] = ()
-        self._who: tuple[list[float], tuple[str, ...]] = [], ()
-        self._rows: tuple[int, ...] = ()
+        self._who: tuple[list[float], list[str]] = [], []
+        self._rows: list[int] = []  # the core may change them, and the speeds
 
     @property
     def ids(self) -> tuple[str, ...]:
         """Identifiers of the actors in the rows, as in scenes."""
         return tuple([self._actors[row].id for row in self._rows])
 
+    def enter(self, actors: tuple[Actor, ...]) -> None:
+        """Set the actors in sight."""
+        if actors is not self._actors:
+            kinds, ids = self._who
+            kinds[:], ids[:] = [kind_number(actor.kind) for actor in actors], [actor.id for actor in actors]
+            self._actors = actors
+
     def write(self, draft: Draft, place: int, moment: Moment) -> None:
         """Write the columns of ``actors``."""
-        scene, actors = moment.scene, moment.scene.roster.actors
-        if actors is not self._actors:
-            self._who = [kind_number(actor.kind) for actor in actors], tuple([actor.id for actor in actors])
-        found = None
+        scene = moment.scene
+        self.enter(scene.roster.actors)
         is_usual = not (scene.heights or moment.hidden or self._setup.graph.is_left_hand)
-        if scene.columns is not None and is_usual:
-            path = self._path.update(moment.lane).facts
-            found = draft.actors(place, scene.columns, moment.row, self._who, self._limits, self._speeds, path)
-        if found is None:
+        facts = self._path.update(moment.lane).facts
+        if not (is_usual and draft.actors(place, self._who, self._limits, (self._speeds, self._rows), facts)):
             draft.put_array(place, self.observe(moment))
-        else:
-            self._rows, self._speeds = found
-        self._actors = actors
 
     def observe(self, moment: Moment) -> NDArray[np.float64]:
         """Return the columns of ``actors``."""
@@ -142,8 +151,8 @@ class ActorsReader(Reader):
         own_x, own_y = center_of(scene, row)
         own_cos, own_sin = cos(headings[row]), sin(headings[row])
         path = self._path.update(moment.lane)
-        found, last_speeds = [], self._speeds
-        self._speeds = {}
+        found, last_speeds = [], dict(self._speeds)
+        self._speeds.clear()
         near = self._actors_near(moment)
         for _, other, x, y in near:
             actor, heading, speed = actors[other], headings[other], speeds[other]
@@ -161,7 +170,7 @@ class ActorsReader(Reader):
                     ahead, offset, float(bool(signals & _BRAKE_LIGHT)), indicator,
                 )
             )  # fmt: skip
-        self._actors, self._rows = actors, tuple([other for _, other, _, _ in near])
+        self._actors, self._rows[:] = actors, [other for _, other, _, _ in near]
         rows = np.zeros(self._setup.shape)
         if found:
             rows[: len(found)] = found
@@ -231,9 +240,9 @@ class PathAhead:
         return found
 
     @property
-    def facts(self) -> tuple[frozenset[str], dict[str, bool], Callable[[str], bool]]:
-        """The lanes that the route continues to, the known answers of `is_entered_from`, and this method."""
-        return self._lanes, self._entered[self._lane], self.is_entered_from
+    def facts(self) -> tuple[frozenset[str], Callable[[str], bool]]:
+        """The lanes that the route continues to, and `is_entered_from`."""
+        return self._lanes, self.is_entered_from
 
     def _reached(self, lane: str, edges: frozenset[str] | None = None) -> set[str]:
         """Return the lanes that can be reached from a lane, within the reach and on the given edges."""

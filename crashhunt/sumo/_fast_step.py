@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.native import Columns, Core, Vehicles
+    from crashhunt.native import Columns, Core, Draft, Vehicles
     from crashhunt.simulators import Kinematics, Observations, Simulator, StepResult
     from crashhunt.sumo._range_of_sight import Sight
     from crashhunt.sumo._traffic_events import SumoEvents
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 _MAX_ROSTERS = 3  # rosters to keep: of the last scene, the scene before it, and the next scene, which may not be needed
-_FLOAT32 = np.dtype("<f4")
+_FLOAT32, _FLOAT64 = np.dtype("<f4"), np.dtype("<f8")
 
 
 P = ParamSpec("P")
@@ -77,6 +77,10 @@ class UsualSteps:
         lateral: Whether vehicles may leave the centre line of a lane.
         takes_speed: Whether actions are `SpeedAndLaneChange`.
         perceive: Function that makes an observation that consists of parts; None for the default observation.
+        draft: What the core writes observations that consist of parts into; None if it does not write them.
+        enter_parts: Function called with the vehicles in sight, the row of the agent and the roster; None without a
+            draft.
+        shape: Shape of the observation's array.
         restore: Function that returns what the agent receives, from such an observation.
         instead_of: Attributes of the simulator that the core bypasses, by name.
     """
@@ -100,7 +104,10 @@ class UsualSteps:
         step_length_s: float,
         lateral: bool,
         takes_speed: bool,
-        perceive: Callable[[Scene, int, str, int], NDArray[np.generic]] | None,
+        perceive: Callable[[Scene, int, str], NDArray[np.generic]] | None,
+        draft: Draft | None,
+        enter_parts: Callable[[Vehicles, int, Roster], None] | None,
+        shape: tuple[int, ...],
         restore: Callable[[NDArray[np.generic]], object],
         instead_of: Mapping[str, object],
     ) -> None:
@@ -108,14 +115,14 @@ class UsualSteps:
         self._sight, self._events, self._kinematics = sight, events, kinematics
         self._present, self._arrive = present, arrive
         self.apply, self.finish, self.enter = part(apply), part(finish), part(self._enter)
-        shape = kinematics.shape
+        array = np.ndarray, shape, _FLOAT32 if draft is None else _FLOAT64
         self.core = core.UsualSteps(
-            agent, SimpleNamespace(simulationStep=simulate), (np.ndarray, shape, _FLOAT32), shape[0] - 1,
+            agent, SimpleNamespace(simulationStep=simulate), array, kinematics.shape[0] - 1,
             step_length_s, lateral, takes_speed, sight.around, start_m,
         )  # fmt: skip
-        self._perceive = perceive
+        self._perceive, self._enter_parts = perceive, enter_parts
         if perceive is not None:
-            self.core.perceive(self._make_observation, restore)
+            self.core.perceive(self._make_observation, restore, draft)
         self._from_left, self._instead_of = from_left, instead_of
         self._last: StepResult = ({}, {}, {}, {}, {})
         self._rosters: dict[Vehicles, Roster] = {}  # of the scenes that `catch_up` may need
@@ -143,12 +150,14 @@ class UsualSteps:
         while len(self._rosters) > _MAX_ROSTERS:
             del self._rosters[next(iter(self._rosters))]
         self._rosters[seen[0]] = self.roster
+        if self._enter_parts is not None:
+            self._enter_parts(seen[0], row, self.roster)
         return *seen, row, self._controlled
 
-    def _make_observation(self, columns: Columns, time_s: float, row: int, lane: str, step: int) -> NDArray[np.generic]:
+    def _make_observation(self, columns: Columns, time_s: float, row: int, lane: str) -> NDArray[np.generic]:
         assert self._perceive is not None
         scene = Scene(time_s, self.roster, swept=True, core=self._core, columns=columns)
-        return self._perceive(scene, row, lane, step)
+        return self._perceive(scene, row, lane)
 
     def resume(self) -> Scene | None:
         """Bring the core to the state of the simulator; return the scene, or None if that is not possible yet."""
@@ -199,6 +208,7 @@ class UsualSteps:
             sumo.vehicle_getLateralSpeed(agent),
             along,
             sumo.lane_getAngle(lane, along),
+            sumo.lane_getMaxSpeed(lane),
             sumo.vehicle_getDecel(agent),
             "".join(f"{sumo.vehicle_getLaneID(vehicle)}\n" for vehicle in ids),
             sumo.vehicle_getFollower(agent)[0],
@@ -206,7 +216,10 @@ class UsualSteps:
             sumo.simulation_getTime(),
             sumo.simulation_getEmergencyStoppingVehiclesNumber(),
         )
-        return repr(self.core.reads(vehicles)) == repr(read)
+        lights = sumo.trafficlight_getIDList()[:1]
+        states = [sumo.trafficlight_getRedYellowGreenState(light) for light in lights]
+        right = repr(self.core.reads(vehicles)) == repr(read)
+        return right and [self._core.light_state(light) for light in lights] == states
 
     def _scene(self, like: Scene, back: bool, vehicles: Vehicles, time_s: float, lanes: str) -> Scene:
         scene = Scene(

@@ -39,11 +39,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.native import Core, Draft
+    from crashhunt.native import Core, Draft, Vehicles
     from crashhunt.scenario import Scenario
     from crashhunt.sumo._lane_graph import LaneGraph
     from crashhunt.sumo._lane_paths import NearLanesOf
     from crashhunt.sumo._reader_protocol import Moment, Reader
+    from crashhunt.world import Roster
 
 READERS: Mapping[str, type[Reader]] = {
     "actor_ids": ActorIdsReader,
@@ -163,7 +164,7 @@ class ObservedParts:
             if self.core is None or layout.history or layout.reference_share or layout.flat_space.dtype != np.float64:
                 continue
             places = [(layout.begins[name], reader) for name, reader in readers.items()]
-            self._drafts[agent] = self.core.Draft(math.prod(layout.flat_space.shape)), places
+            self._drafts[agent] = self.core.Draft(agent, math.prod(layout.flat_space.shape)), places
 
     def observe(self, agent: str, moment: Moment) -> NDArray[np.generic]:
         """Return the recorded array of an agent's observation."""
@@ -176,13 +177,26 @@ class ObservedParts:
         drafted = self._drafts.get(agent)
         if drafted is not None:
             draft, places = drafted
+            draft.begin(moment.scene.columns, moment.row, moment.lane, moment.scene.time_s)
             for place, reader in places:
-                reader.write(draft, place, moment)
+                if not draft.has(place):
+                    reader.write(draft, place, moment)
             return np.frombuffer(draft.take())
         arrays = self.read(agent, moment)
         if layout.reference_share:
             with_reference_point(arrays, layout.columns, layout.reference_share)
         return layout.flat(self._histories[agent].add(arrays))
+
+    def enter(self, agent: str, vehicles: Vehicles, row: int, roster: Roster) -> None:
+        """Set the vehicles in sight of an agent, in whose observation the core writes from now on."""
+        reader = self._readers[agent].get("actors")
+        if isinstance(reader, ActorsReader):
+            reader.enter(roster.actors)
+        self._drafts[agent][0].enter(vehicles, row)
+
+    def draft(self, agent: str) -> Draft | None:
+        """Return what the core writes an agent's observations into; None if it does not."""
+        return self._drafts[agent][0] if agent in self._drafts else None
 
     def read(self, agent: str, moment: Moment) -> dict[str, NDArray[np.generic]]:
         """Return the parts of an agent's observation, before modifiers."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from itertools import repeat
 from math import cos, sin
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,11 +27,11 @@ from crashhunt.sumo._reader_protocol import Reader
 from crashhunt.world import PERSON, is_person
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from crashhunt.native import Draft, LaneBlock
+    from crashhunt.native import Draft, LaneBlock, Streams
     from crashhunt.simulators import RequestedPart
     from crashhunt.sumo._conflicts import Approach, Conflict
     from crashhunt.sumo._lane_graph import GraphLane, LaneGraph, LaneLink, RouteGuide, Signal
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
     from crashhunt.world import Scene
 
     Array = NDArray[np.float64]
-    _OnLane = tuple[str, int, float, str]  # lane, index on the route, position on the lane in m, route
 
 _WINDOW_M = 24.0  # within a square, the nearest point of a lane moves less along the lane
 _NO_PERSON_M = 1000.0  # the distance of the nearest person where there is none
@@ -67,9 +65,10 @@ class LanesReader(Reader):
         self._window = 2 * math.ceil(_WINDOW_M / self._sampling.grid_m) + 1
         self._paths: dict[tuple[int, int], LanePaths] = {}
         self._key: tuple[object, ...] = ()
-        self._block: _Block
-        self._in_core: LaneBlock
-        self._size = self._lanes, points, self._sampling.before, self._sampling.stride
+        self._block: _Block | None = None
+        self._in_core: LaneBlock | None = None
+        self._place: Place | None = None
+        self._size = self._lanes, points, self._sampling.before, self._sampling.stride, NEAR_M, SQUARE_M
 
     @staticmethod
     def prepare(graph: LaneGraph, request: RequestedPart, vehicle_class: str, near: NearLanesOf) -> None:
@@ -81,7 +80,8 @@ class LanesReader(Reader):
         place = self._setup.places.find(moment)
         if place is None:
             return np.zeros(self._setup.shape)
-        if self._moves_to(place):
+        self._move_to(place, _square_of(place))
+        if self._block is None:
             self._block = _block_of(self._candidates(place), *self._middle, np.arange(self._window))
         block = self._block
         # The squared distances, except for a term that all points have in common.
@@ -104,26 +104,31 @@ class LanesReader(Reader):
 
     def write(self, draft: Draft, at: int, moment: Moment) -> None:
         """Write the columns of ``lanes``."""
-        core, place = self._setup.core, self._setup.places.find(moment)
-        if place is None or core is None:
-            return
-        if self._moves_to(place):
+        place = self._place = self._setup.places.find(moment)
+        if place is not None and not draft.lanes(at, self._block_at, self._size):
+            super().write(draft, at, moment)
+
+    def _block_at(self, column: int, row: int) -> LaneBlock:
+        """Return the candidates for a square, for the core."""
+        core, place = self._setup.core, self._place
+        assert core is not None
+        assert place is not None
+        self._move_to(place, (column, row))
+        if self._in_core is None:
             paths = [
                 None if one is None else (one.rows, one.begin if number < 3 else one.first, one.last)
                 for number, one in enumerate(self._candidates(place))
             ]
             self._in_core = core.LaneBlock(paths, *self._middle, self._window)
-        draft.lanes(at, self._in_core, place.x, place.y, self._limit(place), self._size)
+        return self._in_core
 
-    def _moves_to(self, place: Place) -> bool:
-        """Set the square and the lane; return whether the candidates are not those of the last step."""
-        square = math.floor(place.x / SQUARE_M), math.floor(place.y / SQUARE_M)
+    def _move_to(self, place: Place, square: tuple[int, int]) -> None:
+        """Set the square and the lane, and delete the candidates of another square or lane."""
         key = place.lane, id(place.guide), place.number, square
-        if key == self._key:
-            return False
-        self._key, self._square = key, square
-        self._middle = (square[0] + 0.5) * SQUARE_M, (square[1] + 0.5) * SQUARE_M
-        return True
+        if key != self._key:
+            self._key, self._square = key, square
+            self._middle = (square[0] + 0.5) * SQUARE_M, (square[1] + 0.5) * SQUARE_M
+            self._block = self._in_core = None
 
     def _limit(self, place: Place) -> float:
         """Return the largest squared distance of a lane, without the term that all points have in common, in m²."""
@@ -163,6 +168,10 @@ class LanesReader(Reader):
                 partial(straight_behind, self._graph, vehicle_class=vehicle_class, preferred=before),
             )
         return found
+
+
+def _square_of(place: Place) -> tuple[int, int]:
+    return math.floor(place.x / SQUARE_M), math.floor(place.y / SQUARE_M)
 
 
 def _sampling_of(request: RequestedPart) -> Sampling:
@@ -268,14 +277,13 @@ class RouteReader(Reader):
 
     def write(self, draft: Draft, at: int, moment: Moment) -> None:
         """Write the columns of ``route``."""
-        if self._before:  # the core writes the points ahead only
-            super().write(draft, at, moment)
-            return
         place = self._setup.places.find(moment)
-        if place is not None and place.number >= 0:
-            path = self._path(place)
-            size = self._setup.shape[0], self._sampling.stride
-            draft.route(at, path.rows, (path.begin, path.last), place.x, place.y, size)
+        if place is None or place.number < 0:
+            return
+        path = self._path(place)
+        window = path.begin, path.last, self._setup.shape[0], self._sampling.stride
+        if self._before or not draft.route(at, path.rows, window):  # the core writes the points ahead only
+            super().write(draft, at, moment)
 
     def _path(self, place: Place) -> LanePath:
         key = id(place.guide), place.number
@@ -307,12 +315,36 @@ class RouteStateReader(Reader):
         place = self._setup.places.find(moment)
         if place is None or place.number < 0:
             return np.zeros(self._setup.shape)
+        rest, changes, run, after = self._distances(place)
+        left = -place.position_m + after
+        return np.array((max(0.0, rest + left), changes, max(0.0, run + left), *place.guide.goal))
+
+    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+        """Write the columns of ``route_state``."""
+        place = self._setup.places.find(moment)
+        if place is None or place.number < 0:
+            return
+        rest, changes, run, after = self._distances(place)
+        values = 0.0, changes, 0.0, *place.guide.goal
+        if not draft.along(at, values, [(0, rest, after, 0.0), (2, run, after, 0.0)]):
+            super().write(draft, at, moment)
+
+    @staticmethod
+    def _distances(place: Place) -> tuple[float, int, float, float]:
+        """Return what is left of the route behind the end of the lane, and the changes to its best lane.
+
+        Returns:
+            - The rest of the route, from the start of the lane, in m. Inside a junction, the lane is the next one.
+            - The number of lane changes.
+            - The distance until a lane change is needed, from there, in m.
+            - The distance from the start of the vehicle's lane to there, in m.
+        """
         guide, lane = place.guide, place.lane
-        changes, number, left = 0, place.number, -place.position_m
+        changes, number, after = 0, place.number, 0.0
         if lane.is_internal:
             link = guide.link(number, lane)
             assert link is not None
-            left += lane.data.length_m + link.length_m
+            after = lane.data.length_m + link.length_m
             number, lane = number + 1, guide.graph.lanes[link.target]
         else:
             changes = guide.lane_changes(number, lane)
@@ -322,7 +354,7 @@ class RouteStateReader(Reader):
             rest, run = (guide.rest_m(number, best) if best is not None else 0.0), 0.0
         else:
             rest, run = step.rest_m, step.run_m
-        return np.array((max(0.0, rest + left), changes, max(0.0, run + left), *guide.goal))
+        return rest, changes, run, after
 
 
 class _RowsReader(Reader):
@@ -349,29 +381,48 @@ class SignalsReader(_RowsReader):
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
         self._ahead: dict[tuple[int, int, str], list[Signal]] = {}
-        self._seen: dict[tuple[str, int], tuple[float, float]] = {}  # state of the lights ahead, and since when
+        self._seen: dict[tuple[str, int], list[float]] = {}  # state of the lights ahead, and since when
+
+    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+        """Write the columns of ``signals``."""
+        if not draft.signals(at, self._lights(moment), self._setup.step_length_s):
+            super().write(draft, at, moment)
 
     def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
-        seen, self._seen = self._seen, {}
         found: list[tuple[float, ...]] = []
+        time_s, place = moment.scene.time_s, self._setup.places.find(moment)
+        for distance, light, link, last in self._lights(moment):
+            state = _state_of(light, link)
+            if last[0] != state:  # it changed when the step began
+                last[:] = state, time_s - self._setup.step_length_s
+            assert place is not None
+            found.append((1.0, state, distance - place.position_m, time_s - last[1]))
+        return found
+
+    def _lights(self, moment: Moment) -> list[tuple[float, str, int, list[float]]]:
+        """Return the lights ahead: distance from the start of the lane, id, link, and the state with its beginning.
+
+        The core may change the states.
+        """
+        seen, self._seen = self._seen, {}
         place = self._setup.places.find(moment)
         if place is None or place.number < 0:
-            return found
+            return []
         key = id(place.guide), place.number, place.lane.id
         ahead = self._ahead.get(key)
         if ahead is None:
             ahead = self._ahead[key] = place.guide.signals(place.number, place.lane, self._setup.limit)
-        time_s = moment.scene.time_s
-        for distance, light, link in ahead:
-            state = SIGNAL_STATES.get(sumo.trafficlight_getRedYellowGreenState(light)[link], _OFF)
+        for _, light, link in ahead:
             last = seen.get((light, link))
             if last is None:
-                last = state, time_s - _time_in_state(light, link, state)
-            elif last[0] != state:  # it changed when the step began
-                last = state, time_s - self._setup.step_length_s
+                state = _state_of(light, link)
+                last = [state, moment.scene.time_s - _time_in_state(light, link, state)]
             self._seen[light, link] = last
-            found.append((1.0, state, distance - place.position_m, time_s - last[1]))
-        return found
+        return [(distance, light, link, self._seen[light, link]) for distance, light, link in ahead]
+
+
+def _state_of(light: str, link: int) -> float:
+    return SIGNAL_STATES.get(sumo.trafficlight_getRedYellowGreenState(light)[link], _OFF)
 
 
 def _time_in_state(light: str, link: int, state: float) -> float:
@@ -429,6 +480,25 @@ class RightOfWayReader(_RowsReader):
         super().__init__(setup)
         self._graph = setup.graph
         self._takes: dict[tuple[int, str, int, str], list[tuple[Conflict, float]]] = {}
+        self._streams: dict[int, Streams] = {}  # of the core, by the identity of the approaches
+
+    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+        """Write the columns of ``right_of_way``."""
+        place, core = self._setup.places.find(moment), self._setup.core
+        path = path_from(place) if place is not None else None
+        approaches = self._setup.conflicts.around(path[0]) if path is not None else {}
+        if path is None or core is None or not approaches:
+            return
+        link, line = path
+        streams = self._streams.get(id(approaches))
+        if streams is None:
+            streams = self._streams[id(approaches)] = core.Streams(
+                tuple(approaches), partial(self._taken_by, approaches)
+            )
+        facts = line, float(link.state in _STOP_STATES), self._setup.limit
+        is_usual = not moment.hidden and link.state != _ALLWAY_STOP
+        if not (is_usual and draft.right_of_way(at, streams, facts)):
+            super().write(draft, at, moment)
 
     def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
         place = self._setup.places.find(moment)
@@ -439,21 +509,16 @@ class RightOfWayReader(_RowsReader):
         approaches = self._setup.conflicts.around(link)
         if not approaches:
             return []
-        scene, row, core = moment.scene, moment.row, self._setup.core
+        scene, row = moment.scene, moment.row
         actors = scene.roster.actors
-        present: Iterable[tuple[int, _OnLane | None]] | None = None
-        if core is not None and scene.columns is not None:
-            read = core.rows_on_lanes(scene.columns, approaches)
-            present = None if read is None else [(one[0], one[1:]) for one in read]
         front = -line
         rear = front - actors[row].length
         stop_sign = float(link.state in _STOP_STATES)
         rows, speeds = [], scene.speeds
-        for other, state in zip(range(len(actors)), repeat(None)) if present is None else present:
-            actor = actors[other]
+        for other, actor in enumerate(actors):
             if other == row or actor.id in moment.hidden:
                 continue
-            taken, position = self._taken(actor.id, state, scene, other, approaches)
+            taken, position = self._taken(actor.id, scene, other, approaches)
             best = None
             for conflict, offset in taken:
                 place_m = offset + position
@@ -483,7 +548,7 @@ class RightOfWayReader(_RowsReader):
         return conflict._replace(other_begin_m=begin, other_end_m=end), length - position
 
     def _taken(
-        self, name: str, state: _OnLane | None, scene: Scene, row: int, approaches: Mapping[str, list[Approach]]
+        self, name: str, scene: Scene, row: int, approaches: Mapping[str, list[Approach]]
     ) -> tuple[Sequence[tuple[Conflict, float]], float]:
         """Return the conflicting paths that an actor takes, and the position of its front on its lane, in m.
 
@@ -491,7 +556,6 @@ class RightOfWayReader(_RowsReader):
 
         Args:
             name: identifier of the actor.
-            state: lane of the actor, and its place; None if they are not known yet.
             scene: the scene.
             row: row of the actor.
             approaches: the lanes from which actors come into conflict with the path of the vehicle.
@@ -504,24 +568,28 @@ class RightOfWayReader(_RowsReader):
                 return [
                     self._on_crossing(one.conflict, lane, position, heading) for one in approaches.get(lane, ())
                 ], 0.0
-            if state is None:
-                lane = sumo.vehicle_getLaneID(name)
-                state = (lane, *_on_route(name)) if lane in approaches else None
-            if state is None:
+            lane = sumo.vehicle_getLaneID(name)
+            if lane not in approaches:
                 return (), 0.0
-            lane, number, position, route = state
-            key = id(approaches), lane, number, route
+            number, position = sumo.vehicle_getRouteIndex(name), sumo.vehicle_getLanePosition(name)
+            key = id(approaches), lane, number, sumo.vehicle_getRouteID(name)
             found = self._takes.get(key)
             if found is None:
-                edges = tuple(sumo.vehicle_getRoute(name))
-                found = self._takes[key] = [
-                    (one.conflict, one.offset_m)
-                    for one in approaches[lane]
-                    if one.back < 0 or edges[number + one.back : number + one.back + 2] == one.edges
-                ]
+                found = self._takes[key] = _paths_of(name, approaches[lane], number)
         except libsumo.TraCIException:  # an actor of a recording that is played back
             return (), 0.0
         return found, position
+
+    def _taken_by(
+        self, approaches: Mapping[str, list[Approach]], name: str, lane: str, number: int, _: str
+    ) -> list[tuple[bool, float, float, float, float, float, str, int]]:
+        """Return the conflicting paths that a vehicle takes, for the core."""
+        found = []
+        for conflict, offset in _paths_of(name, approaches[lane], number):
+            other = conflict.link
+            light = (other.signal, other.signal_index) if other is not None and other.signal else ("", 0)
+            found.append((*conflict[:5], offset, *light))
+        return found
 
     def _goes_first(
         self, link: LaneLink, line: float, name: str, conflict: Conflict, place_m: float, arrival: float
@@ -541,10 +609,20 @@ class RightOfWayReader(_RowsReader):
         return True
 
 
-def _on_route(vehicle: str) -> tuple[int, float, str]:
-    """Return a vehicle's index on its route, its position on its lane in m, and its route."""
-    number, position = sumo.vehicle_getRouteIndex(vehicle), sumo.vehicle_getLanePosition(vehicle)
-    return number, position, sumo.vehicle_getRouteID(vehicle)
+def _paths_of(vehicle: str, approaches: Sequence[Approach], number: int) -> list[tuple[Conflict, float]]:
+    """Return the conflicting paths that a vehicle takes, each with the distance from its stop line to the lane, in m.
+
+    Args:
+        vehicle: identifier of the vehicle.
+        approaches: the conflicting paths on its lane.
+        number: index of its edge on its route.
+    """
+    edges = tuple(sumo.vehicle_getRoute(vehicle))
+    return [
+        (one.conflict, one.offset_m)
+        for one in approaches
+        if one.back < 0 or edges[number + one.back : number + one.back + 2] == one.edges
+    ]
 
 
 def path_across(place: Place) -> tuple[LaneLink, float] | None:
@@ -552,16 +630,22 @@ def path_across(place: Place) -> tuple[LaneLink, float] | None:
 
     The distance is negative behind the stop line. The result is None if the lane does not lead along the route.
     """
+    found = path_from(place)
+    return None if found is None else (found[0], found[1] - place.position_m)
+
+
+def path_from(place: Place) -> tuple[LaneLink, float] | None:
+    """Return the path across the next junction, or the present one, and the stop line's position on the lane, in m."""
     lane = place.lane
     link = place.guide.link(place.number, lane) if place.number >= 0 else None
     if link is None:
         return None
     if not lane.is_internal:
-        return link, lane.data.length_m - place.position_m
+        return link, lane.data.length_m
     entry = next((one for _, one in lane.entries if one.target == link.target), None)
     if entry is None:
         return None
-    return entry, -(entry.length_m - link.length_m - lane.data.length_m) - place.position_m
+    return entry, -(entry.length_m - link.length_m - lane.data.length_m)
 
 
 class CrossingsReader(_RowsReader):
@@ -614,10 +698,19 @@ class StopLineReader(Reader):
         path = path_across(place) if place is not None else None
         if path is None:
             return np.zeros(self._setup.shape)
-        link, line = path
+        return np.array(self._values(*path), float)
+
+    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+        """Write the columns of ``stop_line``."""
+        place = self._setup.places.find(moment)
+        path = path_from(place) if place is not None else None
+        if path is not None and not draft.along(at, self._values(*path), [(1, 0.0, path[1], -math.inf)]):
+            super().write(draft, at, moment)
+
+    def _values(self, link: LaneLink, line: float) -> tuple[float, ...]:
         around = self._setup.conflicts.around(link)
         yields = any(one.conflict.must_yield for approaches in around.values() for one in approaches)
-        return np.array((1.0, line, yields, link.state in _STOP_STATES, bool(link.signal)), float)
+        return 1.0, line, yields, link.state in _STOP_STATES, bool(link.signal)
 
 
 class SpeedLimitReader(Reader):
@@ -626,3 +719,8 @@ class SpeedLimitReader(Reader):
     def observe(self, moment: Moment) -> Array:
         """Return the speed limit, which can differ from that of the network file while a sign changes it."""
         return np.array((float(sumo.lane_getMaxSpeed(moment.lane)),))
+
+    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+        """Write the speed limit."""
+        if not draft.speed_limit(at):
+            super().write(draft, at, moment)

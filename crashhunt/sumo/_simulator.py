@@ -8,7 +8,6 @@ from types import MethodType
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import libsumo
-import numpy as np
 
 # The package's own functions each wrap one of these in a Python call, which doubles the cost of a getter; a step reads
 # some two hundred values.
@@ -57,6 +56,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.base.errors import EpisodeError
@@ -219,7 +219,6 @@ class SumoSimulator:
         self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
         self._last_lanes: dict[str, tuple[str, int]] = {}
         self._steps = 0
-        self._perceived: tuple[int, NDArray[np.generic]] = -1, np.zeros(0)
         self._kinematics.hidden.clear()
         self._off_road: list[str] = []
         steering = {agent: motion.steering for agent, motion in self._driving.moving.items()}
@@ -454,7 +453,7 @@ class SumoSimulator:
         core, plain = self._sight.core, type(self) is SumoSimulator and not self.scripted and self._taking_part is None
         if core is None or not plain or len(self.agents) != 1 or self._drifts:
             return None
-        has_parts = self.agents[0] in self.observation_layouts
+        has_parts, draft = self.agents[0] in self.observation_layouts, self._parts.draft(self.agents[0])
         if not (has_parts or self._kinematics.usual):
             return None
         if self._lateral and self._driving.left_hand:
@@ -488,16 +487,17 @@ class SumoSimulator:
             lateral=self._lateral,
             takes_speed=type(self.actions[agent]) is SpeedAndLaneChange,
             perceive=self._perceive if has_parts else None,
+            draft=draft,
+            enter_parts=None if draft is None else partial(self._parts.enter, agent),
+            shape=self._parts.layouts[agent].flat_space.shape if has_parts else self._kinematics.shape,
             restore=partial(self.restore_observation, agent),
             instead_of={"actions": self.actions, **own},
         )
 
-    def _perceive(self, scene: Scene, row: int, lane: str, step: int) -> NDArray[np.generic]:
+    def _perceive(self, scene: Scene, row: int, lane: str) -> NDArray[np.generic]:
         """Return the parts that the only agent observes after a step, which the core may yet leave to this object."""
         moment = Moment(scene=scene, row=row, lane=lane, hidden=frozenset())
-        found = self._parts.observe(self.agents[0], moment)
-        self._perceived = step, found
-        return found
+        return self._parts.observe(self.agents[0], moment)
 
     def _infos(self, agents: Iterable[str]) -> dict[str, Info]:
         """Return the info of each agent: the identifiers of the actors in the rows of ``actors``, if it has them."""
@@ -567,8 +567,9 @@ class SumoSimulator:
         self._last_lanes[agent] = edge, lane
         self._scene.agent_lanes[agent] = f"{edge}_{lane}"
         if agent in self.observation_layouts:
-            if self._perceived[0] == self._steps:  # readers keep state, so they read each step once
-                return self._perceived[1]
+            perceived = None if self.at_once is None else self.at_once.core.perceived(self._steps)
+            if perceived is not None:  # readers keep state, so they read each step once
+                return perceived
             moment = Moment(
                 scene=self._scene, row=row, lane=f"{edge}_{lane}", hidden=self._kinematics.hidden_from(agent)
             )

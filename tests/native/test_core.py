@@ -576,6 +576,15 @@ def run(tmp_path):
 
 PARTS = ("ego", "actors", "lanes", "route", "route_state", "signals", "right_of_way", "stop_line", "lidar2d")
 
+WRITTEN_AGAIN = (
+    "ego",
+    "actors",
+    "lanes",
+    "route",
+    "signals",
+    "right_of_way",
+)  # in most steps, the core needs no Python
+
 
 class _StopsAndGoes:
     """Stops again and again, with which steps are handed back to Python after they have been observed."""
@@ -592,6 +601,8 @@ class _StopsAndGoes:
     ("scenario", "parts"),
     [
         ("intersection", PARTS),
+        ("intersection", WRITTEN_AGAIN),
+        ("loop", WRITTEN_AGAIN),
         ("motorway", ("actors:rows=3:radius=60", "lanes:lanes=2:points=9:spacing=3.3", "route:points=200", "ego")),
         ("loop-two-agents", ("ego", "actors", "lanes:lanes=30:behind=0")),
         ("loop", ("ego", "actors", "grid:rows=9:columns=9", "history:steps=2")),
