@@ -247,7 +247,7 @@ def import_module(name: str, *, shown: str = "", installed: bool = False) -> typ
         )
     if not installed:
         add_current_folder().prefer(name)
-    outer = getattr(_importing, "name", "")
+    outer = _importing.name
     _importing.name = name
     try:
         return importlib.import_module(name)
@@ -259,7 +259,11 @@ def import_module(name: str, *, shown: str = "", installed: bool = False) -> typ
         _importing.name = outer
 
 
-_importing = threading.local()  # `name`: the module that `import_module` imports in a thread
+class _Importing(threading.local):
+    name = ""  # of the module that `import_module` imports in this thread
+
+
+_importing = _Importing()
 
 
 def refuse_while_importing() -> None:
@@ -268,7 +272,7 @@ def refuse_while_importing() -> None:
     Raises:
         HuntWhileImportingError: a module is being imported.
     """
-    if name := getattr(_importing, "name", ""):
+    if name := _importing.name:
         raise HuntWhileImportingError(
             f"the module {name!r} starts a hunt when it is imported",
             fix='put the call below: if __name__ == "__main__":',

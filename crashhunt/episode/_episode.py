@@ -102,7 +102,6 @@ MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 Reset = Callable[..., "tuple[Observations, Info]"]
 """What `Simulator.reset` is: called with ``seed`` and ``options``."""
 
-_RUNS_LATER = inspect.CO_GENERATOR | inspect.CO_COROUTINE | inspect.CO_ASYNC_GENERATOR  # flags of functions
 _ACTION_BOUNDARY = Boundary(Party.SIMULATOR, "action conversion")
 _MAP_BOUNDARY = Boundary(Party.ORACLE, "see_map")
 ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # never written to
@@ -514,9 +513,9 @@ def _refuse_without(agent: Agent, method: str, argument: str) -> None:
     found = getattr(agent, method, None)
     if not callable(found):
         raise ValueError(f"it has no method {method}({argument})")
-    flags = getattr(getattr(found, "__code__", None), "co_flags", 0)
-    if flags & _RUNS_LATER:
-        what = "yields" if flags & inspect.CO_GENERATOR else "is async"
+    yields = inspect.isgeneratorfunction(found)
+    if yields or inspect.iscoroutinefunction(found) or inspect.isasyncgenfunction(found):
+        what = "yields" if yields else "is async"
         fix = "define it with def, without yield"
         raise ValueError(f"its method {method}({argument}) {what}, so a call does not run it; {fix}")
 

@@ -38,18 +38,20 @@ if TYPE_CHECKING:
         MotionState as MotionState,
     )
     from ._kinematics_observation import Kinematics as Kinematics, Unseen as Unseen, kind_number as kind_number
+    from ._observation_layout import (
+        History as History,
+        ObservationLayout as ObservationLayout,
+        RequestedPart as RequestedPart,
+        layouts_of as layouts_of,
+        parse_parts as parse_parts,
+    )
     from ._observation_parts import (
         MODIFIERS as MODIFIERS,
         PARTS as PARTS,
         REACH_M as REACH_M,
         REFERENCE_SHARES as REFERENCE_SHARES,
         SCENE_PARTS as SCENE_PARTS,
-        History as History,
-        ObservationLayout as ObservationLayout,
-        RequestedPart as RequestedPart,
         Setting as Setting,
-        layouts_of as layouts_of,
-        parse_parts as parse_parts,
     )
     from ._protocol import (
         FACULTIES as FACULTIES,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.foreign_code import Party
     from crashhunt.native import UsualSteps, Vehicles
-    from crashhunt.simulators._observation_parts import ObservationLayout
+    from crashhunt.simulators._observation_layout import ObservationLayout
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Lane, Motion, Neighbor, Paths, RoadMap, Roster, Scene, Surroundings, VehicleData
 

@@ -12,7 +12,8 @@ import numpy as np
 from crashhunt.base.errors import UsageError
 from crashhunt.simulators._bicycle_model import WHEELBASE_SHARE
 from crashhunt.simulators._kinematics_observation import kind_number
-from crashhunt.simulators._observation_parts import REACH_M, SCENE_PARTS, History, layouts_of
+from crashhunt.simulators._observation_layout import History, layouts_of
+from crashhunt.simulators._observation_parts import REACH_M, SCENE_PARTS
 from crashhunt.simulators._scene_parts import (
     ActorNumbers,
     RayCaster,
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import AgentSetup
-    from crashhunt.simulators._observation_parts import RequestedPart
+    from crashhunt.simulators._observation_layout import RequestedPart
     from crashhunt.simulators._scene_parts import NearActor
     from crashhunt.world import Scene
 

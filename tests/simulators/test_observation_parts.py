@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 from crashhunt.base.errors import UsageError
 from crashhunt.scenario import AgentSetup
 from crashhunt.simulators import PARTS, History, ObservationForm, ObservationLayout, parse_parts
-from crashhunt.simulators._observation_parts import modifiers_of
+from crashhunt.simulators._observation_layout import modifiers_of
 from crashhunt.simulators._scene_observation import SceneObserver
 
 
