@@ -435,10 +435,17 @@ PARTS: Mapping[str, Part] = {
             axes=("rows",),
             columns=(
                 _PRESENT,
-                _distance("distance", "distance of the front bumper to the crossing, negative if it is behind"),
+                _distance(
+                    "distance",
+                    "distance of the front bumper to the conflict area, as in ``right_of_way``, which begins up to "
+                    "1.5 m before the crossing; negative if it is behind",
+                ),
                 _flag("must_yield", "1 if the controlled vehicle must yield to persons on the crossing"),
                 Column("persons", "", 0.0, 1e6, "number of persons within ``near`` of the crossing's centre line"),
-                _distance("nearest", "distance of the nearest person to where the paths cross; 1000 without a person"),
+                _distance(
+                    "nearest",
+                    "distance of the nearest person to the middle of this area on the crossing; 1000 without a person",
+                ),
             ),
             settings=(
                 Setting("rows", 4, 1, 50, "", "number of rows"),

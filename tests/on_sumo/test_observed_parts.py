@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from contextlib import closing
@@ -385,6 +386,29 @@ def must_yield(net, lane, target, crossing):
     return int(junction.find(f"request[@index='{index}']").get("response")[-1 - inside.index(crossing)])
 
 
+@functools.cache
+def area_on(net, lane, target, crossing):
+    """Where a lane ends, where its way to an edge meets a crossing, and the middle of this area on the crossing."""
+    (start,) = (one for one in net.getLane(lane).getOutgoing() if one.getTo().getID() == target)
+    path, via = [], start.getViaLaneID()
+    while via:
+        path += [point[:2] for point in net.getLane(via).getShape()]
+        via = next((one.getViaLaneID() for one in net.getLane(via).getOutgoing()), "")
+    (mine, along), (theirs, across) = densely(path), densely(crossing)
+    close = ((mine[:, None] - theirs[None]) ** 2).sum(axis=2) < (0.8 * (3.2 + 4.0) / 2) ** 2
+    ends = across[close.any(axis=0)][[0, -1]]
+    middle = [np.interp(ends.mean(), across, theirs[:, axis]) for axis in (0, 1)]
+    return net.getLane(lane).getLength(), along[close.any(axis=1)][0], middle
+
+
+def densely(line):
+    """Points every 2 cm along a line, and their distances from its start."""
+    points = np.array(line)
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+    at = np.arange(0.0, along[-1], 0.02)
+    return np.column_stack([np.interp(at, along, points[:, axis]) for axis in (0, 1)]), at
+
+
 @pytest.mark.parametrize(("target", "second"), [("cd", ":c_c1_0"), ("cs", ":c_c2_0")])
 def test_crossings_show_the_persons_near_them(target, second, tmp_path):
     """Persons, distances and their order by SUMO's own shapes and positions."""
@@ -397,7 +421,7 @@ def test_crossings_show_the_persons_near_them(target, second, tmp_path):
     (tmp_path / "scenario.toml").write_text(CROSSING_TOWN)
     net = sumolib.net.readNet(str(NETS / "walks.net.xml"), withInternal=True, withPedestrianConnections=True)
     crossings = (":c_c3_0", second)
-    lines = [[point[:2] for point in net.getLane(name).getShape()] for name in crossings]
+    lines = [tuple(point[:2] for point in net.getLane(name).getShape()) for name in crossings]
     (tmp_path / "stage").mkdir()
     with closing(SumoSimulator(load_scenario(str(tmp_path)), tmp_path / "stage")) as simulator:
         people, yields = 0, False
@@ -414,17 +438,16 @@ def test_crossings_show_the_persons_near_them(target, second, tmp_path):
                 angle = math.radians(90.0 - libsumo.person.getAngle(person))
                 half = libsumo.person.getLength(person) / 2
                 middles.append((x - half * math.cos(angle), y - half * math.sin(angle)))
-            front = libsumo.vehicle.getPosition("ego")
             for row, line, crossing in zip(rows, lines, crossings, strict=False):
                 away = [sumolib.geomhelper.distancePointToPolygon(one, line) for one in middles]
                 assert row[3] == sum(one <= 5.0 for one in away)
-                assert min([1000.0, *away]) <= row[4] + 1e-6
+                stop_line, begin, middle = area_on(net, lane, target, line)
+                assert row[1] == pytest.approx(stop_line - libsumo.vehicle.getLanePosition("ego") + begin, abs=0.1)
+                nearest = min((math.dist(middle, one) for one in middles), default=1000.0)
+                assert row[4] == pytest.approx(nearest, abs=0.1)
                 people += int(row[3])
                 yields |= bool(row[2])
                 assert row[2] == must_yield(net, lane, target, crossing)
-                if abs(row[1]) < 0.3:  # 0.8 of the mean width of lane and crossing
-                    gap = sumolib.geomhelper.distancePointToPolygon(front, line)
-                    assert 1.5 < gap < 0.8 * (3.2 + 4.0) / 2 + 0.6
         assert people > 20
         assert yields == (target == "cs")  # who turns gives way
 
