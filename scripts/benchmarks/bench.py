@@ -172,7 +172,7 @@ def child_step(scenario: str, observation: str = "") -> dict[str, float]:
         arguments = argument_values(chosen)
         spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments=arguments, max_steps=steps)
 
-        def whole(*, parts: bool = False) -> float:
+        def whole(*, parts: bool = False) -> tuple[float, int]:
             box.begin(pid=os.getpid(), trial=0, started=time.monotonic())
             with FastEpisode(
                 spec,
@@ -189,7 +189,8 @@ def child_step(scenario: str, observation: str = "") -> dict[str, float]:
                 began = clock()
                 while result is None:
                     result = episode.step()
-                return (clock() - began) / max(1, result.steps)
+                taken = max(1, result.steps)
+                return (clock() - began) / taken, taken
 
         def bare() -> tuple[float, float]:
             simulator.reset(seed=spec.seed, options={"arguments": arguments})
@@ -205,7 +206,7 @@ def child_step(scenario: str, observation: str = "") -> dict[str, float]:
                     present = [agent for agent in agents if agent in libsumo.vehicle.getIDList()]
             return (clock() - began) / taken, vehicles / taken
 
-        rounds = [(whole(), *bare()) for _ in range(7)]
+        rounds = [(whole()[0], *bare()) for _ in range(7)]
         for owner, name, label in (
             (libsumo, "simulationStep", "simulate"),
             (KeepLaneWithSpeed, "act", "agent"),
@@ -219,9 +220,9 @@ def child_step(scenario: str, observation: str = "") -> dict[str, float]:
             (Recorder, "end", "digest"),
         ):
             setattr(owner, name, timed(getattr(owner, name), label))
-        total = whole(parts=True) * steps
-    found = {f"part {label}": 1e6 * seconds / steps for label, seconds in spent.items()}
-    found["part everything else"] = 1e6 * total / steps - sum(found.values())
+        total, taken = whole(parts=True)
+    found = {f"part {label}": 1e6 * seconds / taken for label, seconds in spent.items()}
+    found["part everything else"] = 1e6 * total - sum(found.values())
     return {
         "ratio": statistics.median(ours / theirs for ours, theirs, _ in rounds),
         "vehicles": rounds[0][2],
