@@ -205,6 +205,16 @@ def test_an_import_that_fails_states_where(tmp_path, monkeypatch, content, name,
     assert says in str(caught.value)
 
 
+def test_current_folder_has_no_module_of_python_or_of_a_dependency(tmp_path):
+    finder = CurrentFolder()
+    finder.folder = str(tmp_path)
+    for name in ("helper", "json", "numpy", "PIL", "tomli_w", "mcap_protobuf"):
+        (tmp_path / f"{name}.py").touch()
+    assert [name for name in ("json", "numpy", "PIL", "tomli_w", "mcap_protobuf") if finder.find_spec(name)] == []
+    assert finder.find_spec("helper").origin == str(tmp_path / "helper.py")
+    assert finder.find_spec("helper", []) is None  # a module of a package
+
+
 def test_clone_in_the_current_folder_is_reported_where_the_installed_package_is_used(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     installed = SimpleNamespace(__name__="highway_env", __file__="/v/lib/site-packages/highway_env/__init__.py")
