@@ -117,11 +117,7 @@ def manoeuvres_of(recording: Recording, actor: str, lanes: LaneMap, end: int) ->
             found.append(Manoeuvre(actor=actor, what=what, step=steps[place], speed=float(speeds[place])))
     place = _change(recording, scenes, actor, lanes)
     if place is not None:
-        found.append(
-            Manoeuvre(
-                actor=actor, what="changed lanes", step=steps[place], speed=float(speeds[min(place, len(speeds) - 1)])
-            )
-        )
+        found.append(Manoeuvre(actor=actor, what="changed lanes", step=steps[place], speed=float(speeds[place])))
     return found
 
 
