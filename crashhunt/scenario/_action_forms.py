@@ -181,47 +181,58 @@ _TRACKER = ActionSetting(
     help="pure_pursuit: a kinematic bicycle model steers to a point ahead on the trajectory",
 )
 
+_VISIBLE = ActionSetting(
+    name="visible",
+    default="front",
+    choices=("front", "outline"),
+    help="the part of the vehicle that others react to: outline includes the part in other lanes than its front's. "
+    "Hunts set outline, unless the form has this setting",
+)
+
 ACTIONS: dict[str, ActionDescription] = {
     "speed_and_lane": ActionDescription(
         title="Target speed, and a lane change that takes one step. The default.",
         components=(_TARGET_SPEED, _LANE_CHANGE),
         second_changes_lane=True,
-        settings=(_LANE_CHANGE_DURATION,),
+        settings=(_LANE_CHANGE_DURATION, _VISIBLE),
     ),
     "speed_and_lateral": ActionDescription(
         title="Target speed, and speed across the lane: the vehicle drifts into the next lane gradually.",
         components=(_TARGET_SPEED, _LATERAL_SPEED),
         second_changes_lane=True,
+        settings=(_VISIBLE,),
     ),
     "meta": ActionDescription(title="One of highway-env's five meta-actions.", components=(_META_ACTION,)),
     "acceleration": ActionDescription(
         title="Acceleration, and a lane change that takes one step.",
         components=(_ACCELERATION, _LANE_CHANGE),
         second_changes_lane=True,
-        settings=(_LANE_CHANGE_DURATION,),
+        settings=(_LANE_CHANGE_DURATION, _VISIBLE),
     ),
     "acceleration_steering": ActionDescription(
         title="Acceleration and steering angle of a kinematic bicycle model; the vehicle moves freely.",
         components=(_ACCELERATION, _STEERING_ANGLE),
         moves_freely=True,
+        settings=(_VISIBLE,),
     ),
     "throttle_brake_steering": ActionDescription(
         title="Pedals and steering of a kinematic bicycle model; the vehicle moves freely.",
         components=(_THROTTLE, _BRAKE, _STEERING),
         moves_freely=True,
+        settings=(_VISIBLE,),
     ),
     "trajectory": ActionDescription(
         title="Points with time, pose and speed, followed by interpolation; the vehicle moves freely.",
         components=(_TIME, _X, _Y, _HEADING, _SPEED),
         shape="K rows of time, x, y, heading, speed; K up to 64",
         moves_freely=True,
-        settings=(_FRAME, _REFERENCE_POINT, _TRACKER),
+        settings=(_FRAME, _REFERENCE_POINT, _TRACKER, _VISIBLE),
     ),
     "target_pose": ActionDescription(
         title="A pose to reach at a time, on a smooth curve; the vehicle moves freely.",
         components=(_X, _Y, _HEADING, _TIME),
         moves_freely=True,
-        settings=(_FRAME, _REFERENCE_POINT),
+        settings=(_FRAME, _REFERENCE_POINT, _VISIBLE),
     ),
     "sumo": ActionDescription(
         title="SUMO's driver model drives. None leaves the whole step to it; a speed or lane change overrides it.",
@@ -271,6 +282,36 @@ def action_settings(name: str | None, where: str = "") -> dict[str, float | str]
             raise UsageError(f"{where}: {form}:{setting} is {word!r}", fix=fix)
         values[setting] = value
     return values
+
+
+def with_visible_outline(name: str | None) -> str | None:
+    """Return a form of actions whose vehicle other vehicles see as a whole, unless the form names another choice.
+
+    Without the setting, a form means what it meant before the setting existed, so recorded trials keep their meaning.
+    New hunts state the setting. They record the choice ``visible=front`` as the form without the setting.
+
+    Args:
+        name: name of a valid form and its settings; None for the default form.
+    """
+    if name is None or not can_be_in_two_lanes(name):
+        return name
+    front = f":{_VISIBLE.name}={_VISIBLE.default}"
+    if f":{_VISIBLE.name}=" in name:
+        return name.replace(front, "")
+    return f"{name}:{_VISIBLE.name}=outline"
+
+
+def with_stated_choice(name: str) -> str:
+    """Return the form that `with_visible_outline` turns into a recorded form of actions."""
+    is_stated = not name or not can_be_in_two_lanes(name) or f":{_VISIBLE.name}=" in name
+    return name if is_stated else f"{name}:{_VISIBLE.name}={_VISIBLE.default}"
+
+
+def can_be_in_two_lanes(name: str) -> bool:
+    """Return whether a vehicle with a form of actions can stay in two lanes for several steps."""
+    form = canonical_action(name)
+    is_free = ACTIONS[form].moves_freely or form == "speed_and_lateral"
+    return is_free or bool(action_settings(name).get("lane_change_duration_s"))
 
 
 def check_action(name: str | None, returned: Sequence[str], agent: str) -> None:

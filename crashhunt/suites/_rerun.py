@@ -27,7 +27,7 @@ from crashhunt.plans import (
     takes_of,
 )
 from crashhunt.results import HuntState, hunt_state
-from crashhunt.scenario import load_scenario, shipped_scenarios
+from crashhunt.scenario import load_scenario, shipped_scenarios, with_stated_choice
 from crashhunt.snapshots import latest_snapshot
 from crashhunt.suites._processes import (
     REQUEST,
@@ -124,13 +124,14 @@ def _request_of(settings: HuntSettings) -> Request:
         for name, spec in chosen.arguments.items()
     }
     options = {name: getattr(settings, name) for name in fields_of(TrialOptions)}
+    actions = {with_stated_choice(chosen.action or "") for chosen in settings.agents.values()}
     return Request(
         **asdict(settings.run),
         **{**options, "crash_on": settings.crash_on_words, "disturb": settings.disturb or (NONE,)},
         trials=settings.trials,
         max_steps=settings.max_steps,
         scenario=settings.scenario,
-        action=next((chosen.action for chosen in settings.agents.values() if chosen.action), ""),
+        action=actions.pop() if len(actions) == 1 else "",  # otherwise the scenario or the agents name the forms
         observe=next((chosen.observation for chosen in settings.agents.values() if chosen.observation), ()),
         agents={agent: chosen.agent for agent, chosen in settings.agents.items()},
         arguments=arguments,

@@ -6,7 +6,8 @@ agent's action. Such a call raises an `ActionError` in the agent, and SUMO does 
 hides the error, the next step raises it again.
 
 Calls of crashhunt, of a user's simulator, oracle or disturbance, and of a program that uses the environment of
-Gymnasium, are not restricted. The nearest function of crashhunt on the stack shows whether an agent calls. Only
+Gymnasium, are not restricted. If such a call of a user's code commands the speed of a vehicle, `Followers` leaves this
+vehicle alone. The nearest function of crashhunt on the stack shows whether an agent calls. Only
 functions that change something are wrapped, so reading costs nothing.
 """
 
@@ -36,12 +37,17 @@ _CALLERS_OF_AGENTS = {
 }
 """The functions that call agents, by module."""
 _STEP = "simulation.step"
+_SPEED_COMMANDS = {"vehicle.setSpeed", "vehicle.setSpeedMode", "vehicle.slowDown", "vehicle.setAcceleration"}
+
+commanded_elsewhere: set[str] = set()
+"""The vehicles whose speed a user's code commands in this episode."""
 _refused: list[ActionError] = []
 """The error of the first call of an agent that was refused, until the next step or episode."""
 
 
 def forget_calls() -> None:
     """Forget the calls of the last episode."""
+    commanded_elsewhere.clear()
     _refused.clear()
 
 
@@ -60,17 +66,27 @@ def _guarded(name: str, function: Callable[..., object]) -> Callable[..., object
     @functools.wraps(function)
     def call(*given: object, **named: object) -> object:
         caller = sys._getframe(1)
-        if not caller.f_globals.get("__name__", "").startswith("crashhunt.sumo.") and _is_by_agent(caller):
-            shown = name.replace(_STEP, "simulationStep").replace("simulation.close", "close")
-            message = f"the agent called libsumo's {shown}, which changes the simulation"
-            error = ActionError(message, fix="return an action; agents may only read the simulation")
-            _refused[:] = _refused or [error]
-            raise error
+        if not caller.f_globals.get("__name__", "").startswith("crashhunt.sumo."):
+            if _is_by_agent(caller):
+                shown = name.replace(_STEP, "simulationStep").replace("simulation.close", "close")
+                message = f"the agent called libsumo's {shown}, which changes the simulation"
+                error = ActionError(message, fix="return an action; agents may only read the simulation")
+                _refused[:] = _refused or [error]
+                raise error
+            if name in _SPEED_COMMANDS:
+                _note_command(*given, **named)
         if _refused and name == _STEP:
             raise _refused.pop()
         return function(*given, **named)
 
     return call
+
+
+def _note_command(vehicle: object = "", speed: object = 0.0, *_: object, **named: object) -> None:
+    """Note that a user's code commands the speed of a vehicle, or returns it to SUMO by a negative speed."""
+    vehicle, speed = named.get("vehID", vehicle), named.get("speed", speed)
+    is_returned = isinstance(speed, int | float) and speed < 0
+    (commanded_elsewhere.discard if is_returned else commanded_elsewhere.add)(str(vehicle))
 
 
 def _is_by_agent(caller: FrameType | None) -> bool:

@@ -423,9 +423,9 @@ class _Slows(VehicleCommand):
         self._change = next(self._changes, self._change)
         speed = sumo.vehicle_getSpeed(self._vehicle)
         if speed < self._target:  # a slower vehicle is ahead; SUMO limits the commanded speed to a safe speed
-            sumo.vehicle_setSpeed(self._vehicle, min(self._target, sumo.vehicle_getAllowedSpeed(self._vehicle)))
+            self._set_speed(min(self._target, sumo.vehicle_getAllowedSpeed(self._vehicle)))
         else:
-            sumo.vehicle_setSpeed(self._vehicle, max(self._target, speed - self._change))
+            self._set_speed(max(self._target, speed - self._change))
 
 
 class _Speeds(VehicleCommand):
@@ -448,18 +448,17 @@ class _CutsIn(VehicleCommand):
         super().__init__(vehicle)
         self.how_strong = deceleration
         self._lane = lane
-        self._before = sumo.vehicle_getLaneChangeMode(vehicle)
         self._change = deceleration * dt
-        sumo.vehicle_setLaneChangeMode(vehicle, _COMMANDED_LANE_CHANGES)
+        self._before = self._command_lane_changes(_COMMANDED_LANE_CHANGES)
         sumo.vehicle_changeLane(vehicle, int(lane.rpartition("_")[2]), how_long)
 
     def _command(self) -> None:
         if self._change and sumo.vehicle_getLaneID(self._vehicle) == self._lane:
             speed = sumo.vehicle_getSpeed(self._vehicle)
-            sumo.vehicle_setSpeed(self._vehicle, max(0.0, speed - self._change))
+            self._set_speed(max(0.0, speed - self._change))
 
     def _release(self) -> None:
-        sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
+        self._release_lane_changes(self._before)
         if self._change:
             super()._release()
 
@@ -476,8 +475,7 @@ class _MergesLate(VehicleCommand):
         self._edge = sumo.vehicle_getRoadID(vehicle)
         self._target = target
         self._length = length
-        self._before = sumo.vehicle_getLaneChangeMode(vehicle)
-        sumo.vehicle_setLaneChangeMode(vehicle, _NO_LANE_CHANGES)
+        self._before = self._command_lane_changes(_NO_LANE_CHANGES)
         self._is_waiting = True
 
     def _command(self) -> None:
@@ -491,7 +489,7 @@ class _MergesLate(VehicleCommand):
                 sumo.vehicle_changeLane(self._vehicle, self._target, _FOR_EVER_S)
 
     def _release(self) -> None:
-        sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
+        self._release_lane_changes(self._before)
         if not self._is_waiting:  # otherwise the command would keep the vehicle in its lane for an hour
             sumo.vehicle_changeLane(self._vehicle, sumo.vehicle_getLaneIndex(self._vehicle), 0.0)
 
@@ -502,8 +500,7 @@ class _Ignores(VehicleCommand):
     def __init__(self, vehicle: str, dt: float) -> None:
         super().__init__(vehicle)
         self._dt = dt
-        self._before = sumo.vehicle_getSpeedMode(vehicle)
-        sumo.vehicle_setSpeedMode(vehicle, _IGNORES_JUNCTIONS)
+        self._before = self._command_speed_mode(_IGNORES_JUNCTIONS)
         self._command()
 
     def _release(self) -> None:

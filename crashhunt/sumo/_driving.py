@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import libsumo
 from libsumo import _libsumo as sumo
@@ -199,6 +199,15 @@ class Driving:
     def _move_freely(self, agent: str, action: NDArray[np.generic]) -> bool:
         return self.moving[agent].apply(action)
 
+    def is_inside_lane(self, agent: str) -> bool:
+        """Return whether an agent's whole vehicle is inside a straight part of the lane of a road that SUMO assigns."""
+        lane = sumo.vehicle_getLaneID(agent)
+        motion = self.moving.get(agent)
+        if motion is not None:
+            return bool(lane == motion.inside and not lane.startswith(":"))
+        aside = abs(sumo.vehicle_getLateralLanePosition(agent)) + sumo.vehicle_getWidth(agent) / 2
+        return bool(lane and aside <= sumo.lane_getWidth(lane) / 2)
+
     def _apply_meta(self, agent: str, encoded: NDArray[np.generic]) -> bool:
         """Apply a meta-action as highway-env does: FASTER and SLOWER select the next target speed."""
         action, targets = META_ACTIONS[int(encoded[0])], self._setups[agent].target_speeds
@@ -310,9 +319,46 @@ class VehicleCommand:
     """
 
     how_strong = 1.0
+    speeds: ClassVar[dict[str, float | None]] = {}
+    """The speeds that commands have set, in m/s, by vehicle; None for a vehicle whose speed mode is also commanded."""
+    lanes: ClassVar[set[str]] = set()
+    """The vehicles whose lane changes are commanded."""
+    speed_modes: ClassVar[dict[str, int]] = {}
+    change_modes: ClassVar[dict[str, int]] = {}
+    """The modes of vehicles that have other modes while an agent's vehicle is in their way; see `Followers`."""
 
     def __init__(self, vehicle: str) -> None:
         self._vehicle = vehicle
+
+    @classmethod
+    def forget_all(cls) -> None:
+        """Forget the commands and modes of the last episode."""
+        for known in (cls.speeds, cls.lanes, cls.speed_modes, cls.change_modes):
+            known.clear()
+
+    def _set_speed(self, speed: float) -> None:
+        sumo.vehicle_setSpeed(self._vehicle, speed)
+        self.speeds[self._vehicle] = speed
+
+    def _command_speed_mode(self, mode: int) -> int:
+        """Set the speed mode; return the mode to restore."""
+        before = self.speed_modes.get(self._vehicle)
+        before = sumo.vehicle_getSpeedMode(self._vehicle) if before is None else before
+        sumo.vehicle_setSpeedMode(self._vehicle, mode)
+        self.speeds[self._vehicle] = None
+        return int(before)
+
+    def _command_lane_changes(self, mode: int) -> int:
+        """Set the lane change mode; return the mode to restore."""
+        before = self.change_modes.get(self._vehicle)
+        before = sumo.vehicle_getLaneChangeMode(self._vehicle) if before is None else before
+        sumo.vehicle_setLaneChangeMode(self._vehicle, mode)
+        self.lanes.add(self._vehicle)
+        return int(before)
+
+    def _release_lane_changes(self, mode: int) -> None:
+        self.lanes.discard(self._vehicle)
+        sumo.vehicle_setLaneChangeMode(self._vehicle, mode)
 
     def keep(self) -> None:
         """Continue the command for a step."""
@@ -328,6 +374,7 @@ class VehicleCommand:
         """Command the vehicle in a step; by default, SUMO keeps the first command."""
 
     def _release(self) -> None:
+        self.speeds.pop(self._vehicle, None)
         sumo.vehicle_setSpeed(self._vehicle, -1.0)
 
 
@@ -344,8 +391,7 @@ class _KeepsSpeed(VehicleCommand):
     def __init__(self, vehicle: str) -> None:
         super().__init__(vehicle)
         self.how_strong = float(sumo.vehicle_getSpeed(vehicle))
-        self._before = sumo.vehicle_getSpeedMode(vehicle)
-        sumo.vehicle_setSpeedMode(vehicle, _NO_SPEED_CHECKS)
+        self._before = self._command_speed_mode(_NO_SPEED_CHECKS)
         sumo.vehicle_setSpeed(vehicle, self.how_strong)
 
     def _release(self) -> None:
@@ -358,8 +404,7 @@ class _KeepsLane(VehicleCommand):
 
     def __init__(self, vehicle: str) -> None:
         super().__init__(vehicle)
-        self._before = sumo.vehicle_getLaneChangeMode(vehicle)
-        sumo.vehicle_setLaneChangeMode(vehicle, _NO_LANE_CHANGES)
+        self._before = self._command_lane_changes(_NO_LANE_CHANGES)
 
     def _release(self) -> None:
-        sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
+        self._release_lane_changes(self._before)

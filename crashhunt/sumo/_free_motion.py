@@ -2,8 +2,8 @@
 
 SUMO places the vehicle by ``moveToXY`` with ``keepRoute=2``, and assigns it to the lane below it, so that the other
 vehicles react to it there. SUMO's vehicles do not see a vehicle off all lanes, nor the part of it that is on another
-lane than its front. SUMO reports no collision of such a vehicle, and it does not arrive by itself. crashhunt detects
-collisions by the outlines, and this module detects arrival and leaving the road.
+lane than its front. `Followers` lets them react to it. SUMO reports no collision of such a vehicle, and it does not
+arrive by itself. crashhunt detects collisions by the outlines, and this module detects arrival and leaving the road.
 """
 
 from __future__ import annotations
@@ -87,6 +87,8 @@ class FreeMotion:
         """The edges of the route; SUMO gives a vehicle that leaves its route another one."""
         self.events: list[tuple[str, str]] = []
         """The events of the last step, each with its kind and what the vehicle did."""
+        self.inside = ""
+        """The lane that the outline is inside, but for 0.1 m; empty if there is none, or it is not known yet."""
         self._is_over_kerb: bool | None = None  # not known yet
         sumo.vehicle_setSpeedMode(vehicle, 0)  # SUMO would otherwise report a speed within its own limits
 
@@ -117,7 +119,8 @@ class FreeMotion:
         At the start of a road, the rear of a vehicle that has just entered may be off the road.
         """
         half, half_width, over = self._half - _KERB_M, self._half_width - _KERB_M, ""
-        if not self._area.has_whole(self.state, half, half_width, self._kind):
+        self.inside = self._area.lane_around(self.state, half, half_width, self._kind)
+        if not self.inside:
             if not self._area.contains(self.state.x, self.state.y, self._kind):
                 return False
             points = zip(_ALONG_OUTLINE, self._outline(_ALONG_OUTLINE, _KERB_M), strict=True)
@@ -459,8 +462,8 @@ class DrivableArea:
             for junction in {sumo.edge_getFromJunction(edge), sumo.edge_getToJunction(edge)}
         )
 
-    def has_whole(self, state: MotionState, half: float, half_width: float, kind: str) -> bool:
-        """Return whether a rectangle is on one straight part of the lane that was last found for a vehicle class.
+    def lane_around(self, state: MotionState, half: float, half_width: float, kind: str) -> str:
+        """Return the lane that was last found for a class of vehicles, if a rectangle is on one straight part of it.
 
         Args:
             state: the pose of its centre.
@@ -470,7 +473,7 @@ class DrivableArea:
         """
         recent = self._recent.get(kind)
         if not recent:
-            return False
+            return ""
         shape, border = self._lane(recent[0])
         x, y, cos, sin = state.x, state.y, math.cos(state.heading), math.sin(state.heading)
         for (ax, ay), (bx, by) in pairwise(shape):
@@ -482,8 +485,8 @@ class DrivableArea:
                 reach <= (x - ax) * dx + (y - ay) * dy <= length * length - reach
                 and abs((y - ay) * dx - (x - ax) * dy) + half * across + half_width * along <= border * length
             ):
-                return True
-        return False
+                return recent[0]
+        return ""
 
     def _open_lanes(self, edge: str, kind: str) -> Sequence[str]:
         """Return the lanes of an edge that a vehicle class may use; the nearest centre line may be of another lane."""

@@ -33,10 +33,11 @@ from crashhunt.simulators import (
 from crashhunt.sumo._agent_calls import forget_calls, guard_against_agents
 from crashhunt.sumo._descriptor import BACKEND
 from crashhunt.sumo._disturbances import SumoDisturbances
-from crashhunt.sumo._driving import FREE_FORMS, Driving, hold_vehicle
+from crashhunt.sumo._driving import FREE_FORMS, Driving, VehicleCommand, hold_vehicle
 from crashhunt.sumo._ego_and_actors import vehicle_data_of
 from crashhunt.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.sumo._files import StagedFiles
+from crashhunt.sumo._followers import Followers
 from crashhunt.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
 from crashhunt.sumo._lane_graph import USUAL_CLASS
 from crashhunt.sumo._lights import LightReader
@@ -122,6 +123,9 @@ class SumoSimulator:
         self._lateral = self._drifts or moves or "lateral-resolution" in options or "lanechange.duration" in options
         net = scenario.folder / scenario.table(SumoSetup).net
         self._driving = Driving(scenario.agents, scenario.step_length_s, net)
+        outlined = [agent for agent, one in scenario.agents.items() if one.action_settings.get("visible") == "outline"]
+        self._followers = Followers(outlined, scenario.agents, lambda: self._parts.graph, scenario.step_length_s)
+        self._followers.prepare()
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s, self._driving)
         self._loading = Loading(fix_link_order=scenario.table(SumoSetup).fix_link_order is not False)
         self._sight = Sight(
@@ -186,6 +190,7 @@ class SumoSimulator:
         global _current
         self._stop_fast_path()
         forget_calls()
+        VehicleCommand.forget_all()
         options = options or {}
         arguments = options.get("arguments", {})
         self.setup_steps = 0
@@ -212,6 +217,7 @@ class SumoSimulator:
             raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
         self.agents = list(self._setups)
         self._driving.begin(self.agents)
+        self._followers.begin()
         for agent, motion in self._driving.moving.items():
             form = self.actions[agent]
             if motion.is_planned and isinstance(form, NumbersAction | TrajectoryAction):
@@ -265,6 +271,8 @@ class SumoSimulator:
             )
         is_simulating = False
         try:
+            if self._followers.agents:
+                self._followers.react(actions, self._driving.is_inside_lane)
             for agent, action in actions.items():
                 if not self._driving.apply(agent, action):
                     self._off_road.append(agent)
@@ -510,6 +518,8 @@ class SumoSimulator:
 
     def _apply_alone(self, agent: str, action: NDArray[np.generic]) -> bool:
         """Apply an action; return whether the vehicle stays on the road, so that the step can stay uneventful."""
+        if self._followers.agents:
+            self._followers.react((agent,), self._driving.is_inside_lane)
         self._off_road = [] if self._driving.apply(agent, action) else [agent]
         motion = self._driving.moving.get(agent)
         return not self._off_road and (motion is None or not motion.events)

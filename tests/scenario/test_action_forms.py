@@ -36,10 +36,12 @@ def test_agent_that_names_its_forms_is_refused_with_another_form():
 
 
 def test_settings_follow_the_name_of_the_form():
-    defaults = {"reference_point": "center", "tracker": "interpolation"}
+    defaults = {"reference_point": "center", "tracker": "interpolation", "visible": "front"}
     assert action_settings("trajectory:frame=ego") == {"frame": "ego", **defaults}
-    assert action_settings(None) == action_settings("continuous") == {"lane_change_duration_s": 0.0}
-    assert AgentSetup(action="speed_and_lane:lane_change_duration_s=3").action_settings == {"lane_change_duration_s": 3}
+    usual = {"lane_change_duration_s": 0.0, "visible": "front"}
+    assert action_settings(None) == action_settings("continuous") == usual
+    setup = AgentSetup(action="speed_and_lane:lane_change_duration_s=3")
+    assert setup.action_settings == {**usual, "lane_change_duration_s": 3}
     assert canonical_action("target_pose:frame=ego") == "target_pose"
 
 

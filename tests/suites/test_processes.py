@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from contextlib import closing
+from dataclasses import replace
 
 import pytest
 
@@ -254,6 +255,12 @@ def test_the_request_of_settings_results_in_the_same_settings():
         ("brake=0.1",),
     )
     assert plan(again)[1] == settings
+    for actions, asked in (
+        (("trajectory", "trajectory"), "trajectory:visible=front"), (("meta", None), ""),
+        (("meta", "trajectory:visible=outline"), ""),
+    ):  # fmt: skip
+        agents = {name: replace(settings.agents["ego"], action=one) for name, one in zip("ab", actions, strict=True)}
+        assert _rerun._request_of(replace(settings, agents=agents)).action == asked
 
 
 @pytest.mark.parametrize(
