@@ -61,6 +61,7 @@ class Parser(argparse.ArgumentParser):
             UsageError: an option does not exist, or there are too many arguments.
         """
         known = [option for option in self._option_string_actions if option.startswith("--")]
+        before = ""
         for word in takewhile(lambda word: word != "--", args or ()):
             if any(word in (action.choices or ()) for action in self._actions if action.nargs == argparse.PARSER):
                 break  # what follows is for the command
@@ -68,6 +69,10 @@ class Parser(argparse.ArgumentParser):
             if name.startswith("--") and " " not in name and not any(option.startswith(name) for option in known):
                 fix = removed_fix(name) or f"{did_you_mean(name, known)} see {self.prog} --help".lstrip()
                 raise UsageError(f"there is no option {name!r}", fix=fix)
+            if re.match(r"-[A-Za-z_]", word) and word[:2] not in self._option_string_actions and before[:2] != "--":
+                fix = f"see {self.prog} --help; if it is a file or folder, write ./{word}"
+                raise UsageError(f"there is no option {word!r}", fix=fix)
+            before = word
         found, rest = super().parse_known_args(args, namespace)
         ends_in_list = next(
             (one for one in reversed(self._actions) if not one.option_strings and one.nargs == "*"), None

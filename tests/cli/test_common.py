@@ -63,10 +63,23 @@ def test_unknown_command_is_named_and_its_own_options_are_left_to_it():
     assert made.parse_args(["show", "--all"]).all is True
     with pytest.raises(UsageError, match=r"^too many arguments: h g; see crashhunt show --help$"):
         made.parse_args(["show", "h", "--all", "g"])
-    with pytest.raises(UsageError, match=r"^there is no option '-x'; see crashhunt show --help$"):
+    with pytest.raises(UsageError, match=r"^there is no option '-x'; see crashhunt show --help; if it is a file or "):
         made.parse_args(["show", "-x"])
     with pytest.raises(UsageError, match="there is no command 'shoe'; did you mean 'show'"):
         made.parse_args(["shoe"])
+
+
+def test_name_that_begins_with_a_hyphen_is_no_missing_argument():
+    """argparse reports only that MAX_STEPS is missing."""
+    with pytest.raises(
+        UsageError, match=r"^there is no option '-dash'; see .*; if it is a file or folder, write ./-dash$"
+    ):
+        make_parser().parse_args(["run", "-dash", "1", "1", "1"])
+    with pytest.raises(
+        UsageError, match=r"^--agent has no value; give one, as --agent=VALUE if it begins with a hyphen"
+    ):
+        make_parser().parse_args(["run", "h", "1", "1", "1", "--agent", "-dash"])
+    assert make_parser().parse_args(["rate", "h", "--bar=-1"]).bar == "-1"
 
 
 def test_help_that_cannot_be_written_is_an_error(parser):
