@@ -565,7 +565,7 @@ def _await(stream: IO[bytes], deadline: float | None, *, writing: bool = False) 
 
 
 _PARTS_FIX = "see crashhunt list observations"
-_LOGS_FIX = "write only messages to standard output, and logs to standard error"
+_LOGS_FIX = "write only messages to standard output, each in one line, and logs to standard error"
 
 
 def write_road_map(folder: Path, simulator: Simulator, agent: str) -> str | None:
