@@ -106,16 +106,17 @@ if TYPE_CHECKING:
     from ._scene_parts import (
         ActorNumbers as ActorNumbers,
         NearActor as NearActor,
+        Raster as Raster,
         RayCaster as RayCaster,
         center_of as center_of,
         covariances_of as covariances_of,
         nearest_actors as nearest_actors,
         occluded as occluded,
+        picture as picture,
         predictions_of as predictions_of,
         with_reference_point as with_reference_point,
         wrapped as wrapped,
     )
     from ._standstill import Standstill as Standstill
-    from ._surroundings_raster import Raster as Raster, picture as picture
 
 offer_lazily(__name__)
