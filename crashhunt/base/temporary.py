@@ -508,12 +508,15 @@ def new_folder(path: Path, *, mode: int = 0o777) -> Iterator[Path]:
 def temporary_name(path: Path, suffix: str = "") -> str:
     """Return a hidden name with the token of this process, for a temporary file in the folder of a path.
 
+    Each thread has another name, because a program may, for example, minimize the same crash in two threads.
+
     Args:
         path: final path of the file or folder.
         suffix: end of the name; by default the ending of the path, because some libraries choose the format by it.
     """
     stem, suffix = (path.name, suffix) if suffix else (path.stem, path.suffix)
-    rest = f".{this_process().token}{suffix}"
+    thread = "" if threading.current_thread() is threading.main_thread() else f"-{threading.get_native_id()}"
+    rest = f".{this_process().token}{thread}{suffix}"
     room = _MAX_NAME_BYTES - 1 - len(os.fsencode(rest))
     while len(os.fsencode(stem)) > room:
         stem = stem[:-1]

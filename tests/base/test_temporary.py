@@ -15,6 +15,7 @@ import threading
 import time
 import uuid
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from multiprocessing import shared_memory
 from pathlib import Path
@@ -146,6 +147,24 @@ def test_temporary_name_is_shortened_no_more_than_the_system_needs():
     assert temporary_name(Path("a.csv"), ".x") == f".a.csv.{this_process().token}.x"
     assert len(temporary_name(Path(f"{'a' * 250}.csv"))) == 255
     assert len(os.fsencode(temporary_name(Path(f"{'ä' * 124}.csv")))) in (254, 255)
+
+
+def test_threads_that_write_the_same_file_have_temporary_files_of_their_own(tmp_path):
+    """Two threads that minimized the same crash removed each other's files."""
+    both, folder = threading.Barrier(2), tmp_path / "there"
+    folder.mkdir()
+
+    def write(word):
+        with temporary_beside(folder / "a") as there:
+            there.write_text(word)
+            both.wait(30)
+            return there.name, there.read_text(), owner_in(there.name)
+
+    with ThreadPoolExecutor(2) as threads:
+        (one, word, owner), (other, *rest) = threads.map(write, ["one", "two"])
+    assert one != other
+    assert (word, owner, rest) == ("one", this_process(), ["two", this_process()])
+    assert list(folder.iterdir()) == []
 
 
 def test_the_first_thing_of_a_process_removes_leftovers_too(place):
