@@ -11,7 +11,7 @@ from crashhunt.agents._protocol import SPEED_OR_META, meta_actions, wanted_meta_
 from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     import numpy as np
     from gymnasium import Space
@@ -41,8 +41,14 @@ def check_layout(space: Space[object] | None) -> None:
     """Refuse an observation space that lacks the columns which the agent reads.
 
     Raises:
-        ValueError: the observation space does not have the columns presence, x, y, vx, vy, cos_h and sin_h.
+        ValueError: the observation space has parts, or not the columns presence, x, y, vx, vy, cos_h and sin_h.
     """
+    parts: Mapping[str, object] = getattr(space, "spaces", {})
+    if parts:
+        raise ValueError(
+            f"the agent observes Kinematics, but would receive the parts {', '.join(parts)}; name no parts for it, or "
+            "--observe kinematics"
+        )
     columns = None if space is None else (space.shape or (0,))[-1]
     if columns not in (None, SIN_H + 1):
         raise ValueError(
