@@ -141,7 +141,7 @@ def find(tmp_path, monkeypatch):
             assert crash.result.outcome in (Outcome.COLLISION, Outcome.OFF_ROAD)
             bundle = SimpleNamespace(result=crash.result, driver="ego", path=tmp_path)
             rerun = SimpleNamespace(bundle=bundle, recorded=crash.recording, spec=crash.result.spec)
-            return crash.result, _omissions._Search(rerun, InProcess(), 20, lambda _: None).find("differs")
+            return crash.result, _omissions._Search(rerun, InProcess(), 20, lambda: None).find("differs")
         finally:
             simulator.close()
 
