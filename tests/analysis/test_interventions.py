@@ -192,6 +192,15 @@ def test_agent_that_cannot_take_over_is_refused(given, message):
         HandOver(**{"from_step": 4, "agent": "ego", **given}).applied(rerun_of({"ego": KEEPS, "bus": KEEPS}))
 
 
+def test_what_the_engine_changes_itself_leaves_the_run_as_it_is():
+    rerun = rerun_of({"ego": KEEPS})
+    for one in (SetArguments(changes={"speed": "7"}), LeaveOut(actors=("a",)), Reseed(from_step=4)):
+        assert one.applied(rerun) is rerun
+    more = Disturbance(9, "ahead", "brake", 1.0, 1.0, "ego")
+    disturbed = Disturb(disturbances=(more,)).applied(Disturb(disturbances=(replace(more, step=20),)).applied(rerun))
+    assert [one.step for one in disturbed.spec.disturbances] == [9, 20]
+
+
 def test_interventions_are_described_in_words():
     brake, late = (Disturbance(9, "ahead", what, 1.0, 1.0, "ego") for what in ("brake", "late_observation"))
     assert [str(one) for one in (
