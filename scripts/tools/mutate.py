@@ -149,7 +149,12 @@ _TESTS_ELSEWHERE = {
     "episode/_fast_path.py": ("native/test_usual_steps.py", "episode/test_episode*.py"),
     "episode/_branches.py": ("episode/test_branches_asked.py", "episode/test_branching.py"),
     "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),
-    "statistics/_hunt_pairs.py": ("e2e/test_gate.py",),
+    "statistics/_hunt_pairs.py": (
+        "statistics/test_pairs_of_hunts.py",
+        "suites/test_gate_of_hunts.py",
+        "suites/test_gate_parts.py",
+        "e2e/test_gate.py",
+    ),
     # Processes of trials are seen by what is left of trials that harm them.
     "executors/_fork_server.py": (
         "executors/test_harm.py",

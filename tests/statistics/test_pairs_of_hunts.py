@@ -7,10 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings, RunSettings, write_settings
 from crashhunt.statistics import PairedHunts, PairWatch, _hunt_pairs
 from crashhunt.statistics._comparison import why_unpaired
+from crashhunt.statistics._hunt_pairs import GateCase
 from crashhunt.trial import KILLED, Constant, Failure, Outcome, Range, TrialResult, TrialSpec
 
 HUNT = {
@@ -44,10 +46,11 @@ def test_hunts_are_paired_if_the_same_number_is_the_same_traffic(one, other, rea
     assert bool(found) == bool(reason)
 
 
-def hunt(path, killed=()):
+def hunt(path, killed=(), **more):
     """A hunt of four trials, without running it, whose processes were killed in some of them."""
     path.mkdir()
-    settings = HuntSettings(scenario="toy", scenario_digest="a", trials=4, max_steps=9, seed=4, run=RunSettings())
+    usual = {"scenario": "toy", "scenario_digest": "a", "trials": 4, "max_steps": 9, "seed": 4, "run": RunSettings()}
+    settings = HuntSettings(**usual | more)
     write_settings(path / "hunt.toml", settings, ["crashhunt"])
     with closing(Ledger(path / "ledger.sqlite", writable=True)) as ledger:
         record(ledger, range(4), killed)
@@ -67,7 +70,8 @@ def test_trials_that_were_killed_in_an_earlier_run_count_only_after_the_hunts_ha
     pairs.take(watch)
     assert (pairs.counts.pairs, pairs.is_complete) == (1, False)
     pairs.take(watch, has_ended=True)
-    assert (pairs.counts.pairs, pairs.counts.sides[1].killed, pairs.is_complete) == (3, 1, True)
+    assert (pairs.counts.pairs, pairs.is_complete) == (3, True)
+    assert [side.killed for side in pairs.counts.sides] == [0, 1]
     assert watch.test.difference().low < 0 < watch.test.difference().high
     again, watch = PairedHunts("toy", base, head, 4), PairWatch(0.0)
     again.take(watch)
@@ -92,3 +96,27 @@ def test_crash_types_are_counted_in_the_pairs_only(tmp_path, monkeypatch):
     types = {base: {0: "A", 1: "B", 3: "C"}, head: {1: "B", 2: "D"}}
     monkeypatch.setattr(_hunt_pairs, "crash_types", types.get)
     assert pairs.crash_types() == {"A": (1, 0), "B": (1, 1), "D": (0, 1)}
+
+
+def test_hunts_with_different_traffic_are_refused_and_base_is_named_first(tmp_path):
+    base, head = hunt(tmp_path / "base", disturb=("brake=0.1",)), hunt(tmp_path / "head", disturb=("stop=0.2",))
+    with pytest.raises(
+        HuntDirectoryError, match=r"they have the disturbances brake=0\.1 and the disturbances stop=0\.2"
+    ) as refused:
+        PairedHunts("toy", base, head, 4).take(PairWatch(0.0))
+    assert refused.value.where == "toy"
+
+
+@pytest.mark.parametrize(("held_out", "pairs", "trained_on"), [({0, 1, 2, 3}, 4, 0), ({1, 3}, 2, 2), (set(), 0, 4)])
+def test_traffic_of_the_training_does_not_count(tmp_path, monkeypatch, held_out, pairs, trained_on):
+    traffics = SimpleNamespace(is_empty=not held_out, has=lambda seed: seed in held_out)
+    monkeypatch.setattr(_hunt_pairs, "held_out_traffics", lambda settings, folders: traffics)
+    found = PairedHunts("toy", hunt(tmp_path / "base"), hunt(tmp_path / "head"), 4)
+    found.take(PairWatch(0.0), has_ended=True)
+    assert (found.counts.pairs, found.trained_on, found.is_complete) == (pairs, trained_on, True)
+
+
+@pytest.mark.parametrize("expected", ["still", "fixed"])
+@pytest.mark.parametrize(("got", "crashes"), [("still", 1), ("changed", 1), ("fixed", 0), ("cannot_run", 0)])
+def test_case_has_come_back_if_it_was_fixed_and_crashes(expected, got, crashes):
+    assert GateCase("a", expected, got, "now").has_come_back is (expected == "fixed" and bool(crashes))
