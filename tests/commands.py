@@ -49,7 +49,7 @@ _WHILE_RUNNING = (
     "crashhunt.gym._descriptor", "crashhunt.highway._descriptor", "crashhunt.results._log_reader",
     "crashhunt.samplers._space_filling", "crashhunt.samplers._strategies", "crashhunt.simulators._toy_descriptor",
     "crashhunt.suites._gate_runs", "crashhunt.suites._suite_file", "crashhunt.sumo._descriptor",
-    "crashhunt.sumo._files", "crashhunt.sumo._setup_check", "encodings.ascii", "encodings.cp437", "gzip",
+    "crashhunt.sumo._files", "crashhunt.sumo._scenario_check", "encodings.ascii", "encodings.cp437", "gzip",
     "importlib.readers", "numpy.ma", "numpy.random", "pydantic.dataclasses", "rich._emoji_codes", "rich.progress",
     "rich.status", "tomli_w", "urllib.request",
     "xml.etree.ElementTree", "xml.sax",

@@ -51,7 +51,7 @@ def import_at_call(place: str) -> Callable[..., Any]:
     """Return a function that imports another function at each call, and calls it.
 
     Args:
-        place: the module and the name of the other function, such as ``crashhunt.sumo._names:check_names``.
+        place: the module and the name of the other function, such as ``crashhunt.sumo._scenario_check:check_names``.
     """
 
     def call(*given: object, **named: object) -> Any:

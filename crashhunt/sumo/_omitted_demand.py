@@ -17,8 +17,8 @@ from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.base.text import NOTICE_TOPIC, count_of
 from crashhunt.sumo._ego import seconds
 from crashhunt.sumo._files import read_xml
-from crashhunt.sumo._names import places_of
 from crashhunt.sumo._options import SumoSetup
+from crashhunt.sumo._scenario_check import places_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

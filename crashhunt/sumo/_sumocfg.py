@@ -24,7 +24,7 @@ from crashhunt.sumo._options import (
     is_true,
     writes,
 )
-from crashhunt.sumo._setup_check import check_options
+from crashhunt.sumo._scenario_check import check_options
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

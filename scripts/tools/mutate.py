@@ -326,7 +326,7 @@ _TESTS_ELSEWHERE = {
         "on_sumo/test_surroundings.py",
         "on_sumo/test_world.py",
     ),
-    "sumo/_manoeuvres.py": ("on_sumo/test_manoeuvres.py",),
+    "sumo/_scripted.py": ("on_sumo/test_manoeuvres.py", "on_sumo/test_scripted.py"),
     "sumo/_fast_step.py": ("native/test_usual_steps.py",),
     "sumo/_traffic_survey.py": ("hunts/test_traffic_survey.py", "on_sumo/test_sumo_reports.py"),
     "simulators/toy.py": (

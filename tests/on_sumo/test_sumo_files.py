@@ -15,7 +15,7 @@ from crashhunt.plans import Request, plan, with_settings
 from crashhunt.scenario import as_plain_data, load_scenario, shipped_folder
 from crashhunt.sumo._files import StagedFiles, references, rewritten
 from crashhunt.sumo._options import canonical, is_true
-from crashhunt.sumo._setup_check import check_options
+from crashhunt.sumo._scenario_check import check_options
 from crashhunt.sumo._side_effects import side_effect
 
 ROUTES = (

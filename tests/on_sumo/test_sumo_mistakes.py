@@ -10,7 +10,7 @@ import pytest
 
 from crashhunt.errors import ScenarioError
 from crashhunt.scenario import load_scenario, shipped_folder
-from crashhunt.sumo._names import explained
+from crashhunt.sumo._scenario_check import explained
 
 ROUTES = """<routes>
   <vType id="car"/><vType id="ego"/>

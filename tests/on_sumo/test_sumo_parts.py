@@ -11,7 +11,7 @@ import pytest
 
 from crashhunt.base.errors import NoValidTrialError, ScenarioError
 from crashhunt.scenario import AgentSetup, ObservationSetup, Scenario, shipped_folder
-from crashhunt.sumo import SumoSetup, _ego, _names, _sumocfg
+from crashhunt.sumo import SumoSetup, _ego, _scenario_check, _sumocfg
 from crashhunt.sumo._ego import Departure, choose_ego, draw_among, number, seconds
 from crashhunt.sumo._options import FIXED_OPTIONS
 from crashhunt.sumo._sumocfg import changes, load_sumocfg, read_config, split_names
@@ -336,18 +336,18 @@ def test_network_of_a_configuration_is_one_file(write, tmp_path):
 
 def test_names_are_found_in_the_files(tmp_path):
     texts = [b'<routes><flow id="f"/><vehicle id="v"/><person id="p"/><trip id="t&quot;1"/></routes>']
-    assert _names._ids(b"vehicle|trip", texts) == ["v", 't"1']
+    assert _scenario_check._ids(b"vehicle|trip", texts) == ["v", 't"1']
     for name in ("v", "f.0", "p_0", 't"1'):
-        _names._check_vehicle(name, texts, "--ego", "here")
+        _scenario_check._check_vehicle(name, texts, "--ego", "here")
     for name, says in (("f", "'f'"), ("w", "'w'")):
         with pytest.raises(ScenarioError, match=says) as caught:
-            _names._check_vehicle(name, texts, "--ego", "here")
+            _scenario_check._check_vehicle(name, texts, "--ego", "here")
         assert caught.value.where == "here"
     with pytest.raises(ScenarioError) as caught:
-        _names._check_vehicle("f", texts, "--ego", "here")
+        _scenario_check._check_vehicle("f", texts, "--ego", "here")
     assert "f.0" in caught.value.fix
     with pytest.raises(ScenarioError, match=r"--ego: .*edge 'b'") as caught:
-        _names._check("--ego", "edge", "b", [b'<edge id="a"/><edge id=":x"/>'], "here")
+        _scenario_check._check_name("--ego", "edge", "b", [b'<edge id="a"/><edge id=":x"/>'], "here")
     assert "a" in caught.value.fix
     assert ":x" not in caught.value.fix
-    _names._check("--ego", "edge", "a", [b'<edge id="a"/>'], "here")
+    _scenario_check._check_name("--ego", "edge", "a", [b'<edge id="a"/>'], "here")

@@ -28,6 +28,6 @@ if TYPE_CHECKING:
         parse_bbox as parse_bbox,
         parse_shape as parse_shape,
     )
-    from ._traffic_flow import PlainRun as PlainRun
+    from ._traffic import PlainRun as PlainRun
 
 offer_lazily(__name__)

@@ -12,7 +12,7 @@ from crashhunt.base.text import command_line
 from crashhunt.base.version import __version__
 
 if TYPE_CHECKING:
-    from crashhunt.sumo.maps._demand import Demand
+    from crashhunt.sumo.maps._traffic import Demand
 
 AGENT = "agent:Driver"
 """The agent of ``agent.py``."""

@@ -23,7 +23,6 @@ from crashhunt.base.text import count_of
 from crashhunt.base.version import __version__
 from crashhunt.scenario import load_scenario
 from crashhunt.sumo.maps._convert import NET, ConvertOptions, convert
-from crashhunt.sumo.maps._demand import ROUTES, Demand, find_demand, route_file
 from crashhunt.sumo.maps._folder import (
     DEFAULT_AGENT,
     WORKFLOW,
@@ -38,7 +37,7 @@ from crashhunt.sumo.maps._picture import draw_map
 from crashhunt.sumo.maps._road_network import CAR, RoadNetwork
 from crashhunt.sumo.maps._source import MapSource, check_source, kind_of_file
 from crashhunt.sumo.maps._tools import find_tools
-from crashhunt.sumo.maps._traffic_flow import RUN_S, PlainRun, calibrate
+from crashhunt.sumo.maps._traffic import ROUTES, RUN_S, Demand, PlainRun, calibrate, find_demand, route_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable

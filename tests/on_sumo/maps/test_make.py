@@ -12,12 +12,11 @@ import pytest
 
 from crashhunt.errors import HuntDirectoryError, ScenarioError, UsageError
 from crashhunt.scenario import load_scenario, shipped_folder
-from crashhunt.sumo.maps import MapOptions, MapSource, _make, _traffic_flow, describe_place, make_scenario, read_network
+from crashhunt.sumo.maps import MapOptions, MapSource, _make, _traffic, describe_place, make_scenario, read_network
 from crashhunt.sumo.maps._convert import NET, Converted, ConvertOptions, _command_arguments, convert
-from crashhunt.sumo.maps._demand import Demand, Route
 from crashhunt.sumo.maps._make import PlainTrial
 from crashhunt.sumo.maps._tools import ToolResult, Tools
-from crashhunt.sumo.maps._traffic_flow import RUN_S, PlainRun, calibrate, run_plain_traffic
+from crashhunt.sumo.maps._traffic import RUN_S, Demand, PlainRun, Route, calibrate, run_plain_traffic
 
 MAP = shipped_folder() / "intersection" / "intersection.net.xml"
 GRID = MapSource(kind="grid", shape=(2, 2))
@@ -180,7 +179,7 @@ def test_traffic_is_thinned_until_it_flows_and_routes_without_room_are_excluded(
         jams = demand.vehicles_per_hour > 400
         return flowing(demand=scale, teleports=50 * jams, probe_delays_s={"r0": 10.0, "r1": 10.1})
 
-    monkeypatch.setattr(_traffic_flow, "run_plain_traffic", run)
+    monkeypatch.setattr(_traffic, "run_plain_traffic", run)
     common = {"net": "n", "scales": (1.0, 2.0), "probes_at_s": 30.0, "bicycles": False}
     demand, plain, busy = calibrate(DEMAND, None, None, None, {}, **common)
     thinner = [900 / 1.6, 900 / 1.6**2]
@@ -191,10 +190,10 @@ def test_traffic_is_thinned_until_it_flows_and_routes_without_room_are_excluded(
     assert runs[1][2] > 0.1  # to look whether it jams, rough steps do
     assert (demand.vehicles_per_hour, demand.ego_routes) == (pytest.approx(thinner[1]), ("r0",))
     assert (plain.demand, busy.demand) == (1.0, 2.0)
-    monkeypatch.setattr(_traffic_flow, "run_plain_traffic", lambda *_, **__: flowing(entered=0))
+    monkeypatch.setattr(_traffic, "run_plain_traffic", lambda *_, **__: flowing(entered=0))
     with pytest.raises(ScenarioError, match=r"jams even with 172 vehicles/h: no vehicle enters"):
         calibrate(DEMAND, None, None, None, {}, **common)
-    monkeypatch.setattr(_traffic_flow, "run_plain_traffic", lambda *_, **__: flowing(probe_delays_s={"r1": 11.0}))
+    monkeypatch.setattr(_traffic, "run_plain_traffic", lambda *_, **__: flowing(probe_delays_s={"r1": 11.0}))
     with pytest.raises(ScenarioError, match="can enter within 10 s") as caught:
         calibrate(DEMAND, None, None, None, {}, **common)
     assert caught.value.fix.endswith("which is 2")

@@ -9,11 +9,20 @@ import pytest
 
 from crashhunt.base.errors import HuntDirectoryError, ScenarioError
 from crashhunt.sumo.maps import MapSource, _make
-from crashhunt.sumo.maps._demand import Demand, Route, _counted, _ego_routes, _entry_capacity, find_demand, route_file
 from crashhunt.sumo.maps._folder import arguments_of
 from crashhunt.sumo.maps._make import MadeScenario, PlainTrial, _busiest, _check_directory, _thin_traffic
 from crashhunt.sumo.maps._road_network import Edge, NetworkLane, RoadNetwork
-from crashhunt.sumo.maps._traffic_flow import RUN_S, PlainRun
+from crashhunt.sumo.maps._traffic import (
+    RUN_S,
+    Demand,
+    PlainRun,
+    Route,
+    _counted,
+    _ego_routes,
+    _entry_capacity,
+    find_demand,
+    route_file,
+)
 
 
 def edge(name, length_m=100.0, speed_mps=10.0, *, lanes=1, disallowed=()):

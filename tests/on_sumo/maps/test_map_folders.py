@@ -19,11 +19,11 @@ from crashhunt.errors import ScenarioError
 from crashhunt.scenario import scenario_from_dict, shipped_folder
 from crashhunt.sumo.maps import MapSource, read_network
 from crashhunt.sumo.maps._convert import ConvertOptions, convert
-from crashhunt.sumo.maps._demand import Demand, Route, _ego_routes, _entry_capacity, route_file
 from crashhunt.sumo.maps._folder import agent_module, arguments_of, next_commands, readme, scenario_toml, workflow
 from crashhunt.sumo.maps._picture import draw_map, drawable
 from crashhunt.sumo.maps._road_network import Edge, NetworkLane, RoadNetwork
 from crashhunt.sumo.maps._tools import Tools
+from crashhunt.sumo.maps._traffic import Demand, Route, _ego_routes, _entry_capacity, route_file
 
 
 def lane(allowed=None, disallowed=(), length=100.0, at_m=0.0):

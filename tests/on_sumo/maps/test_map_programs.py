@@ -14,8 +14,8 @@ from crashhunt.errors import ScenarioError
 from crashhunt.scenario import load_scenario, shipped_folder
 from crashhunt.sumo.maps import MapOptions, MapSource, _tools, cached_scenario, describe_place, make_scenario
 from crashhunt.sumo.maps._convert import NET, ConvertOptions, convert
-from crashhunt.sumo.maps._demand import find_demand
 from crashhunt.sumo.maps._tools import Tools, find_tools, first_error
+from crashhunt.sumo.maps._traffic import find_demand
 
 pytest.importorskip("sumo", reason="needs eclipse-sumo: pip install 'crashhunt[maps]'")
 

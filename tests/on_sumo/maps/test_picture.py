@@ -18,7 +18,7 @@ from crashhunt.sumo.maps._picture import (
     draw_map,
 )
 from crashhunt.sumo.maps._road_network import Edge, NetworkLane, RoadNetwork
-from crashhunt.sumo.maps._traffic_flow import PlainRun
+from crashhunt.sumo.maps._traffic import PlainRun
 
 BLUE, ORANGE, RED = (146, 180, 214), (224, 138, 0), (198, 40, 40)
 
