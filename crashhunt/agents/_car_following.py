@@ -11,7 +11,7 @@ from crashhunt.agents._protocol import SPEED_OR_META, meta_actions, wanted_meta_
 from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
     import numpy as np
     from gymnasium import Space
@@ -43,14 +43,17 @@ def check_layout(space: Space[object] | None) -> None:
     Raises:
         ValueError: the observation space has parts, or not the columns presence, x, y, vx, vy, cos_h and sin_h.
     """
-    parts: Mapping[str, object] = getattr(space, "spaces", {})
-    if parts:
+    if space is None:
+        return
+    from gymnasium.spaces import Dict  # takes no time here: whoever made the space has imported it
+
+    if isinstance(space, Dict):
         raise ValueError(
-            f"the agent observes Kinematics, but would receive the parts {', '.join(parts)}; name no parts for it, or "
+            f"the agent observes Kinematics, but would receive the parts {', '.join(space)}; name no parts for it, or "
             "--observe kinematics"
         )
-    columns = None if space is None else (space.shape or (0,))[-1]
-    if columns not in (None, SIN_H + 1):
+    columns = (space.shape or (0,))[-1]
+    if columns != SIN_H + 1:
         raise ValueError(
             "the agent needs the default features (presence, x, y, vx, vy, cos_h, sin_h), but the observation has "
             f"{columns} columns"
