@@ -114,6 +114,7 @@ if TYPE_CHECKING:
         occluded as occluded,
         picture as picture,
         predictions_of as predictions_of,
+        with_range_noise as with_range_noise,
         with_reference_point as with_reference_point,
         wrapped as wrapped,
     )

@@ -462,6 +462,10 @@ PARTS: Mapping[str, Part] = {
             settings=(
                 Setting("rays", 360, 1, 10_000, "", "number of rays, evenly distributed over the full circle"),
                 Setting("range", 100.0, 1.0, REACH_M, "m", "largest distance"),
+                Setting(
+                    "noise", 0.0, 0.0, 10.0, "m",
+                    "standard deviation of a normal error of each distance below ``range``, by the trial's seed",
+                ),
             ),
             measured=("distance",),
         ),

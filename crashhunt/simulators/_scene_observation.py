@@ -22,6 +22,7 @@ from crashhunt.simulators._scene_parts import (
     nearest_actors,
     occluded,
     predictions_of,
+    with_range_noise,
     with_reference_point,
     wrapped,
 )
@@ -74,14 +75,15 @@ class SceneObserver:
                 raise UsageError(f"{where}, which this simulator does not have", fix="leave it out")
         self.hidden: set[tuple[str, str]] = set()
         self._step_length_s = self._start_s = 0.0
+        self._seed = 0
         self._histories: dict[str, History] = {}
         self._casters: dict[tuple[int, float], RayCaster] = {}
         self._numbers: dict[str, ActorNumbers] = {}
         self._before: dict[str, dict[str, tuple[float, float]]] = {}
 
-    def begin(self, time_s: float, step_length_s: float) -> None:
-        """Begin an episode at a simulation time, with a step length, both in s."""
-        self._start_s, self._step_length_s = time_s, step_length_s
+    def begin(self, time_s: float, step_length_s: float, seed: int) -> None:
+        """Begin an episode of a seed at a simulation time, with a step length, both in s."""
+        self._start_s, self._step_length_s, self._seed = time_s, step_length_s, seed
         self._histories = {agent: History(layout) for agent, layout in self.layouts.items()}
         self._before, self._numbers = {}, {}
         self.hidden.clear()
@@ -129,7 +131,9 @@ class SceneObserver:
             near = nearest_actors(scene, row, hidden=hidden, radius=reach, limit=limit)
             if name == "lidar2d":
                 caster = self._caster(int(one.settings["rays"]), one.settings["range"])
-                arrays[name] = caster.cast(scene, row, [found.row for found in near])
+                ranges = caster.cast(scene, row, [found.row for found in near])
+                step = round((scene.time_s - self._start_s) / self._step_length_s)
+                arrays[name] = with_range_noise(ranges, one.settings, seed=self._seed, agent=agent, step=step)
             elif name == "predictions":
                 arrays[name] = predictions_of(
                     scene, near, shape=one.shape, interval=one.settings["interval"],

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     Line = NDArray[np.float64]
 
 
+_NOISE_STREAM = 0x6C696461  # apart from what else is drawn of a trial's seed
+
+
 class NearActor(NamedTuple):
     """An actor near the controlled vehicle.
 
@@ -130,6 +133,25 @@ def covariances_of(
         found[place, :, 1] = s * s * along + c * c * across
         found[place, :, 2] = c * s * (along - across)
     return found
+
+
+def with_range_noise(
+    ranges: NDArray[np.float64], settings: Mapping[str, float], *, seed: int, agent: str, step: int
+) -> NDArray[np.float64]:
+    """Return the values of ``lidar2d`` with their errors: the same ones for the same seed, agent and step.
+
+    Args:
+        ranges: The distances without errors, in m.
+        settings: The settings of the part.
+        seed: Seed of the trial.
+        agent: Identifier of the agent.
+        step: Number of the step.
+    """
+    if not settings["noise"]:
+        return ranges
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_NOISE_STREAM, step, *agent.encode())))
+    noisy = np.clip(ranges + rng.normal(0.0, settings["noise"], len(ranges)), 0.0, settings["range"])
+    return np.where(ranges < settings["range"], noisy, ranges)
 
 
 class ActorNumbers:

@@ -86,7 +86,7 @@ class ToySimulator:
         self._start = dict(self._x)
         self._touched: set[str] = set()
         self._kinematics.hidden.clear()
-        self._parts.begin(0.0, self.step_length_s)
+        self._parts.begin(0.0, self.step_length_s, seed)
         self._disturbed: dict[str, float] = {}  # disturbed vehicles: target speed in m/s
         self._roster_of()
         self._look(())

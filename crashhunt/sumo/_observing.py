@@ -122,7 +122,12 @@ class ObservedParts:
         return found
 
     def begin(
-        self, starts: Mapping[str, float], time_s: float, steering: Mapping[str, Callable[[], float]] | None = None
+        self,
+        starts: Mapping[str, float],
+        time_s: float,
+        steering: Mapping[str, Callable[[], float]] | None = None,
+        *,
+        seed: int = 0,
     ) -> None:
         """Begin an episode.
 
@@ -130,6 +135,7 @@ class ObservedParts:
             starts: The odometer of every agent's vehicle, in m.
             time_s: The simulation time, in s.
             steering: Functions that return the steering angle of vehicles whose actions contain one.
+            seed: The seed of the trial.
         """
         known = steering or {}
         self._histories = {agent: History(layout) for agent, layout in self.layouts.items()}
@@ -151,6 +157,7 @@ class ObservedParts:
                         reference_share=layout.reference_share,
                         near=self._near,
                         moving=frozenset(known),
+                        seed=seed,
                     )
                 )
                 for name, request in layout.parts.items()

@@ -45,6 +45,7 @@ class ReaderSetup:
         reference_share: How far the reference point is ahead of the centre, as a share of a vehicle's length.
         near: The lanes near each square, by sampling and vehicle class, shared like the lanes.
         moving: Identifiers of the vehicles that move freely.
+        seed: Seed of the trial.
     """
 
     agent: str
@@ -60,6 +61,7 @@ class ReaderSetup:
     reference_share: float = 0.0
     near: NearLanesOf = field(default_factory=dict)
     moving: frozenset[str] = frozenset()
+    seed: int = 0
 
     @property
     def settings(self) -> Mapping[str, float]:

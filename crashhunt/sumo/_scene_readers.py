@@ -19,6 +19,7 @@ from crashhunt.simulators import (
     nearest_actors,
     picture,
     predictions_of,
+    with_range_noise,
 )
 from crashhunt.sumo._lane_paths import NearLanes, Sampling
 from crashhunt.sumo._reader_protocol import Reader
@@ -149,7 +150,9 @@ class RangesReader(Reader):
         scene, row = moment.scene, moment.row
         longest = max(scene.roster.lengths)
         near = nearest_actors(scene, row, hidden=moment.hidden, radius=self._reach_m + longest)
-        return self._caster.cast(scene, row, [one.row for one in near])
+        ranges, setup = self._caster.cast(scene, row, [one.row for one in near]), self._setup
+        step = round((scene.time_s - setup.start_s) / setup.step_length_s)
+        return with_range_noise(ranges, setup.settings, seed=setup.seed, agent=setup.agent, step=step)
 
 
 class _RasterReader(Reader):

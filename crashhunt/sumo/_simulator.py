@@ -227,7 +227,7 @@ class SumoSimulator:
         self._kinematics.hidden.clear()
         self._off_road: list[str] = []
         steering = {agent: motion.steering for agent, motion in self._driving.moving.items()}
-        self._parts.begin(self._start, sumo.simulation_getTime(), steering)
+        self._parts.begin(self._start, sumo.simulation_getTime(), steering, seed=seed)
         self._lights = None
         self._read_scene()
         observations = self._observe_all()
@@ -235,7 +235,7 @@ class SumoSimulator:
         if self._sight.core is not None and self._is_core_wrong(observations, usual):
             self._sight.distrust()
             self._parts.core = None
-            self._parts.begin(self._start, sumo.simulation_getTime(), steering)
+            self._parts.begin(self._start, sumo.simulation_getTime(), steering, seed=seed)
             self._notices.append(_CORE_DISABLED_NOTICE)
             self._read_scene()
             observations, usual = self._observe_all(), None

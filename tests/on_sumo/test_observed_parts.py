@@ -344,6 +344,33 @@ def test_predictions_along_lanes_lead_where_actors_then_drive_that_stay_in_their
     assert along.max() < 1.6  # the way is known at steps of 0.1 s only
 
 
+def test_noise_of_ranges_is_normal_and_that_of_the_seed(tmp_path):
+    def drive(name, seed, words, core=True):
+        with closing(simulator_of("motorway", tmp_path / name, "ego", words)) as simulator:
+            if not core:
+                simulator._parts.core = None
+            shown = list(episode(simulator, seed, 40, speed=25.0))
+            assert simulator.observation_layouts["ego"].space.contains(shown[-1])
+        return np.array([one["lidar2d"] for one in shown])
+
+    true, noisy, again, other = (
+        drive(name, 2, words, core)
+        for name, words, core in (
+            ("a", "lidar2d", True), ("b", "lidar2d:noise=0.2", True), ("c", "lidar2d:noise=0.2", False),
+            ("d", "lidar2d:rays=360:range=100:noise=0.1", True),
+        )
+    )  # fmt: skip
+    assert noisy.tobytes() == again.tobytes()
+    hits = true < 100.0
+    assert (noisy[~hits] == 100.0).all()
+    errors = (noisy - true)[hits]
+    assert len(errors) > 1000
+    assert errors.std() == pytest.approx(0.2, rel=0.1)
+    assert abs(errors.mean()) < 0.03
+    assert (other - true)[hits] == pytest.approx(errors / 2, abs=1e-9)
+    assert (noisy[1] - true[1])[hits[1] & hits[2]] != pytest.approx((noisy[2] - true[2])[hits[1] & hits[2]])
+
+
 def test_occlusion_hides_the_same_actors_in_every_part(tmp_path):
     parts = ("actors:radius=120:rows=99", "actor_ids:radius=120:rows=99", "predictions:radius=120:rows=99", "lidar2d")
     with (

@@ -19,6 +19,7 @@ from crashhunt.simulators import (
     occluded,
     picture,
     predictions_of,
+    with_range_noise,
     wrapped,
 )
 from crashhunt.world import Actor, Roster, Scene, corners
@@ -205,6 +206,19 @@ def test_actor_behind_a_lorry_is_hidden_until_it_looks_out():
     for y, is_hidden in ((0.0, True), (1.0, True), (3.5, False)):
         scene = scene_of((0.0, 0.0, 0.0, 4.0, 1.8, 0.0), lorry, (60.0, y, 0.0, 4.0, 1.8, 0.0))
         assert (occluded(scene, 0, RayCaster(3600, 120.0)) == {"a2"}) == is_hidden, y
+
+
+@pytest.mark.parametrize(("seed", "agent", "step"), [(2, "ego", 3), (1, "other", 3), (1, "ego", 4)])
+def test_noise_of_ranges_differs_between_seeds_agents_and_steps(seed, agent, step):
+    settings = {"noise": 0.5, "range": 50.0}
+    ranges = np.array([20.0, 50.0, 0.0, 49.999])
+    first = with_range_noise(ranges, settings, seed=1, agent="ego", step=3)
+    assert first.tobytes() == with_range_noise(ranges, settings, seed=1, agent="ego", step=3).tobytes()
+    assert first[0] != with_range_noise(ranges, settings, seed=seed, agent=agent, step=step)[0]
+    assert first[1] == 50.0  # no outline
+    assert (first >= 0.0).all()
+    assert (first <= 50.0).all()
+    assert with_range_noise(ranges, {**settings, "noise": 0.0}, seed=1, agent="ego", step=3) is ranges
 
 
 def test_covariances_are_those_of_actors_with_random_accelerations():
