@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import shutil
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import libsumo
 import pytest
 
+from crashhunt.oracles import Overlap
 from crashhunt.scenario import load_scenario
 from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._bent_vehicles import Bends
@@ -187,3 +189,29 @@ def test_long_vehicle_keeps_its_side_of_the_lane_in_a_bend(tmp_path):
     finally:
         libsumo.close()
     assert all(sum(abs(one) > 0.3 for one in found) > 5 for found in sides.values())
+
+
+@pytest.mark.parametrize("form", ["acceleration_steering", "speed_and_lateral"])
+@pytest.mark.parametrize("visible", ["front", "outline"])
+def test_vehicle_behind_reacts_to_the_part_of_ego_that_is_in_its_lane(tmp_path, form, visible):
+    shutil.copy(NET, tmp_path)
+    behind = '<vehicle id="behind" type="car" route="st" depart="0" departPos="15" departLane="2" departSpeed="12"/>'
+    (tmp_path / "r.rou.xml").write_text(
+        f'<routes><vType id="car" sigma="0" lcStrategic="-1" lcSpeedGain="0" lcKeepRight="0"/>'
+        f'<route id="st" edges="st"/>{behind}</routes>'
+    )
+    (tmp_path / "scenario.toml").write_text(SCENARIO % ("", f"{form}:visible={visible}"))
+    with closing(SumoSimulator(load_scenario(str(tmp_path)), tmp_path)) as simulator:
+        simulator.reset(seed=1, options={})
+        lanes = [libsumo.lane.getShape(f"st_{lane}")[0][1] for lane in (1, 2)]
+        right = 1.0 if lanes[1] < lanes[0] else -1.0  # lane 2 is to the right of ego
+        hits, encode = [], simulator.actions["ego"].encode
+        for step in range(120):
+            given = (8.0 if step < 15 else 0.0, -right if step < 15 else 0.0)
+            if form == "acceleration_steering":
+                motion, given = simulator._driving.moving["ego"], (0.0, 0.0)
+                motion.state = replace(motion.state, x=100.0, y=lanes[0] - 1.5 * right, heading=0.0, speed=0.0)
+            simulator.step({"ego": encode(given)})
+            hits += Overlap().check(simulator.scene(), ("ego",))
+        assert libsumo.vehicle.getLaneID("ego") == "st_1"
+        assert bool(hits) == (visible == "front")
