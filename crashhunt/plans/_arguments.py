@@ -224,6 +224,20 @@ def settings_of_agents(
     *,
     hunted: bool,
 ) -> dict[str, AgentSettings]:
+    """Return the settings of each agent, with a specification of each argument that has a value.
+
+    Args:
+        request: what the user asks for.
+        scenario: scenario with the agents that drive.
+        signatures: signature of each agent.
+        actions: form of actions of each agent, if one is chosen.
+        observations: observed parts of each agent, if they are chosen.
+        hunted: whether declared ranges apply, and not only values that the user gives.
+
+    Raises:
+        ArgumentError: an argument is unknown, missing or invalid.
+        ScenarioError: the scenario names an argument that the agent does not take.
+    """
     asked: dict[str, dict[str, str]] = {agent: {} for agent in scenario.agents}
     for name, spec in spec_words(request.arguments).items():
         agent, argument = _owner(name, scenario, signatures)
@@ -309,6 +323,18 @@ def _spec(
 def specs_of_scenario(
     request: Request, scenario: Scenario, disturb: Sequence[str], *, hunted: bool
 ) -> dict[str, ArgumentSpec]:
+    """Return the specification of each argument of the scenario, and of the signals of disturbances.
+
+    Args:
+        request: what the user asks for.
+        scenario: the scenario.
+        disturb: the disturbances as words.
+        hunted: whether declared ranges apply, and not only values that the user gives.
+
+    Raises:
+        ArgumentError: an argument is unknown or invalid.
+        ScenarioError: an argument has no value.
+    """
     known = scenario.scenario_arguments()
     wanted: dict[str, str] = {}
     for name, spec in spec_words(request.scenario_arguments).items():

@@ -286,6 +286,7 @@ def disturber_apart(scenario: Scenario, settings: HuntSettings) -> DisturbanceSa
 
 
 def model_apart(code: CodeFacts | None, timeout_s: float, name: str) -> DisturbanceModel:
+    """Return the disturbance model of a name; a model of the user runs in a separate process."""
     known = code.disturbances.get(name, "") if code is not None else ""
     if known or is_foreign("disturbances", name):
         return ModelApart(name, known, timeout_s=IMPORT_S + timeout_s)
