@@ -28,8 +28,10 @@ import libsumo
 from libsumo import _libsumo as sumo
 
 from crashhunt.sumo._agent_calls import commanded_elsewhere
+from crashhunt.sumo._bent_vehicles import height_at
 from crashhunt.sumo._driving import VehicleCommand
 from crashhunt.sumo._lane_graph import VEHICLE_CLASSES, is_open
+from crashhunt.world import LEVEL_M
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
@@ -246,10 +248,12 @@ class Followers:
             along, aside = zip(*turned, strict=True)
             if min(along) < piece.length and max(along) > 0.0 and min(aside) < path and max(aside) > -path:
                 pieces[piece.lane].append((piece, turned))
+        height = sumo.vehicle_getPosition3D(agent)[2]
         found = {
             lane: _Part(pieces[lane], max(0.0, speed * (piece.cos * cos + piece.sin * sin)))
             for lane in sorted(pieces)
-            for piece, _ in pieces[lane][:1]
+            for piece, turned in pieces[lane][:1]
+            if abs(height_at(lane, piece.start + turned[0][0] * piece.scale) - height) < LEVEL_M  # below no bridge
         }
         self._parts[agent] = pose, found
         return found

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         event_counts as event_counts,
     )
     from ._geometry import (
+        LEVEL_M as LEVEL_M,
         Rectangle as Rectangle,
         corners as corners,
         levels as levels,

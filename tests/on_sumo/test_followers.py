@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 import random
+import shutil
+from contextlib import closing
 from itertools import pairwise
+from pathlib import Path
 
 import libsumo
 import pytest
@@ -42,11 +45,11 @@ def begin(tmp_path):
 class Drive:
     """An episode in which ego holds its action."""
 
-    def __init__(self, simulator, arguments):
+    def __init__(self, simulator, arguments, keeps=()):
         self.simulator, self.hits = simulator, []
         simulator.reset(seed=3, options={"arguments": arguments})
         for car in libsumo.vehicle.getIDList():
-            if car != "ego":
+            if car not in ("ego", *keeps):
                 libsumo.vehicle.remove(car)
 
     def add(self, name, route, lane, place, speed, **attributes):
@@ -162,6 +165,24 @@ def test_vehicle_does_not_change_to_the_lane_of_the_tail_next_to_it(begin, visib
     drive.put((900.0, left), 0.0, 14.0)
     drive.speeds(2)
     assert libsumo.vehicle.getLaneChangeMode("car") == 1621  # SUMO's default
+
+
+def test_vehicle_below_a_bridge_does_not_brake_for_ego_on_it(tmp_path):
+    shutil.copy(Path(__file__).with_name("nets") / "bridge.net.xml", tmp_path)
+    (tmp_path / "r.rou.xml").write_text(
+        '<routes><vehicle id="low" depart="0" departPos="150" departLane="1" departSpeed="15">'
+        '<route edges="low"/></vehicle></routes>'
+    )
+    (tmp_path / "scenario.toml").write_text(
+        'schema = 1\nsimulator = "sumo"\n[sumo]\nnet = "bridge.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\n'
+        'edges = ["bridge", "down"]\ndepart_pos = "58"\naction = "acceleration_steering:visible=outline"\n'
+    )
+    with closing(SumoSimulator(load_scenario(tmp_path), tmp_path)) as simulator:
+        drive = Drive(simulator, {}, keeps=["low"])
+        drive.put((303.0, 300.5), math.pi / 2)  # across the side of its lane
+        assert min(drive.speeds(100, "low")[1:]) > 14.0
+        assert libsumo.vehicle.getPosition("low")[0] > 290.0
+        assert [*simulator._followers._parts_of("ego")] == []
 
 
 def test_traffic_is_bit_identical_while_ego_is_inside_its_lane(begin):
