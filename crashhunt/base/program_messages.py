@@ -140,6 +140,7 @@ class RoadMapData(TypedDict):
     route: list[str]
     reference_path: list[list[float]]
     is_left_hand: bool
+    obstacles: dict[str, list[list[float]]]
     vehicle: dict[str, float | str]
 
 

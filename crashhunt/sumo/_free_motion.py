@@ -396,6 +396,16 @@ class FreeMotion:
         return bool(place > sumo.lane_getLength(sumo.vehicle_getLaneID(self._vehicle)))
 
 
+def obstacle_outlines() -> dict[str, list[tuple[float, float]]]:
+    """Return the outline of each polygon of the episode that is an obstacle, by identifier, in order."""
+    shapes = {
+        name: [tuple(point[:2]) for point in sumo.polygon_getShape(name)]
+        for name in sorted(sumo.polygon_getIDList())
+        if sumo.polygon_getType(name).partition(".")[0] in _OBSTACLES
+    }
+    return {name: shape for name, shape in shapes.items() if len(shape) > 2}
+
+
 class DrivableArea:
     """The lanes that a class of vehicles may use, the junctions between them, and the obstacles.
 
@@ -415,10 +425,8 @@ class DrivableArea:
         """Read the obstacles of the episode."""
         self._obstacles.clear()
         self._recent.clear()
-        for name in sorted(sumo.polygon_getIDList()):
-            kind, shape = sumo.polygon_getType(name), [tuple(point[:2]) for point in sumo.polygon_getShape(name)]
-            if kind.partition(".")[0] in _OBSTACLES and len(shape) > 2:
-                self._obstacles.append((f"{kind} {name!r}", shape))
+        for name, shape in obstacle_outlines().items():
+            self._obstacles.append((f"{sumo.polygon_getType(name)} {name!r}", shape))
         boxes = [(*np.min(shape, axis=0), *np.max(shape, axis=0)) for _, shape in self._obstacles]
         self._boxes = np.array(boxes).reshape(-1, 4)
 

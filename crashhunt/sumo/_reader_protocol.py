@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from libsumo import _libsumo as sumo
 
 from crashhunt.simulators import center_of, nearest_actors
+from crashhunt.sumo._free_motion import obstacle_outlines
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -155,7 +157,10 @@ class Places:
         """Return the map of the roads with the vehicle's route, from its present lane on."""
         name, number = sumo.vehicle_getLaneID(self._agent), max(0, sumo.vehicle_getRouteIndex(self._agent))
         guide = self._graph.guide(tuple(sumo.vehicle_getRoute(self._agent)), self._class)
-        return guide.road_map(number, self._graph.lanes.get(name))
+        outlines = {one: np.array(shape) for one, shape in obstacle_outlines().items()}
+        for outline in outlines.values():
+            outline.flags.writeable = False
+        return replace(guide.road_map(number, self._graph.lanes.get(name)), obstacles=MappingProxyType(outlines))
 
     def _found(self, moment: Moment) -> Place | None:
         agent, scene, row = self._agent, moment.scene, moment.row

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -101,6 +102,8 @@ class RoadMap:
             passes it.
         reference_path: centre of the route as points, shape (N, 2), at most 2 m apart. A lane change is a smooth line.
         is_left_hand: whether traffic drives on the left.
+        obstacles: outlines of buildings and other obstacles by identifier, each of shape (N, 2). A vehicle that moves
+            freely leaves the road where it touches one.
     """
 
     lanes: Mapping[str, MapLane]
@@ -108,6 +111,7 @@ class RoadMap:
     route: tuple[str, ...]
     reference_path: Line
     is_left_hand: bool
+    obstacles: Mapping[str, Line] = field(default_factory=lambda: MappingProxyType({}))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,6 +168,7 @@ def describe_road_map(road_map: RoadMap, vehicle: VehicleData) -> RoadMapData:
         ],
         "route": list(road_map.route), "reference_path": road_map.reference_path.tolist(),
         "is_left_hand": road_map.is_left_hand, "vehicle": asdict(vehicle),
+        "obstacles": {name: outline.tolist() for name, outline in road_map.obstacles.items()},
     }  # fmt: skip
 
 

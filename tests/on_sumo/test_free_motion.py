@@ -18,7 +18,7 @@ from crashhunt.scenario import AgentSetup, argument_values, load_scenario
 from crashhunt.simulators import BicycleModel, MotionState
 from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._free_motion import DrivableArea, FreeMotion, _is_inside, _overlap
-from crashhunt.world import Contact
+from crashhunt.world import Contact, describe_road_map
 
 EMPTY = {"priority_demand": 1, "minor_demand": 1}
 
@@ -171,6 +171,12 @@ def test_vehicle_that_drives_into_a_building_is_off_the_road_and_the_event_names
     toml.write_text(toml.read_text().replace("[sumo]\n", '[sumo]\nadditional = ["polygons.add.xml"]\n'))
     simulator.close()
     simulator, step = start("acceleration_steering", str(folder), **EMPTY)
+    road_map = simulator.road_map("ego")
+    assert {*road_map.obstacles} == ({"b1"} if harms else set())
+    for name, outline in road_map.obstacles.items():
+        assert outline[:4] == pytest.approx(np.array(shape), abs=0.01)
+        assert not outline.flags.writeable
+        assert describe_road_map(road_map, simulator.vehicle_data("ego"))["obstacles"] == {name: outline.tolist()}
     driven = 0.0
     for _ in range(60):
         ended = step((0.0, 0.0))
