@@ -160,6 +160,7 @@ def test_a_crash_that_cannot_be_read_is_damaged(hunt, name):
     cut(hunt / "crashes" / CRASH / name)
     found = found_in(hunt)
     assert (found.crashes, found.damaged_crashes) == (["000002-collision"], [CRASH])
+    assert found.findings[0].where == str(hunt / "crashes" / CRASH / name)
     assert all(str(hunt / "crashes" / CRASH) in finding.where for finding in found.findings)
     assert found.findings[0].damaged
     one = found_in(hunt / "crashes" / CRASH)
