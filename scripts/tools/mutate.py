@@ -326,6 +326,8 @@ _TESTS_ELSEWHERE = {
         "on_sumo/test_surroundings.py",
         "on_sumo/test_world.py",
     ),
+    "sumo/_lane_paths.py": ("on_sumo/test_observed_parts.py", "on_sumo/test_road_readers.py"),
+    "sumo/_scene_readers.py": ("on_sumo/test_observed_parts.py", "on_sumo/test_road_readers.py"),
     "sumo/_scripted.py": ("on_sumo/test_manoeuvres.py", "on_sumo/test_scripted.py"),
     "sumo/_fast_step.py": ("native/test_usual_steps.py",),
     "sumo/_traffic_survey.py": ("hunts/test_traffic_survey.py", "on_sumo/test_sumo_reports.py"),
@@ -500,8 +502,11 @@ def modules_of(name: str) -> list[Path]:
 def nearest_tests(file: Path) -> tuple[Path, ...]:
     """Return the test files that lie as a module does: of its name, or of its folder, or of the folder above that."""
     inside = file.relative_to("crashhunt")
-    for name in (str(inside), *map(str, [*inside.parents][:-1])):
-        found = [path for pattern in _TESTS_ELSEWHERE.get(name, ()) for path in sorted((ROOT / "tests").glob(pattern))]
+    module, *packages = (str(inside), *map(str, [*inside.parents][:-1]))
+    # Tests of simulators lie in `on_sumo` and its like.
+    own = f"on_{inside.parts[0]}/**/test_{file.stem.strip('_')}*.py"
+    for patterns in (_TESTS_ELSEWHERE.get(module, ()), (own,), *(_TESTS_ELSEWHERE.get(name, ()) for name in packages)):
+        found = [path for pattern in patterns for path in sorted((ROOT / "tests").glob(pattern))]
         if found:
             return tuple(path.relative_to(ROOT) for path in found)
     words = file.stem.strip("_").split("_")
