@@ -143,6 +143,7 @@ def test_each_future_has_its_own_seed_and_the_first_runs_twice(times):
     runs, reruns, told = futures(lambda seed: seed, times)
     runs.run_futures(3)
     assert [(one.number, one.digest) for one in runs.counted] == [(n, str(future_seed(7, n))) for n in range(times)]
+    assert {one.excluded for one in runs.counted} == {""}
     assert {one.after for one in reruns.asked} == {3}
     seeds = [future_seed(7, number) for number in (*range(max(4, times)), 0)]
     assert sorted(one.seed for one in reruns.asked) == sorted(seeds)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import libsumo
@@ -338,6 +339,24 @@ def test_reference_driver_corrects_steering_out_of_the_lane(start, form):
     kept = simulator.action_with("ego", left, speed_mps=motion.state.speed - 0.2, keeps_lane=True)
     assert motion._next(kept.tolist()).steering < motion.state.steering
     assert simulator.motion_of("ego", kept).speed_mps == pytest.approx(motion.state.speed - 0.2, abs=1e-6)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_steering_leaves_the_lane_only_away_from_its_middle(start, side):
+    simulator, _ = start("acceleration_steering", "motorway")
+    motion, straight = simulator._driving.moving["ego"], simulator.actions["ego"].encode((0.0, 0.0))
+    state = replace(motion.state, speed=20.0)
+
+    def change(aside_m, turn):
+        x, y = (state.x - aside_m * math.sin(state.heading), state.y + aside_m * math.cos(state.heading))
+        motion.state = replace(state, x=x, y=y, heading=state.heading + turn)
+        return simulator.motion_of("ego", straight).lane_change
+
+    assert change(side * 1.5, side * 0.05) == side
+    assert change(side * 0.9, side * 0.04) == side  # 0.4 m further within the next 0.5 s
+    assert change(side * 0.2, side * 0.01) == 0
+    assert change(side * 1.5, side * -0.05) == 0  # it returns
+    assert change(side * 1.5, side * -0.4) == -side  # it returns, and beyond
 
 
 def test_standing_vehicle_keeps_its_heading(start):
