@@ -18,7 +18,7 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.text import command_line, count_of, one_line
 from crashhunt.base.version import __version__
 from crashhunt.crashes import own_frames
-from crashhunt.report._words import list_preventing
+from crashhunt.report._words import fault_words, list_preventing
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None =
     for group in groups:
         example = group.shortest
         file, line = _place(example)
-        fault = f" At fault: {group.fault}." if group.fault not in ("", "nobody can tell") else ""
+        fault = f" At fault: {fault_words(group.fault)}." if group.fault not in ("", "nobody can tell") else ""
         show = command_line("crashhunt", "show", example.path)
         prevented = f" Preventable ({words})." if (words := list_preventing(group.preventable_by)) else ""
         message = f"{example.result.summary}.{fault}{prevented} {count_of(group.count, 'crash')}. To look at it: {show}"
@@ -160,7 +160,7 @@ def crashes_summary(findings: Sequence[CrashFinding], *, compared: bool = False)
         cells = [
             str(group.count),
             escaped(finding.title),
-            group.fault,
+            fault_words(group.fault),
             f"`{shortest.id}`",
             str(shortest.result.steps),
         ]

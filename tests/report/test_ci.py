@@ -61,6 +61,7 @@ def test_a_failure_is_reported_where_it_was_in_the_agents_code(groups):
     assert (collision.file, collision.line) == ("", 1)  # there is no snapshot
     lines = crash_annotations([collision, fault])
     assert lines[0].startswith("::error title=rear end%2C the agent into the other::ego drove into a|b at step 5.")
+    assert " At fault: the agent. " in lines[0]
     assert lines[1].startswith("::error file=src/my planner.py,line=13,title=ValueError in my planner.py%3Aact::")
     assert "50 %25, or: |" in lines[1]
     notice, *shown = crash_annotations([fault] * 12)
@@ -101,6 +102,7 @@ def test_the_summary_is_a_table_that_nothing_breaks(groups):
     rows = [line for line in summary.splitlines() if line.startswith("| ")]
     assert len(rows) == 4
     assert {row.replace("\\|", "").count("|") for row in rows} == {6}
+    assert [row.split(" | ")[-3] for row in rows[-2:]] == ["the agent"] * 2  # which may have another name than ego
     compared = crashes_summary(findings_of(groups, {groups[0].signature: "kept/one"}), compared=True)
     assert "2 types, 1 new" in compared
     assert "| `kept/one` |" in compared
