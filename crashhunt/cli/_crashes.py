@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
-from crashhunt.base.text import count_of
+from crashhunt.base.text import command_line, count_of
 from crashhunt.cli._common import (
     DONE,
     INTERRUPTED,
@@ -251,6 +251,11 @@ def checked_cases(options: argparse.Namespace) -> list[Case] | None:
             )
         return None
     if corpus.is_dir() and not any(corpus.rglob(layout.CASE)):
+        if (corpus / layout.HUNT).exists():
+            add = command_line("crashhunt", "corpus", "add", corpus, "--to", "crashes")
+            raise UsageError(
+                f"--known {command_line(corpus)} is a hunt, not a corpus", fix=f"make a corpus of it: {add}"
+            )
         return []
     return [read_case(path) for path in find_cases([corpus])]
 

@@ -224,6 +224,14 @@ def test_new_crash_fails_where_that_is_asked_for(grouped, monkeypatch, capsys, t
         run("crashes", "a", "--fail-on-new")
 
 
+def test_hunt_is_not_taken_for_an_empty_corpus(grouped, tmp_path):
+    hunt = tmp_path / "other"
+    hunt.mkdir()
+    (hunt / "hunt.toml").touch()
+    with pytest.raises(UsageError, match="is a hunt, not a corpus; make a corpus of it: crashhunt corpus add "):
+        run("crashes", "a", "--known", hunt)
+
+
 # crashhunt replay
 
 
