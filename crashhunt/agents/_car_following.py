@@ -45,7 +45,7 @@ def check_layout(space: Space[object] | None) -> None:
     """
     if space is None:
         return
-    from gymnasium.spaces import Dict  # takes no time here: whoever made the space has imported it
+    from gymnasium.spaces import Dict  # takes no time here: the maker of the space has imported it
 
     if isinstance(space, Dict):
         raise ValueError(
