@@ -10,6 +10,7 @@ import difflib
 import math
 import re
 import shlex
+import sys
 import unicodedata
 from typing import TYPE_CHECKING
 
@@ -231,6 +232,20 @@ def out_of(done: int, planned: int, separator: str = " of ") -> str:
         separator: text between the two numbers.
     """
     return f"{done}{separator}{planned}" if planned and done <= planned else str(done)
+
+
+_ESCAPED_LETTER = re.compile(r"\\(x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})")
+
+
+def unescape_letters(stack: str) -> str:
+    r"""Return a stack with the letters that `faulthandler` escapes outside of ASCII, such as ``\xdf`` in a path."""
+
+    def letter(found: re.Match[str]) -> str:
+        number = int(found[1][1:], 16)
+        is_letter = 0x80 <= number < 0xD800 or 0xE000 <= number <= sys.maxunicode  # JSON has no surrogates
+        return chr(number) if is_letter else found[0]
+
+    return _ESCAPED_LETTER.sub(letter, stack)
 
 
 def _normalized(name: str) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError
-from crashhunt.base.text import count_of
+from crashhunt.base.text import count_of, unescape_letters
 from crashhunt.crashes import Bundle, judgement_of, preventable_by
 from crashhunt.crashes._contact_record import contact_record
 from crashhunt.crashes._fault import Verdict, fault_of
@@ -75,7 +75,7 @@ def _frames(text: str) -> list[StackFrame]:
     """Return each call of a traceback, the innermost first."""
     found = [
         StackFrame(PurePath(match["file"]), int(match["line"]), match["function"])
-        for match in _FRAME_LINE.finditer(text)
+        for match in _FRAME_LINE.finditer(unescape_letters(text))  # earlier versions kept the escapes of faulthandler
     ]
     # A stuck or dead process has written its stack that way already, an exception the other way.
     return found if "most recent call first" in text else found[::-1]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.exceptions import is_users
 from crashhunt.base.signals import is_sent_from_outside, signal_name
+from crashhunt.base.text import unescape_letters
 from crashhunt.episode import scratch_of
 from crashhunt.executors._native_stack import split_native_calls
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, read_black_box, read_header
@@ -298,4 +299,4 @@ def _read_stack(path: Path) -> str:
     except OSError:
         return ""
     native, rest = split_native_calls(text)
-    return f"{native}{rest[-_TAIL_BYTES:]}" if native else read_tail(path)
+    return f"{native}{unescape_letters(rest[-_TAIL_BYTES:])}" if native else unescape_letters(read_tail(path))

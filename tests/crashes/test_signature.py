@@ -63,6 +63,16 @@ def test_the_stack_of_a_stuck_process_begins_with_the_innermost_function():
     assert found.where.startswith("test_signature.py:test_the_stack_of_a_stuck_process_begins_with_")
 
 
+def test_stack_of_an_earlier_version_has_the_same_type_in_a_file_with_letters_outside_of_ascii():
+    """Earlier versions kept the escapes of `faulthandler`."""
+    now, before = (
+        Failure("timeout", "60 s", f'Thread 0x1 (most recent call first):\n  File "/mine/{name}.py", line 1 in act')
+        for name in ("für", r"f\xfcr")
+    )
+    found = [signature_of(bundle(0, outcome=Outcome.HANG, failure=failure)) for failure in (now, before)]
+    assert [one.where for one in found] == ["für.py:act"] * 2
+
+
 def test_a_dead_process_is_known_by_its_signal_and_stack():
     code = (
         "import faulthandler, os, signal; faulthandler.enable()\ndef act(): os.kill(os.getpid(), signal.SIGSEGV)\nact()"

@@ -104,6 +104,19 @@ def test_hang_names_the_function_of_the_user_that_does_not_return(begun, phase):
     assert message == "still running after 2.5 s (envs.py, line 4 in close) while the episode was being set up"
 
 
+@pytest.mark.parametrize(
+    ("name", "written"), [("fußball", r"fu\xdfball"), ("道", r"\u9053"), ("🚗", r"\U0001f697"), (r"\udcff", r"\udcff")]
+)
+def test_letters_outside_of_ascii_in_a_stack_are_as_in_the_path(begun, phase, name, written):
+    """`faulthandler` escapes them, so the modules of crashhunt and of the agent were not found in such a folder."""
+    lines = ["Current thread 0x1 (most recent call first):", f'  File "/{written}/a.py", line 4 in act']
+    (scratch_of(begun, 7) / layout.STACK).write_text("\n".join(["Fatal Python error", "", *lines]))
+    phase(Phase.SIMULATE)
+    failure = _postmortem.died(SPEC, begun, SEGV, agents={"ego": f"{name}.a"}).failure
+    assert failure.traceback.endswith(f'File "/{name}/a.py", line 4 in act')
+    assert failure.agent == "ego"
+
+
 def test_before_the_first_step_it_is_no_crash(begun, tmp_path, phase):
     other = TrialSpec(8, 1, {"ego": {}}, {}, 99)
     nothing = _postmortem.died(other, tmp_path, 3)
