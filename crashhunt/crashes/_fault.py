@@ -360,7 +360,9 @@ def fault_of(bundle: Bundle, recording: Recording | None = None, record: Contact
     if result.outcome is Outcome.AGENT_ERROR:
         return _egos("agent error", "the code of the agent failed", "the agent controls the vehicle")
     if result.outcome is Outcome.OFF_ROAD and hit is not None and not hit.other:
-        return _egos("off the road", "it left the road without contact", "Vienna, article 13 (1); StVO § 3 (1)")
+        return _egos(
+            "off the road", "it left the road without contact with an actor", "Vienna, article 13 (1); StVO § 3 (1)"
+        )
     event = result.event
     driven_s = result.steps * (result.step_length_s or 0.0)  # results of early versions have no length of a step
     if event is not None and event.kind in _SOURCES and driven_s >= _INSERTED_S:
