@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import re
 import shutil
+from contextlib import nullcontext
 
 import pytest
 
@@ -112,6 +113,15 @@ def test_names_in_a_scenario_are_looked_up(tmp_path, line, wrong, says):
         load_scenario(file)
     assert says in str(caught.value)
     load_scenario(file, kept=True)  # a snapshot's has been run
+
+
+@pytest.mark.parametrize(("route", "is_known"), [("!left.1", True), ("left.1!", False)])
+def test_route_with_the_name_that_sumo_gives_it_is_not_looked_up(tmp_path, route, is_known):
+    shutil.copytree(shipped_folder() / "loop", tmp_path / "own")
+    file = tmp_path / "own" / "scenario.toml"
+    file.write_text(file.read_text().replace('route = "counterclockwise"', f'route = "{route}"'))
+    with nullcontext() if is_known else pytest.raises(ScenarioError, match=f"no route '{route}'"):
+        load_scenario(file)
 
 
 def test_the_default_of_the_vehicle_that_is_replaced_is_looked_up(town):
