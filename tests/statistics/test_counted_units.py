@@ -66,6 +66,13 @@ def test_crashes_without_any_driven_distance_have_no_rate_per_hour():
     assert counted(trials).certain is not None
 
 
+def test_trial_that_drove_longer_than_its_hunt_allows_leaves_no_rate_per_hour():
+    trials = [trial(0), trial(1), trial(2, steps=900), trial(3, steps=990)]
+    found = counted(trials, per="hour")
+    assert found.why_not.startswith("trial 2 is beyond the bounds of the hunt: one trial has 0 events and exposure 0.0")
+    assert counted(trials).why_not == ""
+
+
 def test_trial_that_was_killed_from_outside_has_not_ended():
     found = counted([trial(0), trial(1, valid=False, has_ended=False), trial(2)])
     assert (found.trials, found.excluded) == (1, {"after_unfinished": 1})
