@@ -17,9 +17,11 @@ import dataclasses
 import fcntl
 import functools
 import gc
+import hashlib
 import importlib
 import importlib.util
 import json
+import marshal
 import os
 import select
 import signal
@@ -53,8 +55,10 @@ _FREE = 500  # where a process has no files of its own
 OF_THE_GROUP = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM)
 
 
-_compiled: dict[bytes | str, types.CodeType] = {}  # what a file of crashhunt says, to what Python makes of it
-_given: set[bytes | str] = set()  # the texts whose code has become that of a module
+# What Python makes of the files of crashhunt, by the digests of these; as bytes, because each fork copies the tables of
+# all pages that code objects would take.
+_compiled: dict[bytes, bytes] = {}
+_run: dict[str, types.CodeType] = {}  # what dataclasses compile
 _read: dict[tuple[str, str], str | None] = {}  # what a file says of something that is installed
 _made: dict[str, tuple[types.CodeType, bytes]] = {}  # what a module of crashhunt is made from
 # What is there when one of these has been imported: modules, their code, and what their files say.
@@ -318,14 +322,11 @@ class _Known(SourceFileLoader):
 
     def get_code(self, fullname: str) -> types.CodeType | None:
         text = self.get_data(self.path)
-        known = _compiled.get(text)
-        if known is None:
+        compiled = _compiled.get(_digest_of(text))
+        if compiled is None:
             return super().get_code(fullname)
-        if text in _given:  # another file says the same
-            known = _of_file(known, self.path)
-        else:
-            _given.add(text)
-            _imp._fix_co_filename(known, self.path)  # type: ignore[attr-defined] - as importlib does it, in C
+        known: types.CodeType = marshal.loads(compiled)
+        _imp._fix_co_filename(known, self.path)  # type: ignore[attr-defined] - as importlib does it, in C
         _made[fullname] = known, text
         return known
 
@@ -339,9 +340,8 @@ class _Known(SourceFileLoader):
         return spec
 
 
-def _of_file(code: types.CodeType, file: str) -> types.CodeType:
-    inner = (_of_file(part, file) if isinstance(part, types.CodeType) else part for part in code.co_consts)
-    return code.replace(co_filename=file, co_consts=tuple(inner))
+def _digest_of(text: bytes) -> bytes:
+    return hashlib.blake2b(text, digest_size=16).digest()
 
 
 def _compile() -> None:
@@ -351,30 +351,29 @@ def _compile() -> None:
         for file in Path(folder).rglob("*.py"):
             code = SourceFileLoader("", str(file)).get_code("")
             if code is not None:
-                _compiled[file.read_bytes()] = code
+                _compiled[_digest_of(file.read_bytes())] = marshal.dumps(code)
 
 
 def _import_ours(simulator: str = "") -> None:
-    """Import what processes of crashhunt begin with, each by itself, and put it aside."""
+    """Import what processes of crashhunt begin with, and put it aside; the second needs all that the first does."""
     for name in filter(_is_ours, [*sys.modules]):
         del sys.modules[name]
     sys.meta_path.insert(0, _Known)
+    found: dict[str, tuple[types.ModuleType, types.CodeType, dict[str, bytes]]] = {}
     for begins_with in _BEGIN_WITH:
         for name in (begins_with, *_GO_ON_WITH[simulator]):
             importlib.import_module(name)
         prepare_ours()
         if begins_with == "crashhunt.executors._fork_server":
             _rehearse()
-        found = _imported[begins_with] = {}
         for name in filter(_is_ours, [*sys.modules]):
-            module = sys.modules.pop(name)
             code, text = _made[name]
-            files = {".py": text}
-            if hasattr(module, "__path__"):
-                files = {"/__init__.py": text}
-            found[name] = module, code, files
-        del found[begins_with]  # which knows its process, as no other does
-        _given.clear()
+            is_package = hasattr(sys.modules[name], "__path__")
+            found[name] = sys.modules[name], code, {"/__init__.py" if is_package else ".py": text}
+        _imported[begins_with] = {**found}
+        del _imported[begins_with][begins_with]  # which knows its process, as no other does
+    for name in found:
+        del sys.modules[name]
     sys.meta_path.remove(_Known)
     gc.collect()
     gc.freeze()
@@ -389,10 +388,11 @@ def prepare_ours() -> None:
 
 
 def _rehearse() -> None:
-    """Rehearse trials once, so that the rehearsal of each fork finds most caches filled: 30 ms in place of 45 ms."""
-    rehearse = importlib.import_module("crashhunt.executors._rehearsal").rehearse_trial
+    """Rehearse trials once, which fills the caches of all forks: another rehearsal in each of them costs 36 ms."""
+    rehearsal = importlib.import_module("crashhunt.executors._rehearsal")
     with tempfile.TemporaryDirectory() as folder:
-        rehearse(Path(folder), lambda _: None)
+        rehearsal.rehearse_trial(Path(folder), lambda _: None)
+    rehearsal._rehearse = lambda _: None  # where the code of a snapshot is the same, see `_put_back`
 
 
 class _Contents:
@@ -528,9 +528,9 @@ def _remember() -> None:
         return _read[key]
 
     def run(text: str, *namespaces: dict[str, object]) -> None:
-        if text not in _compiled:
-            _compiled[text] = compile(text, "<string>", "exec")
-        exec(_compiled[text], *namespaces)
+        if text not in _run:
+            _run[text] = compile(text, "<string>", "exec")
+        exec(_run[text], *namespaces)
 
     metadata.PathDistribution.read_text = read_once  # type: ignore[method-assign]
     vars(dataclasses)["exec"] = run
@@ -584,7 +584,6 @@ def _put_back(begins_with: str) -> None:
     for name, (module, code, files) in found.items():
         file, *_ = (stems[name] + end for end in files)
         _imp._fix_co_filename(code, file)  # type: ignore[attr-defined]
-        _given.add(next(iter(files.values())))
         contents = _contents.get(id(vars(module)))
         is_same = contents is not None and contents.is_same
         module.__loader__ = loader = _Known(name, file)
