@@ -28,6 +28,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import as_installed  # noqa: F401 - before anything imports crashhunt
 import hypothesis
 import json_schemas
 import pytest
@@ -320,7 +321,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     All tests in a browser go to the first worker, since a browser takes seconds to start.
     """
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    browser, long, others = ([item for item in items if _group(item) == group] for group in ("browser", "long", ""))
+    groups: dict[str, list[pytest.Item]] = {"browser": [], "long": [], "": []}
+    for item in items:
+        groups[_group(item)].append(item)
+    browser, long, others = groups.values()
     each = len(items) // workers  # which is how they are handed out at first
     items[:] = browser
     for worker in range(workers):
