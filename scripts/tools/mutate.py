@@ -504,8 +504,12 @@ def nearest_tests(file: Path) -> tuple[Path, ...]:
     inside = file.relative_to("crashhunt")
     module, *packages = (str(inside), *map(str, [*inside.parents][:-1]))
     # Tests of simulators lie in `on_sumo` and its like.
-    own = f"on_{inside.parts[0]}/**/test_{file.stem.strip('_')}*.py"
-    for patterns in (_TESTS_ELSEWHERE.get(module, ()), (own,), *(_TESTS_ELSEWHERE.get(name, ()) for name in packages)):
+    of_simulator = f"on_{inside.parts[0]}/**/test_{file.stem.strip('_')}*.py"
+    for patterns in (
+        _TESTS_ELSEWHERE.get(module, ()),
+        (of_simulator,),
+        *(_TESTS_ELSEWHERE.get(name, ()) for name in packages),
+    ):
         found = [path for pattern in patterns for path in sorted((ROOT / "tests").glob(pattern))]
         if found:
             return tuple(path.relative_to(ROOT) for path in found)
