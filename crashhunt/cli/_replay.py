@@ -190,10 +190,11 @@ def _shot(
     meanings: Sequence[str] = (),
 ) -> Shot:
     from crashhunt.crashes import most_dangerous, names_of_actions
-    from crashhunt.recording import read_lanes
+    from crashhunt.recording import read_lanes, read_obstacles
     from crashhunt.render import Shot
 
-    lanes = read_lanes(bundle.path / layout.LOG)
+    log = bundle.path / layout.LOG
+    lanes, obstacles = read_lanes(log), read_obstacles(log)
     near = most_dangerous(recording) if bundle.is_near_miss and not crashed else None
     if near is not None:
         return Shot(
@@ -205,6 +206,7 @@ def _shot(
             panels=panels,
             meanings=meanings or names_of_actions(bundle, near.agent),
             nearest=near.step,
+            obstacles=obstacles,
         )
     hit = result.collision
     other = hit.other if hit else ""
@@ -217,6 +219,7 @@ def _shot(
         panels=panels,
         meanings=meanings or names_of_actions(bundle, bundle.driver),
         crash_words=_crash_words(result.outcome),
+        obstacles=obstacles,
     )
 
 

@@ -51,6 +51,7 @@ from crashhunt.executors._native_stack import record_native_stack
 from crashhunt.recording import BlackBox
 from crashhunt.simulators import (
     HasMap,
+    HasObstacles,
     PreparesProcess,
     ReportsNotices,
     RestoresState,
@@ -340,7 +341,8 @@ class TrialProcess:
         kept = settings.keeps(result)
         wants_map = (kept or job["wants_map"]) and result.outcome is not Outcome.INVALID
         if wants_map and supports(simulator, HasMap):
-            report["map"] = _dumps([[lane.id, lane.width, lane.shape] for lane in simulator.lanes()])
+            obstacles = simulator.obstacles() if supports(simulator, HasObstacles) else ()
+            report["map"] = _dumps([[one.id, one.width, one.shape] for one in (*simulator.lanes(), *obstacles)])
         if kept and result.spec.only is not None and supports(simulator, SupportsExclusion):
             report["entered"] = list(simulator.entered)
         if kept and self._reference is not None:

@@ -24,7 +24,12 @@ if TYPE_CHECKING:
         has_same_scenes as has_same_scenes,
         values_around as values_around,
     )
-    from ._foxglove import foxglove_layout as foxglove_layout, lane_borders as lane_borders, read_lanes as read_lanes
+    from ._foxglove import (
+        foxglove_layout as foxglove_layout,
+        lane_borders as lane_borders,
+        read_lanes as read_lanes,
+        read_obstacles as read_obstacles,
+    )
     from ._log import read_log as read_log, write_log as write_log
     from ._reading import (
         AgentChannel as AgentChannel,

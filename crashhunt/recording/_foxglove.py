@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 _MAX_CHUNK_BYTES = 256 << 20  # unpacked; crashhunt begins a new chunk after 1 MB, and the log may be a stranger's
 _MAP_REACH_M = 300.0  # around where anybody drove; a town's whole map is too much for a viewer
+_OBSTACLES = "obstacles"  # entity of the map whose lines are outlines, and not borders of lanes
 _HEIGHT_M = 1.5  # of a car of unknown height
 _PERSON_HEIGHT_M = 1.7  # likewise
 _COLORS = {
@@ -120,26 +121,28 @@ def foxglove_layout(recording: Recording) -> dict[str, object]:
 
 
 def _write_map(log: LogWriter, recording: Recording, scenes: Sequence[Scene], lanes: Sequence[Lane]) -> None:
-    """Write both borders of every lane near a controlled vehicle, once, at the beginning."""
+    """Write both borders of every lane near a controlled vehicle, and the obstacles there, once, at the beginning."""
     rows = ((scene, scene.roster.index.get(agent)) for scene in scenes[::10] for agent in recording.agents)
     driven = np.array([scene.points[row] for scene, row in rows if row is not None]).reshape(-1, 2)
     if not len(driven):
         return
     low, high = driven.min(axis=0) - _MAP_REACH_M, driven.max(axis=0) + _MAP_REACH_M
-    entity = SceneEntity(id="lanes", frame_id="map")
-    _stamp(entity.timestamp, scenes[0].time_s)
+    entities = [SceneEntity(id=name, frame_id="map") for name in ("lanes", _OBSTACLES)]
+    for entity in entities:
+        _stamp(entity.timestamp, scenes[0].time_s)
     for lane in lanes:
         shape = np.array(lane.shape, dtype=float).reshape(-1, 2)
         if len(shape) < 2 or not ((shape.max(axis=0) >= low) & (shape.min(axis=0) <= high)).all():
             continue
-        for side in (-0.5, 0.5):
-            line = entity.lines.add(
+        for side in (-0.5, 0.5) if lane.width else (0.0,):
+            line = entities[0 if lane.width else 1].lines.add(
                 type=LinePrimitive.LINE_STRIP, thickness=0.12, scale_invariant=False, color=_color("border")
             )
             line.pose.orientation.w = 1.0
             for x, y in _shifted(shape, side * lane.width).tolist():
                 line.points.add(x=x, y=y)
-    log.write("/map", SceneUpdate, SceneUpdate(entities=[entity]).SerializeToString(), to_ns(scenes[0].time_s))
+    shown = [entity for entity in entities if entity.id != _OBSTACLES or entity.lines]
+    log.write("/map", SceneUpdate, SceneUpdate(entities=shown).SerializeToString(), to_ns(scenes[0].time_s))
 
 
 def lane_borders(lanes: Sequence[Lane]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
@@ -158,6 +161,20 @@ def read_lanes(path: Path) -> list[tuple[NDArray[np.float64], NDArray[np.float64
     Raises:
         BundleError: the log cannot be read.
     """
+    lines = _read_lines(path, is_obstacle=False)
+    return list(zip(lines[0::2], lines[1::2], strict=True))
+
+
+def read_obstacles(path: Path) -> list[NDArray[np.float64]]:
+    """Return the outlines of the obstacles in a log, such as buildings, each of shape (n, 2), in m.
+
+    Raises:
+        BundleError: the log cannot be read.
+    """
+    return _read_lines(path, is_obstacle=True)
+
+
+def _read_lines(path: Path, *, is_obstacle: bool) -> list[NDArray[np.float64]]:
     try:
         with path.open("rb") as file:
             for _, _, _, data in messages_of(file, SeekingReader(file), topic="/map"):
@@ -165,9 +182,12 @@ def read_lanes(path: Path) -> list[tuple[NDArray[np.float64], NDArray[np.float64
                 lines = [
                     np.array([(point.x, point.y) for point in line.points]).reshape(-1, 2)
                     for entity in update.entities
+                    if (entity.id == _OBSTACLES) == is_obstacle
                     for line in entity.lines
                 ]
-                return list(zip(lines[0::2], lines[1::2], strict=True))
+                if len(lines) % 2 and not is_obstacle:
+                    raise ValueError("a lane has one border")
+                return lines
     except OSError as error:
         raise BundleError(
             f"cannot be read: {error.strerror}", fix="check that the file exists and may be read", where=str(path)

@@ -85,6 +85,7 @@ class Shot:
         meanings: names of the agent's discrete actions, if they are known.
         nearest: for a near miss, the step around which the film is made; -1 for a crash, with which the film ends.
         crash_words: text above the step of the crash.
+        obstacles: outlines of the obstacles of the crash's map.
     """
 
     recording: Recording
@@ -96,6 +97,7 @@ class Shot:
     meanings: Sequence[str] = ()
     nearest: int = -1
     crash_words: str = "CRASH"
+    obstacles: Sequence[NDArray[np.float64]] = ()
 
 
 class Layout:
@@ -189,6 +191,7 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
             crash_step=shot.crash_step,
             nearest_step=shot.nearest,
             crash_words=shot.crash_words,
+            obstacles=shot.obstacles,
         )
         builtin = None
         if options.panels:

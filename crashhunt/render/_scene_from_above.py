@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import Disturbance
     from crashhunt.world import Scene
 
-_SKY, _ROAD, _MARK = (246, 247, 249), (228, 232, 237), (170, 180, 192)
+_SKY, _ROAD, _MARK, _OBSTACLE = (246, 247, 249), (228, 232, 237), (170, 180, 192), (196, 186, 176)
 # The contrast of the agent and its collision partner is that of the report.
 _EGO, _PARTNER, _AGENT, _OTHER = (255, 179, 26), (143, 15, 63), (46, 158, 91), (154, 165, 179)
 _CRASH = (198, 40, 40)
@@ -53,6 +53,7 @@ class SceneView:
         crash_step: step at which to mark the crash; -1 for none.
         nearest_step: step at which to mark the nearest moment of a near miss, for a second; -1 for none.
         crash_words: text above the marked crash.
+        obstacles: outlines of obstacles, shape (n, 2), in m.
     """
 
     def __init__(
@@ -68,10 +69,12 @@ class SceneView:
         crash_step: int = -1,
         nearest_step: int = -1,
         crash_words: str = "CRASH",
+        obstacles: Sequence[NDArray[np.float64]] = (),
     ) -> None:
         self.width, self.height = width, height
         self._recording = recording
         self._lanes = [(right, left, _box(right, left)) for right, left in lanes if len(right) > 1]
+        self._obstacles = [outline for outline in obstacles if len(outline) > 2]
         self._agent, self._other = agent, other
         self._agents = set(recording.agents)
         self._scale = scale
@@ -148,6 +151,9 @@ class SceneView:
         for right, left, _ in seen:
             for border in (right, left):
                 draw.line(self._to_pixels(border.copy()).ravel().tolist(), fill=_MARK, width=_OVERSAMPLING)
+        for outline in self._obstacles:
+            if (outline.min(axis=0) <= high).all() and (outline.max(axis=0) >= low).all():
+                draw.polygon(self._to_pixels(outline.copy()).ravel().tolist(), fill=_OBSTACLE)
 
     def _draw_trail(self, draw: ImageDraw.ImageDraw, name: str, color: tuple[int, int, int], step: int) -> None:
         points = []

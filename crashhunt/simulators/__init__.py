@@ -62,6 +62,7 @@ if TYPE_CHECKING:
         FlattensObservations as FlattensObservations,
         FullBraking as FullBraking,
         HasMap as HasMap,
+        HasObstacles as HasObstacles,
         HasWindow as HasWindow,
         Info as Info,
         KnowsEncodedType as KnowsEncodedType,

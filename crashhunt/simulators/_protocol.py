@@ -268,6 +268,13 @@ class HasMap(Protocol):
         """
 
 
+class HasObstacles(Protocol):
+    """A simulator with obstacles that do not move and are no actors, such as buildings."""
+
+    def obstacles(self) -> Sequence[Lane]:
+        """Return the obstacles of the episode, each as a closed line of the width 0."""
+
+
 class ProvidesRoadMaps(Protocol):
     """A simulator that gives its agents the map of the roads, and the data of their vehicles."""
 

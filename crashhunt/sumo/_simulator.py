@@ -38,6 +38,7 @@ from crashhunt.sumo._ego_and_actors import vehicle_data_of
 from crashhunt.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.sumo._files import StagedFiles
 from crashhunt.sumo._followers import Followers
+from crashhunt.sumo._free_motion import obstacle_outlines
 from crashhunt.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
 from crashhunt.sumo._lane_graph import USUAL_CLASS
 from crashhunt.sumo._lights import LightReader
@@ -326,6 +327,10 @@ class SumoSimulator:
                 for lane in sumo.lane_getIDList()
             ]
         return self._lanes
+
+    def obstacles(self) -> list[Lane]:
+        """Return the outlines of the obstacles in additional files."""
+        return [Lane(name, 0.0, (*shape, shape[0])) for name, shape in obstacle_outlines().items()]
 
     def lights(self) -> Lights:
         """Return traffic lights, the lights of vehicles, and what is ahead of the agents on their routes."""

@@ -24,7 +24,8 @@ VIOLATED = Outcome.own(REQUIREMENT, RequirementOracle.outcomes[REQUIREMENT])
     ],
 )
 def test_only_a_traffic_crash_is_called_a_crash(monkeypatch, tmp_path, outcome, words):
-    monkeypatch.setattr("crashhunt.recording.read_lanes", lambda _: [])
+    for name in ("read_lanes", "read_obstacles"):
+        monkeypatch.setattr(f"crashhunt.recording.{name}", lambda _: [])
     bundle = SimpleNamespace(path=tmp_path, is_near_miss=False, driver="ego", files={})
     result = SimpleNamespace(outcome=outcome, collision=None)
     shot = _replay._shot(bundle, SimpleNamespace(steps=7), result, {}, crashed=True)

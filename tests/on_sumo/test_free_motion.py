@@ -173,7 +173,7 @@ def test_vehicle_that_drives_into_a_building_is_off_the_road_and_the_event_names
     simulator.close()
     simulator, step = start("acceleration_steering", str(folder), **EMPTY)
     road_map = simulator.road_map("ego")
-    assert {*road_map.obstacles} == ({"b1"} if harms else set())
+    assert {*road_map.obstacles} == {one.id for one in simulator.obstacles()} == ({"b1"} if harms else set())
     for name, outline in road_map.obstacles.items():
         assert outline[:4] == pytest.approx(np.array(shape), abs=0.01)
         assert not outline.flags.writeable

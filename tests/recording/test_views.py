@@ -25,6 +25,7 @@ from crashhunt.recording import (
     foxglove_layout,
     lane_borders,
     read_lanes,
+    read_obstacles,
     write_log,
 )
 from crashhunt.recording._blackbox import Record
@@ -253,6 +254,16 @@ def test_the_map_is_what_an_agent_came_near(shown, tmp_path):
     assert len(direct) == len(lanes) - 1
     assert np.array_equal(direct[0], [[[0, -2], [100, -2]], [[0, 2], [100, 2]]])
     assert np.allclose(direct[1][1], found[1][1])
+
+
+def test_obstacles_are_apart_from_the_lanes_of_the_map(shown, tmp_path):
+    outline = ((20.0, 5.0), (24.0, 5.0), (24.0, 9.0), (20.0, 5.0))
+    lanes = [Lane("house", 0.0, outline), Lane("east", 4.0, ((0.0, 0.0), (100.0, 0.0)))]
+    ((_, update),) = shown(record({}, {}), lanes=lanes)["/map"]
+    assert [(entity.id, len(entity.lines)) for entity in update.entities] == [("lanes", 2), ("obstacles", 1)]
+    assert [found.tolist() for found in read_obstacles(tmp_path / "log.mcap")] == [[list(one) for one in outline]]
+    ((right, left),) = read_lanes(tmp_path / "log.mcap")
+    assert (right.tolist(), left.tolist()) == ([[0, -2], [100, -2]], [[0, 2], [100, 2]])
 
 
 def test_without_scenes_or_agents_there_is_nothing_to_see(shown, tmp_path):

@@ -125,6 +125,16 @@ def test_lanes_in_sight_are_drawn_between_their_borders():
     assert tuple(with_lanes[150 + 28, 300]) == (228, 232, 237)
 
 
+def test_obstacles_in_sight_are_drawn_as_areas():
+    found = recording({"ego": (2.5, 0.0, 0.0, 0.0)}, actors=[CAR])
+    house = np.array([(5.0, 3.0), (15.0, 3.0), (15.0, 8.0), (5.0, 8.0), (5.0, 3.0)])
+    picture = view(found, obstacles=[house, house + np.array((0.0, 500.0)), house[:2]]).draw(0)
+    changed = (picture != view(found).draw(0)).any(axis=2).nonzero()
+    assert (changed[0].min(), changed[0].max()) == (pytest.approx(150 - 64, abs=1), pytest.approx(150 - 24, abs=1))
+    assert (changed[1].min(), changed[1].max()) == (pytest.approx(200 + 40, abs=1), pytest.approx(200 + 120, abs=1))
+    assert tuple(picture[150 - 40, 200 + 80]) == (196, 186, 176)
+
+
 TOP, BELOW = slice(44), slice(55, 110)
 
 
