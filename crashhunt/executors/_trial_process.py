@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, NotRequired, TypedDict
+from typing import TYPE_CHECKING, NoReturn, NotRequired, TextIO, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
@@ -77,6 +77,22 @@ _EXCLUDED_FROM_HERE_WORDS = " are left out from here on: "
 
 # Bound here, before any agent is imported that could replace them.
 _dumps, _leave, _open, _dup2, _close = json.dumps, os._exit, os.open, os.dup2, os.close
+
+_FATAL_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE)
+
+
+def record_stack(file: TextIO) -> None:
+    """Have this process write its Python stack to a file when it dies of a signal, and at each SIGUSR1.
+
+    pygame, which highway-env imports, aborts at fatal signals, so a process would die of SIGABRT instead of SIGSEGV.
+    Its handlers are in C, so `signal.getsignal` does not see them. A handler in Python stays.
+    """
+    faulthandler.disable()
+    for number in _FATAL_SIGNALS:
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.SIG_DFL)
+    faulthandler.enable(file)
+    faulthandler.register(signal.SIGUSR1, file)
 
 
 class Job(TypedDict):
@@ -318,8 +334,7 @@ class TrialProcess:
         stack = _open(f"{folder}/{layout.STACK}", os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         _dup2(stack, self._stack.fileno(), inheritable=False)
         _close(stack)
-        faulthandler.enable(self._stack)
-        faulthandler.register(signal.SIGUSR1, self._stack)
+        record_stack(self._stack)
         if any(is_native(setup.agent) for setup in self._settings.scenario.agents.values()):
             record_native_stack(self._stack.fileno())
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
+import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -278,3 +280,19 @@ def test_a_simulator_that_starts_threads_is_not_forked_once_it_is_there(monkeypa
     assert _fork_server._is_forkable_with(SimpleNamespace(simulator=lambda: None))
     assert not _fork_server._is_forkable_with(SimpleNamespace(simulator=with_threads))
     assert not _fork_server._is_forkable_with(SimpleNamespace(simulator=fails))
+
+
+@pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE])
+def test_process_with_pygame_dies_of_the_signal_itself(tmp_path, number):
+    """pygame aborts at a fatal signal, so crashes of agents in highway-env seemed to be SIGABRT."""
+    code = f"""
+import os, pygame
+from crashhunt.executors._trial_process import record_stack
+with open({str(tmp_path / "stack")!r}, "w") as stack:
+    for _ in range(2):
+        record_stack(stack)
+    os.kill(os.getpid(), {int(number)})
+"""
+    died = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False)
+    assert died.returncode == -number
+    assert "most recent call first" in (tmp_path / "stack").read_text()
