@@ -8,12 +8,10 @@ if TYPE_CHECKING:
     from ._crash_oracles import (
         MAX_BRAKING_MPS2 as MAX_BRAKING_MPS2,
         OffRoad as OffRoad,
-        Overlap as Overlap,
-        ReportedCollision as ReportedCollision,
-    )
-    from ._event_oracles import (
         OffRoute as OffRoute,
+        Overlap as Overlap,
         RedLight as RedLight,
+        ReportedCollision as ReportedCollision,
         Teleport as Teleport,
         TooClose as TooClose,
         TrafficEvents as TrafficEvents,
