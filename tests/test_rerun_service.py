@@ -234,7 +234,7 @@ def test_calls_in_threads_return_in_the_order_of_the_items():
 
     def call(item):
         if item == 0:
-            assert first.wait(20)
+            assert first.wait(300)
         first.set()
         return -item
 

@@ -54,14 +54,14 @@ def test_each_harm_costs_its_own_trial_with_a_message_that_names_the_vehicle_and
     harms = {
         "garbage": "ego: its answer to observe of step 3 is not JSON: thinking",
         "SIGSEGV": "ego: the program died of SIGSEGV instead of answering observe of step 3",
-        "late": "ego: it has not answered observe of step 3 within 4 s",
+        "late": "ego: it has not answered observe of step 3 within 20 s",
         "NaN": "the action [nan, 0] is not (target_speed, lane_change)",
     }
     kinds = "|".join([*harms, "none"])
     (toy.folder / "garbage").write_text("a file with the name of a value")
     toy.crashhunt(
         "run", "h", "2", "5", "20", "--agent", "exec:./planner - observe", "--arg", f"kind={kinds}", "--arg",
-        "speed=8.0", "--set", "gap_m=30.0", "--sampler", "grid", *RUN, "--keep-going", "--step-timeout", "4", "--json",
+        "speed=8.0", "--set", "gap_m=30.0", "--sampler", "grid", *RUN, "--keep-going", "--step-timeout", "20", "--json",
     )  # fmt: skip
     outcomes = {row["ego.kind"]: row["outcome"] for row in rows_of(toy, "h")}
     assert outcomes == {**dict.fromkeys(harms, "agent_error"), "none": "survived"}
