@@ -44,7 +44,7 @@ def begin(tmp_path: Path, does: str, timeout_s: float = 60.0) -> tuple[subproces
 
 
 def has_ended(pid: int) -> bool:
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 300
     while is_alive(pid):
         if time.monotonic() > deadline:
             kill(pid)
@@ -64,7 +64,7 @@ def has_ended(pid: int) -> bool:
 )
 def test_a_program_that_the_work_has_started_ends_with_the_work(tmp_path, does, timeout_s, says):
     process, started = begin(tmp_path, does, timeout_s)
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=300)
     assert has_ended(started)
     assert says in said
     assert (process.returncode == 0) == (not says)
@@ -74,7 +74,7 @@ def test_a_program_that_the_work_has_started_ends_with_the_work(tmp_path, does, 
 def test_a_program_that_the_work_has_started_ends_with_the_command(tmp_path, number):
     process, started = begin(tmp_path, "time.sleep(600)")
     process.send_signal(number)
-    process.communicate(timeout=60)
+    process.communicate(timeout=300)
     assert has_ended(started)
 
 

@@ -157,7 +157,7 @@ def test_threads_that_write_the_same_file_have_temporary_files_of_their_own(tmp_
     def write(word):
         with temporary_beside(folder / "a") as there:
             there.write_text(word)
-            both.wait(30)
+            both.wait(300)
             return there.name, there.read_text(), owner_in(there.name)
 
     with ThreadPoolExecutor(2) as threads:

@@ -72,7 +72,7 @@ def test_a_hunt_that_is_killed_shows_as_killed(shell, page):
             page.wait("document.querySelector('tbody .state')?.innerText === 'running'")
             page.wait("!document.querySelector('tbody').innerText.includes('0 of 3,000')")
             os.kill(hunt.pid, signal.SIGKILL)
-            hunt.wait(60)
+            hunt.wait(300)
             page.wait("document.querySelector('tbody .state').innerText === 'killed'")
         finally:
             with suppress(ProcessLookupError):

@@ -76,7 +76,7 @@ def test_a_page_on_a_terminal_is_drawn(shell):
                 drawn += reader.read(4096) or b""
             except OSError:  # the other end is closed
                 break
-    assert done.wait(30) == 0
+    assert done.wait(300) == 0
     text = drawn.decode()
     assert "\x1b[" in text
     assert "| --- |" not in text  # the table is one

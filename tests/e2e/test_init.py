@@ -83,7 +83,7 @@ def test_init_that_is_interrupted_leaves_no_half_folder(shell, shape, sign):
         time.sleep(0.02)
     assert [*shell.folder.glob(sign)], "it has not begun"
     begun.send_signal(signal.SIGINT)
-    _, err = begun.communicate(timeout=60)
+    _, err = begun.communicate(timeout=300)
     assert begun.returncode == 130, err
     assert err == "crashhunt: interrupted; place was not made\n"
     assert not [path for path in shell.folder.iterdir() if "place" in path.name]

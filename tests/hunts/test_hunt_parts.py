@@ -741,12 +741,12 @@ class Runs:
 
     def confirm_one(self, bundle, stopped):
         self.asked.put(("confirm", bundle.id))
-        assert self.go.wait(20)
+        assert self.go.wait(300)
         return bundle if stopped() else replace(bundle, confirmed=True)
 
     def judge_one(self, bundle, stopped):
         self.asked.put(("judge", bundle.id))
-        assert self.go.wait(20)
+        assert self.go.wait(300)
         return Judged(bundle, "cause")
 
 
@@ -763,12 +763,12 @@ def test_crashes_are_confirmed_while_the_hunt_runs():
     assert confirmation._thread is None
     progress.kinds = kinds
     confirmation.look(progress)
-    assert runs.asked.get(timeout=20) == ("confirm", "a")
+    assert runs.asked.get(timeout=300) == ("confirm", "a")
     assert executor.held_back == 1
     confirmation.look(progress)
     runs.go.set()
-    assert [runs.asked.get(timeout=20) for _ in range(2)] == [("judge", "b"), ("confirm", "b")]
-    deadline = time.monotonic() + 20
+    assert [runs.asked.get(timeout=300) for _ in range(2)] == [("judge", "b"), ("confirm", "b")]
+    deadline = time.monotonic() + 300
     while len(settled) < 1 or sum(bool(one.confirmed) for one in progress.crashes) < 2:
         assert time.monotonic() < deadline
         confirmation.look(progress)
@@ -818,7 +818,7 @@ def test_crash_whose_cause_was_not_searched_for_before_the_end_of_the_hunt_is_ch
     runs = SimpleNamespace(confirm_one=confirm, judge_one=lambda bundle, stopped: judged.append(bundle))
     confirmation = Confirmation(runs, None)
     confirmation.look(progress)
-    assert begun.wait(20)
+    assert begun.wait(300)
     confirmation.look(progress)  # the search waits for the end of the confirmation
     confirmation.close(progress)
     assert judged == []
