@@ -586,5 +586,5 @@ def _value(option: HuntOption, given: Any) -> object:
     if option.form == "table":
         return pairs(given, about.flag, named=about.named)
     if about.separator and isinstance(given, str):
-        return tuple(word for word in given.split(about.separator) if word)
+        return tuple(filter(None, map(str.strip, given.split(about.separator))))
     return (given or option.default) if option.form == "list" else given

@@ -246,7 +246,7 @@ class _Groups(dict):
 
 def test_options_of_a_hunt_are_read_as_python_has_them():
     given = hunt_parser().parse_args(
-        ["--arg", "speed=3", "--arg", "ego.mode=x", "--agent", "idm", "--seed", "7", "--crash-on", "hang,,collision"]
+        ["--arg", "speed=3", "--arg", "ego.mode=x", "--agent", "idm", "--seed", "7", "--crash-on", "hang, ,collision"]
     )
     found = _common.chosen_options(given)
     assert found["arguments"] == {"speed": "3", "ego.mode": "x"}
