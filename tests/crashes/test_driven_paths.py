@@ -170,6 +170,9 @@ def test_vehicle_that_overtakes_on_the_opposite_lane_is_at_fault_in_the_head_on_
     case = record(overtakes, oncoming(y), lanes=lanes, step_s=step_s)
     assert in_every_view(case) == ("head-on", "", "ego")
     assert rules(case) == ["wrong way"]
+    (found,) = fault_in(case).findings
+    assert found.words.startswith("ego drove against the direction of its lane")
+    assert found.source.startswith("Vienna, articles 10 and 11")
     case = record(oncoming(y), overtakes, lanes=lanes, step_s=step_s)
     assert in_every_view(case) == ("head-on", "", "the other")
 

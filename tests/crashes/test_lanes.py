@@ -125,6 +125,7 @@ def test_a_lane_change_began_where_it_first_moved_towards_the_other_lane(side, a
 
     crossed = [0.0] * 6 + [0.17 * k for k in range(1, 19)] + [3.2] * 5
     assert began(crossed) == 5
+    assert began([0.0] * 6 + [0.18 * k for k in range(1, 19)]) == 5  # one scene faster
     assert began(crossed[:14]) == 5  # it reaches over the side by then
     assert began([0.3, 0.2, 0.1, *crossed]) == 8  # the drift the other way is no part of it
     assert began([0.0] * 20) is None
