@@ -11,6 +11,7 @@
     ├── ScenarioError              a scenario file: which file, which key, which value
     │   └── NoValidTrialError      no trial in it can be set up; exit code 3
     ├── PluginError                a name or ``module:attribute`` that leads nowhere
+    │   └── HuntWhileImportingError  a module that starts a hunt when it is imported
     ├── HuntDirectoryError         the directory of a hunt: busy, foreign, unwritable, full
     │   └── BusyError              another hunt is running in it
     ├── BundleError                a crash bundle or log that is damaged or incomplete

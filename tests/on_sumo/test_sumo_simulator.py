@@ -276,7 +276,7 @@ def test_core_runs_steps_of_one_usual_agent(running, monkeypatch, change, fast):
     running._taking_part = change.get("_taking_part")
     running._lateral = change.get("_lateral", False)
     running._driving.left_hand = change.get("left_hand", False)
-    running._kinematics = SimpleNamespace(usual=change.get("usual", True))
+    running._kinematics = SimpleNamespace(usual=change.get("usual", True), shape=(8, 7))
     assert running._usual_steps() == ("fast" if fast else None)
     if fast:
         ((given, named),) = made
