@@ -22,7 +22,7 @@ from crashhunt.base.version import __version__
 from crashhunt.crashes import closest_actors, read_notes, signature_of
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
-from crashhunt.recording import is_opaque, read_lanes
+from crashhunt.recording import is_opaque, read_lanes, read_obstacles
 from crashhunt.report._crash_text import Story
 from crashhunt.report._player_layers import packed_floats, player_layers
 from crashhunt.report._rate_text import describe_running
@@ -487,6 +487,7 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
         "actionWords": story.action_words,
         **(_to_closest(story) if story.encounter is None else _to_other(story.encounter, recording)),
         "lanes": _lanes(bundle, recording),
+        **_obstacles(bundle, recording),
         **player_layers(bundle, recording, story.agent, story.contact, _origin(recording)),
         "disturbances": [
             [one.step, one.step + steps_of(one.how_long, recording.prologue.step_length_s) - 1, one.words, one.vehicle]
@@ -604,6 +605,12 @@ def _lanes(bundle: Bundle, recording: Recording) -> list[list[str]]:
         for right, left in read_lanes(bundle.path / layout.LOG)
         if len(right) > 1
     ]
+
+
+def _obstacles(bundle: Bundle, recording: Recording) -> dict[str, object]:
+    """Return the outlines of obstacles, such as buildings; nothing if there are none."""
+    outlines = [one for one in read_obstacles(bundle.path / layout.LOG) if len(one) > 2]
+    return {"obstacles": [packed_floats(one - _origin(recording)) for one in outlines]} if outlines else {}
 
 
 def _origin(recording: Recording) -> NDArray[np.float64]:

@@ -88,6 +88,11 @@ async function load(crash) {
     for (let i = left.length - 2; i >= 0; i -= 2) crash.road.lineTo(left[i], left[i + 1]);
     crash.road.closePath();
   }
+  crash.buildings = await Promise.all((crash.obstacles ?? []).map(async (packed) => {
+    const outline = await unpack(packed), area = new Path2D();
+    for (let i = 0; i < outline.length; i += 2) area.lineTo(outline[i], outline[i + 1]);
+    return area;
+  }));
 }
 
 /* The observed matrix of a step, such as highway-env's Kinematics; rows of zeros have no actor. */
@@ -448,6 +453,8 @@ function drawScene() {
   context.strokeStyle = css("--mark");
   context.lineWidth = Math.max(0.12, 0.8 / view.scale);
   context.stroke(crash.marks);
+  context.fillStyle = css("--building");
+  for (const area of crash.buildings) context.fill(area);
   drawStopLines(context);
   drawRoute(context);
   /* where the two have been */

@@ -15,6 +15,7 @@ from crashhunt.base import layout
 from crashhunt.crashes import list_bundles
 from crashhunt.ledger import Ledger
 from crashhunt.report import describe_running
+from crashhunt.report._player_layers import packed_floats
 from crashhunt.results import HuntResults, hunt_state
 
 selenium = pytest.importorskip("selenium")
@@ -114,6 +115,30 @@ def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
         )
         assert pixel[:3] == [0xFF, 0xB3, 0x1A]
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def test_obstacles_are_drawn_as_areas_below_the_actors(hunt, browser):
+    report_of(hunt, browser)
+    x, y = browser.execute_script("view.follow = true; go(5); return [view.x, view.y]")
+    house = [(x + along, y + across) for along, across in ((-20, -6), (20, -6), (20, 6), (-20, 6))]
+
+    def colour(along, across):
+        return browser.execute_script(
+            "const c = document.getElementById('scene'), p = view.scale * window.devicePixelRatio;"
+            "return [...c.getContext('2d').getImageData("
+            "c.width / 2 + arguments[0] * p, c.height / 2 - arguments[1] * p, 1, 1).data].slice(0, 3)",
+            along, across,
+        )  # fmt: skip
+
+    places = ((-12.0, 5.0), (-12.0, -5.0), (-12.0, 7.0))
+    before = [colour(*place) for place in places]
+    browser.execute_async_script(
+        "const done = arguments[1]; view.crash.obstacles = [arguments[0]]; view.crash.values = null;"
+        "load(view.crash).then(() => { drawScene(); done(); })",
+        packed_floats(np.array(house)),
+    )
+    assert [colour(*place) for place in places] == [[0xC4, 0xBA, 0xB0], [0xC4, 0xBA, 0xB0], before[2]]
+    assert before[0] != [0xC4, 0xBA, 0xB0]
 
 
 def test_curves_are_those_of_the_recording_for_both_vehicles(hunt, browser):

@@ -68,6 +68,16 @@ def test_boxes_of_a_scene_are_where_its_actors_are_and_the_rays_end_at_outlines(
         assert rays[step][0] == pytest.approx(ahead, abs=0.02)  # the toy drives along the x axis
 
 
+def test_outlines_of_obstacles_begin_at_the_origin_as_lanes_do(hunt, monkeypatch):
+    bundle = list_bundles(hunt.folder / "seen")[0]
+    assert "obstacles" not in player_data(bundle)
+    house = np.array([(20.0, 5.0), (24.0, 5.0), (24.0, 9.0), (20.0, 5.0)])
+    monkeypatch.setattr("crashhunt.report._page.read_obstacles", lambda _: [house, house[:2]])
+    data = player_data(bundle)
+    (packed,) = data["obstacles"]
+    assert unpacked({"values": packed, "size": [2]}) == pytest.approx(house - data["origin"])
+
+
 def test_recording_without_observations_shows_none(hunt):
     bundle = list_bundles(hunt.folder / "seen")[0]
     compact = bundle.recording().compacted([], 1000.0, observations=False)
