@@ -74,7 +74,7 @@ def _guarded(name: str, function: Callable[..., object]) -> Callable[..., object
                 _refused[:] = _refused or [error]
                 raise error
             if name in _SPEED_COMMANDS:
-                _note_command(*given, **named)
+                _note_command(name, *given, **named)
         if _refused and name == _STEP:
             raise _refused.pop()
         return function(*given, **named)
@@ -82,10 +82,10 @@ def _guarded(name: str, function: Callable[..., object]) -> Callable[..., object
     return call
 
 
-def _note_command(vehicle: object = "", speed: object = 0.0, *_: object, **named: object) -> None:
-    """Note that a user's code commands the speed of a vehicle, or returns it to SUMO by a negative speed."""
+def _note_command(name: str, vehicle: object = "", speed: object = 0.0, *_: object, **named: object) -> None:
+    """Note that a user's code commands the speed of a vehicle, or returns it to SUMO by ``setSpeed`` with -1."""
     vehicle, speed = named.get("vehID", vehicle), named.get("speed", speed)
-    is_returned = isinstance(speed, int | float) and speed < 0
+    is_returned = name == "vehicle.setSpeed" and isinstance(speed, int | float) and speed < 0
     (commanded_elsewhere.discard if is_returned else commanded_elsewhere.add)(str(vehicle))
 
 

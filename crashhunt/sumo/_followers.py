@@ -161,11 +161,13 @@ class Followers:
         bounds: dict[str, float] = {}
         waiting: set[str] = set()
         for agent in self.agents:
-            if agent in agents and not is_inside(agent):
-                try:
+            if agent not in agents:
+                continue
+            try:
+                if not is_inside(agent):
                     self._look_behind(agent, bounds, waiting)
-                except libsumo.TraCIException:
-                    continue  # the agent's own code has removed a vehicle
+            except libsumo.TraCIException:
+                continue  # a user's code has removed a vehicle
         if bounds or self._speed_modes:
             self._bound(bounds)
         if waiting or self._change_modes:

@@ -11,6 +11,7 @@ from crashhunt.episode import Episode
 from crashhunt.oracles import OffRoad
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.sumo import SumoSimulator
+from crashhunt.sumo._agent_calls import commanded_elsewhere
 from crashhunt.trial import Outcome, TrialSpec
 
 
@@ -117,4 +118,12 @@ def test_oracle_of_a_user_and_a_program_may_command_sumo(simulator):
             return []
 
     assert driven(simulator, lambda: None, oracles=[Commands()]).outcome is Outcome.SURVIVED
-    libsumo.vehicle.setSpeed(other(), -1.0)
+    name = other()
+    for call, commanded in (
+        (lambda: libsumo.vehicle.setSpeed(name, -1.0), False),
+        (lambda: libsumo.vehicle.setAcceleration(name, -3.0, 1.0), True),  # it brakes
+        (lambda: libsumo.vehicle.setSpeed(vehID=name, speed=-1.0), False),
+        (lambda: libsumo.vehicle.slowDown(name, 1.0, 1.0), True),
+    ):
+        call()
+        assert (name in commanded_elsewhere) == commanded

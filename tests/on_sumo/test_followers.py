@@ -227,6 +227,14 @@ def test_command_of_a_disturbance_is_bounded_and_a_hold_takes_precedence(begin, 
         assert libsumo.vehicle.getSpeedMode("car") == 31
 
 
+@SEEN
+def test_vehicle_of_an_agent_that_a_program_removes_has_left(begin, visible):
+    simulator = begin("motorway", visible, "speed_and_lateral").simulator
+    libsumo.vehicle.remove("ego")
+    _, _, terminations, *_ = simulator.step({"ego": simulator.actions["ego"].encode((9.0, 1.0))})
+    assert terminations == {"ego": True}
+
+
 def test_outline_in_a_lane_agrees_with_points_of_the_outline():
     """Independent: a dense grid of points of the rectangle, turned into the frame of the lane point by point."""
     draw = random.Random(5)
