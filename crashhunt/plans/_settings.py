@@ -6,6 +6,7 @@ import inspect
 import os
 import sys
 import tomllib
+from contextlib import suppress
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
@@ -23,7 +24,7 @@ from crashhunt.plans._run_options import Driver, HuntOptions, RunOptions, Spec, 
 from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from crashhunt.base.json_types import Plain
     from crashhunt.samplers import Space
@@ -162,7 +163,10 @@ class HuntSettings(TrialOptions):
 
     def differences(self, other: HuntSettings) -> list[str]:
         """Return the differences between the settings that determine trials, as texts; ``[run]`` is ignored."""
-        mine, theirs = _flat(asdict(self)), _flat(asdict(other))
+        mine, theirs = (
+            _flat(asdict(one)) | {f"agents.{agent}.action": text for agent, text in one._stated_actions()}
+            for one in (self, other)
+        )
         missing = "(not there)"
         return [
             f"{key} was {_toml_value(mine.get(key, missing))} and is now {_toml_value(theirs.get(key, missing))}"
@@ -173,6 +177,15 @@ class HuntSettings(TrialOptions):
             # The kind of an argument that only one of them has says nothing more.
             and not (key.endswith(".kind") and key.removesuffix(".kind") in mine.keys() ^ theirs.keys())
         ]
+
+    def _stated_actions(self) -> Iterator[tuple[str, str]]:
+        """Yield agents with their forms of actions as a user would have to request them."""
+        from crashhunt.scenario import with_stated_choice
+
+        for agent, chosen in self.agents.items():
+            with suppress(UsageError):  # a later version may have written a form that this version does not know
+                if chosen.action is not None:
+                    yield agent, with_stated_choice(chosen.action)
 
 
 def _flat(data: object, prefix: str = "") -> dict[str, str]:

@@ -309,9 +309,8 @@ def with_stated_choice(name: str) -> str:
 
 def can_be_in_two_lanes(name: str) -> bool:
     """Return whether a vehicle with a form of actions can stay in two lanes for several steps."""
-    form = canonical_action(name)
-    is_free = ACTIONS[form].moves_freely or form == "speed_and_lateral"
-    return is_free or bool(action_settings(name).get("lane_change_duration_s"))
+    form, settings = canonical_action(name), action_settings(name)
+    return ACTIONS[form].moves_freely or form == "speed_and_lateral" or bool(settings.get("lane_change_duration_s"))
 
 
 def check_action(name: str | None, returned: Sequence[str], agent: str) -> None:

@@ -533,3 +533,17 @@ def test_argument_that_only_one_of_two_hunts_has_is_one_difference():
         "seed was 1 and is now 2", f"scenario_arguments.{name} was {value} and is now (not there)",
     ]  # fmt: skip
     assert other.differences(settings)[1] == f"scenario_arguments.{name} was (not there) and is now {value}"
+
+
+def test_difference_of_forms_of_actions_names_what_resumes_the_hunt():
+    """A hunt from before the setting ``visible``, or with ``visible=front``, has recorded the form without it."""
+    _, settings = plan(Request(trials=1, max_steps=10, seed=1))
+
+    def acting(form):
+        return replace(settings, agents={"ego": replace(settings.agents["ego"], action=form)})
+
+    before, now = acting("trajectory"), acting("trajectory:visible=outline")
+    says = "agents.ego.action was trajectory:visible=front and is now trajectory:visible=outline"
+    assert before.differences(now) == [says]
+    assert before.differences(before) == []
+    assert before.differences(acting("of_a_later_version"))[0].endswith("is now of_a_later_version")
