@@ -45,7 +45,6 @@ _TESTS_ELSEWHERE = {
     "base/exceptions.py": ("base/test_exception_text.py", "episode/test_episode_cases.py"),
     "base/isolation.py": ("base/test_isolated_work.py",),
     "base/opened_files.py": ("snapshots/test_sources.py", "snapshots/test_unsaved.py"),
-    "base/older_versions.py": ("base/test_removed.py",),
     "base/programs.py": (
         "agents/test_fmu_agents.py",
         "agents/test_library_agents.py",
