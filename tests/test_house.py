@@ -269,3 +269,20 @@ def test_a_file_name_stands_once():
     """The second file of a name is what a first guess misses."""
     names = Counter(file.stem for file in ROOT.rglob("*.py") if not file.stem.startswith("__"))
     assert {name for name, count in names.items() if count > 1} <= ROLES
+
+
+def test_private_modules_that_comments_and_pages_name_are_there():
+    files = [
+        ROOT.parent / "pyproject.toml",
+        *(file for kind in ("py", "md", "*pp") for file in ROOT.rglob(f"*.{kind}")),
+    ]
+    stale = []
+    for file in files:
+        text = file.read_text()
+        paths = re.findall(r"(?<![\w./])(?:crashhunt/)?((?:\w+/)+_\w+\.\w+)", text)
+        modules = re.findall(r"\bcrashhunt\.((?:[a-z]\w*\.)*_[a-z]\w*)", text)
+        for name in [*paths, *(f"{name.replace('.', '/')}.py" for name in modules)]:
+            place = ROOT / name
+            is_there = place.exists() or place.with_suffix("").is_dir() or place.parent.with_suffix(".py").exists()
+            stale += [] if is_there or "NAME" in name else [f"{file.relative_to(ROOT.parent)}: {name}"]
+    assert stale == []
