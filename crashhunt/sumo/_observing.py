@@ -168,7 +168,8 @@ class ObservedParts:
         self._drafts = {}
         for agent, readers in self._readers.items():
             layout = self.layouts[agent]
-            if self.core is None or layout.history or layout.reference_share or layout.flat_space.dtype != np.float64:
+            is_changed = layout.history or layout.occlusion_rays or layout.reference_share  # by what only Python does
+            if self.core is None or is_changed or layout.flat_space.dtype != np.float64:
                 continue
             places = [(layout.begins[name], reader) for name, reader in readers.items()]
             self._drafts[agent] = self.core.Draft(agent, math.prod(layout.flat_space.shape)), places

@@ -606,6 +606,7 @@ class _StopsAndGoes:
         ("motorway", ("actors:rows=3:radius=60", "lanes:lanes=2:points=9:spacing=3.3", "route:points=200", "ego")),
         ("loop-two-agents", ("ego", "actors", "lanes:lanes=30:behind=0")),
         ("loop", ("ego", "actors", "grid:rows=9:columns=9", "history:steps=2")),
+        ("motorway", ("ego", "actors", "occlusion")),
     ],
 )
 def test_parts_of_observations_are_the_same_bit_by_bit(run, scenario, parts):
