@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         SCENE_PARTS as SCENE_PARTS,
         Setting as Setting,
     )
+    from ._obstacle_outlines import ObstacleOutlines as ObstacleOutlines
     from ._protocol import (
         FACULTIES as FACULTIES,
         ActionForm as ActionForm,

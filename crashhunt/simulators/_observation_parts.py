@@ -187,8 +187,8 @@ REFERENCE_POINT = Part(
 
 OCCLUSION = Part(
     name="occlusion",
-    meaning="hides actors behind others in all parts: an actor is seen if one of the rays from the centre of the "
-    "controlled vehicle hits its outline first",
+    meaning="hides actors behind others and behind obstacles in all parts: an actor is seen if one of the rays from "
+    "the centre of the controlled vehicle hits its outline first",
     settings=(Setting("rays", 3600, 360, 36_000, "", "number of rays, evenly distributed over the full circle"),),
 )
 
@@ -455,8 +455,8 @@ PARTS: Mapping[str, Part] = {
         ),
         Part(
             name="lidar2d",
-            meaning="distances from the centre of the controlled vehicle to the nearest outline, for directions "
-            "counter-clockwise from its heading; ``range`` if no outline is nearer",
+            meaning="distances from the centre of the controlled vehicle to the nearest outline of an actor or "
+            "obstacle, for directions counter-clockwise from its heading; ``range`` if no outline is nearer",
             axes=("rays",),
             values=Column("distance", "m", 0.0, REACH_M, "distance along the ray"),
             settings=(
@@ -471,9 +471,9 @@ PARTS: Mapping[str, Part] = {
         ),
         Part(
             name="grid",
-            meaning="cells around the controlled vehicle: layer 0 is 1 where an actor is, layer 1 is 1 where a lane "
-            "is. The vehicle is in the middle. Its heading points to smaller row numbers, and its left side to smaller "
-            "column numbers",
+            meaning="cells around the controlled vehicle: layer 0 is 1 where an actor or obstacle is, layer 1 is 1 "
+            "where a lane is. The vehicle is in the middle. Its heading points to smaller row numbers, and its left "
+            "side to smaller column numbers",
             axes=(2, "rows", "columns"),
             values=Column("cell", "", 0.0, 1.0, "1 if the centre of the cell is inside"),
             settings=(
@@ -486,7 +486,8 @@ PARTS: Mapping[str, Part] = {
         Part(
             name="image",
             meaning="picture of the surroundings from above, as ``grid``: red, green and blue. The vehicle is "
-            "(224, 138, 0), actors are (125, 139, 156), lanes (228, 232, 237), all else (246, 247, 249)",
+            "(224, 138, 0), actors are (125, 139, 156), obstacles (196, 186, 176), lanes (228, 232, 237), all else "
+            "(246, 247, 249)",
             axes=("rows", "columns", 3),
             values=Column("value", "", 0.0, 255.0, "brightness"),
             settings=(

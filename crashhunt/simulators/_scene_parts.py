@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from crashhunt.simulators._obstacle_outlines import ObstacleOutlines
     from crashhunt.world import Scene
 
     Mask = NDArray[np.bool_]
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 
 _NOISE_STREAM = 0x6C696461  # apart from what else is drawn of a trial's seed
+_HALF_TURN_RAD = 3.1  # a little less, between the ends of an edge as seen from a point at it
 
 
 class NearActor(NamedTuple):
@@ -53,6 +55,14 @@ def center_of(scene: Scene, row: int) -> tuple[float, float]:
     x, y = scene.points[row]
     heading, half = scene.headings[row], scene.roster.actors[row].length / 2
     return x - half * cos(heading), y - half * sin(heading)
+
+
+def _in_frame(scene: Scene, row: int, points: Line) -> Line:
+    """Return points in the frame of a vehicle: the distance ahead and to the left of its centre."""
+    own_x, own_y = center_of(scene, row)
+    c, s = cos(scene.headings[row]), sin(scene.headings[row])
+    dx, dy = points[:, 0] - own_x, points[:, 1] - own_y
+    return np.stack((dx * c + dy * s, dy * c - dx * s), axis=1)
 
 
 def nearest_actors(
@@ -189,7 +199,7 @@ def with_reference_point(
 
 
 def occluded(scene: Scene, row: int, caster: RayCaster) -> frozenset[str]:
-    """Return the identifiers of the actors that other actors hide from a vehicle.
+    """Return the identifiers of the actors that other actors and obstacles hide from a vehicle.
 
     Args:
         scene: The scene after the last step.
@@ -203,18 +213,19 @@ def occluded(scene: Scene, row: int, caster: RayCaster) -> frozenset[str]:
 
 
 class RayCaster:
-    """Casts rays from the centre of a vehicle to the outlines of actors.
+    """Casts rays from the centre of a vehicle to the outlines of actors and obstacles.
 
     Args:
         rays: Number of rays, evenly distributed over the full circle; the first one points along the heading.
         reach_m: Largest distance, in m.
+        obstacles: The obstacles; None if there are none.
 
     Attributes:
         reach_m: Largest distance, in m.
     """
 
-    def __init__(self, rays: int, reach_m: float) -> None:
-        self._rays, self.reach_m = rays, reach_m
+    def __init__(self, rays: int, reach_m: float, obstacles: ObstacleOutlines | None = None) -> None:
+        self._rays, self.reach_m, self._obstacles = rays, reach_m, obstacles
         angles = [math.tau * number / rays for number in range(rays)]
         self._cos, self._sin = np.array([*map(cos, angles)]), np.array([*map(sin, angles)])
 
@@ -226,17 +237,47 @@ class RayCaster:
             row: Row of the vehicle in the scene.
             others: Rows of the actors whose outlines the rays hit.
         """
-        found = np.full(self._rays, self.reach_m)
+        found = self._clear(scene, row)
         _, ray, enters = self._hits(scene, row, others)
         np.minimum.at(found, ray, enters)
         return found
 
     def seen(self, scene: Scene, row: int, others: Sequence[int]) -> frozenset[int]:
         """Return the rows of the actors that a ray hits first, of the given rows."""
-        nearest = np.full(self._rays, self.reach_m)
+        nearest = self._clear(scene, row)
         owner, ray, enters = self._hits(scene, row, others)
         np.minimum.at(nearest, ray, enters)
         return frozenset(np.asarray(others)[owner[enters == nearest[ray]]].tolist() if len(owner) else ())
+
+    def _clear(self, scene: Scene, row: int) -> NDArray[np.float64]:
+        """Return the distance along each ray to the nearest obstacle, in m; the largest distance if there is none."""
+        found = np.full(self._rays, self.reach_m)
+        if self._obstacles is None:
+            return found
+        edges = self._obstacles.edges_near(*center_of(scene, row), self.reach_m)
+        starts, ends = _in_frame(scene, row, edges[:, :2]), _in_frame(scene, row, edges[:, 2:])
+        (ax, ay), (bx, by) = starts.T, ends.T
+        angle, turn = np.arctan2(ay, ax), np.arctan2(ax * by - bx * ay, ax * bx + ay * by)
+        # Rounding decides on which side an edge is that the centre of the vehicle is on.
+        is_at_edge = np.abs(turn) > _HALF_TURN_RAD
+        which, ray = self._rays_between(
+            np.where(is_at_edge, -math.pi, angle + np.minimum(turn, 0.0)),
+            np.where(is_at_edge, math.pi, angle + np.maximum(turn, 0.0)),
+            np.ones(len(edges), bool),
+        )
+        ray_cos, ray_sin = self._cos[ray], self._sin[ray]
+        # Edges that meet have the same numbers at the corner, so no ray passes between them.
+        (first_along, first_left), (last_along, last_left) = (
+            (ray_cos * x[which] + ray_sin * y[which], ray_cos * y[which] - ray_sin * x[which])
+            for x, y in ((ax, ay), (bx, by))
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # A ray along an edge gives 0 / 0; it hits the edges before and after it.
+            away = first_along + (last_along - first_along) * (first_left / (first_left - last_left))
+        is_hit = (np.minimum(first_left, last_left) <= 0.0) & (np.maximum(first_left, last_left) >= 0.0)
+        is_hit &= (away >= 0.0) & (away <= self.reach_m)
+        np.minimum.at(found, ray[is_hit], away[is_hit])
+        return found
 
     def _hits(
         self, scene: Scene, row: int, others: Sequence[int]
@@ -285,18 +326,31 @@ class RayCaster:
         direction = np.arctan2(-across, -along) - np.arctan2(first_sin, first_cos)
         inside = distance <= radius
         half = np.where(inside, math.pi, np.arcsin(np.minimum(1.0, radius / np.where(inside, 1.0, distance))))
+        is_near = distance - radius <= self.reach_m
+        return self._rays_between(direction - half, direction + half, is_near)
+
+    def _rays_between(
+        self, begin: NDArray[np.float64], end: NDArray[np.float64], is_near: Mask
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return pairs of an index and a ray: the rays between two angles to the heading, and one more on each side.
+
+        Args:
+            begin: The smaller angle, in rad.
+            end: The larger angle, in rad.
+            is_near: Whether an index has pairs.
+        """
         step = math.tau / self._rays
-        first = np.floor((direction - half) / step).astype(np.intp)  # one ray more on each side than is hit
-        last = np.ceil((direction + half) / step).astype(np.intp)
-        counts = np.where(distance - radius > self.reach_m, 0, np.minimum(last - first + 1, self._rays))
-        which = np.repeat(np.arange(len(table)), counts)
+        first, last = np.floor(begin / step).astype(np.intp), np.ceil(end / step).astype(np.intp)
+        counts = np.where(is_near, np.minimum(last - first + 1, self._rays), 0)
+        which = np.repeat(np.arange(len(first)), counts)
         offset = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
         return which, (first[which] + offset) % self._rays
 
 
 # Grids and pictures of the surroundings of a vehicle, computed from outlines and centre lines.
 
-_BACKGROUND, _ROAD, _ACTOR, _OWN = (246, 247, 249), (228, 232, 237), (125, 139, 156), (224, 138, 0)
+_BACKGROUND, _ROAD, _OBSTACLE = (246, 247, 249), (228, 232, 237), (196, 186, 176)
+_ACTOR, _OWN = (125, 139, 156), (224, 138, 0)
 """Colours of pictures (red, green, blue), as in films."""
 
 
@@ -326,7 +380,7 @@ class Raster:
             for x, y, heading, length, width in outlines(scene, other):
                 half = length / 2
                 middle = np.array([[x - half * cos(heading), y - half * sin(heading)]])
-                ahead, left = self._in_frame(scene, row, middle)[0].tolist()
+                ahead, left = _in_frame(scene, row, middle)[0].tolist()
                 turn = heading - scene.headings[row]
                 c, s = cos(turn), sin(turn)
                 part = self._window(ahead, left, math.hypot(half, width / 2))
@@ -335,6 +389,35 @@ class Raster:
                 across = (cell_left - left) * c - (cell_ahead - ahead) * s
                 found[part] |= (np.abs(along) <= half) & (np.abs(across) <= width / 2)
         return found
+
+    def obstructed(self, scene: Scene, row: int, obstacles: ObstacleOutlines) -> Mask:
+        """Return whether the centre of each cell is inside the outline of an obstacle.
+
+        Args:
+            scene: The scene after the last step.
+            row: Row of the vehicle in the scene.
+            obstacles: The obstacles.
+        """
+        edges = obstacles.edges_near(*center_of(scene, row), self.reach_m)
+        # As numbers of rows and columns, which are whole at the centre of a cell.
+        (first_row, first_column), (last_row, last_column) = (
+            (np.array(self._shape) / 2 - 0.5 - _in_frame(scene, row, ends) / self._resolution_m).T
+            for ends in (edges[:, :2], edges[:, 2:])
+        )
+        # All outlines have the same orientation. So a cell is outside if as many edges cross its row upwards as
+        # downwards on its left, also where outlines overlap.
+        begin = np.clip(np.floor(np.minimum(first_row, last_row)), -1, self._shape[0] - 1).astype(int) + 1
+        end = np.clip(np.floor(np.maximum(first_row, last_row)), -1, self._shape[0] - 1).astype(int) + 1
+        counts = end - begin
+        which = np.repeat(np.arange(len(edges)), counts)
+        cell_row = begin[which] + np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+        slope = (last_column - first_column)[which] / (last_row - first_row)[which]
+        crossing = first_column[which] + (cell_row - first_row[which]) * slope
+        cell_column = np.clip(np.floor(crossing), -1, self._shape[1] - 1).astype(int) + 1
+        turns = np.zeros((self._shape[0], self._shape[1] + 1), int)
+        np.add.at(turns, (cell_row, cell_column), np.where(last_row > first_row, 1, -1)[which])
+        inside: Mask = turns.cumsum(axis=1)[:, :-1] != 0
+        return inside
 
     def on_lanes(self, scene: Scene, row: int, lanes: Sequence[tuple[Line, float]]) -> Mask:
         """Return whether the centre of each cell is on a lane: at most half its width from its centre line.
@@ -345,7 +428,7 @@ class Raster:
             lanes: The points (n, 2) of each centre line, and the width of each lane, in m.
         """
         found = np.zeros(self._shape, bool)
-        lines = [(self._in_frame(scene, row, line), width) for line, width in lanes]
+        lines = [(_in_frame(scene, row, line), width) for line, width in lanes]
         starts = np.concatenate([line[:-1] for line, _ in lines] or [np.zeros((0, 2))])
         steps = np.concatenate([np.diff(line, axis=0) for line, _ in lines] or [np.zeros((0, 2))])
         halves = np.repeat([width / 2 for _, width in lines], [len(line) - 1 for line, _ in lines])
@@ -375,13 +458,6 @@ class Raster:
         found[cell_rows[piece, at_row, 0], cell_columns[piece, 0, at_column]] = True
         return found
 
-    def _in_frame(self, scene: Scene, row: int, points: Line) -> Line:
-        """Return points in the frame of the vehicle: the distance ahead and to the left of its centre."""
-        own_x, own_y = center_of(scene, row)
-        c, s = cos(scene.headings[row]), sin(scene.headings[row])
-        dx, dy = points[:, 0] - own_x, points[:, 1] - own_y
-        return np.stack((dx * c + dy * s, dy * c - dx * s), axis=1)
-
     def _window(self, ahead: float, left: float, reach_m: float) -> tuple[slice, slice]:
         """Return the cells in a square around a point, as rows and columns."""
         found = []
@@ -399,9 +475,9 @@ class Raster:
         return ahead[:, None], left[None, :]
 
 
-def picture(road: Mask, actors: Mask, own: Mask) -> NDArray[np.uint8]:
+def picture(road: Mask, obstacles: Mask, actors: Mask, own: Mask) -> NDArray[np.uint8]:
     """Return a picture of cells, shape (rows, columns, 3): red, green and blue."""
     found = np.full((*road.shape, 3), _BACKGROUND, np.uint8)
-    for mask, color in ((road, _ROAD), (actors, _ACTOR), (own, _OWN)):
+    for mask, color in ((road, _ROAD), (obstacles, _OBSTACLE), (actors, _ACTOR), (own, _OWN)):
         found[mask] = color
     return found

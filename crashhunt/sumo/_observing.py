@@ -9,9 +9,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.simulators import REACH_M, History, RayCaster, layouts_of, occluded, with_reference_point
+from crashhunt.simulators import (
+    REACH_M,
+    History,
+    ObstacleOutlines,
+    RayCaster,
+    layouts_of,
+    occluded,
+    with_reference_point,
+)
 from crashhunt.sumo._conflicts import Conflicts
 from crashhunt.sumo._ego_and_actors import ActorsReader, EgoReader
+from crashhunt.sumo._free_motion import obstacle_outlines
 from crashhunt.sumo._lane_graph import USUAL_CLASS, lane_graph
 from crashhunt.sumo._reader_protocol import Places, ReaderSetup
 from crashhunt.sumo._road_readers import (
@@ -66,6 +75,8 @@ READERS: Mapping[str, type[Reader]] = {
     "time_to_switch": SwitchTimesReader,
 }
 """The reader of each part, by name of the part; these are the parts that SUMO has."""
+
+_PARTS_WITH_OBSTACLES = frozenset({"grid", "image", "lidar2d"})
 
 
 class ObservedParts:
@@ -140,6 +151,12 @@ class ObservedParts:
         known = steering or {}
         self._histories = {agent: History(layout) for agent, layout in self.layouts.items()}
         self._places = {}
+        obstacles = self._obstacles()
+        self._casters = {
+            agent: RayCaster(layout.occlusion_rays, REACH_M, obstacles)
+            for agent, layout in self.layouts.items()
+            if layout.occlusion_rays
+        }
         self._readers = {
             agent: {
                 name: READERS[name](
@@ -158,6 +175,7 @@ class ObservedParts:
                         near=self._near,
                         moving=frozenset(known),
                         seed=seed,
+                        obstacles=obstacles,
                     )
                 )
                 for name, request in layout.parts.items()
@@ -174,14 +192,19 @@ class ObservedParts:
             places = [(layout.begins[name], reader) for name, reader in readers.items()]
             self._drafts[agent] = self.core.Draft(agent, math.prod(layout.flat_space.shape)), places
 
+    def _obstacles(self) -> ObstacleOutlines | None:
+        """Return the obstacles of the episode; None if there are none, or no agent sees them."""
+        layouts = self.layouts.values()
+        if not any(layout.occlusion_rays or _PARTS_WITH_OBSTACLES & layout.parts.keys() for layout in layouts):
+            return None
+        outlines = obstacle_outlines()
+        return ObstacleOutlines(outlines.values()) if outlines else None
+
     def observe(self, agent: str, moment: Moment) -> NDArray[np.generic]:
         """Return the recorded array of an agent's observation."""
         layout = self.layouts[agent]
-        if layout.occlusion_rays:
-            caster = self._casters.get(agent)
-            if caster is None:
-                caster = self._casters[agent] = RayCaster(layout.occlusion_rays, REACH_M)
-            moment = replace(moment, hidden=moment.hidden | occluded(moment.scene, moment.row, caster))
+        if agent in self._casters:
+            moment = replace(moment, hidden=moment.hidden | occluded(moment.scene, moment.row, self._casters[agent]))
         drafted = self._drafts.get(agent)
         if drafted is not None:
             draft, places = drafted

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.native import Core, Draft
-    from crashhunt.simulators import NearActor, RequestedPart
+    from crashhunt.simulators import NearActor, ObstacleOutlines, RequestedPart
     from crashhunt.sumo._conflicts import Conflicts
     from crashhunt.sumo._lane_graph import GraphLane, LaneGraph, RouteGuide
     from crashhunt.sumo._lane_paths import NearLanesOf
@@ -48,6 +48,7 @@ class ReaderSetup:
         near: The lanes near each square, by sampling and vehicle class, shared like the lanes.
         moving: Identifiers of the vehicles that move freely.
         seed: Seed of the trial.
+        obstacles: The obstacles of the episode; None if there are none.
     """
 
     agent: str
@@ -64,6 +65,7 @@ class ReaderSetup:
     near: NearLanesOf = field(default_factory=dict)
     moving: frozenset[str] = frozenset()
     seed: int = 0
+    obstacles: ObstacleOutlines | None = None
 
     @property
     def settings(self) -> Mapping[str, float]:

@@ -138,12 +138,12 @@ class ActorIdsReader(Reader):
 
 
 class RangesReader(Reader):
-    """Casts rays to the outlines of the actors."""
+    """Casts rays to the outlines of actors and obstacles."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
         self._reach_m = setup.settings["range"]
-        self._caster = RayCaster(int(setup.settings["rays"]), self._reach_m)
+        self._caster = RayCaster(int(setup.settings["rays"]), self._reach_m, setup.obstacles)
 
     def observe(self, moment: Moment) -> NDArray[np.float64]:
         """Return the values of ``lidar2d``."""
@@ -162,7 +162,9 @@ class _RasterReader(Reader):
         super().__init__(setup)
         settings = setup.settings
         self._graph, self._vehicle_class = setup.graph, sumo.vehicle_getVehicleClass(setup.agent)
-        self._raster = Raster(int(settings["rows"]), int(settings["columns"]), settings["resolution"])
+        shape = int(settings["rows"]), int(settings["columns"])
+        self._raster = Raster(*shape, settings["resolution"])
+        self._nothing = np.zeros(shape, bool)
 
     def _road(self, moment: Moment) -> NDArray[np.bool_]:
         x, y = center_of(moment.scene, moment.row)
@@ -177,13 +179,19 @@ class _RasterReader(Reader):
         near = nearest_actors(scene, row, hidden=moment.hidden, radius=reach)
         return self._raster.occupied(scene, row, [one.row for one in near])
 
+    def _obstacles(self, moment: Moment) -> NDArray[np.bool_]:
+        known = self._setup.obstacles
+        if known is None:
+            return self._nothing
+        return self._raster.obstructed(moment.scene, moment.row, known)
+
 
 class GridReader(_RasterReader):
     """Reads the part ``grid``."""
 
     def observe(self, moment: Moment) -> NDArray[np.uint8]:
         """Return the layers of ``grid``."""
-        return np.stack((self._actors(moment), self._road(moment))).astype(np.uint8)
+        return np.stack((self._actors(moment) | self._obstacles(moment), self._road(moment))).astype(np.uint8)
 
 
 class ImageReader(_RasterReader):
@@ -192,4 +200,4 @@ class ImageReader(_RasterReader):
     def observe(self, moment: Moment) -> NDArray[np.uint8]:
         """Return the picture of ``image``."""
         own = self._raster.occupied(moment.scene, moment.row, [moment.row])
-        return picture(self._road(moment), self._actors(moment), own)
+        return picture(self._road(moment), self._obstacles(moment), self._actors(moment), own)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import shutil
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -257,6 +258,65 @@ def cells_of_vehicles(vehicles, rows, columns, resolution):
         inside = (behind >= 0) & (behind <= libsumo.vehicle.getLength(vehicle))
         found |= inside & (np.abs(beside) <= libsumo.vehicle.getWidth(vehicle) / 2)
     return found
+
+
+def in_front_of(px, py, ahead_m):
+    """Whether places are in a wall of 2 m across the way of ego, in front of the centre of its present rectangle."""
+    (x, y), heading = center("ego"), math.radians(90.0 - libsumo.vehicle.getAngle("ego"))
+    along = (px - x) * math.cos(heading) + (py - y) * math.sin(heading)
+    across = (py - y) * math.cos(heading) - (px - x) * math.sin(heading)
+    return (np.abs(along - ahead_m) < 1.0) & (np.abs(across) < 30.0)
+
+
+@pytest.mark.parametrize("kind", ["building.wall", "park"])
+def test_obstacle_ends_rays_and_sight_and_is_in_grid_and_image(kind, tmp_path):
+    parts = ("actors:radius=120:rows=99", "lidar2d:rays=90", "grid:resolution=1.9", "image:rows=72:columns=40")
+    folder = tmp_path / "walled"
+    shutil.copytree(load_scenario("motorway").folder, folder)
+    with closing(simulator_of("motorway", tmp_path / "a", *parts, "occlusion")) as plain:
+        before = [(shown, plain.identifiers("ego")) for shown in episode(plain, 2, 12, speed=25.0)][::4]
+        last, heading = center("ego"), math.radians(90.0 - libsumo.vehicle.getAngle("ego"))
+    ahead, left = np.array((math.cos(heading), math.sin(heading))), np.array((-math.sin(heading), math.cos(heading)))
+    # Ego, which SUMO drives through the wall, is behind it at first.
+    wall = [last + u * ahead + v * left for u, v in ((-9, 30), (-7, 30), (-7, -30), (-9, -30))]
+    shape = " ".join(f"{x:.2f},{y:.2f}" for x, y in wall)
+    (folder / "wall.add.xml").write_text(f'<additional><poly id="w" type="{kind}" shape="{shape}"/></additional>')
+    toml = folder / "scenario.toml"
+    toml.write_text(toml.read_text().replace("[sumo]\n", '[sumo]\nadditional = ["wall.add.xml"]\n'))
+    sides = []
+    with closing(simulator_of(str(folder), tmp_path / "b", *parts, "occlusion")) as walled:
+        for step, shown in enumerate(episode(walled, 2, 12, speed=25.0)):
+            if step % 4:
+                continue
+            all_, everybody = before[step // 4]
+            seen = walled.identifiers("ego")
+            if kind == "park":
+                assert seen == everybody
+                assert all(shown[name].tobytes() == all_[name].tobytes() for name in all_)
+                continue
+            to_wall = float((last - center("ego")) @ ahead) - 8.0
+            sides.append(to_wall > 0)
+            columns, side = walled.observation_layouts["ego"].columns["actors"], math.copysign(1.0, to_wall)
+            nearest = side * all_["actors"][:, columns["ahead"]] - all_["actors"][:, columns["length"]] / 2
+            rows = zip(everybody, nearest, strict=False)
+            assert seen == tuple(one for one, away in rows if away < abs(to_wall) - 1.0)
+            in_wall = in_front_of(*places_of_cells(64, 64, 1.9), to_wall)
+            assert in_wall.any()
+            cars = cells_of_vehicles(seen, 64, 64, 1.9)
+            assert (shown["grid"] == [cars | in_wall, all_["grid"][1]]).all()
+            # The rays to the near side of the wall, which is across the heading.
+            angles = math.tau * np.arange(90) / 90
+            away = (to_wall - side) / np.cos(angles)
+            to_side = np.where((away > 0) & (np.abs(away * np.sin(angles)) < 30.0), away, 100.0)
+            assert shown["lidar2d"] == pytest.approx(np.minimum(to_side, all_["lidar2d"]), abs=0.1)
+            assert (shown["lidar2d"] < all_["lidar2d"] - 1.0).any()
+            picture = np.full((72, 40, 3), (246, 247, 249), np.uint8)
+            picture[cells_on_lanes(72, 40, 0.5)] = (228, 232, 237)
+            picture[in_front_of(*places_of_cells(72, 40, 0.5), to_wall)] = (196, 186, 176)
+            picture[cells_of_vehicles(seen, 72, 40, 0.5)] = (125, 139, 156)
+            picture[cells_of_vehicles(["ego"], 72, 40, 0.5)] = (224, 138, 0)
+            assert (shown["image"] == picture).all()
+    assert kind == "park" or {*sides} == {True, False}
 
 
 @pytest.mark.parametrize("form", ["acceleration_steering", "throttle_brake_steering"])

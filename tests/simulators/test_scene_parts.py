@@ -11,6 +11,7 @@ from hypothesis import given, settings, strategies as st
 
 from crashhunt.simulators import (
     ActorNumbers,
+    ObstacleOutlines,
     Raster,
     RayCaster,
     center_of,
@@ -37,8 +38,17 @@ def scene_of(*actors, heights=(), spines=None):
     )
 
 
-def slow_range(outline, x, y, angle):
-    """The distance of a ray to an outline by its edges: where the ray crosses one, or 0 from the inside."""
+@st.composite
+def obstacles(draw):
+    """Corners around a point, which also make outlines with dents, in both directions, some of them closed."""
+    (x, y), radii = draw(st.tuples(number, number)), draw(st.lists(st.floats(0.5, 25.0), min_size=3, max_size=7))
+    angles = [math.tau * corner / len(radii) for corner in range(len(radii))]
+    outline = [(x + r * math.cos(angle), y + r * math.sin(angle)) for r, angle in zip(radii, angles, strict=True)]
+    return [*outline, *outline[: draw(st.integers(0, 1))]][:: draw(st.sampled_from([1, -1]))]
+
+
+def slow_range(outline, x, y, angle, *, is_filled=True):
+    """The distance of a ray to an outline by its edges: where the ray crosses one, or 0 inside a filled outline."""
     dx, dy = math.cos(angle), math.sin(angle)
     best, sides = math.inf, []
     for (px, py), (qx, qy) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
@@ -50,26 +60,38 @@ def slow_range(outline, x, y, angle):
             on_edge = ((px - x) * dy - (py - y) * dx) / turn
             if along >= 0 and -1e-12 <= on_edge <= 1 + 1e-12:
                 best = min(best, along)
-    return 0.0 if min(sides) >= 0 or max(sides) <= 0 else best
+    return 0.0 if is_filled and (min(sides) >= 0 or max(sides) <= 0) else best
 
 
-@given(st.lists(poses, min_size=1, max_size=7), st.sampled_from([1, 2, 7, 72, 361]))
-def test_rays_end_where_a_slow_caster_finds_the_first_edge(actors, rays):
+@given(st.lists(poses, min_size=1, max_size=7), st.lists(obstacles(), max_size=3), st.sampled_from([1, 2, 7, 72, 361]))
+def test_rays_end_where_a_slow_caster_finds_the_first_edge(actors, buildings, rays):
     scene = scene_of(*actors)
-    found = RayCaster(rays, 50.0).cast(scene, 0, range(1, len(actors)))
+    known = ObstacleOutlines(buildings) if buildings else None
+    found = RayCaster(rays, 50.0, known).cast(scene, 0, range(1, len(actors)))
     x, y = center_of(scene, 0)
+
+    def nearest(angle):
+        away = [slow_range(corners(scene, other), x, y, angle) for other in range(1, len(actors))]
+        return min([50.0, *away, *(slow_range(np.array(one), x, y, angle, is_filled=False) for one in buildings)])
+
     for ray, distance in enumerate(found):
         angle = scene.headings[0] + math.tau * ray / rays
-        slow = [slow_range(corners(scene, other), x, y, angle) for other in range(1, len(actors))]
-        nearest = min([50.0, *slow])
-        if distance == pytest.approx(nearest, abs=1e-6):
+        if distance == pytest.approx(nearest(angle), abs=1e-6):
             continue
         # A ray along an edge or through a corner may hit or miss it by rounding.
-        beside = [
-            min([50.0, *(slow_range(corners(scene, other), x, y, angle + turn) for other in range(1, len(actors)))])
-            for turn in (-1e-7, 1e-7)
-        ]
+        beside = [nearest(angle + turn) for turn in (-1e-7, 1e-7)]
         assert any(distance == pytest.approx(one, abs=1e-3) for one in beside)
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.3, math.pi / 2, 3.0])
+def test_no_ray_leaves_a_closed_outline_through_a_corner(heading):
+    """Every 16th ray passes through a corner of a polygon around the vehicle."""
+    turns = [heading + math.tau * corner / 16 for corner in range(16)]
+    ring = [(10 * math.cos(turn), 10 * math.sin(turn)) for turn in turns]
+    scene = scene_of((2 * math.cos(heading), 2 * math.sin(heading), heading, 4.0, 2.0, 0.0))
+    found = RayCaster(256, 50.0, ObstacleOutlines([ring])).cast(scene, 0, [])
+    assert found == pytest.approx(10.0, abs=0.2)
+    assert found[::16] == pytest.approx(10.0)
 
 
 def test_first_ray_points_ahead_and_the_next_ones_to_the_left():
@@ -145,6 +167,25 @@ def test_cells_are_occupied_if_their_centre_is_inside_an_outline(actors, shape, 
             assert found[cell] == any(slow) or len(set(nearly)) == 2
 
 
+def turns_around(outline, x, y):
+    """How often an outline winds around a point, by the angles at which its corners are seen."""
+    angles = np.arctan2(*(np.array(outline) - (x, y)).T[::-1])
+    steps = np.diff(np.append(angles, angles[0]))
+    return round(float(np.sum((steps + math.pi) % math.tau - math.pi)) / math.tau)
+
+
+@given(poses, st.lists(obstacles(), max_size=4), st.sampled_from([(8, 8), (13, 5)]), st.sampled_from([0.7, 3.0, 9.0]))
+def test_cells_are_obstructed_if_an_outline_winds_around_their_centre(ego, buildings, shape, resolution):
+    scene = scene_of(ego)
+    found = Raster(*shape, resolution).obstructed(scene, 0, ObstacleOutlines(buildings))
+    for cell in np.ndindex(*shape):
+        x, y = cell_center(scene, cell, shape, resolution)
+        around = {
+            any(turns_around(one, x + dx, y + dy) for one in buildings) for dx in (-1e-6, 1e-6) for dy in (-1e-6, 1e-6)
+        }
+        assert found[cell] in around
+
+
 @given(
     poses,
     st.lists(st.lists(st.tuples(number, number), min_size=2, max_size=4), min_size=1, max_size=3),
@@ -171,8 +212,10 @@ def test_raster_without_lanes_is_empty_and_pictures_have_the_colours_of_films():
     raster = Raster(30, 10, 1.0)
     assert not raster.on_lanes(scene, 0, []).any()
     assert not raster.on_lanes(scene, 0, [(np.array([[500.0, 0.0], [600.0, 0.0]]), 3.0)]).any()
+    house = ObstacleOutlines([[(-20.0, -9.0), (-8.0, -9.0), (-8.0, 9.0), (-20.0, 9.0)]])
     drawn = picture(
         raster.on_lanes(scene, 0, [(np.array([[-50.0, 0.0], [50.0, 0.0]]), 4.0)]),
+        raster.obstructed(scene, 0, house),
         raster.occupied(scene, 0, [1]),
         raster.occupied(scene, 0, [0]),
     )
@@ -181,13 +224,14 @@ def test_raster_without_lanes_is_empty_and_pictures_have_the_colours_of_films():
     assert drawn[5, 5].tolist() == [125, 139, 156]  # 10 m ahead
     assert drawn[0, 5].tolist() == [228, 232, 237]  # the road
     assert drawn[15, 0].tolist() == [246, 247, 249]
+    assert drawn[25, 5].tolist() == drawn[25, 0].tolist() == [196, 186, 176]  # a building, also on the road
 
 
 @settings(max_examples=15)
-@given(st.lists(poses, min_size=2, max_size=6))
-def test_actor_is_hidden_if_and_only_if_every_slow_ray_hits_another_actor_first(actors):
+@given(st.lists(poses, min_size=2, max_size=6), st.lists(obstacles(), max_size=2))
+def test_actor_is_hidden_if_and_only_if_every_slow_ray_hits_something_else_first(actors, buildings):
     scene, rays = scene_of(*actors), 60
-    hidden = occluded(scene, 0, RayCaster(rays, 120.0))
+    hidden = occluded(scene, 0, RayCaster(rays, 120.0, ObstacleOutlines(buildings) if buildings else None))
     x, y = center_of(scene, 0)
     surely, nearly = set(), set()
     for ray in range(rays):
@@ -195,10 +239,12 @@ def test_actor_is_hidden_if_and_only_if_every_slow_ray_hits_another_actor_first(
         for turn in (0.0, -1e-7, 1e-7):  # a ray along an edge or through a corner may hit or miss it by rounding
             angle = scene.headings[0] + math.tau * ray / rays + turn
             away = [slow_range(corners(scene, other), x, y, angle) for other in range(1, len(actors))]
+            away += [slow_range(np.array(one), x, y, angle, is_filled=False) for one in buildings]
             winners.append({other for other, one in enumerate(away, 1) if one <= min([*away, 120.0]) + 1e-3})
         nearly |= set().union(*winners)
         surely |= winners[0] if winners[0] == winners[1] == winners[2] and len(winners[0]) == 1 else set()
-    assert surely <= {other for other in range(1, len(actors)) if scene.roster.actors[other].id not in hidden} <= nearly
+    cars = set(range(1, len(actors)))  # the numbers behind are those of obstacles
+    assert surely & cars <= {other for other in cars if scene.roster.actors[other].id not in hidden} <= nearly
 
 
 def test_actor_behind_a_lorry_is_hidden_until_it_looks_out():
