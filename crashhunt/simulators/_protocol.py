@@ -102,8 +102,8 @@ class Simulator(Protocol):
     actions. This guarantee holds in the same process and in another process, whatever ran before. The simulator never
     changes an array that it has returned.
 
-    Each optional capability is its own protocol: `ReportsNotices`, `FlattensObservations`, `RestoresObservations`,
-    `ObservesParts`, `NamesObservations`, `ReportsEvents`, `MasksActions`, `HasMap`, `HasWindow`,
+    Optional capabilities are protocols: `ReportsNotices`, `FlattensObservations`, `RestoresObservations`,
+    `ObservesParts`, `NamesObservations`, `ReportsEvents`, `MasksActions`, `HasMap`, `HasObstacles`, `HasWindow`,
     `SupportsFullBraking`, `ReportsSurroundings`, `ReportsNearestAhead`, `ReportsSpeedLimit`, `SupportsDisturbances`,
     `SupportsHolds`, `SupportsExclusion`, `SupportsScripts`, `SupportsReseeding`, `CountsSetUp`, `RunsForeignCode`,
     `RestoresState` and `PreparesProcess`. A simulator supports a protocol if it has the methods and attributes of the
@@ -269,7 +269,7 @@ class HasMap(Protocol):
 
 
 class HasObstacles(Protocol):
-    """A simulator with obstacles that do not move and are no actors, such as buildings."""
+    """A simulator with a map (`HasMap`) and with obstacles that do not move and are no actors, such as buildings."""
 
     def obstacles(self) -> Sequence[Lane]:
         """Return the obstacles of the episode, each as a closed line of the width 0."""
@@ -607,6 +607,7 @@ FACULTIES: tuple[type, ...] = (
     ReportsEvents,
     MasksActions,
     HasMap,
+    HasObstacles,
     ProvidesRoadMaps,
     HasWindow,
     SupportsFullBraking,

@@ -17,6 +17,7 @@ from crashhunt.simulators import (
     FlattensObservations,
     FullBraking,
     HasMap,
+    HasObstacles,
     NamesObservations,
     ObservesParts,
     ReportsEvents,
@@ -223,6 +224,22 @@ class SimulatorContract:
                 assert len(lane.shape) > 1
                 assert np.isfinite(lane.shape).all()
             assert list(simulator.lanes()) == lanes
+        simulator.close()
+
+    def test_obstacles_are_closed_lines(self, make: Make) -> None:
+        """`HasObstacles`: every obstacle has a unique name and a closed outline; the simulator has a map as well."""
+        simulator = make()
+        simulator.reset(seed=1)
+        if supports(simulator, HasObstacles):
+            assert supports(simulator, HasMap)
+            obstacles = list(simulator.obstacles())
+            assert len({one.id for one in obstacles}) == len(obstacles)
+            for one in obstacles:
+                assert one.width == 0
+                assert np.shape(one.shape)[1:] == (2,)
+                assert len(one.shape) > 3
+                assert one.shape[0] == one.shape[-1]
+                assert np.isfinite(one.shape).all()
         simulator.close()
 
     def test_structured_observations_can_be_had_back(self, make: Make) -> None:

@@ -33,7 +33,7 @@ from crashhunt.testing import (
 from crashhunt.testing._disturbance_contract import DisturbanceContract
 from crashhunt.testing._last_avoidable_step_check import EscapeCheck, RecordedThenBrakes
 from crashhunt.testing._oracle_contract import _LANES
-from crashhunt.world import Event
+from crashhunt.world import Event, Lane
 
 
 class Model:
@@ -513,6 +513,13 @@ class Moves(ToySimulator):
         return [replace(first, width=float(self.asked)), *others]
 
 
+class Open(ToySimulator):
+    """Has an obstacle whose outline is open."""
+
+    def obstacles(self):
+        return [Lane("house", 0.0, ((0.0, 9.0), (4.0, 9.0), (4.0, 12.0), (0.0, 12.0)))]
+
+
 class AnyAction(SpeedAndLaneChange):
     """Takes a text for an action."""
 
@@ -562,6 +569,7 @@ NAMES, MAP = "test_columns_have_a_name_each", "test_the_map_has_every_lane_once"
         (Thin, {MAP}),
         (Point, {MAP}),
         (Moves, {MAP}),
+        (Open, {"test_obstacles_are_closed_lines"}),
         (Lenient, {"test_actions_are_checked_and_encoded_once_and_for_all"}),
     ],
 )
