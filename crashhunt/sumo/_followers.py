@@ -133,7 +133,7 @@ class Followers:
         kinds = VEHICLE_CLASSES - _ON_FOOT
         for lane in graph.lanes.values():
             data = lane.data
-            if not any(is_open(data, kind) for kind in (("passenger",) if data.allowed is None else kinds)):
+            if not any(is_open(data, kind) for kind in kinds):
                 continue
             total = sum(math.dist(one, two) for one, two in pairwise(data.shape))
             done, scale = 0.0, data.length_m / total if total else 1.0

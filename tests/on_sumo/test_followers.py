@@ -8,6 +8,7 @@ import shutil
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import libsumo
 import pytest
@@ -19,7 +20,8 @@ from crashhunt.plans._choices import chosen_actions
 from crashhunt.scenario import argument_values, load_scenario, with_action, with_stated_choice, with_visible_outline
 from crashhunt.simulators import MotionState
 from crashhunt.sumo import SumoSimulator
-from crashhunt.sumo._followers import Piece, _Part
+from crashhunt.sumo._followers import Followers, Piece, _Part
+from crashhunt.sumo.maps._road_network import NetworkLane
 from crashhunt.trial import Signature
 
 EMPTY = {"intersection": {"priority_demand": 1, "minor_demand": 1}, "motorway": {"demand": 1}}
@@ -225,6 +227,22 @@ def test_command_of_a_disturbance_is_bounded_and_a_hold_takes_precedence(begin, 
     if command is not None:
         command.end()
         assert libsumo.vehicle.getSpeedMode("car") == 31
+
+
+@pytest.mark.parametrize(
+    ("lane", "is_examined"),
+    [
+        ({}, True), ({"disallowed": {"passenger"}}, True), ({"disallowed": {"all"}}, False),
+        ({"allowed": {"bus"}}, True), ({"allowed": {"pedestrian", "wheelchair"}}, False), ({"allowed": {"all"}}, True),
+    ],
+)  # fmt: skip
+def test_lanes_of_all_vehicles_are_examined_also_without_cars(lane, is_examined):
+    given = {"allowed": None, "disallowed": frozenset(), **lane}
+    data = NetworkLane(length_m=9.0, speed_mps=9.0, shape=((0.0, 0.0), (9.0, 0.0)), **given)
+    graph = SimpleNamespace(lanes={"a": SimpleNamespace(id="a", data=data)})
+    followers = Followers(["ego"], ["ego"], lambda: graph, 0.1)
+    followers.prepare()
+    assert bool(followers._near([(4.0, 1.0), (5.0, 1.0)], 1.0)) == is_examined
 
 
 @SEEN
