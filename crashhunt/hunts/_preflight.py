@@ -1,4 +1,7 @@
-"""Checks at the start of a hunt, so that an agent that cannot start causes one error and not many invalid trials."""
+"""Checks before a hunt, so that a mistake causes one error and not many invalid trials.
+
+They find agents that cannot start, vehicles for ``--ego any`` that never enter, and unknown signals of requirements.
+"""
 
 from __future__ import annotations
 
