@@ -317,6 +317,7 @@ def shrink(
 
 
 def _bundle_of(crash: Bundle | Path | str, crash_id: str) -> Bundle:
+    refuse_while_importing()
     from crashhunt.crashes import Bundle, find_bundle
 
     return crash if isinstance(crash, Bundle) else find_bundle(Path(crash), crash_id)

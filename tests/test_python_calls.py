@@ -11,6 +11,7 @@ import pytest
 
 import crashhunt
 from crashhunt import analysis, api, cli, crashes, replays
+from crashhunt.base.plugins import import_module
 from crashhunt.errors import HuntWhileImportingError, UsageError
 from crashhunt.plans import HuntOptions
 
@@ -222,7 +223,16 @@ def test_module_that_starts_a_hunt_when_it_is_imported_is_refused(tmp_path, monk
     monkeypatch.chdir(tmp_path)
     if threads:  # then the module is imported in this process
         monkeypatch.setattr("crashhunt.base.isolation._is_embedded", lambda: True)
-    message = r"^the module 'hunts_again' starts a hunt when it is imported; put the call below: if __name__ =="
+    message = r"^the module 'hunts_again' runs trials when it is imported; put the call below: if __name__ =="
     with pytest.raises(HuntWhileImportingError, match=message):
         crashhunt.run("h", 1, 1, 9, scenario="loop", agents={"ego": "hunts_again:Mine"})
     assert not (tmp_path / "h").exists()
+
+
+@pytest.mark.parametrize("call", ["replay", "what_if", "judge", "shrink"])
+def test_module_that_examines_a_crash_when_it_is_imported_is_refused(tmp_path, monkeypatch, call):
+    more = ", []" if call == "what_if" else ""
+    (tmp_path / f"{call}s_again.py").write_text(f"import crashhunt\ncrashhunt.{call}('h'{more})\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(HuntWhileImportingError, match=f"^the module '{call}s_again' runs trials when it is imported"):
+        import_module(f"{call}s_again")

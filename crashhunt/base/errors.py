@@ -11,7 +11,7 @@
     ├── ScenarioError              a scenario file: which file, which key, which value
     │   └── NoValidTrialError      no trial in it can be set up; exit code 3
     ├── PluginError                a name or ``module:attribute`` that leads nowhere
-    │   └── HuntWhileImportingError  a module that starts a hunt when it is imported
+    │   └── HuntWhileImportingError  a module that runs trials when it is imported
     ├── HuntDirectoryError         the directory of a hunt: busy, foreign, unwritable, full
     │   └── BusyError              another hunt is running in it
     ├── BundleError                a crash bundle or log that is damaged or incomplete
@@ -168,7 +168,7 @@ class PluginError(CrashhuntError):
 
 
 class HuntWhileImportingError(PluginError):
-    """A module starts a hunt at its top level, so every process that imports it would start the hunt again."""
+    """A module runs trials at its top level, so every process that imports it would run them again."""
 
 
 class HuntDirectoryError(CrashhuntError):

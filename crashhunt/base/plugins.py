@@ -267,14 +267,14 @@ _importing = _Importing()
 
 
 def refuse_while_importing() -> None:
-    """Refuse to start a hunt while `import_module` imports a module in this thread.
+    """Refuse to start a hunt or a replay while `import_module` imports a module in this thread.
 
     Raises:
         HuntWhileImportingError: a module is being imported.
     """
     if name := _importing.name:
         raise HuntWhileImportingError(
-            f"the module {name!r} starts a hunt when it is imported",
+            f"the module {name!r} runs trials when it is imported",
             fix='put the call below: if __name__ == "__main__":',
         )
 
