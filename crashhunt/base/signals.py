@@ -183,6 +183,23 @@ def stop_requests() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Return a context in which a Ctrl-C raises `KeyboardInterrupt`, even inside `stop_requests`.
+
+    For a question to the user: what has only been collected would wait for an answer.
+    """
+    try:
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    except ValueError:  # not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def is_sent_from_outside(exit_code: int) -> bool:
     """Return whether a process died of a signal that another process or the kernel may have sent.
 

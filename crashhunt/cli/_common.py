@@ -420,11 +420,14 @@ def check_trust(bundle: Bundle, trusted: bool | None) -> None:
 
 def ask_to_trust(refusal: UntrustedError, *, as_json: bool) -> bool:
     """Ask whether the user trusts the code from now on; return False without a terminal."""
+    from crashhunt.base.signals import interruptible
+
     if as_json or not (sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()):
         return False
     print(one_line(f"{refusal.where}: {refusal.message}"), file=sys.stderr)  # an archive names its maker as it likes
     print("Trust this code from now on and run it? [y/N] ", end="", file=sys.stderr, flush=True)
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
+    with interruptible():
+        return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 # The bar of `film`, `export` and whatever takes its time; what a hunt shows while it runs is in `report`.

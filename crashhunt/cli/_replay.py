@@ -365,12 +365,11 @@ def _replay_often(options: argparse.Namespace, chosen: ReplayOptions) -> int:
     from crashhunt.base.signals import stop_requests
     from crashhunt.reruns import StoppedError
 
-    with opened_crash(options.directory, options.crash) as (bundle, archive):
+    with opened_crash(options.directory, options.crash) as (bundle, archive), stop_requests() as stops:
         chosen = replace(chosen, look=_view_of(options, bundle))
 
         def run(trusted: bool | None) -> tuple[ReplayReport, JsonObject]:
-            with stop_requests() as stops:  # not while the user is asked whether to trust the code
-                return _replay_one(options, bundle, replace(chosen, trusted=trusted), lambda: bool(stops))
+            return _replay_one(options, bundle, replace(chosen, trusted=trusted), lambda: bool(stops))
 
         try:
             report, answer = run_trusted(run, bundle, archive, options)

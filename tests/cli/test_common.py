@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
+import signal
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from crashhunt.base.signals import stop_requests
 from crashhunt.cli import _common, make_parser
 from crashhunt.cli._common import Parser
 from crashhunt.errors import HuntDirectoryError, UntrustedError, UsageError
@@ -153,6 +156,24 @@ def test_trust_is_asked_for_at_a_terminal_only(monkeypatch):
     assert asked(monkeypatch, "y\n", stdin=False) == (False, "")
     asked(monkeypatch, "y\n")
     assert _common.ask_to_trust(UntrustedError("not trusted", fix="trust it"), as_json=True) is False
+
+
+def test_interrupt_at_the_question_for_trust_is_not_only_collected(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+        def readline(self):
+            os.kill(os.getpid(), signal.SIGINT)
+            return "y\n"
+
+    monkeypatch.setattr(sys, "stdin", Terminal())
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with stop_requests() as stops:
+        with pytest.raises(KeyboardInterrupt):
+            _common.ask_to_trust(UntrustedError("not trusted", fix="trust it"), as_json=False)
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stops == [signal.SIGINT]
 
 
 @pytest.mark.parametrize("faults", [[], ["damaged"]])
