@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from itertools import pairwise, product
 
 import numpy as np
@@ -289,6 +290,10 @@ def test_many_different_exposures_are_spread_and_never_make_the_interval_narrowe
     for rate in np.geomspace(1e-3, 10, 60):
         assert (spread.log_capitals(rate) <= exact.log_capitals(rate) + 1e-9).all()
     assert spread.interval() == pytest.approx(exact.interval(), rel=1e-3)
+    at_once = deepcopy(spread)
+    at_once.add(1.0, 0.7, times=3)
+    spread.extend([(1.0, 0.7)] * 3)
+    assert at_once.log_capitals(0.1) == pytest.approx(spread.log_capitals(0.1))
 
 
 def test_interval_of_many_events_is_as_narrow_as_the_data_allow():

@@ -212,6 +212,14 @@ def test_agent_that_does_not_start_fails_in_the_pairs_in_which_the_other_agent_s
     assert (test.both, test.only_second) == (40, 0)  # no agent is better
 
 
+def test_trials_that_were_killed_are_counted_apart_from_other_trials_without_a_result():
+    died = Failure("signal", "it died of SIGKILL", exit_code=-9)
+    second = [trial(0, failure=NOT_INSERTED), trial(1, has_ended=False), trial(2, valid=False), trial(3, failure=died)]
+    _, test = pairs_of([trial(n) for n in range(4)], second)
+    side = test.side(1)
+    assert (side.killed, side.unknown, side.not_started) == (2, 2, 0)
+
+
 @pytest.mark.parametrize("lost", [{"has_ended": False, "valid": False}, {"failure": NOT_INSERTED}])
 def test_verdict_is_valid_for_every_result_of_trials_without_one(lost):
     def seen(known, missing):
