@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
@@ -56,3 +57,23 @@ def test_speeds_before_the_period_do_not_count():
 )
 def test_speed_is_kept_as_long_as_it_is_that_of_the_end(speeds, kept_s):
     assert instead(*speeds)[1] == kept_s
+
+
+@dataclass(frozen=True)
+class Spec:
+    max_steps: int = 60
+
+
+@pytest.mark.parametrize("repeated", [True, False])
+def test_omission_is_reported_only_if_its_run_can_be_repeated(monkeypatch, repeated):
+    digests = iter(["a", "b", "c", "a" if repeated else "d"])
+    search = object.__new__(_omissions._Search)
+    search._dt, search._left, search._end, search.runs = 0.5, 10, 40, []
+    search._rerun = SimpleNamespace(spec=Spec())
+    monkeypatch.setattr(search, "_omission", lambda candidate, faculty: "omitted", raising=False)
+    monkeypatch.setattr(search, "_judged", lambda *_: SimpleNamespace(ending="none"), raising=False)
+    ended = lambda: SimpleNamespace(result=SimpleNamespace(digest=next(digests)))  # noqa: E731
+    monkeypatch.setattr(search, "_run", lambda specs, faculty, steps: [ended() for _ in steps], raising=False)
+    found = search._try({"first": 30, "last": 38, "actor": "", "faculty": "speed"}, "speed")
+    assert (found.omission, len(found.runs)) == ("omitted" if repeated else None, 3)
+    assert found.why_not == ("" if repeated else "a run with the reference driver could not be repeated")
