@@ -34,7 +34,11 @@ def test_the_agent_receives_the_signal_in_place_of_its_points():
     assert fold_signals({"x[0]": 1.0}) == {"x[0]": 1.0}
 
 
-@given(points=st.lists(st.floats(-5, 5, allow_subnormal=False), min_size=2, max_size=9), share=st.floats(0, 1))
+# SciPy divides by slopes, so those near the smallest float overflow there.
+VALUES = st.floats(-5, 5).filter(lambda value: value == 0 or abs(value) > 1e-100)
+
+
+@given(points=st.lists(VALUES, min_size=2, max_size=9), share=st.floats(0, 1))
 def test_values_are_those_of_the_interpolation(points, share):
     places, at = np.linspace(0, 10, len(points)), 10 * share
     signal = {kind: InputSignal(tuple(points), kind, 10.0) for kind in ("constant", "linear", "pchip")}
