@@ -758,7 +758,7 @@ typedef std::vector<long> Earlier;
 
 long earlier_row(const Earlier &earlier, size_t row) { return earlier.empty() ? static_cast<long>(row) : earlier[row]; }
 
-// As _moved of oracles/_crash_oracles.py.
+// As _moved of oracles/_included_oracles.py.
 Moved moved(const Scene &previous, const Scene &present, size_t row, const Earlier &earlier) {
     const long found = earlier_row(earlier, row);
     if (found < 0) {
@@ -775,7 +775,7 @@ Moved moved(const Scene &previous, const Scene &present, size_t row, const Earli
     return {dx, dy, aside};
 }
 
-// As _within_reach of oracles/_crash_oracles.py, of two scenes; false where that is Python's to do.
+// As _within_reach of oracles/_included_oracles.py, of two scenes; false where that is Python's to do.
 bool reach(const Scene &present, const Scene &previous, size_t row, double step_s, double hardest,
            std::vector<size_t> &found, const Earlier &earlier = Earlier()) {
     const std::vector<double> &reaches = present.roster->reaches;
@@ -1297,7 +1297,7 @@ struct Way {
         return std::max(found, fabs(across * turn_c - along_x * turn_s) - width - own_l * wide - own_w * far);
     }
 
-    // Whether somebody, of whom the front and half sizes are given, may be touched on one of the places that are looked
+    // Whether an actor, whose front and half sizes are given, may be touched on one of the places that are looked
     // at, ahead of a sample (or behind it, with a negative spacing). What is not a number may.
     bool touches(size_t sample, double gap, double far, double fx, double fy, double angle, double length,
                  double width) const {

@@ -124,7 +124,7 @@ struct Here {
     const Scene &scene;
     size_t row;
     double time_s, along, x, y; // of the vehicle: its position on the lane, and its middle
-    mutable std::vector<std::string> lanes; // of those of whom it has been asked
+    mutable std::vector<std::string> lanes; // of the vehicles whose lane was read
 
     Here(const Scene &present, size_t own, double now_s, double position)
         : scene(present), row(own), time_s(now_s), along(position), lanes(scene.size) {

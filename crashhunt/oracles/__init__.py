@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._crash_oracles import (
+    from ._included_oracles import (
         MAX_BRAKING_MPS2 as MAX_BRAKING_MPS2,
         OffRoad as OffRoad,
         OffRoute as OffRoute,

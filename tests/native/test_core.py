@@ -16,7 +16,7 @@ from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.episode import run_episode
 from crashhunt.native import _core, core_for, why_not
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
-from crashhunt.oracles._crash_oracles import _within_reach
+from crashhunt.oracles._included_oracles import _within_reach
 from crashhunt.recording import BlackBox
 from crashhunt.scenario import ObservationSetup, argument_values, load_scenario
 from crashhunt.simulators import Kinematics
