@@ -9,7 +9,7 @@ from contextlib import closing, suppress
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.errors import CrashhuntError, HostError, HuntDirectoryError, remedy
+from crashhunt.base.errors import CallError, CrashhuntError, HostError, HuntDirectoryError, remedy
 from crashhunt.base.exceptions import in_words
 from crashhunt.base.signals import stop_requests
 from crashhunt.base.temporary import remove_at_once, remove_scratch
@@ -101,6 +101,8 @@ class Hunt:
             FormulaError: a requirement names an unknown signal.
             CrashhuntError: a process or a file failed; `InternalError` if crashhunt has a defect.
         """
+        if watch is not None and not callable(watch):
+            raise CallError(f"run(): watch is {watch!r}", fix="give a function that receives the progress")
         require_known_signals(self.scenario, self.settings)
         with self._place.locked(), stop_requests() as self._stops:
             self.settings = self._place.claim(

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 import crashhunt
-from crashhunt.errors import CrashhuntError, HuntDirectoryError, ScenarioError
+from crashhunt.errors import CallError, CrashhuntError, HuntDirectoryError, ScenarioError
 from crashhunt.hunts import _hunt as hunt_module, _next_trials, _running_hunt
 from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace
@@ -98,6 +98,11 @@ def run(tmp_path, monkeypatch):
         return found
 
     return hunt
+
+
+def test_progress_that_no_function_can_receive_is_refused_in_one_line(run):
+    with pytest.raises(CallError, match=r"^run\(\): watch is 5; give a function"):
+        run(1, watch=5)
 
 
 def test_loop_submits_as_many_trials_as_workers_need_and_ends_with_the_last(run):
