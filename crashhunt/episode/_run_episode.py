@@ -284,7 +284,8 @@ class Parts:
             given["step_length_s"] = simulator.step_length_s
         if "columns" in wanted:
             layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
-            given["columns"] = {} if (layout := layouts.get(agent)) is None else layout.columns
+            layout = layouts.get(agent)  # copied: what an agent does to its columns costs nobody else
+            given["columns"] = {} if layout is None else {part: {**of} for part, of in layout.columns.items()}
         if "map" in wanted:
             given["map"] = simulator.road_map(agent) if supports(simulator, ProvidesRoadMaps) else None
         if "vehicle" in wanted:

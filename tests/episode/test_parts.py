@@ -15,6 +15,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.plugins import CurrentFolder, locate
 from crashhunt.episode import Parts, WorkerSettings, _run_episode as _run, require_origin, seal
 from crashhunt.scenario import load_scenario
+from crashhunt.simulators import ObservationLayout, parse_parts
 from crashhunt.trial import Signature
 
 AGENT = """
@@ -80,6 +81,15 @@ def test_agents_are_given_what_they_ask_for(made):
     simulator.shown_spaces = {"ego": "as it is meant"}
     assert parts.agent("ego", simulator, {}).given[0] == "as it is meant"
     assert type(parts.agent("ego", simulator, {})) is type(driver)
+
+
+def test_agent_that_changes_its_columns_changes_only_its_own(made):
+    parts = made()
+    parts._factories["ego"] = dict, Signature({}, open=True, given=("columns",))
+    simulator = parts.simulator()
+    simulator.observation_layouts = {"ego": ObservationLayout(parse_parts(("ego",), where=""))}
+    parts.agent("ego", simulator, {})["columns"]["ego"].clear()
+    assert parts.agent("ego", simulator, {})["columns"]["ego"]["heading"] == 2
 
 
 def test_agent_is_given_the_masks_of_its_simulator(made):
