@@ -70,7 +70,6 @@ def chosen_actions(
     for agent, setup in scenario.agents.items():
         signature = signatures[agent]
         action_settings(signature.action, where=f"action of {setup.agent}")
-        action_settings(asked, where="--action")
         if asked:
             found[agent] = asked
         elif signature.action and (setup.action is None or agent in brought):

@@ -202,7 +202,7 @@ def _agents_in(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
                 f"--action {action} is for {meant}, but the scenario {scenario.name} has another simulator", fix=fix
             )
         if action:
-            scenario = with_action(scenario, agent, action)
+            scenario = with_action(scenario, agent, action, where="--action")
     return scenario
 
 

@@ -305,13 +305,13 @@ class Scenario:
         return replace(self, agents=agents)
 
 
-def with_action(scenario: Scenario, agent: str, action: str) -> Scenario:
-    """Return the scenario with another form of actions for one agent.
+def with_action(scenario: Scenario, agent: str, action: str, where: str = "action") -> Scenario:
+    """Return the scenario with another form of actions for one agent; `where` names the form's origin in messages.
 
     Raises:
         UsageError: the form of actions or a setting of it does not exist.
     """
-    action_settings(action, where="action")
+    action_settings(action, where=where)
     setup = replace(scenario.agents[agent], action=action)
     return replace(scenario, agents={**scenario.agents, agent: setup})
 

@@ -74,6 +74,7 @@ def test_agent_without_a_declaration_leaves_the_settings_as_they_are():
     [
         ("Strict", {"action": "meta"}, "Strict returns actions of the form acceleration or sumo, not meta"),
         ("Other", {}, "action of acting_agents:Other: 'teleport' is not a form of actions"),
+        ("Accelerates", {"action": "trajectory:visible=back"}, "^--action: trajectory:visible is 'back'; give front"),
         ("crashhunt.agents:CarFollowing", {"action": "acceleration"}, "speed_and_lane or meta, not acceleration"),
         (
             "Busy",
