@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialSpec
 
 
-_TAIL_BYTES = 4000  # bytes
+_HEAD_BYTES, _TAIL_BYTES = 2000, 4000
 _MAX_NATIVE_BYTES = 1 << 16
 _FRAME_LINE = re.compile(r'  File "(.*)", line (\d+) in (.*)')  # of a stack that faulthandler wrote
 MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside
@@ -144,7 +144,7 @@ def damaged(spec: TrialSpec, scratch: Path, message: str, *, agent: str = "", re
     if recorded:
         header = where_it_is(scratch, spec.number)
         return _result(spec, scratch, header, Outcome.AGENT_ERROR, "damaged process", message, None, agent)
-    output = read_tail(scratch_of(scratch, spec.number) / layout.RUN_LOG)
+    output = read_ends(scratch_of(scratch, spec.number) / layout.RUN_LOG)
     failure = Failure("damaged recording", message, agent=agent, last_output=output)
     return TrialResult(spec, Outcome.AGENT_ERROR, failure=failure, kept=True)
 
@@ -168,7 +168,7 @@ def _result(
     agents: Mapping[str, str] | None = None,
 ) -> TrialResult:
     folder = scratch_of(scratch, spec.number)
-    output = read_tail(folder / layout.RUN_LOG)
+    output = read_ends(folder / layout.RUN_LOG)
     stack = _read_stack(folder / layout.STACK)
     steps, sim_time_s, digest, closest = 0, 0.0, "", ClosestApproach()
     danger: float | None = None
@@ -280,13 +280,17 @@ def read_map(scratch: Path, trial: Path) -> list[Lane]:
     return []
 
 
-def read_tail(path: Path) -> str:
-    """Return the last few thousand characters of a file; empty if the file does not exist."""
+def read_ends(path: Path) -> str:
+    """Return the first and the last few thousand characters of a file; empty if the file does not exist."""
     try:
         with path.open("rb") as file:
-            file.seek(0, os.SEEK_END)
-            file.seek(max(0, file.tell() - _TAIL_BYTES))
-            return file.read().decode("utf-8", "replace")
+            between = file.seek(0, os.SEEK_END) - _HEAD_BYTES - _TAIL_BYTES
+            file.seek(0)
+            if between <= 0:
+                return file.read().decode("utf-8", "replace")
+            head = file.read(_HEAD_BYTES).decode("utf-8", "replace")
+            file.seek(between, os.SEEK_CUR)
+            return f"{head}\n[{between:,} bytes omitted]\n{file.read().decode('utf-8', 'replace')}"
     except OSError:
         return ""
 
@@ -299,4 +303,4 @@ def _read_stack(path: Path) -> str:
     except OSError:
         return ""
     native, rest = split_native_calls(text)
-    return f"{native}{unescape_letters(rest[-_TAIL_BYTES:])}" if native else unescape_letters(read_tail(path))
+    return f"{native}{unescape_letters(rest[-_TAIL_BYTES:])}" if native else unescape_letters(read_ends(path))

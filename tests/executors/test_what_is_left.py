@@ -68,7 +68,6 @@ def test_a_death_in_an_agent_is_that_of_the_step_that_began(begun, phase, code, 
     assert (failure.kind, failure.agent, failure.exit_code) == (kind, "left.25", code)
     assert failure.message == f"the process {words} in left.25's act() of step 13"
     assert failure.traceback == "File a.py, line 3 in act"
-    assert len(failure.last_output) == 4000
     assert failure.last_output.endswith("last words")
     assert len(result.digest) == 32
     assert result.sim_time_s == pytest.approx(20 + 12 * 0.1)
@@ -215,7 +214,15 @@ def test_the_map_of_a_trial_is_its_own_or_that_of_the_hunt(tmp_path):
     assert [lane.id for lane in _postmortem.read_map(tmp_path, trial)] == ["b_0"]
     (trial / layout.MAP).write_text("[")
     assert len(_postmortem.read_map(tmp_path, trial)) == 1
-    assert _postmortem.read_tail(tmp_path / "nowhere") == ""
+
+
+def test_head_and_tail_of_a_long_output_are_kept(tmp_path):
+    log = tmp_path / "run.log"
+    assert _postmortem.read_ends(log) == ""
+    log.write_text("no map\n" + "x" * 5993)
+    assert _postmortem.read_ends(log) == log.read_text()
+    log.write_text("no map\n" + "x" * 7000 + "\nno plan\n")
+    assert _postmortem.read_ends(log) == f"no map\n{'x' * 1993}\n[1,016 bytes omitted]\n{'x' * 3991}\nno plan\n"
 
 
 def test_each_note_is_reported_once(tmp_path):
