@@ -284,7 +284,7 @@ class Parts:
             given["step_length_s"] = simulator.step_length_s
         if "columns" in wanted:
             layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
-            layout = layouts.get(agent)  # copied: what an agent does to its columns costs nobody else
+            layout = layouts.get(agent)  # copied, because an agent may change it
             given["columns"] = {} if layout is None else {part: {**of} for part, of in layout.columns.items()}
         if "map" in wanted:
             given["map"] = simulator.road_map(agent) if supports(simulator, ProvidesRoadMaps) else None

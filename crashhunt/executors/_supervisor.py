@@ -26,7 +26,7 @@ from crashhunt.base.processes import die_with, resume
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import internal_error, scratch_of
-from crashhunt.executors._postmortem import MAX_ATTEMPTS, damaged, died, hung, read_map, read_ends
+from crashhunt.executors._postmortem import MAX_ATTEMPTS, damaged, died, hung, read_ends, read_map
 from crashhunt.executors._time_limits import START_UP_S, PauseMeter, has_hung
 from crashhunt.executors._trial_process import CHECKSUM_BYTES, checksum_of
 from crashhunt.recording import BlackBoxFile, Recording, Tag, digest_of, is_evidence, read_black_box
