@@ -25,7 +25,7 @@ from crashhunt.crashes import (
     features_of,
     join_causes,
 )
-from crashhunt.recording import Prologue, StepRecord
+from crashhunt.recording import Prologue
 from crashhunt.trial import Outcome
 from crashhunt.world import Actor, Roster, Scene
 
@@ -179,30 +179,33 @@ def test_length_is_no_cause_where_cars_were_hit_as_well():
     assert found.causes() == {0: car, 1: car, 2: car}
 
 
-def features(side, turn):
-    """Return the features of a crash into a vehicle on the next lane, on a road of some direction."""
-    roster = Roster((Actor("ego", "passenger", 5.0, 1.8), Actor("x", "passenger", 5.0, 1.8)))
+def features(side, turn=0.0, at=(0.0, 0.0), steps=40):
+    """Return the features of a crash into a truck that moves over from the next lane, on a road somewhere."""
+    roster = Roster((Actor("ego", "passenger", 5.0, 1.8), Actor("x", "truck", 9.0, 2.2)))
     c, s = math.cos(turn), math.sin(turn)
-    steps = []
-    for number in range(40):
-        points = [
-            (number * 2.0 * c - y * s, number * 2.0 * s + y * c) for y in (0.0, side * (3.2 if number < 39 else 0))
-        ]
-        steps.append(StepRecord(number, Scene(number / 10, roster, points, [turn] * 2, [20.0] * 2)))
+    scenes = []
+    for number in range(steps):
+        way = [(number * 2.0, 0.0), (number * 2.0 + 17.0, side * (3.2 if number < steps - 1 else 0.5))]
+        points = [(at[0] + x * c - y * s, at[1] + x * s + y * c) for x, y in way]
+        scenes.append(Scene(number / 10, roster, points, [turn] * 2, [20.0, 21.0]))
     hit = SimpleNamespace(agent="ego", other="x")
     crash = SimpleNamespace(result=SimpleNamespace(collision=hit))
-    scenes = [step.scene for step in steps]
     recording = SimpleNamespace(
         scenes=lambda: scenes, scene=scenes.__getitem__, prologue=Prologue((), 0.1), actors=roster.actors
     )
     return features_of(crash, recording)
 
 
-def test_changes_to_the_left_and_to_the_right_are_far_apart():
+def test_features_are_motions_before_the_crash_in_differences_that_matter():
     """A crash that is not judged has the cause of the nearest one, and the side is a part of the cause."""
-    left, right = features(1, 0.0), features(-1, 0.0)
-    assert math.dist(left, right) > 5.0
-    assert features(1, 2.5) == pytest.approx(left)
+    gap_m = math.hypot(17.0 - 9.0, 3.2 - 2.0)
+    for side in (1, -1):
+        earlier = (20.0 / 5.0, 21.0 / 5.0, gap_m / 5.0, side * 3.2 / 1.5)
+        expected = pytest.approx((*earlier * 3, 9.0 / 4.0))
+        assert features(side) == expected
+        assert features(side, turn=2.5, at=(300.0, -70.0)) == expected  # wherever the road is
+    sudden = features(1, steps=1)  # the crash is all that is recorded
+    assert sudden == pytest.approx((*(4.0, 4.2, 8.0 / 5.0, 0.5 / 1.5) * 3, 9.0 / 4.0))
 
 
 LEFT = Cause("omission", "gap left", "changed lanes")
