@@ -226,11 +226,14 @@ class ObservationLayout:
         return np.zeros(self.flat_space.shape, self._dtype)
 
     def restore(self, array: NDArray[np.generic]) -> dict[str, NDArray[np.generic]]:
-        """Return the observation that the agent receives, from its recorded array."""
-        return {
-            name: array[place].reshape(shape) if dtype is array.dtype else array[place].reshape(shape).astype(dtype)
-            for name, place, shape, dtype in self._places
-        }
+        """Return the observation that the agent receives, from its recorded array; whole numbers are read-only too."""
+        found = {}
+        for name, place, shape, dtype in self._places:
+            found[name] = array[place].reshape(shape)
+            if dtype is not array.dtype:
+                found[name] = found[name].astype(dtype)
+                found[name].flags.writeable = False
+        return found
 
     def with_errors(
         self, array: NDArray[Any], factors: NDArray[np.float64], center: tuple[float, float]

@@ -78,6 +78,15 @@ def test_recorded_array_is_what_gymnasium_flattens(names, data):
     assert ObservationForm(layout.space).space == layout.flat_space
 
 
+@pytest.mark.parametrize("part", ["ego", "actor_ids", "grid", "image"])
+def test_arrays_of_every_type_are_read_only(part):
+    layout = layout_of("ego", "actor_ids", "grid", "image")
+    shown = layout.restore(layout.flat({name: np.zeros(shape) for name, shape in layout.shapes.items()}))
+    assert shown[part].dtype == layout.space[part].dtype
+    with pytest.raises(ValueError, match="read-only"):
+        shown[part][...] = 1
+
+
 def test_columns_give_the_index_of_each_column():
     layout = layout_of("ego", "actors:rows=2", "lidar2d:rays=3")
     assert layout.columns["ego"]["speed"] == 3
