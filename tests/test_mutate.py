@@ -82,3 +82,10 @@ def test_a_module_has_the_tests_of_the_innermost_folder_that_is_listed(mutate):
     assert "test_harm.py" not in ray
     (own,) = mutate.nearest_tests(Path("crashhunt/cli/_list.py"))
     assert own == Path("tests/e2e/test_listing.py")
+
+
+def test_tests_that_import_a_private_module_are_near_wherever_they_lie(mutate):
+    found = mutate.nearest_tests(Path("crashhunt/sumo/_surroundings.py"))
+    assert {str(path) for path in found} == {
+        "tests/on_sumo/test_surroundings.py", "tests/on_sumo/test_sumo_noticed.py"
+    }  # fmt: skip
