@@ -1,44 +1,32 @@
 """An agent that leaves state behind, of one kind in each trial, and looks for every kind that an earlier trial left.
 
+A trial is a fork of a process that has run no trial, so all objects of Python are one kind: memory. There are a few of
+them, of each place that has memory; the other kinds are those of the kernel, and those that forks share.
+
 Tests copy this file to where they work. Run by itself, it prints for each kind whether it is found before and after it
 is left: a kind that is never found would test nothing.
 """
 
-import abc
 import array
-import asyncio
 import atexit
 import builtins
-import codecs
-import collections
 import contextlib
 import contextvars
-import copyreg
 import ctypes
-import dataclasses
-import decimal
-import enum
 import fcntl
 import functools
 import gc
 import io
-import itertools
 import json
-import linecache
 import locale
 import logging
 import math
-import mimetypes
 import mmap
 import multiprocessing
-import numbers
 import os
 import platform
-import random
-import re
 import resource
 import signal
-import socket
 import sqlite3
 import subprocess
 import sys
@@ -47,13 +35,11 @@ import threading
 import time
 import types
 import warnings
-import weakref
 
 import gymnasium
 import numpy as np
 
 from crashhunt.simulators import toy
-from crashhunt.world import DangerMeter
 
 KINDS = {}
 libc = ctypes.CDLL(None, use_errno=True)
@@ -85,12 +71,6 @@ def left_as(read):
 # ---- objects of a module ------------------------------------------------------------------------------------------
 
 COUNT = 0
-LISTED = []
-NAMES = {}
-CHOSEN = set()
-QUEUE = collections.deque([1, 2], maxlen=2)
-ORDERED = collections.OrderedDict(a=1, b=2)
-GROUPS = collections.defaultdict(list)
 BYTES = bytearray(8)
 NUMBERS = array.array("d", [0.0])
 VALUES = np.zeros(3)
@@ -103,23 +83,6 @@ def module_global():
     COUNT += 1
 
 
-@left_where(lambda: len(LISTED))
-def module_list():
-    LISTED.append(1)
-
-
-@left_where(lambda: NAMES or CHOSEN)
-def module_dict_and_set():
-    NAMES["left"] = CHOSEN.add(1)
-
-
-@left_where(lambda: list(QUEUE) != [1, 2] or list(ORDERED) != ["a", "b"] or GROUPS)
-def collection():
-    QUEUE.append(3)
-    ORDERED.move_to_end("a")
-    GROUPS["read"]
-
-
 @left_where(lambda: any(BYTES) or NUMBERS[0] or VALUES.any() or any(VIEW))
 def buffer_of_numbers():
     BYTES[0] = VIEW[1] = 1
@@ -127,81 +90,12 @@ def buffer_of_numbers():
 
 
 class Plain:
-    speed = 5.0
     nested = {"gains": [1.0, 2.0]}  # noqa: RUF012
-
-
-@left_where(lambda: Plain.speed != 5.0)
-def class_attribute():
-    Plain.speed = 9.0
 
 
 @left_where(lambda: Plain.nested["gains"][0] != 1.0)
 def nested_in_class():
     Plain.nested["gains"][0] = 3.0
-
-
-@dataclasses.dataclass(slots=True)
-class Slotted:
-    trials: int = 0
-
-
-SLOTTED = Slotted()
-
-
-@left_where(lambda: SLOTTED.trials)
-def slots_object():
-    SLOTTED.trials += 1
-
-
-def _counter():
-    count = 0
-
-    def up(by):
-        nonlocal count
-        count += by
-        return count
-
-    return up
-
-
-UP = _counter()
-
-
-@left_where(lambda: UP(0))
-def closure_cell():
-    UP(1)
-
-
-def defaults(value, seen=[]):  # noqa: B006
-    seen.append(value)
-
-
-@left_where(lambda: defaults.__defaults__[0])
-def default_argument():
-    defaults(1)
-
-
-@left_where(lambda: hasattr(defaults, "calls"))
-def function_attribute():
-    defaults.calls = 1
-
-
-def replaced():
-    return 1
-
-
-@left_where(lambda: replaced() != 1)
-def function_code():
-    replaced.__code__ = (lambda: 2).__code__
-
-
-PARTIAL = functools.partial(dict, speed=1)
-
-
-@left_where(lambda: PARTIAL() != {"speed": 1})
-def partial_keywords():
-    PARTIAL.keywords["speed"] = 2
 
 
 @functools.lru_cache
@@ -214,75 +108,7 @@ def lru_cache():
     cached(1)
 
 
-class Memo:
-    @functools.cached_property
-    def plan(self):
-        return []
-
-
-MEMO = Memo()
-
-
-@left_where(lambda: "plan" in vars(MEMO))
-def cached_property():
-    MEMO.plan.append(1)
-
-
-@functools.singledispatch
-def shown(value):
-    return ""
-
-
-@left_where(lambda: len(shown.registry) > 1)
-def singledispatch_registry():
-    shown.register(int, str)
-
-
-class Colour(enum.Enum):
-    RED = 1
-
-
-@left_where(lambda: Colour.RED._value_ != 1)
-def enum_member():
-    Colour.RED._value_ = 2
-
-
-class Shape(abc.ABC):  # noqa: B024
-    pass
-
-
-@left_where(lambda: isinstance("", (Shape, numbers.Number)))
-def abstract_registry():
-    Shape.register(str)
-    numbers.Number.register(str)
-
-
-class Odd(dict):
-    pass
-
-
-ODD = Odd()
-
-
-@left_where(lambda: ODD or vars(ODD))
-def dict_subclass():
-    ODD["left"] = ODD.left = 1
-
-
-ERROR = ValueError("kept")
-
-
-@left_where(lambda: getattr(ERROR, "__notes__", None) or ERROR.__traceback__)
-def exception_object():
-    ERROR.add_note("left")
-    with contextlib.suppress(ValueError):
-        raise ERROR
-
-
 GENERATOR = (number for number in range(100))
-ITERATOR = iter(range(100))
-COUNTER = itertools.count()
-CYCLE = itertools.cycle("abc")
 
 
 @left_where(lambda: GENERATOR.gi_frame.f_lasti > 4 and next(GENERATOR) != 0)
@@ -291,41 +117,9 @@ def generator():
     next(GENERATOR)
 
 
-@left_where(lambda: ITERATOR.__length_hint__() != 100)
-def iterator():
-    next(ITERATOR)
-
-
-@left_where(lambda: repr(COUNTER) != "count(0)" or next(CYCLE) != "a")
-def itertools_object():
-    next(COUNTER)
-    next(CYCLE)
-
-
-async def _waits():
-    await asyncio.sleep(0)
-    await asyncio.sleep(0)
-
-
-COROUTINE = _waits()
-atexit.register(COROUTINE.close)
-
-
-@left_where(lambda: COROUTINE.cr_await is not None)
-def coroutine():
-    COROUTINE.send(None)
-
-
-LOCAL = threading.local()
-LOCAL.value = 0
 CONTEXT = contextvars.ContextVar("CONTEXT", default=0)
 LOCK = threading.Lock()
 EVENT = threading.Event()
-
-
-@left_where(lambda: LOCAL.value)
-def thread_local():
-    LOCAL.value += 1
 
 
 @left_where(lambda: CONTEXT.get())
@@ -337,20 +131,6 @@ def context_variable():
 def lock_and_event():
     LOCK.acquire()
     EVENT.set()
-
-
-STREAM = io.BytesIO(b"abc")
-TEXT = io.StringIO("abc")
-
-
-@left_where(lambda: STREAM.getvalue() != b"abc" or STREAM.tell())
-def bytes_io():
-    STREAM.write(b"x")
-
-
-@left_where(lambda: TEXT.tell())
-def string_io():
-    TEXT.read(1)
 
 
 DATABASE = sqlite3.connect(":memory:")
@@ -365,21 +145,9 @@ def database_in_memory():
 C_BUFFER = ctypes.create_string_buffer(8)
 
 
-class Struct(ctypes.Structure):
-    _fields_ = (("value", ctypes.c_double),)
-
-
-C_STRUCT = Struct()
-
-
 @left_where(lambda: C_BUFFER.raw != bytes(8))
 def ctypes_buffer():
     ctypes.memset(C_BUFFER, 1, 8)
-
-
-@left_where(lambda: C_STRUCT.value)
-def ctypes_structure():
-    C_STRUCT.value = 1.5
 
 
 class Cyclic:
@@ -400,28 +168,14 @@ def garbage_with_finalizer():
 KEPT = Plain()
 
 
-@left_as(lambda: weakref.getweakrefcount(KEPT))
-def weak_reference():
-    weakref.finalize(KEPT, os._exit, 5).atexit = False
-    LISTED_REFERENCES.append(weakref.ref(KEPT, lambda _: os._exit(5)))
-
-
-LISTED_REFERENCES = []
-
 # ---- random numbers and arithmetic --------------------------------------------------------------------------------
 
 RNG = np.random.default_rng(1)
-DICE = random.Random(1)
 
 
 @left_as(lambda: str(RNG.bit_generator.state))
 def numpy_generator():
     RNG.random()
-
-
-@left_as(DICE.getstate)
-def random_instance():
-    DICE.random()
 
 
 @left_where(lambda: libc.rand() != 1804289383)
@@ -439,21 +193,6 @@ def numpy_error_state():
     np.seterr(all="ignore")
 
 
-@left_as(lambda: str(np.get_printoptions()))
-def numpy_print_options():
-    np.set_printoptions(precision=1)
-
-
-@left_as(lambda: decimal.getcontext().prec)
-def decimal_context():
-    decimal.getcontext().prec = 3
-
-
-@left_as(lambda: decimal.DefaultContext.prec)
-def decimal_default():
-    decimal.DefaultContext.prec = 4
-
-
 # ---- crashhunt, the simulator, libraries ----------------------------------------------------------------------------
 
 
@@ -467,35 +206,15 @@ def method_of_simulator():
     toy.ToySimulator._target = lambda *_: 3.0
 
 
-@left_as(lambda: vars(DangerMeter).get("left"))
-def class_of_crashhunt():
-    DangerMeter.left = 1
-
-
 @left_as(lambda: (vars(gymnasium.Env).get("left"), len(gymnasium.registry)))
 def gymnasium_class_and_registry():
     gymnasium.Env.left = 1
     gymnasium.register("Left-v0", "nowhere:Nothing")
 
 
-@left_as(lambda: (np.sinh, math.pi))
-def function_of_numpy_and_math():
-    np.sinh, math.pi = None, 3.0
-
-
 @left_as(lambda: (builtins.abs, hasattr(builtins, "left")))
 def builtin_function():
     builtins.abs, builtins.left = (lambda _: 1), 1
-
-
-@left_as(lambda: (time.gmtime, os.getlogin))
-def function_of_standard_library():
-    time.gmtime = os.getlogin = None
-
-
-@left_as(lambda: json.JSONEncoder.default)
-def json_encoder():
-    json.JSONEncoder.default = lambda *_: "left"
 
 
 def _found_in(*names):
@@ -535,11 +254,6 @@ def import_hooks():
     sys.path_importer_cache["/left"] = None
 
 
-@left_as(lambda: "left" in linecache.cache)
-def cache_of_lines():
-    linecache.cache["left"] = (0, None, [], "left")
-
-
 @left_as(lambda: len(warnings.filters))
 def warning_filters():
     warnings.filterwarnings("error", "left")
@@ -572,23 +286,6 @@ def trace_and_profile():
     threading.settrace(lambda *_: None)
 
 
-@left_as(lambda: (sys.excepthook, sys.displayhook, sys.unraisablehook, threading.excepthook, sys.breakpointhook))
-def hooks():
-    sys.excepthook = sys.displayhook = sys.unraisablehook = threading.excepthook = sys.breakpointhook = print
-
-
-@left_as(sys.getrecursionlimit)
-def recursion_limit():
-    sys.setrecursionlimit(sys.getrecursionlimit() + 7)
-
-
-@left_as(lambda: (sys.getswitchinterval(), sys.get_int_max_str_digits(), sys.dont_write_bytecode))
-def interpreter_settings():
-    sys.setswitchinterval(0.5)
-    sys.set_int_max_str_digits(700)
-    sys.dont_write_bytecode = not sys.dont_write_bytecode
-
-
 @left_where(lambda: hasattr(sys.stdout, "left") or sys.stdin is None)
 def standard_streams():
     sys.stdin, sys.stdout = None, io.StringIO()
@@ -607,75 +304,16 @@ def logging_state():
     logging.disable(5)
 
 
-@left_where(lambda: tempfile.tempdir == "/left")
-def folder_of_temporary_files():
-    tempfile.tempdir = "/left"
-
-
-@left_as(socket.getdefaulttimeout)
-def socket_timeout():
-    socket.setdefaulttimeout(7)
-
-
 @left_as(lambda: (time.timezone, os.environ.get("TZ")))
 def time_zone():
     os.environ["TZ"] = "left-3"
     time.tzset()
 
 
-def _knows_codec():
-    with contextlib.suppress(LookupError):
-        return codecs.lookup("leftcodec") is not None
-
-
-@left_where(_knows_codec)
-def codec():
-    codecs.register(lambda name: codecs.lookup("ascii") if name == "leftcodec" else None)
-
-
-def _knows_error():
-    with contextlib.suppress(LookupError):
-        return codecs.lookup_error("left") is not None
-
-
-@left_where(_knows_error)
-def codec_error():
-    codecs.register_error("left", codecs.ignore_errors)
-
-
-@left_where(lambda: Plain in copyreg.dispatch_table)
-def pickling_table():
-    copyreg.pickle(Plain, lambda one: (Plain, ()))
-
-
 @left_where(lambda: locale.setlocale(locale.LC_TIME) != locale.setlocale(locale.LC_MONETARY))
 def locale_setting():
     now = locale.setlocale(locale.LC_TIME)  # which SUMO sets for all categories at once
     locale.setlocale(locale.LC_TIME, "C" if now != "C" else "C.UTF-8")
-
-
-def _cached_patterns():
-    return len([key for key in re._cache if "left over" in str(key)])
-
-
-@left_where(_cached_patterns)
-def pattern_cache():
-    re.compile("left over [0-9]+")
-
-
-@left_as(lambda: mimetypes.guess_type("x.leftover"))
-def mime_types():
-    mimetypes.add_type("text/left", ".leftover")
-
-
-class Policy(asyncio.DefaultEventLoopPolicy):
-    pass
-
-
-@left_where(lambda: isinstance(asyncio.get_event_loop_policy(), Policy))
-def asyncio_policy():
-    asyncio.set_event_loop_policy(Policy())
-    asyncio.set_event_loop(asyncio.new_event_loop())
 
 
 @left_where(lambda: multiprocessing.get_start_method(allow_none=True) == "spawn")
@@ -697,16 +335,6 @@ libc.getenv.restype = ctypes.c_char_p
 @left_where(lambda: libc.getenv(b"LEFT_IN_C"))
 def environment_of_c():
     libc.setenv(b"LEFT_IN_C", b"1", 1)
-
-
-@left_where(lambda: ctypes.c_int.in_dll(libc, "optind").value != 1)
-def global_of_c():
-    ctypes.c_int.in_dll(libc, "optind").value = 7
-
-
-@left_where(lambda: ctypes.get_errno() == 77)
-def errno_of_ctypes():
-    ctypes.set_errno(77)
 
 
 @left_as(os.getcwd)
