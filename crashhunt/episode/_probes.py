@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Literal, cast
 
 from crashhunt.base.errors import CrashhuntError
@@ -17,7 +18,7 @@ from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import KINDS, SENSOR_KINDS, Disturbance, Outcome, Stress, steps_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Container, Mapping, Sequence
 
     from crashhunt.base.forks import NoAnswer
     from crashhunt.base.json_types import Plain
@@ -125,6 +126,7 @@ class Prober:
         delay: function called with the wall time that forks have taken, in s.
         budget: maximum number of steps of forks for each step of their trial.
         tell: function called with texts for the user.
+        refused: kinds of disturbances that do not fit the actions of an agent, by identifier of the agent.
 
     Attributes:
         fork_runner: object that runs the forks, and counts those without a result.
@@ -137,8 +139,9 @@ class Prober:
         delay: Callable[[float], None],
         budget: int = BUDGET,
         tell: Callable[[str], None] = lambda _: None,
+        refused: Mapping[str, Container[str]] = MappingProxyType({}),
     ) -> None:
-        self._every_s = every_s
+        self._every_s, self._refused = every_s, refused
         self._budget = budget
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
@@ -200,6 +203,7 @@ class Prober:
             if kind.what in kinds or kind.what in SENSOR_KINDS
             for who in kind.who
             for number in episode.acting
+            if kind.what not in self._refused.get(episode.names[number], ())
         ]
         others = [] if self._is_spent(episode) else [one for one in every if one.kind.what not in SENSOR_KINDS]
 

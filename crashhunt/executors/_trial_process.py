@@ -377,7 +377,8 @@ class TrialProcess:
         forcer: OnsetForcer | None = None
         if settings.probe_s:
             budget = BUDGET_BESIDE if settings.branch else BUDGET
-            prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget, self._notices.append)
+            refused = {name: setup.refused_delays for name, setup in settings.scenario.agents.items()}
+            prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget, self._notices.append, refused)
         if settings.branch:
             brancher = Brancher(settings.branch, settings.crash_on, self._delay, self._notices.append)
         if settings.force:

@@ -83,19 +83,24 @@ def chosen_actions(
 
 
 def refuse_late_plans(scenario: Scenario, kinds: Iterable[str]) -> None:
-    """Refuse late actions of agents that return plans: a plan is relative to the step in which it is returned.
+    """Refuse delays for agents that return plans, which begin where the vehicle is in the step of the plan.
 
     Args:
         scenario: scenario with its agents.
         kinds: kinds of the disturbances.
 
     Raises:
-        UsageError: the actions of an agent are plans, and a disturbance delays them.
+        UsageError: a disturbance delays the plans of an agent, or the places from which they begin.
     """
+    kinds = frozenset(kinds)
     for agent, setup in scenario.agents.items():
-        if setup.action_form in ("trajectory", "target_pose") and "late_action" in kinds:
+        refused = kinds & setup.refused_delays
+        if "late_action" in refused:
             message = f"--disturb late_action: {agent} returns a {setup.action_form}, which cannot be delayed"
             raise UsageError(message, fix="omit late_action, or give --action acceleration_steering")
+        if refused:
+            message = f"--disturb late_observation: {agent} would return a trajectory that begins where it was before"
+            raise UsageError(message, fix="give --action trajectory:tracker=pure_pursuit, or omit late_observation")
 
 
 def notes_on_declarations(scenario: Scenario, signatures: Mapping[str, Signature]) -> Iterator[str]:

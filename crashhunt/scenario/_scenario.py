@@ -142,6 +142,19 @@ class AgentSetup:
         """The value of every setting of the form of the actions, by name."""
         return action_settings(self.action)
 
+    @property
+    def refused_delays(self) -> frozenset[str]:
+        """The kinds of disturbances that delay what the agent's plans depend on.
+
+        A plan begins where the vehicle is in the step of the plan. So a plan cannot be delayed, and neither can the
+        places from which an exact trajectory begins.
+        """
+        form, settings = self.action_form, self.action_settings
+        if form not in ("trajectory", "target_pose"):
+            return frozenset()
+        is_exact = form == "trajectory" and settings["frame"] != "ego" and settings["tracker"] != "pure_pursuit"
+        return frozenset({"late_action", "late_observation"} if is_exact else {"late_action"})
+
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationSetup:

@@ -239,6 +239,15 @@ def test_copies_take_four_times_the_steps_of_their_trial_and_others_are_excluded
     assert [one.what for one in road.asked] == ["brake"]
 
 
+def test_kinds_that_do_not_fit_the_actions_of_an_agent_are_excluded():
+    asker = Prober(2.0, CRASHES, lambda _: None, refused={"ego": {"late_action", "late_observation"}})
+    road = Road({})
+    asker.ask(road)
+    found = {one.what for one in road.asked if one is not None}
+    assert {"brake", "noisy_observation"} <= found
+    assert not found & {"late_action", "late_observation"}
+
+
 def test_every_agent_that_drives_is_asked_about():
     asker, _ = prober()
     road = Road({}, names=("a", "b", "c"), acting=(0, 2), kinds=())

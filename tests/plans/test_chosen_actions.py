@@ -81,6 +81,11 @@ def test_agent_without_a_declaration_leaves_the_settings_as_they_are():
             {"action": "trajectory", "disturb": ("late_action=0.1",)},
             "ego returns a trajectory, which cannot be",
         ),
+        (
+            "Busy",
+            {"action": "trajectory", "disturb": ("brake=0.1", "late_observation=0.1")},
+            "begins where it was before; give --action trajectory:tracker=pure_pursuit",
+        ),
     ],
 )
 def test_form_that_an_agent_cannot_return_is_refused_before_the_first_trial(agent, options, message):
