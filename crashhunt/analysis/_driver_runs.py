@@ -184,6 +184,8 @@ def _answer(rerun: Rerun, model: str, since: int, ended: EndedRun) -> DriverRun:
         return replace(found, prevented=True, margin_m=seen["least_gap_m"])
     if ending == "hit":
         return replace(found, prevented=False)
+    if result.failure is not None:
+        return replace(found, why_not=f"the run ends with {result.outcome}: {result.failure.message}")
     return replace(found, why_not=_UNDECIDED.get(ending, "the model perceived no risk"))
 
 

@@ -51,8 +51,7 @@ class CompetentDriver:
     def __init__(self, driver: Agent, simulator: Simulator, overruled: Overruled) -> None:
         if not supports(simulator, ReportsSurroundings):
             raise InvalidEpisodeError("the simulator reports no surroundings of the vehicle")
-        self._form = simulator.actions[overruled.agent]
-        self._names = tuple(self._form.names)
+        self._names = tuple(simulator.actions[overruled.agent].names)
         self._steers = (
             simulator if supports(simulator, TranslatesMotion) and simulator.is_steered(overruled.agent) else None
         )
@@ -128,13 +127,13 @@ class CompetentDriver:
             return action
         if any(crossing.actor == self._other for crossing in around.crossing):
             self._response["in_junction"] = True
-        return self._braking(action, speed, acceleration)
+        return self._braking(speed, acceleration)
 
-    def _braking(self, action: object, speed: float, acceleration: float) -> object:
-        """Return the action with the acceleration of the model; a vehicle that moves freely keeps its lane."""
+    def _braking(self, speed: float, acceleration: float) -> object:
+        """Return an action with the acceleration of the model; a vehicle that moves freely keeps its lane."""
         target = max(0.0, speed + acceleration * self._step_s)
         if self._steers is not None:
-            return self._steers.action_with(self._agent, self._form.encode(action), speed_mps=target, keeps_lane=True)
+            return self._steers.action_with(self._agent, None, speed_mps=target, keeps_lane=True)
         if self._names == _SPEED_AND_LANE:
             return target, 0
         if self._names == _SPEED_AND_LATERAL:

@@ -280,7 +280,7 @@ class HighwaySimulator:
         return motion_of(self._kinds[agent], self._controlled[agent], action, self.step_length_s)
 
     def action_with(
-        self, agent: str, action: NDArray[np.generic], *, speed_mps: float | None, keeps_lane: bool
+        self, agent: str, action: NDArray[np.generic] | None, *, speed_mps: float | None, keeps_lane: bool
     ) -> NDArray[np.generic]:
         """Return an action with another speed, or with the steering that keeps the lane."""
         kind, vehicle = self._kinds[agent], self._controlled[agent]

@@ -75,7 +75,7 @@ def lane_change_of(vehicle: Any, aside_m: float) -> int:
 def action_with(
     kind: Any,
     vehicle: Any,
-    action: NDArray[Any],
+    action: NDArray[Any] | None,
     step_s: float,
     *,
     speed_mps: float | None,
@@ -86,12 +86,12 @@ def action_with(
     Args:
         kind: action type of the vehicle, as `is_steered` accepts it.
         vehicle: the vehicle.
-        action: the action that is corrected.
+        action: the action that is corrected; may be None if both its speed and its steering are replaced.
         step_s: step length, in s.
         speed_mps: speed after the step, at least 0, as far as the vehicle can reach it; None leaves the acceleration.
         keeps_lane: whether the vehicle steers to the middle of its lane.
     """
-    found = np.array(action)
+    found = np.zeros(2) if action is None else np.array(action)
     if speed_mps is not None:
         found[0] = lmap((speed_mps - float(vehicle.speed)) / step_s, kind.acceleration_range, [-1, 1])
     if keeps_lane:

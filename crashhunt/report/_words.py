@@ -354,7 +354,10 @@ def about_drivers(drivers: Preventability, ago: Callable[[int], str], agent: str
     if not drivers.runs:
         return [f"Whether a competent driver would have prevented it is not known: {drivers.why_not}."]
     answers = "; ".join(_driver_answer(run) for run in drivers.runs)
-    sentences = [f"Preventable by a competent driver ({answers})."]
+    if drivers.by_any is None:
+        sentences = [f"Whether a competent driver would have prevented it is not known ({answers})."]
+    else:
+        sentences = [f"Preventable by a competent driver ({answers})."]
     perceived = drivers.perceived
     if perceived is not None and perceived.perceived_step is not None:
         sentences.append(

@@ -405,13 +405,13 @@ class TranslatesMotion(Protocol):
         """Return what an encoded action does within the next step."""
 
     def action_with(
-        self, agent: str, action: NDArray[np.generic], *, speed_mps: float | None, keeps_lane: bool
+        self, agent: str, action: NDArray[np.generic] | None, *, speed_mps: float | None, keeps_lane: bool
     ) -> NDArray[np.generic]:
         """Return an encoded action with another speed or with other steering.
 
         Args:
             agent: The identifier of an agent's vehicle that has not left the simulation.
-            action: The action that is corrected.
+            action: The action that is corrected; may be None if both its speed and its steering are replaced.
             speed_mps: The speed after the step, in m/s; None keeps the acceleration of the given action.
             keeps_lane: Whether the vehicle steers to the middle of its lane.
         """

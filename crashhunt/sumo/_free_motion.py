@@ -65,6 +65,7 @@ class FreeMotion:
     ) -> None:
         self._vehicle, self._form, self._dt, self._area = vehicle, form, step_length_s, area
         self._is_relative = settings.get("frame") == "ego"
+        self._is_overruled = False
         self._pursues = settings.get("tracker") == "pure_pursuit"
         self._half, self._half_width = sumo.vehicle_getLength(vehicle) / 2, sumo.vehicle_getWidth(vehicle) / 2
         self._ahead = 2 * self._half * REFERENCE_SHARES[str(settings.get("reference_point", "center"))]
@@ -156,33 +157,43 @@ class FreeMotion:
         """Check that the vehicle can follow an encoded trajectory or target pose in the next step.
 
         Raises:
-            ActionError: the vehicle would jump, turn on the spot, drive backwards, or has no point to follow.
+            ActionError: the vehicle would jump, turn on the spot, drive backwards, or has no point to follow. A
+                trajectory of an agent that was overruled may be anywhere.
         """
         state, values, dt = self.state, action.tolist(), self._dt
         if self._form == "trajectory" and values[-1][0] < dt:
             message = f"the trajectory ends {values[-1][0]:g} s from now, before the step of {dt:g} s"
             raise ActionError(message, fix="return points beyond the end of the step")
+        if self._form == "trajectory" and self._is_overruled:
+            return
         if self._pursues:
             gap = min(math.dist(point[1:3], (state.x, state.y)) for point in self._in_map(action).tolist())
             if gap > _MAX_GAP_M:
                 message = f"the trajectory is {gap:.1f} m away from the vehicle"
                 raise ActionError(message, fix=f"return a point within {_MAX_GAP_M:g} m")
             return
-        following = self._next(values)
-        dx, dy = following.x - state.x, following.y - state.y
+        refusal = self._refusal(self._next(values))
+        if refusal is not None:
+            raise refusal
+
+    def _refusal(self, after: MotionState) -> ActionError | None:
+        """Return why the vehicle cannot get to a state within a step; None if it can."""
+        state, dt = self.state, self._dt
+        dx, dy = after.x - state.x, after.y - state.y
         moved = math.hypot(dx, dy)
         most = (state.speed + _MAX_ACCELERATION_MPS2 * dt) * dt + _MAX_SLIDE_M
         least = (state.speed - _MAX_BRAKING_MPS2 * dt) * dt - _MAX_SLIDE_M
         if not least <= moved <= most:
             message = f"the {self._words} moves the vehicle by {moved:.2f} m in a step of {dt:g} s"
             fix = f"return a pose between {max(0.0, least):.2f} and {most:.2f} m away"
-            raise ActionError(message, fix=f"{fix}; positions are those of {self._point}")
-        turned = math.remainder(following.heading - state.heading, math.tau)
+            return ActionError(message, fix=f"{fix}; positions are those of {self._point}")
+        turned = math.remainder(after.heading - state.heading, math.tau)
         if abs(turned) > _MAX_YAW_RATE_RADPS * dt + _MAX_TURN_RAD:
             message = f"the {self._words} turns the vehicle by {turned:.2f} rad in a step of {dt:g} s"
-            raise ActionError(message, fix=f"turn by at most {_MAX_YAW_RATE_RADPS * dt + _MAX_TURN_RAD:.2f} rad")
+            return ActionError(message, fix=f"turn by at most {_MAX_YAW_RATE_RADPS * dt + _MAX_TURN_RAD:.2f} rad")
         if dx * math.cos(state.heading) + dy * math.sin(state.heading) < -_MAX_SLIDE_M:
-            raise ActionError(f"the {self._words} moves the vehicle backwards", fix="return poses ahead of it")
+            return ActionError(f"the {self._words} moves the vehicle backwards", fix="return poses ahead of it")
+        return None
 
     def motion_of(self, action: NDArray[np.generic]) -> Motion:
         """Return what an encoded action does: the speed after the step, and whether the vehicle leaves its lane."""
@@ -194,9 +205,14 @@ class FreeMotion:
         leaves = abs(aside + moves) > border and moves * (aside + moves) > 0
         return Motion(speed_mps=after.speed, lane_change=0 if not leaves else 1 if aside + moves > 0 else -1)
 
-    def action_with(self, action: NDArray[np.generic], *, speed_mps: float | None, keeps_lane: bool) -> object:
-        """Return the action with another speed after the step, or with the steering that keeps the lane."""
-        after = self._next(action.tolist())
+    def action_with(self, action: NDArray[np.generic] | None, *, speed_mps: float | None, keeps_lane: bool) -> object:
+        """Return the action with another speed after the step, or with the steering that keeps the lane.
+
+        From then on, the vehicle may not be where the agent's plans begin: it pursues a trajectory that it cannot
+        follow.
+        """
+        self._is_overruled = True
+        after = self.state if action is None else self._next(action.tolist())
         acceleration = after.acceleration if speed_mps is None else (speed_mps - self.state.speed) / self._dt
         return self._action(acceleration, self._lane_keeping_angle() if keeps_lane else after.steering)
 
@@ -306,7 +322,8 @@ class FreeMotion:
         """Return the state after a step."""
         if self._form == "trajectory":
             points = self._in_map(np.array(values))
-            return self._pursue(points) if self._pursues else self._on_trajectory(points)
+            after = self._pursue(points) if self._pursues else self._on_trajectory(points)
+            return self._pursue(points) if self._is_overruled and self._refusal(after) is not None else after
         if self._form == "target_pose":
             x, y, heading, time_s = values
             _, x, y, heading, _ = self._in_map(np.array([[0.0, x, y, heading, 0.0]]))[0].tolist()

@@ -379,7 +379,7 @@ class SumoSimulator:
         return self._driving.moving[agent].motion_of(action)
 
     def action_with(
-        self, agent: str, action: NDArray[np.generic], *, speed_mps: float | None, keeps_lane: bool
+        self, agent: str, action: NDArray[np.generic] | None, *, speed_mps: float | None, keeps_lane: bool
     ) -> NDArray[np.generic]:
         """Return an action with another speed, or with the steering that keeps the lane."""
         moving = self._driving.moving[agent]

@@ -33,6 +33,19 @@ class Blind:
         return self.action
 
 
+class OpenLoop(Blind):
+    """Follows the plan of the first step, wherever the vehicle is."""
+
+    def act(self, observation):
+        scene = self.action.scene()
+        if not hasattr(self, "pose"):
+            self.pose, self.steps = [*scene.centers[0].tolist(), float(scene.headings[0])], 0
+        x, y, heading = self.pose
+        self.steps += 1
+        away = 6 / 3.6 * self.steps
+        return [[0.1, x + away * np.cos(heading), y + away * np.sin(heading), heading, 60 / 3.6]]
+
+
 def driven(folder, form):
     """Return the speeds of the vehicle, and what the driver reports."""
     scenario = load_scenario("r157-cut-in")
@@ -40,9 +53,8 @@ def driven(folder, form):
     simulator = SumoSimulator(scenario, folder)
     try:
         observations, _ = simulator.reset(seed=1, options={"arguments": CASE})
-        driver = CompetentDriver(
-            Blind(KEEPS_SPEED.get(form, 1)), simulator, Overruled("ego", 0, reference="fsm", other="other")
-        )
+        agent = OpenLoop(simulator) if form == "trajectory" else Blind(KEEPS_SPEED.get(form, 1))
+        driver = CompetentDriver(agent, simulator, Overruled("ego", 0, reference="fsm", other="other"))
         driver.reset(1)
         speeds = []
         for _ in range(60):
@@ -55,7 +67,7 @@ def driven(folder, form):
         simulator.close()
 
 
-@pytest.mark.parametrize("form", [form for form in KEEPS_SPEED if form != "speed_and_lane"])
+@pytest.mark.parametrize("form", [*(form for form in KEEPS_SPEED if form != "speed_and_lane"), "trajectory"])
 def test_driver_brakes_as_with_a_target_speed(tmp_path, form):
     expected, seen = driven(tmp_path, "speed_and_lane")
     speeds, also_seen = driven(tmp_path, form)

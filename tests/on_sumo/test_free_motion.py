@@ -341,6 +341,28 @@ def test_reference_driver_corrects_steering_out_of_the_lane(start, form):
     assert simulator.motion_of("ego", kept).speed_mps == pytest.approx(motion.state.speed - 0.2, abs=1e-6)
 
 
+def test_vehicle_of_an_overruled_agent_pursues_a_trajectory_that_begins_elsewhere(start):
+    simulator, step = start("trajectory", "motorway")
+    encode, motion = simulator.actions["ego"].encode, simulator._driving.moving["ego"]
+    begin = motion.state
+    cos, sin = math.cos(begin.heading), math.sin(begin.heading)
+
+    def plan(steps):
+        """3 m ahead of where the vehicle would be, and 0.5 m to the left."""
+        along = 3.0 + begin.speed * 0.1 * steps
+        x, y = begin.x + along * cos - 0.5 * sin, begin.y + along * sin + 0.5 * cos
+        return [(0.1, x, y, begin.heading, begin.speed)]
+
+    with pytest.raises(ActionError, match="moves the vehicle by"):
+        encode(plan(1))
+    simulator.action_with("ego", None, speed_mps=begin.speed, keeps_lane=True)
+    for steps in range(1, 60):
+        step(encode(plan(steps)))
+    dx, dy = motion.state.x - begin.x, motion.state.y - begin.y
+    assert dy * cos - dx * sin == pytest.approx(0.5, abs=0.05)
+    assert motion.state.speed == pytest.approx(begin.speed, abs=0.5)
+
+
 @pytest.mark.parametrize("side", [1, -1])
 def test_steering_leaves_the_lane_only_away_from_its_middle(start, side):
     simulator, _ = start("acceleration_steering", "motorway")

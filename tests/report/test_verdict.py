@@ -9,11 +9,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from crashhunt.crashes import Attempt, Fault, Judgement, LaneMap, Omission, Reference, ReferenceRun
+from crashhunt.crashes import (
+    Attempt,
+    DriverRun,
+    Fault,
+    Judgement,
+    LaneMap,
+    Omission,
+    Preventability,
+    Reference,
+    ReferenceRun,
+)
 from crashhunt.crashes._contact_record import record_in
 from crashhunt.report._crash_text import _cells
 from crashhunt.report._verdict import describe_contact, verdict_of
-from crashhunt.report._words import about_reference
+from crashhunt.report._words import about_drivers, about_reference
 from crashhunt.trial import Collision, Escape
 from crashhunt.world import Actor, Roster, Scene
 
@@ -255,3 +265,18 @@ def test_agent_failed_to_yield_only_where_a_rule_blames_it(fault, verb):
     blamed = fault in ("ego", "both")
     (cause, *_) = about_reference(judgement.reference, str, "ego", had_to_yield=blamed)
     assert cause.startswith(f"Cause: ego did not {verb} {'to' if blamed else 'for'} x ")
+
+
+@pytest.mark.parametrize(
+    ("prevented", "words"),
+    [
+        (None, "Whether a competent driver would have prevented it is not known (FSM: no answer because it failed)."),
+        (False, "Preventable by a competent driver (FSM: no)."),
+        (True, "Preventable by a competent driver (FSM: yes, by 2.0 m)."),
+    ],
+)
+def test_a_crash_is_called_preventable_only_if_a_model_has_an_answer(prevented, words):
+    run = DriverRun(
+        model="fsm", prevented=prevented, why_not="" if prevented is not None else "it failed", margin_m=2.0
+    )
+    assert about_drivers(Preventability(runs=(run,)), str, "ego", "car") == [words]
