@@ -79,7 +79,7 @@ def test_what_no_test_should_notice_is_no_slip(mutate):
 def test_a_module_has_the_tests_of_the_innermost_folder_that_is_listed(mutate):
     ray = {path.name for path in mutate.nearest_tests(Path("crashhunt/executors/ray/_bridge.py"))}
     assert "test_ray_bridge.py" in ray
-    assert "test_harm.py" not in ray
+    assert "test_harms.py" not in ray
     (own,) = mutate.nearest_tests(Path("crashhunt/cli/_list.py"))
     assert own == Path("tests/e2e/test_listing.py")
 

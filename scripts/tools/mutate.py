@@ -121,17 +121,17 @@ _TESTS_ELSEWHERE = {
     "statistics/_hunt_pairs.py": ("suites/test_gate_of_hunts.py", "e2e/test_gate.py"),
     # Processes of trials are seen by what is left of trials that harm them.
     "executors/_fork_server.py": (
-        "executors/test_harm.py",
+        "executors/test_harms.py",
         "executors/test_lost_processes.py",
         "executors/test_warm_traffics.py",
     ),
-    "executors/_fresh.py": ("executors/test_harm.py",),
+    "executors/_fresh.py": ("executors/test_harms.py",),
     "executors/_pool.py": ("executors/test_lost_processes.py",),
     "executors/_postmortem.py": ("executors/test_evidence.py",),
     "executors/_protocol.py": ("executors/test_pool_of_trials.py",),
     "executors/_supervisor.py": ("executors/test_killed_trials.py", "executors/test_warm_traffics.py"),
     "executors/_time_limits.py": ("executors/test_last_words.py",),
-    "executors/_trial_process.py": ("executors/test_harm.py", "executors/test_warm_traffics.py"),
+    "executors/_trial_process.py": ("executors/test_harms.py", "executors/test_warm_traffics.py"),
     "executors/ray": (
         "executors/test_ray_address.py",
         "executors/test_ray_bridge.py",

@@ -52,6 +52,11 @@ class MuteError(Exception):
         raise RuntimeError("no words")
 
 
+class LeavingError(Exception):
+    def __str__(self):
+        sys.exit(4)
+
+
 class BareError(BaseException):
     pass
 
@@ -79,6 +84,11 @@ def exits():
 @harm("raises")
 def raises_mute():
     raise MuteError
+
+
+@harm("raises")
+def raises_leaving():
+    raise LeavingError
 
 
 @harm("raises")
@@ -168,6 +178,12 @@ def exits_at_once():
 
 
 @harm("dies")
+def dies_with_program():
+    starts_daemon()
+    os._exit(3)
+
+
+@harm("dies")
 def exits_with_success():
     os._exit(0)
 
@@ -244,6 +260,12 @@ def frees_what_is_not_its_own():
 
 @harm("hangs")
 def sleeps():
+    time.sleep(3600)
+
+
+@harm("hangs")
+def hangs_with_program():
+    starts_daemon()
     time.sleep(3600)
 
 
@@ -416,6 +438,11 @@ def freezes_random():
     import random
 
     random.random = lambda: 0.5
+
+
+@harm("lives")
+def halves_recursion_limit():
+    sys.setrecursionlimit(sys.getrecursionlimit() // 2)
 
 
 @harm("lives")

@@ -6,10 +6,12 @@ import inspect
 import re
 import shutil
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import harms
 import pytest
+from conftest import wait_for
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import WorkerSettings
@@ -64,6 +66,7 @@ EXCEPTIONS: dict[str, dict[str, tuple[str, bool]]] = {
     "sleeps_in_c": {"thread": (HANG, NAMED)},  # it holds the interpreter
     "stops_itself": {"thread": (HANG, NAMED)},  # with all its threads
 }
+HANGS = ("hangs_with_program", "fifth act")
 ATTACKS = [name for name in harms.HARMS if "_to_" in name]
 DEADLY = [one for one in ATTACKS if "KILL" in one or one in ("SIGTERM_to_zygote", "SIGTERM_to_supervisor")]
 TABLE = {
@@ -187,8 +190,38 @@ def sample(start, *, natures=("raises", "dies", "lives"), every=17):
     return chosen[start::every]
 
 
-def test_there_are_more_than_300_kinds():
+def programs() -> list[int]:
+    """The programs that the agent starts, wherever they have gone."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            line = path.read_bytes()
+            here = (path.parent / "cwd").readlink()
+        except OSError:
+            continue
+        if line.startswith(b"sleep\x00986") and here == Path.cwd():
+            found.append(int(path.parent.name))
+    return found
+
+
+def test_harm_of_each_kind_costs_its_own_trial_and_nothing_of_it_stays(run):
     assert len(TABLE) + len(ATTACKS) > 300
+    natures = ("raises", "dies", "lives")
+    trials = [(name, "fifth act") for name, (nature, _) in harms.HARMS.items() if nature in natures]
+    trials = [pair for pair in trials if pair in TABLE and pair not in MESSAGES]
+    check(trials, run(trials, timeout_s=60.0))  # none of these hangs, and the machine may be busy
+    check([HANGS], run([HANGS], timeout_s=10.0))
+    # The template ends what a worker has left behind after it has told of its end.
+    wait_for(lambda: not programs(), every_s=0.05)
+
+
+@pytest.mark.parametrize(
+    "what", ["starts_daemon", "dies_with_program", "hangs_with_program", "closes_everything", "raises_surrogate"]
+)
+def test_fresh_process_leaves_nothing_either(run, what):
+    trials = [(what, "fifth act")]
+    check(trials, run(trials, FreshProcessExecutor, timeout_s=10.0 if trials == [HANGS] else 60.0))
+    assert programs() == []
 
 
 @pytest.mark.nightly
