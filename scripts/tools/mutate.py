@@ -3,8 +3,8 @@
 A slip is put into a copy of the repository, and of the tests nearest to its module those run that reach its line, the
 fastest first, and then those that start processes, which may reach it unseen, up to the first that fails. Nearest are
 the tests that lie as the module does: those of ``crashhunt/world/_scene.py`` are ``tests/world/test_scene*.py``, and
-where there are none all of ``tests/world``. Tests that import a private module by its name are near to it wherever they
-lie, and `_TESTS_ELSEWHERE` lists tests that use it under the name of its package or as a command.
+where there are none all of ``tests/world``. Tests that import a module by its name are near to it too, those of a
+private one wherever they lie. `_TESTS_ELSEWHERE` lists tests that use it under another name, or as a command.
 
 Each run is a fork of this process, which has imported everything that is not crashhunt: about a second a slip, where a
 process of its own would take four. mutmut and cosmic-ray were looked at: the former chooses among all tests by what it
@@ -44,6 +44,10 @@ _TESTS_ELSEWHERE = {
     "highway/accelerator": ("on_highway/accelerator/test_*.py", "on_highway/test_dynamic_*.py"),
     "api.py": ("test_python_calls.py", "e2e/test_api.py"),
     "base/codec.py": ("base/test_codec.py", "trial/test_result.py"),
+    "base/doors.py": ("test_public_face.py",),
+    "base/errors.py": ("base/test_exception_text.py", "requirements/test_language.py"),
+    "base/library_probe.py": ("agents/test_library_agents.py", "base/test_binaries.py"),
+    "base/text.py": ("base/test_text.py", "report/test_table.py"),
     "base/foreign_code.py": ("base/test_scalars.py", "episode/test_blame.py", "episode/test_probes_of_a_trial.py"),
     "base/exceptions.py": ("base/test_exception_text.py", "episode/test_episode_cases.py"),
     "base/isolation.py": ("base/test_isolated_work.py",),
@@ -333,10 +337,17 @@ def modules_of(name: str) -> list[Path]:
 
 
 def nearest_tests(file: Path) -> tuple[Path, ...]:
-    """Return the test files that lie as a module does, and those that import a private module."""
+    """Return the test files that lie as a module does, that import it, or that run its examples.
+
+    Of a public module, only tests of its package count: all others import the foundations, too.
+    """
     module = ".".join(file.with_suffix("").parts)
-    imported = (path for path, names in _imported_by_tests().items() if module in names)
-    return tuple(dict.fromkeys((*_tests_in_place(file), *(imported if file.stem.startswith("_") else ()))))
+    found = [path for path, names in _imported_by_tests().items() if module in names]
+    if not file.stem.startswith("_"):
+        found = [path for path in found if path.parts[1] == file.parts[1]]
+    if ">>> " in (ROOT / file).read_text(encoding="utf-8"):
+        found.append(Path("tests/test_examples.py"))
+    return tuple(dict.fromkeys((*_tests_in_place(file), *found)))
 
 
 @functools.cache

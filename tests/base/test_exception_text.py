@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
 import sys
 import traceback
 
 import pytest
 
 from crashhunt.base.exceptions import MAX_TRACEBACK_CHARACTERS, class_name, format_error, in_words, message_of
-from crashhunt.errors import CallError, SimulatorError, UsageError
+from crashhunt.errors import CallError, CrashhuntError, FormulaError, InternalError, SimulatorError, UsageError
 
 LONG = 30_000_000  # characters
 
@@ -127,13 +128,44 @@ def test_class_and_message_are_those_of_the_exception():
     assert in_words(ValueError("two\n lines")) == "ValueError: two lines"
 
 
-@pytest.mark.parametrize("kind", [UsageError, SimulatorError, CallError])
+@pytest.mark.parametrize("kind", [UsageError, SimulatorError, CallError, FormulaError])
 def test_copy_of_an_error_has_its_text(kind):
     # Gymnasium's AsyncVectorEnv raises `type(error)(error)` in the main process.
     error = kind("speed is 3", fix="give 2", where="hunt.toml")
     assert str(kind(error)) == str(error) == "hunt.toml: speed is 3; give 2"
     assert str(kind(error, fix="give 1")) == "hunt.toml: speed is 3; give 1"
-    assert kind(error).to_json() == error.to_json()
+    assert str(kind(error, where="x")) == "x: speed is 3; give 2"
+    assert str(kind("speed is 3")) == "speed is 3"
+    assert str(kind("speed is 3", where="a\nb")) == "$'a\\x0ab': speed is 3"
+    for same in (kind(error), pickle.loads(pickle.dumps(error)), kind.from_json(error.to_json())):
+        assert (type(same), same.to_json()) == (kind, error.to_json())
+
+
+def test_traceback_of_a_defect_crosses_processes_and_json():
+    fault = InternalError("crashhunt itself failed", fix="report it", where="trial 3")
+    fault.traceback = "Traceback: here"
+    for same in (pickle.loads(pickle.dumps(fault)), CrashhuntError.from_json(fault.to_json())):
+        assert (type(same), str(same), same.traceback) == (InternalError, str(fault), "Traceback: here")
+    older = CrashhuntError.from_json({"error": {"message": "failed"}})  # versions before this one wrote fewer keys
+    assert (type(older), str(older)) == (CrashhuntError, "failed")
+
+
+def test_explained_error_has_the_names_of_the_user():
+    error = UsageError("max_steps is 3", fix="give 2", where="max_steps")
+    error.explain("", lambda text: text.replace("max_steps", "--steps"))
+    assert (str(error), error.args) == ("--steps: --steps is 3; give 2", ("--steps is 3", "give 2", "--steps"))
+    error.explain("give 5", str.upper)
+    assert str(error) == "--STEPS: --STEPS IS 3; give 5"
+
+
+@pytest.mark.parametrize(("begin", "end"), [(0, 3), (59, 61), (60, 60), (61, 62), (150, 300), (395, 400)])
+def test_place_in_a_long_formula_is_marked_below_it(begin, end):
+    text = "".join(chr(0x4E00 + number) for number in range(399)) + "\n"
+    shown, marks = (line[2:] for line in FormulaError("no", text=text, begin=begin, end=end).excerpt.split("\n"))
+    marked = "".join(char for char, mark in zip(shown, marks, strict=False) if mark == "^")
+    assert marked == (text[begin : min(max(end, begin + 1), begin + 60)]).replace("\n", " ")
+    assert shown == text[max(0, begin - 60) : min(end, begin + 60) + 60].replace("\n", " ")
+    assert marks.strip(" ^") == ""
 
 
 def test_python_does_not_format_a_message_of_a_million_lines(monkeypatch):
