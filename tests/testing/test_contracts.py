@@ -112,44 +112,11 @@ SPACE = {
 }
 
 
-class TestRandomSampler(SamplerContract):
-    @pytest.fixture
-    def make(self):
-        return RandomSampler
-
-    @pytest.fixture
-    def space(self):
-        return SPACE
+LEARNING = [CmaEsSampler, CrossEntropySampler, GuidedSampler, MutationSampler]
 
 
-class TestGridSampler(TestRandomSampler):
-    @pytest.fixture
-    def make(self):
-        return lambda space: GridSampler(space, points=4)
-
-    def test_every_combination_comes_once_a_round(self, make, space):
-        sampler = make(space)
-        assert sampler.size == 4 * 2 * 4
-        rng = np.random.default_rng(0)
-        one_round = [tuple(sampler.ask(number, rng).arguments.values()) for number in range(sampler.size)]
-        assert len(set(one_round)) == sampler.size
-        assert tuple(sampler.ask(sampler.size, rng).arguments.values()) == one_round[0]
-
-
-class TestHaltonSampler(TestRandomSampler):
-    @pytest.fixture
-    def make(self):
-        return HaltonSampler
-
-
-class TestSobolSampler(TestRandomSampler):
-    @pytest.fixture
-    def make(self):
-        return SobolSampler
-
-
-@pytest.mark.parametrize("kind", [CmaEsSampler, CrossEntropySampler, GuidedSampler, MutationSampler])
-class TestSamplersThatLearn(SamplerContract):
+@pytest.mark.parametrize("kind", [RandomSampler, HaltonSampler, SobolSampler, *LEARNING])
+class TestSamplers(SamplerContract):
     @pytest.fixture
     def make(self, kind):
         if kind is CmaEsSampler:
@@ -159,6 +126,24 @@ class TestSamplersThatLearn(SamplerContract):
     @pytest.fixture
     def space(self):
         return SPACE
+
+
+class TestGridSampler(SamplerContract):
+    @pytest.fixture
+    def make(self):
+        return lambda space: GridSampler(space, points=4)
+
+    @pytest.fixture
+    def space(self):
+        return SPACE
+
+    def test_every_combination_comes_once_a_round(self, make, space):
+        sampler = make(space)
+        assert sampler.size == 4 * 2 * 4
+        rng = np.random.default_rng(0)
+        one_round = [tuple(sampler.ask(number, rng).arguments.values()) for number in range(sampler.size)]
+        assert len(set(one_round)) == sampler.size
+        assert tuple(sampler.ask(sampler.size, rng).arguments.values()) == one_round[0]
 
 
 OPTUNA = ["cma-es", "nsgaii", "nsgaiii", "qmc", "random"]  # by day, its own tests are enough
@@ -196,55 +181,17 @@ class TestSweepSampler(SamplerContract):
                 SweepSampler(space)
 
 
-class TestReportedCollision(OracleContract):
-    @pytest.fixture
-    def make(self):
-        return ReportedCollision
-
+@pytest.mark.parametrize("make", [ReportedCollision, Overlap, OffRoad, TooClose, RedLight, TrafficEvents])
+class TestOracles(OracleContract):
     def test_it_finds_something(self, make):
         assert any(make().check(scene, ["ego"]) for scene in drive())
 
 
-class TestOverlap(TestReportedCollision):
+@pytest.mark.parametrize("kind", [PoolExecutor, FreshProcessExecutor])
+class TestExecutors(ExecutorContract):
     @pytest.fixture
-    def make(self):
-        return Overlap
-
-
-class TestOffRoad(TestReportedCollision):
-    @pytest.fixture
-    def make(self):
-        return OffRoad
-
-
-class TestTooClose(TestReportedCollision):
-    @pytest.fixture
-    def make(self):
-        return TooClose
-
-
-class TestRedLight(TestReportedCollision):
-    @pytest.fixture
-    def make(self):
-        return RedLight
-
-
-class TestTrafficEvents(TestReportedCollision):
-    @pytest.fixture
-    def make(self):
-        return TrafficEvents
-
-
-class TestPoolExecutor(ExecutorContract):
-    @pytest.fixture
-    def make(self):
-        return lambda settings, parallel: PoolExecutor(settings, parallel=parallel)
-
-
-class TestFreshProcessExecutor(ExecutorContract):
-    @pytest.fixture
-    def make(self):
-        return lambda settings, parallel: FreshProcessExecutor(settings, parallel=parallel)
+    def make(self, kind):
+        return lambda settings, parallel: kind(settings, parallel=parallel)
 
 
 class _Agents(AgentContract):
@@ -266,74 +213,24 @@ class _Agents(AgentContract):
         return found
 
 
-class TestKeepLane(_Agents):
+@pytest.mark.parametrize(
+    ("form", "kind", "arguments"),
+    [
+        (SpeedAndLaneChange(), KeepLaneWithSpeed, {"speed": 12.0}),
+        (MetaAction(), KeepLaneWithSpeed, {"speed": 12.0}),
+        (SpeedAndLaneChange(), CarFollowing, {"delay_s": 0.4}),
+        (MetaAction(("SLOWER", "IDLE", "FASTER")), CarFollowing, {"delay_s": 0.4}),
+        (SpeedAndLaneChange(), LaneChanger, {"patience_s": 1.0}),
+        (MetaAction(), LaneChanger, {"patience_s": 1.0}),
+        (SpeedAndLaneChange(), IntelligentDriver, {"politeness": 0.5}),
+        (MetaAction(), IntelligentDriver, {"politeness": 0.5}),
+        (SpeedAndLaneChange(), RandomAgent, {"hold_steps": 3}),
+    ],
+)
+class TestAgents(_Agents):
     @pytest.fixture
-    def make(self):
-        return lambda: KeepLaneWithSpeed(12.0)
-
-
-class TestKeepLaneMeta(TestKeepLane):
-    @pytest.fixture
-    def form(self):
-        return MetaAction()
-
-    @pytest.fixture
-    def make(self):
-        return lambda: KeepLaneWithSpeed(12.0, MetaAction().space)
-
-
-class TestCarFollowing(_Agents):
-    @pytest.fixture
-    def make(self):
-        return lambda: CarFollowing(delay_s=0.4)
-
-
-class TestLaneChanger(_Agents):
-    @pytest.fixture
-    def make(self):
-        return lambda: LaneChanger(patience_s=1.0)
-
-
-class TestLaneChangerMeta(TestLaneChanger):
-    @pytest.fixture
-    def form(self):
-        return MetaAction()
-
-    @pytest.fixture
-    def make(self, form):
-        return lambda: LaneChanger(patience_s=1.0, action_space=form.space)
-
-
-class TestCarFollowingBySpeedAlone(_Agents):
-    @pytest.fixture
-    def form(self):
-        return MetaAction(("SLOWER", "IDLE", "FASTER"))
-
-    @pytest.fixture
-    def make(self, form):
-        return lambda: CarFollowing(delay_s=0.4, action_space=form.space)
-
-
-class TestIntelligentDriver(_Agents):
-    @pytest.fixture
-    def make(self):
-        return lambda: IntelligentDriver(politeness=0.5)
-
-
-class TestIntelligentDriverMeta(_Agents):
-    @pytest.fixture
-    def form(self):
-        return MetaAction()
-
-    @pytest.fixture
-    def make(self, form):
-        return lambda: IntelligentDriver(politeness=0.5, action_space=form.space)
-
-
-class TestRandomAgent(_Agents):
-    @pytest.fixture
-    def make(self, form):
-        return lambda: RandomAgent(form.space, hold_steps=3)
+    def make(self, form, kind, arguments):
+        return lambda: kind(**arguments, action_space=form.space)
 
 
 class TestRecorded(_Agents):
