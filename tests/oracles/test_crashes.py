@@ -53,6 +53,7 @@ def test_speeds_are_those_of_collider_and_victim_the_one_that_is_asked_about():
     assert (hit.x, hit.lane) == (-4, "")
     two = hits(Overlap(), scene(*REAR_END), agents=["gone", "ego", "other"])
     assert [hit.agent for hit in two] == ["ego", "other"]
+    assert hits(Overlap(), scene(("ego", 0, 0, 0, 1), ("other", 5, 0, 0, 1))) == []  # bumper to bumper
 
 
 def test_the_lane_is_what_the_simulator_states_of_the_agent():

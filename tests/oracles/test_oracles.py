@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
 
-from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, TooClose, merge_findings
+from crashhunt.oracles import Overlap, ReportedCollision, TooClose, merge_findings
 from crashhunt.trial import Collision, Outcome
 from crashhunt.world import (
     Actor,
@@ -175,23 +175,6 @@ def test_neighbors_are_sorted_and_complete():
     assert corners(view, 1) == pytest.approx(np.array([[3, 5], [-2, 5], [-2, 3], [3, 3]]))
 
 
-def test_who_drove_into_which():
-    behind = scene(("ego", 0, 0, 0, 20), ("a", 4, 0, 0, 10))
-    (finding,) = Overlap().check(behind, ["ego"])
-    hit = finding.collision
-    assert (hit.role, hit.collider, hit.victim, hit.collider_speed, hit.victim_speed) == (
-        "collider",
-        "ego",
-        "a",
-        20,
-        10,
-    )
-    (finding,) = Overlap().check(behind, ["a"])
-    assert (finding.collision.role, finding.collision.collider) == ("victim", "ego")
-    assert Overlap().check(scene(("ego", 0, 0, 0, 1), ("a", 5, 0, 0, 1)), ["ego"]) == []  # bumper to bumper
-    assert Overlap().check(behind, ["gone"]) == []
-
-
 def test_two_witnesses_of_one_crash_are_one_finding():
     contact = Contact("ego", "a", "junction", "x_0", 20.0, 10.0)
     view = scene(("ego", 0, 0, 0, 20), ("a", 4, 0, 0, 10), ("b", 4, 1, 0, 10), contacts=(contact,))
@@ -203,23 +186,6 @@ def test_two_witnesses_of_one_crash_are_one_finding():
     assert (merged.collision.victim, merged.collision.kind, merged.collision.lane) == ("a", "junction", "x_0")
     assert merge_findings([]) is None
     assert ReportedCollision().check(view, ["b"]) == []
-
-
-def test_leaving_the_road():
-    view = scene(("ego", 3, 4, 0, 7), off_road=("ego",))
-    (finding,) = OffRoad().check(view, ["ego"])
-    assert finding.outcome is Outcome.OFF_ROAD
-    assert (finding.collision.role, finding.collision.x, finding.collision.collider_speed) == ("alone", 3, 7)
-    assert OffRoad().check(view, ["other"]) == []
-
-
-def test_a_scene_knows_the_one_before_and_no_more():
-    first, second, third = scene(("ego", 0, 0, 0, 1)), scene(("ego", 1, 0, 0, 1)), scene(("ego", 2, 0, 0, 1))
-    second.follow(first)
-    third.follow(second)
-    third.follow(third)  # a simulator that hands out the same object again
-    assert third.previous is second
-    assert second.previous is None
 
 
 def test_a_collision_written_before_its_time_was_known_is_read():
