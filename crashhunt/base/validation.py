@@ -215,11 +215,8 @@ def _known_keys(kind: Any, path: tuple[str, ...]) -> list[str]:
     for part in path:
         if is_dataclass(kind):
             kind = get_type_hints(kind).get(part)
-        else:  # a table of named tables
-            kind = next((inner for inner in get_args(kind) if is_dataclass(inner)), None)
-        kind = next((inner for inner in get_args(kind) if is_dataclass(inner)), kind) if not _is_table(kind) else kind
+        else:  # a list of tables, or a table of named tables
+            kind = next(filter(is_dataclass, get_args(kind)), None)
+        if get_origin(kind) in (Union, UnionType):
+            kind = next(filter(is_dataclass, get_args(kind)), None)
     return [item.name for item in fields(kind)] if is_dataclass(kind) else []
-
-
-def _is_table(kind: object) -> bool:
-    return is_dataclass(kind) or getattr(kind, "__origin__", None) is dict

@@ -8,7 +8,7 @@ import json
 import subprocess
 import sys
 import tomllib
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 
 import pytest
 from pydantic import TypeAdapter, ValidationError
@@ -139,3 +139,51 @@ def test_errors_name_the_key_and_all_types_that_a_value_may_have(data, says):
     with pytest.raises(UsageError) as caught:
         validate(SuiteEntry, data, where="here", error=UsageError)
     assert str(caught.value).startswith(f"here: {says}")
+
+
+@dataclass
+class Wheel:
+    size_m: float
+    name: str = ""
+
+
+@dataclass
+class Car:
+    front: Wheel
+    spare: Wheel | None = None
+    named: dict[str, Wheel] = field(default_factory=dict)
+    others: tuple[Wheel, ...] = ()
+
+
+RIGHT = {"size_m": 0.3}
+THERE = "the keys here are size_m, name"
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        ({"front": {"size": 0.3}}, "unknown key 'front.size'; did you mean 'size_m'?"),  # not: it is missing
+        ({"front": {"name": "x"}}, "the key 'front.size_m' is missing; add it"),
+        ({"front": {"colour": 2}}, "the key 'front.size_m' is missing; add it"),
+        ({"front": RIGHT | {"colour": 2}}, f"unknown key 'front.colour'; {THERE}"),
+        ({"front": RIGHT, "spare": RIGHT | {"colour": 2}}, f"unknown key 'spare.colour'; {THERE}"),
+        ({"front": RIGHT, "named": {"a": RIGHT, "b": RIGHT | {"colour": 2}}}, f"unknown key 'named.b.colour'; {THERE}"),
+        ({"front": RIGHT, "others": [RIGHT, RIGHT | {"colour": 2}]}, f"unknown key 'others.1.colour'; {THERE}"),
+        ({"front": RIGHT, "colour": 2}, "unknown key 'colour'; the keys here are front, spare, named, others"),
+        ({"front": {"size_m": "wide"}}, "front.size_m = 'wide': input should be a valid number"),
+    ],
+)  # fmt: skip
+def test_wrong_keys_are_named_with_those_of_their_table(data, says):
+    def refusal(**given):
+        with pytest.raises(ScenarioError) as caught:
+            validate(Car, data, where="here", error=ScenarioError, **given)
+        return str(caught.value)
+
+    assert refusal().startswith(f"here: {says}")
+    within = says.replace("key '", "key 'car.") if "key '" in says else f"car.{says}"
+    assert refusal(under="car", keys=lambda: ["one", "two"]).startswith(
+        f"here: {within.replace('front, spare, named, others', 'one, two')}"
+    )
+    assert (
+        validate(Car, {"front": RIGHT, "named": {"a": RIGHT}}, where="", error=ScenarioError).named["a"].size_m == 0.3
+    )
