@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 import shutil
 import time
@@ -13,7 +12,6 @@ import harms
 import pytest
 from conftest import wait_for
 
-from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.scenario import AgentSetup, Scenario
@@ -116,57 +114,6 @@ def run(tmp_path, monkeypatch) -> Callable[..., dict[int, TrialResult]]:
         return {number // 2: found[number] for number in range(1, len(asked), 2)}
 
     return run_trials
-
-
-AT_IMPORT = "the module 'imported' of agent ego cannot be imported:"
-IMPORTED = {
-    "raises_bare": "harms.py, line {line}: BareError: harm, which keeps 'imported:Agent' from being imported",
-    "exits_at_once": f"{AT_IMPORT} its process exited with 3 meanwhile",
-    "raises_error": "harms.py, line {line}: ValueError: harm, which keeps 'imported:Agent' from being imported",
-    "raises_mute": "(its message cannot be had: RuntimeError), which keeps",
-    "raises_long_message": "more characters are left out), which keeps 'imported:Agent' from being imported",
-    "recurses": "RecursionError: maximum recursion depth exceeded",
-    "segfaults": f"{AT_IMPORT} its process was killed by SIGSEGV meanwhile",
-    "becomes_another_program": f"{AT_IMPORT} its process exited with 0 meanwhile",
-    "closes_everything": f"{AT_IMPORT} its process exited with 1 meanwhile",
-    **dict.fromkeys(("deaf", "no_output", "starts_threads", "starts_daemon", "forks", "stops_itself")),
-}
-
-
-@pytest.mark.parametrize(
-    ("what", "message"),
-    [
-        pytest.param(what, message, marks=[] if place < 2 else [pytest.mark.nightly])
-        for place, (what, message) in enumerate(IMPORTED.items())
-    ],
-)
-def test_harm_at_import_ends_in_a_message_or_in_nothing(tmp_path, monkeypatch, what, message):
-    """What a module does when it is imported, every trial would meet."""
-    shutil.copy(harms.__file__, tmp_path)
-    (tmp_path / "imported.py").write_text(f"import harms\nharms.HARMS[{what!r}][1]()\nAgent = harms.Agent\n")
-    monkeypatch.chdir(tmp_path)
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="imported:Agent")})
-    settings = WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch, timeout_s=20.0)
-    found: list[TrialResult] = []
-    pool = PoolExecutor(settings, parallel=2)
-    said, deadline = None, time.monotonic() + 300
-    try:
-        for number in range(3):
-            pool.submit(TrialSpec(number, 7, {"ego": {}}, {}, MAX_STEPS))
-        while len(found) < 3 and time.monotonic() < deadline:
-            found += pool.completed(0.2)
-    except CrashhuntError as error:
-        said = str(error)
-    finally:
-        pool.close()
-    if message is None:
-        assert [str(result.outcome) for result in found] == [SURVIVED] * 3
-    else:
-        line = inspect.getsourcelines(harms.HARMS[what][1])[1] + 2
-        assert message.format(line=line) in (said or "")
-        assert len(said.splitlines()) == 1
 
 
 def check(trials, found):

@@ -1,9 +1,11 @@
-"""A module of an agent that hangs, or ends its process, when it is imported: one error that names the import."""
+"""A module of an agent that does harm when it is imported: one error that names the import, or nothing."""
 
 from __future__ import annotations
 
+import shutil
 import time
 
+import harms
 import pytest
 from conftest import mostly_nightly
 
@@ -16,6 +18,8 @@ from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import CRASHES, TrialSpec
 
 LIMIT_S = 2.0
+KEEPS = ", which keeps 'driver:Agent' from being imported"
+# Code and why the module cannot be imported; empty if it can.
 DOES = {
     "while True: pass": f"it takes more than {LIMIT_S:g} s",
     "time.sleep(1e9)": f"it takes more than {LIMIT_S:g} s",
@@ -25,10 +29,19 @@ DOES = {
     "os.kill(os.getpid(), signal.SIGKILL)": "its process was killed by SIGKILL meanwhile, ",
     "os.fork() or time.sleep(1e9); os._exit(3)": "its process exited with 3 meanwhile",  # a copy holds what it inherits
     "os.kill(os.getpid(), signal.SIGSTOP)": "",  # it is resumed
+    "becomes_another_program": "its process exited with 0 meanwhile",
+    "closes_everything": "its process exited with 1 meanwhile",
+    "raises_bare": f"BareError: harm{KEEPS}",
+    "raises_error": f"ValueError: harm{KEEPS}",
+    "raises_mute": f"(its message cannot be had: RuntimeError){KEEPS}",
+    "raises_long_message": f"more characters are left out){KEEPS}",
+    "recurses": "RecursionError: maximum recursion depth exceeded",
+    **dict.fromkeys(("deaf", "no_output", "starts_threads", "starts_daemon", "forks"), ""),
 }
 # By day, an import that hangs waits: one that calculates would take the processor from other tests for all of LIMIT_S.
 ALWAYS = [("time.sleep(1e9)", PoolExecutor), ("os.kill(os.getpid(), signal.SIGKILL)", PoolExecutor),
-          ("time.sleep(1e9)", FreshProcessExecutor), ("os._exit(3)", FreshProcessExecutor)]  # fmt: skip
+          ("time.sleep(1e9)", FreshProcessExecutor), ("os._exit(3)", FreshProcessExecutor),
+          ("raises_bare", PoolExecutor)]  # fmt: skip
 
 
 def completed_until(deadline, executor):
@@ -40,10 +53,10 @@ def completed_until(deadline, executor):
     ("does", "kind"), mostly_nightly([(does, kind) for does in DOES for kind in (PoolExecutor, FreshProcessExecutor)],
                                      always=ALWAYS)
 )  # fmt: skip
-def test_import_that_hangs_or_ends_its_process_is_named_in_one_error(tmp_path, monkeypatch, does, kind):
-    (tmp_path / "driver.py").write_text(
-        f"import os, signal, time\nfrom crashhunt.agents import KeepLaneWithSpeed\n{does}\nAgent = KeepLaneWithSpeed\n"
-    )
+def test_import_that_does_harm_is_named_in_one_error(tmp_path, monkeypatch, does, kind):
+    shutil.copy(harms.__file__, tmp_path)
+    code = f"harms.HARMS[{does!r}][1]()" if does in harms.HARMS else does
+    (tmp_path / "driver.py").write_text(f"import os, signal, time\nimport harms\n{code}\nAgent = harms.Agent\n")
     monkeypatch.chdir(tmp_path)
     scratch = tmp_path / "scratch"
     scratch.mkdir()
@@ -65,8 +78,12 @@ def test_import_that_hangs_or_ends_its_process_is_named_in_one_error(tmp_path, m
     finally:
         executor.close()
     said = caught.value
-    assert said.message.startswith(f"the module 'driver' of agent ego cannot be imported: {DOES[does]}")
-    assert said.fix.startswith("see what the module does when it is imported")
+    assert DOES[does] in said.message
+    if DOES[does].startswith("it"):  # its process hung or ended
+        assert said.message.startswith("the module 'driver' of agent ego cannot be imported: it")
+        assert said.fix.startswith("see what the module does when it is imported")
+    else:
+        assert said.where.startswith("harms.py, line ")
     assert (len(str(said).splitlines()), found) == (1, [])
 
 
