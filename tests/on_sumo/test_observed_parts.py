@@ -9,6 +9,7 @@ import shutil
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import libsumo
@@ -20,6 +21,7 @@ from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.simulators import PARTS, BicycleModel, MotionState
 from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._observing import READERS
+from crashhunt.sumo._scene_readers import PredictionsReader
 from crashhunt.trial import Disturbance
 
 STEPS = 90
@@ -402,6 +404,12 @@ def test_predictions_along_lanes_lead_where_actors_then_drive_that_stay_in_their
     assert len(along) > 20
     assert straight.max() > 2.0
     assert along.max() < 1.6  # the way is known at steps of 0.1 s only
+
+
+@pytest.mark.parametrize(("interval", "steps", "length_m"), [(0.5, 4, 120), (0.25, 7, 105), (0.5, 60, 1000)])
+def test_path_of_a_prediction_is_as_long_as_a_vehicle_may_drive(interval, steps, length_m):
+    reader = PredictionsReader(SimpleNamespace(settings={"interval": interval}, shape=(1, steps, 4)))
+    assert (reader._sampling.points - 1) * reader._sampling.spacing_m == length_m
 
 
 def test_noise_of_ranges_is_normal_and_that_of_the_seed(tmp_path):

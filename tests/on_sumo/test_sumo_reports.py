@@ -55,8 +55,8 @@ def world(sumo):
             f"{kind}_getSpeed": lambda name, there=there: there[name][3],
             f"{kind}_getVehicleClass": "passenger" if kind == "vehicle" else "pedestrian",
             f"{kind}_getLength": 5.0 if kind == "vehicle" else 0.25, f"{kind}_getWidth": 1.8, f"{kind}_getHeight": 1.5,
-            f"{kind}_getPosition3D": lambda name, there=there: (*there[name][:2], 7.0),
-            f"{kind}_getSlope": 45.0,
+            f"{kind}_getPosition3D": lambda name, there=there, high=float(len(kind)): (*there[name][:2], high),
+            f"{kind}_getSlope": 45.0 if kind == "vehicle" else 0.0,
         }  # fmt: skip
     return sumo
 
@@ -227,12 +227,13 @@ def test_heights_are_read_where_the_network_has_them(world, heights, high):
         return 0.0, 0.0, heights[place > 30.0]
 
     world.answers |= {"lane_getIDList": ("e_0", ":j_0_1"), "lane_getLength": 50.0, "simulation_convert3D": convert}
+    world.persons["p"] = (10.0, 5.0, 0.0, 1.0)
     scene = sight().look(0, ())
-    assert scene.heights == ([7.0, 7.0] if high else [])
-    assert [round(grade, 9) for grade in scene.grades] == ([1.0, 1.0] if high else [])
+    assert scene.heights == ([7.0, 7.0, 6.0] if high else [])
+    assert [round(grade, 9) for grade in scene.grades] == ([1.0, 1.0, 0.0] if high else [])
     assert [place for edge, place, *_ in asked if edge == "e"] == pytest.approx([0.0, 50 / 3, 100 / 3, 50.0], abs=1e-5)
     assert {(edge, index, geo) for edge, _, index, geo in asked} == {("e", 0, False), (":j_0", 1, False)}
-    assert scene.roster.actors[0].height == (1.5 if high else 0.0)
+    assert [actor.height for actor in scene.roster.actors] == [1.5 if high else 0.0] * 3
 
 
 def test_vehicles_of_another_episode_are_read_again(world):
