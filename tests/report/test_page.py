@@ -12,6 +12,7 @@ import pytest
 from conftest import wait_for
 
 from crashhunt.base import layout
+from crashhunt.base.text import format_number
 from crashhunt.crashes import list_bundles
 from crashhunt.ledger import Ledger
 from crashhunt.report import describe_running
@@ -287,7 +288,7 @@ def test_dots_say_which_trial_they_are_and_lead_to_it(hunt, browser):
     lowest = min(trials.values(), key=lambda trial: trial["values"][names[0][0]])
     told = text(browser, "tip")
     assert told.startswith(f"trial {lowest['number']}: {lowest['outcome']}")
-    assert f"speed {lowest['values']['speed']:.4g} m/s" in told
+    assert f"speed {format_number(lowest['values']['speed'])} m/s" in told
     canvas.send_keys(Keys.END)
     highest = max(trials.values(), key=lambda trial: trial["values"][names[0][0]])
     assert text(browser, "tip").startswith(f"trial {highest['number']}:")
@@ -326,7 +327,7 @@ def test_nothing_is_wider_than_a_telephone(hunt, telephone):
     telephone.get((hunt.folder / "compare.html").as_uri())
     assert telephone.execute_script("return document.documentElement.scrollWidth") == 375
     labels = [label.text for label in telephone.find_elements(By.CSS_SELECTOR, "svg text")]
-    assert {"speed (m/s)", "crash rate"} <= set(labels)
+    assert {"speed (m/s)", "crash rate per trial"} <= set(labels)
 
 
 DARK = {"name": "prefers-color-scheme", "value": "dark"}
