@@ -48,14 +48,14 @@ def world(sumo):
         "vehicle_getLaneID": lambda name: f"{name}_0", "lane_getIDList": (), "vehicle_getStopState": 0,
         **{f"simulation_get{name}Number": lambda name=name: sumo.numbers[name] for name in sumo.numbers},
     }  # fmt: skip
-    for kind, there in (("vehicle", sumo.vehicles), ("person", sumo.persons)):
+    for kind, there, high in (("vehicle", sumo.vehicles, 7.0), ("person", sumo.persons, 6.0)):
         sumo.answers |= {
             f"{kind}_getPosition": lambda name, there=there: there[name][:2],
             f"{kind}_getAngle": lambda name, there=there: there[name][2],
             f"{kind}_getSpeed": lambda name, there=there: there[name][3],
             f"{kind}_getVehicleClass": "passenger" if kind == "vehicle" else "pedestrian",
             f"{kind}_getLength": 5.0 if kind == "vehicle" else 0.25, f"{kind}_getWidth": 1.8, f"{kind}_getHeight": 1.5,
-            f"{kind}_getPosition3D": lambda name, there=there, high=float(len(kind)): (*there[name][:2], high),
+            f"{kind}_getPosition3D": lambda name, there=there, high=high: (*there[name][:2], high),
             f"{kind}_getSlope": 45.0 if kind == "vehicle" else 0.0,
         }  # fmt: skip
     return sumo
