@@ -53,6 +53,12 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
         return _convert(options)
     if options.recorded_agent:
         raise UsageError("--recorded-agent has no effect without --as", fix=f"add --as {' or '.join(_FORMATS)}")
+    form = next((form for form, suffix in _FORMATS.items() if options.file.suffix == suffix), "")
+    if form:
+        raise UsageError(
+            f"{options.file}: without --as, export writes a zip file",
+            fix=f"add --as {form}, or name it {options.file.with_suffix('.zip')}",
+        )
     from crashhunt.crashes import export_crash
 
     with (
