@@ -1,10 +1,15 @@
-"""A short road of highway-env with vehicles of given classes."""
+"""Short roads of highway-env, and what happens on them without and with the accelerator."""
 
 from __future__ import annotations
 
 import numpy as np
+from highway_env.road.lane import StraightLane
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road, RoadNetwork
+from highway_env.vehicle.behavior import IDMVehicle
+
+from crashhunt.highway import restore_classes
+from crashhunt.highway.accelerator import switch_off, switch_on
 
 
 def small_road(*kinds, lanes=3, connected=False, regulated=False):
@@ -15,3 +20,26 @@ def small_road(*kinds, lanes=3, connected=False, regulated=False):
     place.neighbour_vehicles_connected_lanes = connected
     place.vehicles += [kind(place, [17.0 * n, 4.0 * (n % lanes)], 0.02 * n, 20.0 + n) for n, kind in enumerate(kinds)]
     return place
+
+
+def two_roads(poses):
+    """One after the other, of two lanes each; vehicles by where they are, their speed, how old their last idea is."""
+    network = RoadNetwork()
+    for start, end, at in (("a", "b", 0), ("b", "c", 100)):
+        for beside in range(2):
+            network.add_lane(start, end, StraightLane([at, 4 * beside], [at + 100, 4 * beside], speed_limit=30))
+    place = Road(network, np_random=np.random.default_rng(1))
+    place.vehicles += [IDMVehicle(place, position, 0, speed, timer=timer) for position, speed, timer in poses]
+    return place
+
+
+def slow_and_fast(drive):
+    """Return what a function returns without and with the accelerator, which stays on."""
+    found = []
+    for fast in (False, True):
+        switch_off()
+        restore_classes()
+        if fast:
+            assert switch_on() == ""
+        found.append(drive())
+    return found

@@ -16,9 +16,9 @@ from highway_env.road import regulation, road
 from highway_env.road.lane import StraightLane
 from highway_env.vehicle import behavior, dynamics
 from highway_env.vehicle.controller import ControlledVehicle
+from small_roads import slow_and_fast, two_roads
 
-from crashhunt.highway import restore_classes
-from crashhunt.highway.accelerator import Onlooker, _roads, _switch, kind_of, switch_off, switch_on
+from crashhunt.highway.accelerator import Onlooker, _roads, _switch, kind_of, switch_on
 
 assert highway_env
 NAMES = "position heading speed action crashed impact lane_index target_lane_index target_speed timer route"
@@ -52,14 +52,7 @@ def made(kind=HighwayEnvFast):
 
 def both(make, drive):
     """What happens without and with the accelerator."""
-    found = []
-    for fast in (False, True):
-        switch_off()
-        restore_classes()
-        if fast:
-            assert switch_on() == ""
-        found.append(drive(make()))
-    return found
+    return slow_and_fast(lambda: drive(make()))
 
 
 def driven(change=lambda env: None, steps=3):
@@ -208,17 +201,10 @@ def test_the_one_that_changes_something_between_two_steps_is_noticed():
     assert slow == fast
 
 
-def two_roads(poses):
-    """One after the other, of two lanes each; vehicles by where they are, how old their last idea is, and changes."""
-    network = road.RoadNetwork()
-    for start, end, at in (("a", "b", 0), ("b", "c", 100)):
-        for beside in range(2):
-            network.add_lane(start, end, StraightLane([at, 4 * beside], [at + 100, 4 * beside]))
-    place = road.Road(network, np_random=np.random.default_rng(1))
-    for position, timer, change in poses:
-        vehicle = behavior.IDMVehicle(place, position, 0.0, 15.0, timer=timer)
+def changed(place, changes):
+    """The same road, with attributes of its vehicles changed."""
+    for vehicle, change in zip(place.vehicles, changes, strict=True):
         vars(vehicle).update(change)
-        place.vehicles.append(vehicle)
     return place
 
 
@@ -227,7 +213,7 @@ def test_vehicles_that_share_a_route_drop_its_parts_one_after_another():
 
     def make():
         route = {"route": [("a", "b", 0), ("b", "c", 1)]}
-        return two_roads([([50.0, 4.0], 1.5, route), ([98.5, 0.0], 0.1, route)])
+        return changed(two_roads([([50.0, 4.0], 15.0, 1.5), ([98.5, 0.0], 15.0, 0.1)]), [route] * 2)
 
     slow, fast = both(make, lambda place: stepped(place, 3))
     assert slow == fast
@@ -236,19 +222,19 @@ def test_vehicles_that_share_a_route_drop_its_parts_one_after_another():
 def test_who_sees_the_end_of_a_lane_later_is_still_in_the_way_there():
     def make():
         target = {"target_lane_index": ("a", "b", 1)}
-        return two_roads([([90.0, 0.5], 0.1, target), ([98.5, 0.5], 0.1, target)])
+        return changed(two_roads([([90.0, 0.5], 15.0, 0.1), ([98.5, 0.5], 15.0, 0.1)]), [target] * 2)
 
     slow, fast = both(make, lambda place: stepped(place, 3))
     assert slow == fast
 
 
-SLOW = {"speed": 2.0, "DISTANCE_WANTED": 0.5}  # so that it matters who is ahead
+SLOW = {"target_speed": 15.0, "DISTANCE_WANTED": 0.5}  # so that it matters who is ahead
 
 
 def test_a_lane_that_an_actor_states_a_vehicle_is_on():
     def make():
-        poses = [([3.0 + 7 * number, 0.0 if number % 2 else 4.0], 0.05 * number, SLOW) for number in range(14)]
-        place = two_roads(poses)
+        poses = [([3.0 + 7 * number, 0.0 if number % 2 else 4.0], 2.0, 0.05 * number) for number in range(14)]
+        place = changed(two_roads(poses), [SLOW] * 14)
         place.vehicles[4].lane_index = ("a", "b", 0)
         place.vehicles[6].lane = place.network.get_lane(("a", "b", 0))
         return place
@@ -267,7 +253,7 @@ class Splitting(behavior.IDMVehicle):
 @pytest.mark.parametrize("kind", [behavior.IDMVehicle, Splitting])
 def test_a_vehicle_that_is_the_only_one_when_the_road_begins_to_move(kind):
     def make():
-        place = two_roads([([20.0, 0.0], 0.3, {})])
+        place = two_roads([([20.0, 0.0], 15.0, 0.3)])
         place.vehicles[0].__class__ = kind
         return place
 
@@ -277,8 +263,8 @@ def test_a_vehicle_that_is_the_only_one_when_the_road_begins_to_move(kind):
 
 def test_vehicles_in_the_very_same_place():
     def make():
-        poses = [([3.0 + 7 * (number // 2), 4.0 * (number % 3 == 0)], 0.08 * number, SLOW) for number in range(28)]
-        place = two_roads(poses)
+        poses = [([3.0 + 7 * (number // 2), 4.0 * (number % 3 == 0)], 2.0, 0.08 * number) for number in range(28)]
+        place = changed(two_roads(poses), [SLOW] * 28)
         for vehicle in place.vehicles[::2]:
             vehicle.check_collisions = vehicle.collidable = False
         return place

@@ -21,8 +21,9 @@ from highway_env.road.road import Road
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
+from small_roads import slow_and_fast
 
-from crashhunt.highway import HighwaySimulator, restore_classes
+from crashhunt.highway import HighwaySimulator
 from crashhunt.highway.accelerator import Onlooker, _substep_loop, switch_off, switch_on
 
 assert highway_env
@@ -50,15 +51,7 @@ def trace(make, change, actions):
 
 def both(make, change=lambda env: None, actions=ACTIONS):
     """The trace without and with the accelerator."""
-    found = []
-    for fast in (False, True):
-        switch_off()
-        restore_classes()
-        if fast:
-            assert switch_on() == ""
-        found.append(trace(make, change, actions))
-    switch_off()
-    return found
+    return slow_and_fast(lambda: trace(make, change, actions))
 
 
 def made(kind=HighwayEnvFast, **config):
@@ -189,18 +182,19 @@ def test_replaced_observation_sees_what_it_changes(monkeypatch):
         road.act()  # of the vehicles that are left
         return original(observation)
 
-    slow, fast = [], []
-    for found in (slow, fast):
-        switch_off()
-        monkeypatch.undo()
-        if found is fast:
-            switch_on()
-        env = made()
+    def drive():
+        nonlocal original
+        env, found = made(), []
         env.step(1)
         original = KinematicObservation.observe
-        monkeypatch.setattr(KinematicObservation, "observe", observe)
-        for _ in range(2):
-            found += [exact(env.step(1)), [exact(vars(vehicle)) for vehicle in env.road.vehicles]]
+        with monkeypatch.context() as patch:
+            patch.setattr(KinematicObservation, "observe", observe)
+            for _ in range(2):
+                found += [exact(env.step(1)), [exact(vars(vehicle)) for vehicle in env.road.vehicles]]
+        return found
+
+    original = None
+    slow, fast = slow_and_fast(drive)
     assert slow == fast
 
 
@@ -307,11 +301,7 @@ def test_meta_action_at_the_end_of_a_lane_is_applied_by_highway_env():
 
 
 def test_road_is_read_after_a_step_whose_observation_has_its_own_method():
-    found = []
-    for fast in (False, True):
-        switch_off()
-        if fast:
-            switch_on()
+    def drive():
         env = made()
         env.step(1)
         env.observation_type.normalize_obs = env.observation_type.normalize_obs
@@ -319,8 +309,10 @@ def test_road_is_read_after_a_step_whose_observation_has_its_own_method():
         push(env.road)
         env.road.act()
         env.road.step(0.25)
-        found.append([exact(vars(vehicle)) for vehicle in env.road.vehicles])
-    assert found[0] == found[1]
+        return [exact(vars(vehicle)) for vehicle in env.road.vehicles]
+
+    slow, fast = slow_and_fast(drive)
+    assert slow == fast
 
 
 def test_meta_actions_at_the_end_of_a_road_have_the_effect_that_they_have_in_highway_env():
@@ -370,15 +362,14 @@ def test_simulation_of_all_environments_replaced_during_an_episode_changes_the_o
         run = AbstractEnv._simulate
         monkeypatch.setattr(AbstractEnv, "_simulate", lambda self, action=None: (run(self, action), push(self.road)))
 
-    found = []
-    for fast in (False, True):
+    def drive():
+        found = trace(made, change, ACTIONS[:3])
         monkeypatch.undo()
-        switch_off()
-        if fast:
-            switch_on()
-        found.append(trace(made, change, ACTIONS[:3]))
-    assert found[0] == found[1]
-    assert found[0] != trace(made, lambda env: None, ACTIONS[:3])
+        return found
+
+    slow, fast = slow_and_fast(drive)
+    assert slow == fast
+    assert slow != trace(made, lambda env: None, ACTIONS[:3])
 
 
 @pytest.mark.parametrize("kind", ["Kinematics", "ExitObservation"])
@@ -505,15 +496,13 @@ def test_rewards_are_those_of_highway_env(speed, kind):
         env.vehicle.speed = speed
         env.vehicle.heading = np.float64(0.3)
 
-    found = []
-    for fast in (False, True):
-        switch_off()
-        if fast:
-            switch_on()
+    def rewards():
         env = made(kind)
         change(env)
-        found.append((exact(env._rewards(1)), exact(env._reward(1))))
-    assert found[0] == found[1]
+        return exact(env._rewards(1)), exact(env._reward(1))
+
+    slow, fast = slow_and_fast(rewards)
+    assert slow == fast
 
 
 def test_replaced_clip_limits_the_speed_in_rewards(monkeypatch):

@@ -10,12 +10,11 @@ import pytest
 from compiled import needs_kernel
 from exact_values import exact
 from highway_env.envs.highway_env import HighwayEnvFast
-from highway_env.road import road
-from highway_env.road.lane import StraightLane
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
+from small_roads import slow_and_fast, two_roads
 
-from crashhunt.highway.accelerator import _roads, switch_off, switch_on
+from crashhunt.highway.accelerator import _roads, switch_on
 
 assert highway_env
 NAMES = ["position", "heading", "speed", "crashed", "impact", "lane_index", "target_lane_index", "timer", "route"]
@@ -28,29 +27,16 @@ def state(place):
     return [[len(vehicle.history), *(exact(vars(vehicle).get(name)) for name in NAMES)] for vehicle in place.vehicles]
 
 
-def two_roads(count=5):
-    """One after the other, of two lanes each."""
-    network = road.RoadNetwork()
-    for start, end, at in (("a", "b", 0), ("b", "c", 100)):
-        for beside in range(2):
-            network.add_lane(start, end, StraightLane([at, 4 * beside], [at + 100, 4 * beside], speed_limit=30))
-    place = road.Road(network, np_random=np.random.default_rng(1))
-    place.vehicles += [
-        IDMVehicle(place, [18.0 * number, 4.0 * (number % 2)], 0, 20 + number, timer=0.3 * number)
-        for number in range(count)
-    ]
-    return place
+def five(count=5):
+    return two_roads([([18.0 * number, 4.0 * (number % 2)], 20 + number, 0.3 * number) for number in range(count)])
 
 
 def both(change, steps=8, dt=0.2):
     """The state of all vehicles after each step, without and with the accelerator."""
-    found = []
-    for fast in (False, True):
-        switch_off()
-        if fast:
-            assert switch_on() == ""
+
+    def drive():
         with pytest.MonkeyPatch.context() as patch:
-            place, trace = two_roads(), []
+            place, trace = five(), []
             for number in range(steps):
                 if number == 2:
                     change(place, patch)
@@ -60,8 +46,9 @@ def both(change, steps=8, dt=0.2):
                 except Exception as error:  # somebody may go on after it
                     trace.append(repr(error))
                 trace.append(state(place))
-            found.append(trace)
-    return found
+            return trace
+
+    return slow_and_fast(drive)
 
 
 def nothing(place, patch):
@@ -173,19 +160,16 @@ def test_timer_that_begins_again_in_the_sub_step_of_an_error_is_a_whole_number(t
 
 
 def shown(features, change=lambda env: None):
-    found = []
-    for fast in (False, True):
-        switch_off()
+    def observe():
         env = environment()
         env.observation_type.features = features
-        if fast:
-            assert switch_on() == ""
         change(env)
         try:
-            found.append(exact(env.observation_type.observe()))
+            return exact(env.observation_type.observe())
         except Exception as error:
-            found.append(repr(error))
-    return found
+            return repr(error)
+
+    return slow_and_fast(observe)
 
 
 def far_away(env):
@@ -242,7 +226,7 @@ def one_action(place, patch):
 
 
 def one_of_another_road(place, patch):
-    place.vehicles[2].road = two_roads(1)
+    place.vehicles[2].road = five(1)
 
 
 def one_crashed(place, patch):

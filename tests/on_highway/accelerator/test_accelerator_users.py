@@ -24,6 +24,7 @@ from highway_env import utils
 from highway_env.envs.common import observation
 from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, kinematics, objects
+from small_roads import slow_and_fast
 
 import crashhunt
 from crashhunt.highway import restore_classes
@@ -335,11 +336,8 @@ def small_road(network=None, kind=behavior.IDMVehicle):
 
 def driven(make, change=lambda place: None, steps=12):
     """The state after each step, without and with the accelerator; the change is made after the third."""
-    found = []
-    for fast in (False, True):
-        switch_off()
-        if fast:
-            assert switch_on() == ""
+
+    def drive():
         with pytest.MonkeyPatch.context() as patch:
             place, trace = make(), []
             for number in range(steps):
@@ -348,8 +346,9 @@ def driven(make, change=lambda place: None, steps=12):
                 place.act()
                 place.step(0.2)
                 trace.append([exact([vars(v).get(name) for name in STATE]) for v in place.vehicles])
-            found.append(trace)
-    return found
+            return trace
+
+    return slow_and_fast(drive)
 
 
 class Reversed(road.RoadNetwork):
@@ -357,46 +356,6 @@ class Reversed(road.RoadNetwork):
 
     def get_closest_lane_index(self, position, heading=None):
         return ("0", "1", 0)
-
-
-def test_a_network_of_ones_own_states_which_lane_is_closest():
-    def make():
-        network = Reversed()
-        network.graph = road.RoadNetwork.straight_road_network(2).graph
-        return small_road(network)
-
-    slow, fast = driven(make)
-    assert slow == fast
-
-
-def test_a_network_whose_method_is_replaced_while_driving():
-    def change(place):
-        place.network.get_closest_lane_index = lambda position, heading=None: ("0", "1", 0)
-
-    slow, fast = driven(small_road, change)
-    assert slow == fast
-
-
-def test_a_road_whose_neighbours_are_others():
-    def change(place):
-        place.neighbour_vehicles = lambda vehicle, lane_index=None: (None, None)
-
-    slow, fast = driven(small_road, change)
-    assert slow == fast
-
-
-@pytest.mark.parametrize(("name", "value"), [("width", 0.5), ("length", 30.0), ("start", np.array([9.0, 1.0]))])
-def test_a_lane_that_changes_while_driving(name, value):
-    slow, fast = driven(small_road, lambda place: setattr(place.network.get_lane(("0", "1", 1)), name, value))
-    assert slow == fast
-
-
-def test_a_lane_that_is_moved_in_place():
-    def change(place):
-        place.network.get_lane(("0", "1", 1)).start[1] += 0.7
-
-    slow, fast = driven(small_road, change)
-    assert slow == fast
 
 
 class Empty(behavior.IDMVehicle):
@@ -411,9 +370,38 @@ class Nobody(behavior.IDMVehicle):
         return False
 
 
-@pytest.mark.parametrize("kind", [Empty, Nobody])
-def test_vehicles_that_are_false(kind):
-    slow, fast = driven(lambda: small_road(kind=kind))
+def reversed_network():
+    network = Reversed()
+    network.graph = road.RoadNetwork.straight_road_network(2).graph
+    return network
+
+
+@pytest.mark.parametrize(
+    "given", [{"network": reversed_network()}, {"kind": Empty}, {"kind": Nobody}], ids=["network", "empty", "false"]
+)
+def test_road_of_a_users_own_is_driven_as_by_highway_env(given):
+    slow, fast = driven(lambda: small_road(**given))
+    assert slow == fast
+
+
+def second_lane(place):
+    return place.network.get_lane(("0", "1", 1))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda place: setattr(place.network, "get_closest_lane_index", lambda position, heading=None: ("0", "1", 0)),
+        lambda place: setattr(place, "neighbour_vehicles", lambda vehicle, lane_index=None: (None, None)),
+        lambda place: setattr(second_lane(place), "width", 0.5),
+        lambda place: setattr(second_lane(place), "length", 30.0),
+        lambda place: setattr(second_lane(place), "start", np.array([9.0, 1.0])),
+        lambda place: second_lane(place).start.__iadd__([0.0, 0.7]),  # in place
+    ],
+    ids=["closest lane", "neighbours", "width", "length", "start", "start in place"],
+)
+def test_road_that_changes_while_driving_is_heeded(change):
+    slow, fast = driven(small_road, change)
     assert slow == fast
 
 

@@ -17,6 +17,7 @@ import gymnasium
 import numpy as np
 import pytest
 from compiled import needs_kernel
+from exact_values import exact
 from highway_env.vehicle.behavior import IDMVehicle
 
 from crashhunt.highway.accelerator import switch_off, switch_on
@@ -106,18 +107,6 @@ def configuration(name, rng):
             one = config.get(part, default[part])
             config[part] = {"type": f"MultiAgent{part.capitalize()}", f"{part}_config": one}
     return config
-
-
-def exact(value):
-    if isinstance(value, np.ndarray):
-        return value.dtype.str, value.shape, value.tobytes()
-    if isinstance(value, dict):
-        return {str(key): exact(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [exact(inner) for inner in value]
-    if isinstance(value, float | np.generic):
-        return type(value).__name__, float(value).hex()
-    return value if value is None or isinstance(value, int | str | bool) else type(value).__name__
 
 
 def state(env):
