@@ -377,7 +377,7 @@ class TrialProcess:
         forcer: OnsetForcer | None = None
         if settings.probe_s:
             budget = BUDGET_BESIDE if settings.branch else BUDGET
-            refused = {name: setup.refused_delays for name, setup in settings.scenario.agents.items()}
+            refused = {name: setup.refused_disturbances for name, setup in settings.scenario.agents.items()}
             prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget, self._notices.append, refused)
         if settings.branch:
             brancher = Brancher(settings.branch, settings.crash_on, self._delay, self._notices.append)

@@ -82,25 +82,24 @@ def chosen_actions(
     return found
 
 
-def refuse_late_plans(scenario: Scenario, kinds: Iterable[str]) -> None:
-    """Refuse delays for agents that return plans, which begin where the vehicle is in the step of the plan.
+def refuse_misplaced_plans(scenario: Scenario, kinds: Iterable[str]) -> None:
+    """Refuse disturbances that would make the plans of an agent begin where the vehicle is not.
 
     Args:
         scenario: scenario with its agents.
         kinds: kinds of the disturbances.
 
     Raises:
-        UsageError: a disturbance delays the plans of an agent, or the places from which they begin.
+        UsageError: an agent returns plans, and a disturbance does not fit them.
     """
-    kinds = frozenset(kinds)
+    kinds = tuple(kinds)
     for agent, setup in scenario.agents.items():
-        refused = kinds & setup.refused_delays
-        if "late_action" in refused:
-            message = f"--disturb late_action: {agent} returns a {setup.action_form}, which cannot be delayed"
-            raise UsageError(message, fix="omit late_action, or give --action acceleration_steering")
-        if refused:
-            message = f"--disturb late_observation: {agent} would return a trajectory that begins where it was before"
-            raise UsageError(message, fix="give --action trajectory:tracker=pure_pursuit, or omit late_observation")
+        for kind in (one for one in kinds if one in setup.refused_disturbances):
+            if kind == "late_action":
+                message = f"--disturb late_action: {agent} returns a {setup.action_form}, which cannot be delayed"
+                raise UsageError(message, fix="omit late_action, or give --action acceleration_steering")
+            message = f"--disturb {kind}: {agent} would return a trajectory that does not begin where the vehicle is"
+            raise UsageError(message, fix=f"give --action trajectory:tracker=pure_pursuit, or omit {kind}")
 
 
 def notes_on_declarations(scenario: Scenario, signatures: Mapping[str, Signature]) -> Iterator[str]:

@@ -26,7 +26,7 @@ from crashhunt.plans._choices import (
     name_scenario_in_errors,
     notes_on_declarations,
     parse_crash_on,
-    refuse_late_plans,
+    refuse_misplaced_plans,
     with_notes_on_crashes,
     without_refuted_notes,
 )
@@ -126,7 +126,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     notes = (*code.notes, *_notes_on_statistics(settings, signatures), *notes_on_declarations(scenario, signatures))
     notes += (*notes_on_programs(settings),)
     scenario = replace(scenario, notes=(*scenario.notes, *notes))
-    refuse_late_plans(
+    refuse_misplaced_plans(
         scenario, [*parse_rates(disturb), *(one.what for one in parse_fixed(disturb, tuple(scenario.agents)))]
     )
     find = partial(model_apart, code, request.timeout_s)

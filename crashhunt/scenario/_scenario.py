@@ -143,17 +143,16 @@ class AgentSetup:
         return action_settings(self.action)
 
     @property
-    def refused_delays(self) -> frozenset[str]:
-        """The kinds of disturbances that delay what the agent's plans depend on.
+    def refused_disturbances(self) -> frozenset[str]:
+        """The kinds of disturbances that would make the agent's plans begin where the vehicle is not.
 
-        A plan begins where the vehicle is in the step of the plan. So a plan cannot be delayed, and neither can the
-        places from which an exact trajectory begins.
+        A plan begins where the vehicle is in the step of the plan, with its speed. So a plan cannot be delayed, and an
+        exact trajectory cannot be made from a wrong or late observation.
         """
-        form, settings = self.action_form, self.action_settings
-        if form not in ("trajectory", "target_pose"):
+        if self.action_form not in ("trajectory", "target_pose"):
             return frozenset()
-        is_exact = form == "trajectory" and settings["frame"] != "ego" and settings["tracker"] != "pure_pursuit"
-        return frozenset({"late_action", "late_observation"} if is_exact else {"late_action"})
+        is_exact = self.action_settings.get("tracker") == "interpolation"
+        return frozenset({"late_action", *(("late_observation", "noisy_observation") if is_exact else ())})
 
 
 @dataclass(frozen=True, kw_only=True)

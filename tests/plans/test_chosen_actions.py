@@ -83,8 +83,13 @@ def test_agent_without_a_declaration_leaves_the_settings_as_they_are():
         ),
         (
             "Busy",
-            {"action": "trajectory", "disturb": ("brake=0.1", "late_observation=0.1")},
-            "begins where it was before; give --action trajectory:tracker=pure_pursuit",
+            {"action": "trajectory:frame=ego", "disturb": ("brake=0.1", "late_observation=0.1")},
+            "does not begin where the vehicle is; give --action trajectory:tracker=pure_pursuit, or omit late",
+        ),
+        (
+            "Busy",
+            {"action": "trajectory", "disturb": ("noisy_observation=0.1",)},
+            "does not begin where the vehicle is; give --action trajectory:tracker=pure_pursuit, or omit noisy",
         ),
     ],
 )
