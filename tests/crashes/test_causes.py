@@ -179,13 +179,13 @@ def test_length_is_no_cause_where_cars_were_hit_as_well():
     assert found.causes() == {0: car, 1: car, 2: car}
 
 
-def features(side, turn=0.0, at=(0.0, 0.0), steps=40):
+def features(side, turn=0.0, at=(0.0, 0.0), steps=40, far=(17.0, 3.2)):
     """Return the features of a crash into a truck that moves over from the next lane, on a road somewhere."""
     roster = Roster((Actor("ego", "passenger", 5.0, 1.8), Actor("x", "truck", 9.0, 2.2)))
     c, s = math.cos(turn), math.sin(turn)
     scenes = []
     for number in range(steps):
-        way = [(number * 2.0, 0.0), (number * 2.0 + 17.0, side * (3.2 if number < steps - 1 else 0.5))]
+        way = [(number * 2.0, 0.0), (number * 2.0 + far[0], side * (far[1] if number < steps - 1 else 0.5))]
         points = [(at[0] + x * c - y * s, at[1] + x * s + y * c) for x, y in way]
         scenes.append(Scene(number / 10, roster, points, [turn] * 2, [20.0, 21.0]))
     hit = SimpleNamespace(agent="ego", other="x")
@@ -204,6 +204,8 @@ def test_features_are_motions_before_the_crash_in_differences_that_matter():
         expected = pytest.approx((*earlier * 3, 9.0 / 4.0))
         assert features(side) == expected
         assert features(side, turn=2.5, at=(300.0, -70.0)) == expected  # wherever the road is
+        beyond = (20.0 / 5.0, 21.0 / 5.0, 50.0 / 5.0, side * 5.0 / 1.5)
+        assert features(side, far=(90.0, 6.0)) == pytest.approx((*beyond * 3, 9.0 / 4.0))
     sudden = features(1, steps=1)  # the crash is all that is recorded
     assert sudden == pytest.approx((*(4.0, 4.2, 8.0 / 5.0, 0.5 / 1.5) * 3, 9.0 / 4.0))
 

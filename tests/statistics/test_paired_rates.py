@@ -64,6 +64,39 @@ def test_exchanged_agents_have_the_opposite_difference(per):
     assert wider.low < low < high < wider.high
 
 
+@pytest.mark.parametrize(
+    ("per", "unit"), [("hour", lambda one: one.driven_s / 3600), ("1000km", lambda one: one.driven_m / 1e6)]
+)
+def test_ends_are_where_the_evidence_is_the_inverse_of_the_error_probability(per, unit):
+    pairs = [both for (both,) in drawn(np.random.default_rng(4), 50, (0.006, 0.02), 0.5, speeds=(20.0, 30.0))]
+    lost = {3: 0, 20: 1, 41: 1}  # the unit to the agent whose trial was killed
+    told = [tuple(trial(n, 0.0, has_ended=False) if lost.get(n) == who else one for who, one in enumerate(both))
+            for n, both in enumerate(pairs)]  # fmt: skip
+    found = difference_of_rates([(both,) for both in told], (RULE, RULE), per, alpha=0.06)
+    bets = RULE.bets(per, 0.1)
+    weighted = [(0.5, 0.5), *((math.cos(math.pi * (place + 0.5) / 32), 0.5 / 16) for place in range(16))]
+
+    def evidence(first, rate, difference):
+        most, total = bets.most_events + rate * bets.most_exposure, 0.0
+        one, two = (np.array([(both[who].crashed, unit(both[who])) for n, both in enumerate(pairs) if n not in lost])
+                    for who in (first, 1 - first))  # fmt: skip
+        z = two[:, 0] - one[:, 0] - rate * (two[:, 1] - one[:, 1]) - difference * two[:, 1]
+        for share, weight in weighted:
+            total += weight * (1 - share) ** len(lost) * np.prod(1 - share * z / most)
+        return total
+
+    for first, end in ((0, found.high), (1, -found.low)):
+        ends = []
+        for worst in ((0.0, bets.most_exposure), (bets.most_events, 0.0)):
+            test = RateTest(bets)
+            for n, both in enumerate(pairs):
+                test.add(*(worst if lost.get(n) == first else (float(both[first].crashed), unit(both[first]))))
+            ends.append(test.interval(0.1 * 0.03))
+        low, high = ends[0].low, ends[1].high
+        rates = [low, *np.geomspace(max(low, high / 1000), high, 5)]
+        assert min(evidence(first, rate, end) for rate in rates) == pytest.approx(1 / (0.9 * 0.03), rel=1e-3)
+
+
 def test_trials_that_do_not_start_are_failures_and_those_without_a_result_may_be():
     fine = [trial(n, 30.0) for n in range(60)]
     failed = [trial(n, 30.0) if n % 4 else trial(n, 0.0, failure=RAISED) for n in range(60)]
