@@ -190,6 +190,21 @@ def test_evidence_is_that_of_discordant_pairs_in_closed_form(first, second):
     assert counted(first, second, 7).log_evidence == pytest.approx(expected, abs=1e-9)
 
 
+@given(st.tuples(*[st.integers(0, 30)] * 3), st.sampled_from([-0.9, -0.3, 0.01, 0.5]), st.integers(0, 5))
+def test_evidence_against_a_difference_is_the_mean_of_both_sums(counts, difference, lost):
+    test = counted(*counts)
+    for number in range(lost):  # of the second agent: the difference is 0 or 1
+        test.add(((trial(number), trial(number, valid=False)),))
+    shares = [(0.5, 0.5), *((math.cos(math.pi * (place + 0.5) / 512), 0.5 / 256) for place in range(256))]
+    below = above = 0.0
+    for share, weight in shares:
+        less, more = ([1 - sign * share * (z - difference) / (1 - sign * difference) for z in (-1, 1, 0)]
+                      for sign in (1, -1))  # fmt: skip
+        below += weight * math.prod(map(pow, less, counts)) * less[1] ** lost
+        above += weight * math.prod(map(pow, more, counts)) * more[2] ** lost
+    assert test._log_evidence_against(difference) == pytest.approx(math.log((below + above) / 2), abs=1e-9)
+
+
 def pairs_of(first, second):
     sequence = PairSequence((RULE, RULE))
     test = PairTest()
