@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from crashhunt.analysis import _causes
+from crashhunt.analysis import _causes, _omissions
 from crashhunt.analysis._causes import Manoeuvre, find_why, lanes_around_crash, manoeuvres_of, relevant_actors
 from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why
 from crashhunt.reruns import StoppedError
+from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled, Range, TrialSpec
 from crashhunt.world import Actor, Roster, Scene
 
 DT = 0.1
@@ -32,6 +34,7 @@ def recording(ways, count, *, agents=("ego",)):
         all_steps=[SimpleNamespace(step=step, scene=scene) for step, scene in enumerate(scenes)],
         prologue=SimpleNamespace(step_length_s=DT),
         agents=agents,
+        scene=scenes.__getitem__,
     )
 
 
@@ -193,3 +196,107 @@ def test_collision_partner_is_examined_first_and_then_the_nearest():
     assert relevant_actors(found, "ego", "", 2) == ["near", "a"]
     assert relevant_actors(found, "ego", "gone", 1) == ["gone"]
     assert relevant_actors(recording({}, 0), "ego", "", 9) == []
+
+
+def test_each_run_lacks_one_candidate_from_just_before_it_began(monkeypatch):
+    planned = Disturbance(30, "ahead", "brake", 3.0, 1.0, "ego"), Disturbance(35, "behind", "speed", 0.5, 1.0, "ego")
+    spec = TrialSpec(7, 11, {"ego": {"speed": 20.0, "mode": "a"}}, {"cars": 5}, 300, disturbances=planned)
+    result = SimpleNamespace(
+        steps=80, collision=SimpleNamespace(other="x", x=0.0, y=0.0),
+        disturbances=[replace(planned[0], vehicle="x"), planned[1]],  # no vehicle was behind
+    )  # fmt: skip
+    space = {
+        ("ego", "speed"): Range(5.0, 25.0), ("ego", "mode"): Choice(("a", "b", "c")), ("ego", "gap"): Range(1.0, 2.0),
+        ("", "cars"): Range(1, 9, integer=True), ("ego", "seconds"): Constant(3),
+    }  # fmt: skip
+    monkeypatch.setattr(_causes, "read_settings", lambda path: SimpleNamespace(space=space))
+    monkeypatch.setattr(_causes, "lanes_around_crash", lambda rerun: ())
+    ways = {
+        "ego": speeds((0, 5), (-3, 1)), "x": speeds((0, 2), (3, 1)), "y": stands(9.0, until=4.05), "z": stands(30.0),
+    }  # fmt: skip
+    search = _causes._Search(SimpleNamespace(
+        bundle=SimpleNamespace(result=result, driver="ego", hunt=Path("hunt")), recorded=recording(ways, 81), spec=spec,
+        defaults={("ego", "speed"): 12.0, ("", "cars"): 5},
+    ))  # fmt: skip
+    found = {(one.factor.kind, one.factor.name, one.factor.what): one for one in search.asked()}
+    assert [*found] == [
+        ("disturbance", "x", "brake"), ("agent", "ego", "braked"), ("other", "x", "sped up"),
+        ("argument", "ego.speed", "default"), ("argument", "ego.speed", "drawn"), ("argument", "ego.mode", "drawn"),
+        ("argument", "cars", "drawn"), ("seed", "seed", "drawn"), ("other", "x", "there"), ("other", "y", "there"),
+        ("other", "z", "there"),
+    ]  # fmt: skip
+    assert search.steps == 210  # twice as long, and 5 s
+    inside, whole = replace(spec, max_steps=130), replace(spec, max_steps=210)
+
+    def held(what, name, *steps):
+        hold = [Disturbance(n + 1, "itself", what, 0.0, (130 - n) * DT, "ego", name) for n in steps]
+        return [(n, replace(inside, disturbances=(*planned, one))) for n, one in zip(steps, hold, strict=True)]
+
+    expected = {
+        "disturbance": [(29, replace(inside, disturbances=planned[1:]))],
+        "agent": [(n, replace(inside, overruled=Overruled("ego", n, keeps="speed"))) for n in (50, 45, 40)],
+        ("x", "sped up"): held("keep_speed", "x", 20, 15, 10),
+        ("x", "there"): held("gone", "x", 50, 40, 30),
+        ("y", "there"): held("gone", "y", 40, 30),  # it had left 3 s before the collision
+        ("ego.speed", "default"): [(12.0, replace(whole, arguments={"ego": {"speed": 12.0, "mode": "a"}}))],
+    }
+    for (kind, *name), one in found.items():
+        assert one.runs == expected.get(kind, expected.get(tuple(name), one.runs)), (kind, *name)
+        assert (one.inside, one.held) == (kind not in ("argument", "seed"), "x" if name == ["x", "sped up"] else "")
+    begun = {name: (one.factor.step, one.factor.was) for (_, *name, what), one in found.items() for name in [what]}
+    assert begun["braked"] == (50, 20.0)
+    assert begun["sped up"] == (20, 20.0)
+    assert begun["there"] == (80, None)
+    modes, cars = found["argument", "ego.mode", "drawn"], found["argument", "cars", "drawn"]
+    assert sorted(modes.runs, key=str) == [
+        (mode, replace(whole, arguments={"ego": {"speed": 20.0, "mode": mode}})) for mode in "bc"
+    ]  # fmt: skip
+    assert cars.runs == [(n, replace(whole, scenario_arguments={"cars": n})) for n, _ in cars.runs]
+    assert {n for n, _ in cars.runs} <= {1, 2, 3, 4, 6, 7, 8, 9}
+    assert len({n for n, _ in cars.runs}) == len(cars.runs) > 2
+    assert len(found["argument", "ego.speed", "drawn"].runs) == 8
+    seeds = found["seed", "seed", "drawn"].runs
+    assert seeds == [(seed, replace(whole, seed=seed)) for seed, _ in seeds]
+    assert len({seed for seed, _ in seeds} - {11}) == 8
+
+
+COLLISION = Outcome.COLLISION, ("ego", "x"), ""
+
+
+@pytest.mark.parametrize(
+    ("crash", "run", "ending"),
+    [
+        (COLLISION, (Outcome.SURVIVED, None, ""), "none"),
+        (COLLISION, (Outcome.FINISHED, None, ""), "none"),
+        (COLLISION, COLLISION, "same"),
+        (COLLISION, (Outcome.COLLISION, ("x", "ego"), ""), "same"),
+        (COLLISION, (Outcome.COLLISION, ("ego", "y"), ""), "other"),
+        (COLLISION, (Outcome.OFF_ROAD, None, ""), "other"),
+        (COLLISION, (Outcome.AGENT_ERROR, None, "KeyError"), "other"),
+        *((COLLISION, (outcome, None, ""), "unclear") for outcome in _causes.INCONCLUSIVE_OUTCOMES),
+        ((Outcome.OFF_ROAD, None, ""), (Outcome.OFF_ROAD, None, ""), "same"),
+        ((Outcome.OFF_ROAD, None, ""), COLLISION, "other"),
+        ((Outcome.AGENT_ERROR, None, "KeyError"), (Outcome.AGENT_ERROR, None, "KeyError"), "same"),
+    ],
+)
+def test_run_ends_in_the_same_crash_if_the_same_actors_collide_or_the_same_fails(monkeypatch, crash, run, ending):
+    """Of a software fault, `causes` also compare its place; an omission has no candidate without an actor there."""
+
+    def result(outcome, pair, failure):
+        hit = None if pair is None else SimpleNamespace(collider=pair[0], victim=pair[1])
+        return SimpleNamespace(outcome=outcome, collision=hit, failure=failure)
+
+    monkeypatch.setattr(_causes, "signature_of_fault", lambda result: result.failure)
+    for module in (_causes, _omissions):
+        search = object.__new__(module._Search)
+        search._result, search._recording = result(*crash), None
+        ended = SimpleNamespace(place=0, result=result(*run), recording=None)
+        if module is _omissions:
+            assert search._ending(ended.result) == ending
+        else:
+            asked = _causes._Candidate(Factor("seed", "seed", "drawn"), [(5, "spec")])
+            assert search.ending(asked, 0, ended) == LeftOut(5, ending)
+    if run[2]:  # at another place
+        search = object.__new__(_causes._Search)
+        search._result = result(crash[0], None, "another")
+        assert search._is_same(result(*run)) is False
