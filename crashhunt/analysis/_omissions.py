@@ -128,12 +128,11 @@ class _Search:
             endings = {run.ending for run in self.runs[began:]}
             if "other" in endings and endings <= {"none", "other"}:
                 replaced.append(candidate)
+        if len({str(one["faculty"]) for one in candidates}) > 1:
+            earliest = min(candidates, key=lambda one: int(one["first"]))
+            replaced += [earliest] if earliest not in replaced else []
         for candidate in replaced:
             found = self._try(candidate, "both")
-            if found is not None:
-                return found
-        if len({str(one["faculty"]) for one in candidates}) > 1:
-            found = self._try(min(candidates, key=lambda one: int(one["first"])), "both")
             if found is not None:
                 return found
         return Reference(runs=tuple(self.runs))

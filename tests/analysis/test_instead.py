@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
 
 from crashhunt.analysis import _omissions
+from crashhunt.trial import Outcome, TrialSpec
 
 
 def instead(*speeds, dt=0.5, first=0):
@@ -59,21 +59,105 @@ def test_speed_is_kept_as_long_as_it_is_that_of_the_end(speeds, kept_s):
     assert instead(*speeds)[1] == kept_s
 
 
-@dataclass(frozen=True)
-class Spec:
-    max_steps: int = 60
-
-
-@pytest.mark.parametrize("repeated", [True, False])
-def test_omission_is_reported_only_if_its_run_can_be_repeated(monkeypatch, repeated):
-    digests = iter(["a", "b", "c", "a" if repeated else "d"])
+def searched(**given):
+    """A search for the omission of a crash at step 40, in steps of 0.5 s."""
     search = object.__new__(_omissions._Search)
-    search._dt, search._left, search._end, search.runs = 0.5, 10, 40, []
-    search._rerun = SimpleNamespace(spec=Spec())
+    search._dt, search._left, search._end, search._other, search.runs = 0.5, 10, 40, "x", []
+    search._result = SimpleNamespace(digest="a")
+    search._rerun = SimpleNamespace(spec=TrialSpec(0, 1, {}, {}, 60))
+    for name, value in given.items():
+        setattr(search, name, value)
+    return search
+
+
+@pytest.mark.parametrize(("left", "repeated"), [(10, True), (10, False), (4, True), (3, None)])
+def test_omission_is_reported_only_if_its_run_can_be_repeated(monkeypatch, left, repeated):
+    digests = iter(["a", "b", "c", "a" if repeated else "d"])
+    search, asked = searched(_left=left), []
     monkeypatch.setattr(search, "_omission", lambda candidate, faculty: "omitted", raising=False)
     monkeypatch.setattr(search, "_judged", lambda *_: SimpleNamespace(ending="none"), raising=False)
     ended = lambda: SimpleNamespace(result=SimpleNamespace(digest=next(digests)))  # noqa: E731
-    monkeypatch.setattr(search, "_run", lambda specs, faculty, steps: [ended() for _ in steps], raising=False)
+
+    def run(specs, faculty, steps):
+        asked.append(([spec.max_steps for spec in specs], faculty, steps))
+        return [ended() for _ in steps]
+
+    monkeypatch.setattr(search, "_run", run, raising=False)
     found = search._try({"first": 30, "last": 38, "actor": "", "faculty": "speed"}, "speed")
+    if repeated is None:  # too few runs are left for all of them
+        assert (found, asked) == (None, [])
+        return
+    assert asked == [([50] * 3, "speed", [30, 29, 28]), ([50], "speed", [30])]
     assert (found.omission, len(found.runs)) == ("omitted" if repeated else None, 3)
     assert found.why_not == ("" if repeated else "a run with the reference driver could not be repeated")
+
+
+@pytest.mark.parametrize(
+    ("endings", "is_cause"),
+    [("nnn", True), ("nuu", True), ("unn", False), ("nno", False), ("nsn", False), ("onn", False)],
+)
+def test_period_is_the_cause_if_the_run_from_its_beginning_ends_well_and_no_run_crashes(monkeypatch, endings, is_cause):
+    words = iter({"n": "none", "u": "unclear", "o": "other", "s": "same"}[one] for one in endings)
+    search = searched()
+    monkeypatch.setattr(search, "_omission", lambda candidate, faculty: faculty, raising=False)
+    monkeypatch.setattr(search, "_judged", lambda *_: SimpleNamespace(ending=next(words)), raising=False)
+    same = SimpleNamespace(result=SimpleNamespace(digest="b"))
+    monkeypatch.setattr(search, "_run", lambda specs, faculty, steps: [same for _ in steps], raising=False)
+    found = search._try({"first": 30}, "lateral")
+    assert (found is not None and found.omission == "lateral") is is_cause
+    assert len(search.runs) == 3
+
+
+def period(faculty, last, actor="x", first=0):
+    return {"faculty": faculty, "last": last, "actor": actor, "first": first}
+
+
+def test_lane_changes_are_tried_first_and_then_the_latest_periods_with_the_partner():
+    periods = [
+        period("longitudinal", 39), period("lateral", 30), period("longitudinal", 36, ""), period("lateral", 19),
+        period("longitudinal", 38, "y"), period("lateral", 24, ""), period("longitudinal", 20),
+    ]  # fmt: skip
+    found = [(one["faculty"], one["last"]) for one in searched()._candidates(tuple(periods))]
+    assert found == [("lateral", 30), ("lateral", 24), ("longitudinal", 39), ("longitudinal", 36)]
+    assert [one["last"] for one in searched()._candidates(tuple(periods[-1:] + periods[3:5]))] == [20]
+
+
+SLOW, SIDE = period("longitudinal", 39, first=9), period("lateral", 30, first=4)
+OWN = [("longitudinal", 9), ("lateral", 4)]
+
+
+@pytest.mark.parametrize(
+    ("watched", "endings", "helps", "tried", "why_not"),
+    [
+        ({"digest": "b"}, {}, None, [], "differs"),
+        ({"responses": None}, {}, None, [], "differs"),
+        ({"outcome": Outcome.INVALID, "failure": "no driver"}, {}, None, [], "no driver"),
+        ({"outcome": Outcome.INVALID}, {}, 1, [OWN[0]], ""),
+        ({}, {}, 2, OWN, ""),
+        ({}, {"lateral": ["none", "other"]}, 3, [*OWN, ("both", 4)], ""),
+        ({}, {"longitudinal": ["other"]}, None, [*OWN, ("both", 9), ("both", 4)], ""),
+        ({}, {"lateral": ["other", "same"]}, None, [*OWN, ("both", 4)], ""),
+        ({}, {"lateral": ["other", "unclear"]}, None, [*OWN, ("both", 4)], ""),
+        ({}, {"lateral": ["other"]}, None, [*OWN, ("both", 4)], ""),  # from the first step as well, but not twice
+    ],
+)
+def test_reference_driver_has_both_parts_where_one_brings_another_crash_about(
+    monkeypatch, watched, endings, helps, tried, why_not
+):
+    seen = {"digest": "a", "outcome": Outcome.COLLISION, "responses": (), "failure": None} | watched
+    failure = seen["failure"] and SimpleNamespace(message=seen["failure"])
+    result = SimpleNamespace(digest=seen["digest"], outcome=seen["outcome"], failure=failure)
+    first = SimpleNamespace(result=result, responses=seen["responses"])
+    search, asked = searched(), []
+
+    def attempt(candidate, faculty):
+        asked.append((faculty, candidate["first"]))
+        search.runs += [SimpleNamespace(ending=one) for one in endings.get(faculty, ["same"])]
+        return "cause" if len(asked) == helps else None
+
+    monkeypatch.setattr(search, "_run", lambda *given: [first] if given[1:] == ("none", [0]) else None, raising=False)
+    monkeypatch.setattr(search, "_candidates", lambda responses: [SLOW, SIDE], raising=False)
+    monkeypatch.setattr(search, "_try", attempt, raising=False)
+    found = search.find("differs")
+    assert asked == tried
+    assert found == "cause" if helps else found.why_not == why_not
