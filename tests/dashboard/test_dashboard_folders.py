@@ -538,17 +538,6 @@ def test_missing_libraries_are_named_in_the_order_of_the_extra(monkeypatch):
     assert _server.has_dashboard()
 
 
-def test_browser_needs_a_window(monkeypatch):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(_server.sys, "platform", "darwin")
-    assert _server._has_screen() is True
-    monkeypatch.setattr(_server.sys, "platform", "linux")
-    assert _server._has_screen() is False
-    monkeypatch.setenv("WAYLAND_DISPLAY", "w")
-    assert _server._has_screen() is True
-
-
 def test_server_sends_no_header_of_its_own_and_ignores_those_of_proxies():
     """Of the headers of a proxy, a client could make up its address."""
     config = _serving.make_server("app", print).config

@@ -151,10 +151,13 @@ def test_link_opens_in_a_browser_of_any_machine(address, url, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("browser", "screens", "opened"),
-    [(True, {"DISPLAY": ":0"}, 1), (True, {"WAYLAND_DISPLAY": "w"}, 1), (True, {}, 0), (False, {"DISPLAY": ":0"}, 0)],
-)
-def test_browser_is_opened_where_there_is_a_screen(monkeypatch, browser, screens, opened):
+    ("browser", "screens", "system", "opened"),
+    [
+        (True, {"DISPLAY": ":0"}, "linux", 1), (True, {"WAYLAND_DISPLAY": "w"}, "linux", 1), (True, {}, "linux", 0),
+        (True, {}, "darwin", 1), (False, {"DISPLAY": ":0"}, "linux", 0),
+    ],
+)  # fmt: skip
+def test_browser_is_opened_where_there_is_a_screen(monkeypatch, browser, screens, system, opened):
     calls, announced = [], []
 
     class Thread:
@@ -164,7 +167,7 @@ def test_browser_is_opened_where_there_is_a_screen(monkeypatch, browser, screens
 
     monkeypatch.setattr(_server, "threading", SimpleNamespace(Thread=Thread))
     monkeypatch.setattr(_server.webbrowser, "open", calls.append)
-    monkeypatch.setattr(_server.sys, "platform", "linux")
+    monkeypatch.setattr(_server.sys, "platform", system)
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     for name, value in screens.items():

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
+from ray_node import node_works, submissions
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
@@ -20,7 +21,6 @@ from crashhunt.executors.ray import RayExecutor, _cluster, _executor, _node_work
 from crashhunt.executors.ray._cluster import Cluster, Found, Lost, Meant, TokenError, UnreachableError
 from crashhunt.executors.ray._code_archive import Store, _is_same_snapshot
 from crashhunt.executors.ray._node_actor import Site
-from crashhunt.executors.ray._node_worker import Work
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
@@ -477,58 +477,10 @@ def test_machine_whose_links_are_fixed_wants_nodes_that_fix_them(executor, monke
         assert found._load_order() == wanted
 
 
-class Pool:
-    """The pool of a node: `ends` are the results of each call."""
-
-    def __init__(self, *ends):
-        self.ends, self.submitted, self.cancelled, self.said, self.waits = list(ends), [], [], [], []
-        self.header = BlackBoxHeader(5, 1, 2.0, 300, 4, Phase.ACT, 0)
-
-    def submit(self, given):
-        if given.number == 99:
-            raise OSError("no file")
-        self.submitted.append(given.number)
-
-    def cancel(self, *, above):
-        self.cancelled.append(above)
-
-    def completed(self, wait_s):
-        self.waits.append(wait_s)
-        yield from self.ends.pop(0) if self.ends else ()
-
-    def where(self):
-        return {1: self.header}
-
-    def notes(self):
-        return self.said
-
-    def close(self):
-        self.closed = True
-
-
 @pytest.fixture
 def node(settings, tmp_path, monkeypatch):
-    """Makes what runs trials on a node, with a pool that ends so."""
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    made = []
-
-    def make(*ends, slots=1):
-        job = {"settings": settings.to_json(), "digest": "", "folders": {}, "home": "",
-               "slots": slots}  # fmt: skip
-        work = Work(job)
-        work._place = work._store.place()
-        work._pool = Pool(*ends)
-        made.append(work)
-        return work
-
-    yield make
-    for one in made:
-        one.close()
-
-
-def submissions(*numbers):
-    return [(100 + number, spec(number).to_json()) for number in numbers]
+    with node_works(settings, tmp_path, monkeypatch) as make:
+        yield make
 
 
 def test_node_reports_results_under_their_tickets_and_progress_now_and_then(node, monkeypatch):

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from ray_node import Pool, node_works, submissions
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
@@ -220,56 +221,16 @@ def test_of_a_black_box_only_what_is_in_it_travels(settings, tmp_path, monkeypat
     assert list(read_black_box(tmp_path / "there")) == list(read_black_box(tmp_path / layout.BLACK_BOX)) != []
 
 
-class Pool:
-    """Of which the test says what ends next."""
-
-    def __init__(self, *ending):
-        self.submitted, self.ending = [], list(ending)
-
-    def submit(self, spec):
-        self.submitted.append(spec.number)
-
-    def cancel(self, *, above):
-        self.submitted = [number for number in self.submitted if number <= above]
-
-    def completed(self, wait_s):
-        for number, kept in self.ending[:1]:
-            self.ending.pop(0)
-            yield TrialResult(TrialSpec(number, number, {}, {}, max_steps=3), Outcome.SURVIVED, wall_s=0.0, kept=kept)
-
-    def where(self):
-        return {}
-
-    def notes(self):
-        return []
-
-    def close(self):
-        pass
-
-
 @pytest.fixture
 def work(settings, tmp_path, monkeypatch):
-    """Makes what runs trials on a node, four at a time, with such a pool."""
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")  # which is set
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    """Makes what runs trials on a node, four at a time; each call of its pool ends one of the trials."""
     monkeypatch.setattr("crashhunt.executors.ray._node_worker._GATHER_S", 60.0)
 
-    made = []
+    def result(number, kept):
+        return TrialResult(TrialSpec(number, number, {}, {}, max_steps=3), Outcome.SURVIVED, wall_s=0.0, kept=kept)
 
-    def make(*ending):
-        job = {"settings": settings.to_json(), "digest": "", "folders": {}, "home": "", "slots": 4}
-        made.append(Work(job))
-        made[-1]._place = made[-1]._store.place()
-        made[-1]._pool = Pool(*ending)
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.close()
-
-
-def submissions(*numbers):
-    return [(100 + number, TrialSpec(number, number, {}, {}, max_steps=3).to_json()) for number in numbers]
+    with node_works(settings, tmp_path, monkeypatch) as make:
+        yield lambda *ending: make(*([result(*one)] for one in ending), slots=4)
 
 
 def test_a_node_asks_for_code_once_and_keeps_what_is_whole(settings, tmp_path, monkeypatch):

@@ -85,15 +85,8 @@ def test_a_hunt_whose_process_is_there_runs(hunt):
     assert (found.state, found.owner_alive) == ("running", True)
     assert found.rate_per_s == pytest.approx(2 / 10, rel=0.2)
     assert found.seconds_left == pytest.approx(4 / found.rate_per_s, rel=0.05)
-    note(hunt, until=time.time() + 5)
-    assert hunt_state(hunt).seconds_left == pytest.approx(5, abs=3)
-    note(hunt, until=time.time() - 5)
-    assert hunt_state(hunt).seconds_left == 0
-    note(hunt, planned=0, until=None)
-    assert hunt_state(hunt).seconds_left is None
-    for other in ({**me, "started": me["started"] + 1}, {**me, "pid": 2**22 + 5}):
-        note(hunt, owner=other)
-        assert hunt_state(hunt).state == "killed"
+    note(hunt, owner={**me, "pid": 2**22 + 5})
+    assert hunt_state(hunt).state == "killed"
 
 
 def test_what_not_every_hunt_has_is_in_its_json_only_where_it_has_it(hunt):

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scenes import scene
 
 from crashhunt.oracles import (
     Finding,
@@ -21,14 +22,6 @@ from crashhunt.oracles import (
 )
 from crashhunt.trial import Collision, Outcome
 from crashhunt.world import Actor, Contact, Event, Roster, Scene, first_contact
-
-
-def scene(*vehicles, time_s=0.0, **more):
-    """Each vehicle is (id, x, y, heading, speed), of 5 m by 2 m."""
-    roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name, *_ in vehicles))
-    points = [(float(x), float(y)) for _, x, y, _, _ in vehicles]
-    headings, speeds = [float(v[3]) for v in vehicles], [float(v[4]) for v in vehicles]
-    return Scene(time_s, roster, points, headings, speeds, **more)
 
 
 def hits(oracle, *scenes, agents=("ego",)):

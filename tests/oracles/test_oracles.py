@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
+from scenes import scene
 
 from crashhunt.oracles import Overlap, ReportedCollision, TooClose, merge_findings
 from crashhunt.trial import Collision, Outcome
@@ -127,14 +128,6 @@ def test_time_to_contact_of_vehicles_in_line():
     assert time_to_contact(offset, np.array([[10.0, 0.0]]), turn, half_one, half_two)[0] == math.inf
     assert time_to_contact(offset, np.array([[0.0, 0.0]]), turn, half_one, half_two)[0] == math.inf
     assert rectangle_gap(offset, turn, half_one, half_two)[0] == pytest.approx(20.0)
-
-
-def scene(*vehicles, contacts=(), off_road=(), time_s=0.0):
-    """Each vehicle is (id, x, y, heading, speed)."""
-    roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name, *_ in vehicles))
-    points = [(float(x), float(y)) for _, x, y, _, _ in vehicles]
-    headings, speeds = [float(v[3]) for v in vehicles], [float(v[4]) for v in vehicles]
-    return Scene(time_s, roster, points, headings, speeds, contacts, off_road)
 
 
 def test_the_closest_approach_of_known_scenes():

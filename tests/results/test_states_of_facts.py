@@ -135,8 +135,8 @@ def test_owner_in_another_container_of_the_same_host_name_is_judged_by_its_heart
     pid, started, boot, namespace = here["token"].split("-")
     other = {**here, "token": f"{pid}-{started}-{boot}-{int(namespace, 16) ^ 1:08x}"}
     assert (_hunt_state._is_alive(other, NOW - 59.0), _hunt_state._is_alive(other, NOW - 60.0)) == (True, False)
-    gone = {**here, "pid": 2**22 + 5}
-    assert not _hunt_state._is_alive(gone, NOW)
+    for gone in ({**here, "pid": 2**22 + 5}, {**here, "started": here["started"] + 1}):
+        assert not _hunt_state._is_alive(gone, NOW)
 
 
 def test_folders_of_runs_are_in_the_order_of_their_numbers():
