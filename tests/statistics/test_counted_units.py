@@ -15,7 +15,8 @@ from crashhunt.statistics import BarWatch, CountingRule, RateWatch, TrialFacts
 from crashhunt.statistics._anytime_interval import RateTest
 from crashhunt.statistics._rate_of_running_hunt import Paced
 from crashhunt.statistics._rate_report import make_rate
-from crashhunt.statistics._units import MAX_INVALID_SHARE, RateCounter, UnitSequence
+from crashhunt.statistics._units import MAX_INVALID_SHARE, RateCounter, UnitSequence, facts_of, facts_of_plain
+from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
 RULE = CountingRule(max_steps=100)
 
@@ -50,6 +51,38 @@ def test_order_in_which_trials_end_changes_nothing(crashes, shuffler):
 def test_trials_after_one_that_has_not_ended_do_not_count():
     found = counted([trial(0), trial(1), trial(3, crashed=True), trial(4)])
     assert (found.trials, found.crashes, found.excluded) == (2, 0, {"after_unfinished": 2})
+
+
+def test_trials_before_the_code_changed_do_not_count():
+    rule = replace(RULE, first=3)
+    found = counted([trial(n, crashed=n < 3) for n in (4, 0, 2, 3, 1)], rule)
+    assert (found.trials, found.crashes) == (2, 0)
+    nothing = counted(map(trial, range(3)), rule)
+    assert nothing.why_not == "all 3 trials ran with earlier code, or had begun when the code changed"
+    assert counted([], rule).why_not == "no valid trial has finished"
+    assert counted([trial(0), trial(4)], rule).why_not.startswith("trial 3 has not ended")
+
+
+@pytest.mark.parametrize(
+    ("outcome", "failure", "has_ended", "valid", "crashed"),
+    [
+        (Outcome.SURVIVED, None, True, True, False),
+        (Outcome.COLLISION, None, True, True, True),
+        (Outcome.OFF_ROAD, None, True, True, False),  # no crash of this hunt
+        (Outcome.INVALID, Failure("invalid", "ego was never inserted"), True, False, False),
+        (Outcome.INVALID, Failure(KILLED, "it was killed"), False, False, False),
+    ],
+)
+def test_facts_of_a_result_are_those_of_its_row(outcome, failure, has_ended, valid, crashed):
+    spec = TrialSpec(7, 5, {}, {}, 99, origin="random")
+    result = TrialResult(spec, outcome, steps=42, failure=failure, driven_s=4.2, driven_m=50.0, step_length_s=0.1)
+    expected = TrialFacts(7, has_ended, valid, crashed, 42, 4.2, 50.0, 0.1, "random", seed=5)
+    assert facts_of(result, ("collision",)) == expected
+    row = facts_of_plain(result.to_json(), ("collision",), ("part",))
+    assert row == expected._replace(tags=("part",), failure=failure)
+    assert facts_of_plain({"spec": {"number": 7, "seed": 5}, "outcome": "collision", "steps": 42}, ()) == TrialFacts(
+        7, True, True, False, 42, seed=5
+    )  # a row of an earlier version
 
 
 def test_missing_rate_names_the_earlier_trial_that_has_not_ended():
