@@ -85,7 +85,7 @@ def kill_replays(whom, trials="trial-000000"):
 
     def watch():
         while not over.wait(0.002):
-            for box in usual.glob(f"crashhunt-temporary-*/{os.getpid()}-*/replay-*/{trials}/blackbox.bin"):
+            for box in usual.glob(f"crashhunt-temporary-*/{os.getpid()}-*/rerun-*/{trials}/blackbox.bin"):
                 with suppress(ProcessLookupError, FileNotFoundError):  # it has just ended
                     header = read_header(box)
                     if header is None or header.pid in killed:  # a killed one has another parent for a moment
