@@ -54,6 +54,7 @@ _MAX_STRAIGHT_TURN_RAD = math.radians(10)
 _DRIFTS_M = 0.1
 _ACROSS_M = 50.0  # from the line of a junction to where it ends; there are larger ones
 _BEND_M = 0.4  # with it, an actor on the neighbouring lane is still not in the way: its centre is more than 2 m away
+_MAX_ASIDE_M, _MIN_OVERLAP_M = 1.5, 0.3  # across the lane, of a follower that does not drive in its middle
 _TRAIL_M = 40.0  # of the path before the contact; longer than any vehicle and the part that a follower must share
 _MIN_LEG_M = 0.01  # a shorter leg of a trail has no direction
 _FRONTS_M = 2.0  # between two fronts that met, each with the middle or with a corner
@@ -434,7 +435,8 @@ class ContactRecord:
         if shared is not None and shared.meets_rear:  # where the road bends tightly, the leader shows the way
             ends.insert(1, self._trail(leader).centers(lead.length))
         path = np.vstack((follow.centers, *ends))
-        limit_m = BESIDE_M + min(_BEND_M, self._bend_m / 2)
+        behind_m = min(_MAX_ASIDE_M, (lead.width + follow.width) / 2 - _MIN_OVERLAP_M)
+        limit_m = max(BESIDE_M, behind_m) + min(_BEND_M, self._bend_m / 2)
         found = 0.0
         for back in range(len(self.times) - 1, -1, -1):
             if _distance(path[back:], lead.centers[back]) > limit_m:

@@ -79,9 +79,9 @@ def same_in_every_view(case, angle):
 
 
 @settings(max_examples=examples(12), deadline=None)
-@given(step_s=STEPS, phase=PHASES, angle=ANGLES)
-def test_rear_end_has_a_verdict_at_every_phase_of_every_step(step_s, phase, angle):
-    case = record(drives(15.0), drives(8.0, x=5.0), step_s=step_s, phase=phase)
+@given(step_s=STEPS, phase=PHASES, angle=ANGLES, aside=st.floats(-1.4, 1.4))
+def test_rear_end_has_a_verdict_at_every_phase_of_every_step(step_s, phase, angle, aside):
+    case = record(drives(15.0, y=aside), drives(8.0, x=5.0), step_s=step_s, phase=phase)
     assert case.times[0] >= 4.0 - 1e-6
     manner, collider, follower, changers, verdict, (finding,) = same_in_every_view(case, angle)
     assert (manner, collider, follower, changers, verdict) == ("rear end", "ego", "ego", (), "ego")
