@@ -12,8 +12,9 @@ from types import SimpleNamespace
 import pytest
 from programs import COMPILER
 
+from crashhunt.base import binaries
 from crashhunt.base.binaries import describe_binary, own_libraries
-from crashhunt.base.programs import libraries_folder, library_path
+from crashhunt.base.programs import libraries_folder, library_path, neighbouring_modules
 from crashhunt.snapshots import program_warnings
 
 pytestmark = pytest.mark.skipif(
@@ -94,3 +95,45 @@ def test_programs_that_cannot_run_here_are_reported_in_one_line_each(program, tm
     file.write_bytes(data)
     (warning,) = program_warnings(snapshot, ["exec:./main"])
     assert re.fullmatch(r"the program \./main is for \w+, and this machine is \w+, so it cannot run", warning)
+
+
+LIBC = "/lib/x86_64-linux-gnu/libc.so.6"
+
+
+@pytest.mark.parametrize(
+    ("manager", "answers", "found"),
+    [
+        ("rpm", {LIBC: ["glibc 2.34-1"], "/opt/libtop.so": []}, {LIBC: "glibc 2.34-1"}),
+        (
+            "dpkg-query",
+            {
+                "--search": [f"libc6:i386, libc6:amd64: {LIBC}", "diversion by base from: /x", "other: /elsewhere"],
+                "--show": ["libc6:i386\t2.36-9", "no version"],
+            },
+            {LIBC: "libc6:i386 2.36-9"},
+        ),
+        ("none", {}, {}),
+    ],
+)
+def test_package_manager_names_the_packages_that_it_knows(monkeypatch, manager, answers, found):
+    monkeypatch.setattr(binaries.shutil, "which", lambda name: name if name == manager else None)
+    asked = {"rpm": -1, "dpkg-query": 1}.get(manager)
+    monkeypatch.setattr(binaries, "_lines", lambda *command: answers[command[asked]])
+    assert binaries._packages.__wrapped__((LIBC, "/opt/libtop.so")) == found
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "is_python"),
+    [
+        ("drive.py", "", True), ("drive", "#!/usr/bin/env python3", True), ("drive", "#!/bin/sh", False),
+        ("drive", "python", False), ("drive.sh", "#!/bin/sh", False),
+    ],
+)  # fmt: skip
+def test_modules_beside_a_program_are_its_own_if_it_is_in_python(tmp_path, name, line, is_python):
+    files = [name, "helper.py", "plan/__init__.py", "plan/deep/costs.py", "data/table.csv", "loose/no_package.py"]
+    for path in (tmp_path / file for file in files):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{line}\n")
+    modules = {file: tmp_path / file for file in ("helper.py", "plan/__init__.py", "plan/deep/costs.py")}
+    assert neighbouring_modules(tmp_path / name) == (modules if is_python else {})
+    assert neighbouring_modules(tmp_path / "missing") == {}

@@ -10,7 +10,15 @@ import pytest
 
 from crashhunt import __main__, cli
 from crashhunt.base import signals
-from crashhunt.base.signals import block_signals, blocked_signals, is_interrupt, stop_requests
+from crashhunt.base.signals import (
+    InterruptedCodeError,
+    block_signals,
+    blocked_signals,
+    ended_by_signals,
+    interrupted_after,
+    is_interrupt,
+    stop_requests,
+)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -56,6 +64,59 @@ def test_the_one_that_ignores_hang_ups_continues_ignoring_them_and_threads_are_l
     thread = threading.Thread(target=elsewhere)
     thread.start()
     thread.join()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_command_that_is_told_to_end_stops_at_once_and_ends_by_the_signal(monkeypatch, number):
+    ended, ran = [], []
+    before = signal.signal(number, signal.SIG_DFL)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "kill", lambda pid, sent: ended.append((pid, sent, signal.getsignal(number))))
+            with ended_by_signals():
+                signal.raise_signal(number)
+                ran.append("the rest")
+            assert ended.pop() == (os.getpid(), number, signal.SIG_DFL)
+            with ended_by_signals():
+                assert signal.getsignal(number) is not signal.SIG_DFL
+            assert signal.getsignal(number) is signal.SIG_DFL
+            signal.signal(number, signal.SIG_IGN)  # as of a command that nohup has started
+            with ended_by_signals():
+                signal.raise_signal(number)
+                ran.append("although ignored")
+    finally:
+        signal.signal(number, before)
+    assert (ended, ran) == ([], ["although ignored"])
+
+
+def test_code_that_takes_too_long_is_interrupted_even_where_it_catches_every_exception():
+    before, passed = signal.getsignal(signal.SIGALRM), []
+
+    def endless():
+        while True:
+            try:
+                signal.pause()
+            except Exception as error:
+                passed.append(error)
+
+    timer = signal.setitimer(signal.ITIMER_REAL, 500.0, 7.0)  # of code that has one of its own
+    try:
+        with pytest.raises(InterruptedCodeError), interrupted_after(0.01):
+            endless()
+        with interrupted_after(60.0):
+            assert signal.getitimer(signal.ITIMER_REAL)[1] == 1.0
+        assert (signal.getitimer(signal.ITIMER_REAL)[1], signal.getsignal(signal.SIGALRM)) == (7.0, before)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, *timer)
+
+    def elsewhere():
+        with interrupted_after(0.01):
+            passed.append("in a thread")
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    assert passed == ["in a thread"]
 
 
 def test_no_handler_runs_while_signals_are_blocked():

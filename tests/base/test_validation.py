@@ -153,6 +153,7 @@ class Car:
     spare: Wheel | None = None
     named: dict[str, Wheel] = field(default_factory=dict)
     others: tuple[Wheel, ...] = ()
+    doors: int | bool = 4
 
 
 RIGHT = {"size_m": 0.3}
@@ -169,8 +170,9 @@ THERE = "the keys here are size_m, name"
         ({"front": RIGHT, "spare": RIGHT | {"colour": 2}}, f"unknown key 'spare.colour'; {THERE}"),
         ({"front": RIGHT, "named": {"a": RIGHT, "b": RIGHT | {"colour": 2}}}, f"unknown key 'named.b.colour'; {THERE}"),
         ({"front": RIGHT, "others": [RIGHT, RIGHT | {"colour": 2}]}, f"unknown key 'others.1.colour'; {THERE}"),
-        ({"front": RIGHT, "colour": 2}, "unknown key 'colour'; the keys here are front, spare, named, others"),
+        ({"front": RIGHT, "colour": 2}, "unknown key 'colour'; the keys here are front, spare, named, others, doors"),
         ({"front": {"size_m": "wide"}}, "front.size_m = 'wide': input should be a valid number"),
+        ({"front": RIGHT, "doors": "9" * 5000}, f"doors = '{'9' * 5000}': unable to parse input string as an "),
     ],
 )  # fmt: skip
 def test_wrong_keys_are_named_with_those_of_their_table(data, says):
@@ -182,7 +184,7 @@ def test_wrong_keys_are_named_with_those_of_their_table(data, says):
     assert refusal().startswith(f"here: {says}")
     within = says.replace("key '", "key 'car.") if "key '" in says else f"car.{says}"
     assert refusal(under="car", keys=lambda: ["one", "two"]).startswith(
-        f"here: {within.replace('front, spare, named, others', 'one, two')}"
+        f"here: {within.replace('front, spare, named, others, doors', 'one, two')}"
     )
     assert (
         validate(Car, {"front": RIGHT, "named": {"a": RIGHT}}, where="", error=ScenarioError).named["a"].size_m == 0.3
