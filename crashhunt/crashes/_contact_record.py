@@ -534,6 +534,11 @@ class ContactRecord:
         """Return whether an actor was crossing the side of its lane at the contact, or had crossed it before."""
         return self.changed_s(actor) is not None
 
+    def is_over_side(self, actor: str) -> bool:
+        """Return whether an actor that drove straight on reached over the side of its lane at the contact."""
+        half_width = self.way(actor).width / 2
+        return self._drove_straight(actor) and self.lanes.is_over_side(self._at_contact(actor), half_width)
+
     def meets_sideways(self, actor: str) -> bool:
         """Return whether an actor moved towards the side of the other actor."""
         if self.touch.is_sideways:

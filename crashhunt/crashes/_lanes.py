@@ -206,6 +206,16 @@ class LaneMap:
             return self._is_in_parallel_lane(lane, edge, end.heading)
         return False
 
+    def is_over_side(self, pose: tuple[NDArray[np.float64], float], half_width: float) -> bool:
+        """Return whether an actor reaches over the side of the lane on which it drives.
+
+        Args:
+            pose: its centre, in m, and its heading, in rad.
+            half_width: half of its width, in m.
+        """
+        lane = self._driven(pose)
+        return lane is not None and abs(lane.place(pose[0]).aside_m) + half_width - lane.half_width >= _OVER_M
+
     def reached_since(self, scenes: Sequence[Scene], actor: str, pose: tuple[NDArray[np.float64], float]) -> int | None:
         """Return the index of the scene since which the outline of an actor has always reached into a lane.
 
