@@ -129,7 +129,7 @@ def test_package_manager_names_the_packages_that_it_knows(monkeypatch, manager, 
         ("drive", "python", False), ("drive.sh", "#!/bin/sh", False),
     ],
 )  # fmt: skip
-def test_modules_beside_a_program_are_its_own_if_it_is_in_python(tmp_path, name, line, is_python):
+def test_modules_next_to_a_python_program_are_its_own(tmp_path, name, line, is_python):
     files = [name, "helper.py", "plan/__init__.py", "plan/deep/costs.py", "data/table.csv", "loose/no_package.py"]
     for path in (tmp_path / file for file in files):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -67,7 +67,7 @@ def test_the_one_that_ignores_hang_ups_continues_ignoring_them_and_threads_are_l
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_command_that_is_told_to_end_stops_at_once_and_ends_by_the_signal(monkeypatch, number):
+def test_command_that_is_asked_to_end_stops_at_once_and_ends_by_the_signal(monkeypatch, number):
     ended, ran = [], []
     before = signal.signal(number, signal.SIG_DFL)
     try:
