@@ -198,7 +198,8 @@ def what_if(
         futures: whether to give the simulator's random generators another seed after the step, a different seed in each
             run.
         overrule: the manoeuvre that replaces the agent's actions after the step: ``brake``, ``left``, ``right``,
-            ``keep_lane``, ``keep_speed``, ``reference_speed``, ``reference_lanes`` or ``reference``.
+            ``keep_lane``, ``keep_speed``, ``reference_speed``, ``reference_lanes`` or ``reference``. If there are
+            several agents, ``ID=brake`` names the agent.
         leave_out: ids of actors to remove from the start.
         interventions: further interventions, from `crashhunt.analysis`.
         code: the code that drives: the code of the ``snapshot``, or the ``current`` code, which is the default with

@@ -256,7 +256,7 @@ def _agent_of(name: str, rerun: Rerun) -> str:
             raise UsageError(f"there is no agent {name!r}", fix=one_of(name, agents))
         return name
     if len(agents) > 1:
-        raise UsageError("the crash has several agents", fix=f"name one of {', '.join(agents)}")
+        raise UsageError("the crash has several agents", fix=f"name one of {', '.join(agents)}, as in {agents[0]}=…")
     return agents[0]
 
 
@@ -291,7 +291,7 @@ def interventions_of(
         agent: the agent that takes control, as ``module:Name`` or ``ID=module:Name``.
         arguments: arguments of the agent that takes control.
         futures: whether each run has other random numbers from the given step on.
-        overrule: name of a manoeuvre that replaces the agent's actions from the given step on.
+        overrule: name of a manoeuvre that replaces the agent's actions from the given step on, or ``ID=NAME``.
         leave_out: ids of actors that are excluded.
         code: the code that drives, if the user selects it.
         more: further interventions, which no option can express.
@@ -327,7 +327,7 @@ def interventions_of(
         found.append(SetArguments(changes=changes))
     if overrule:
         assert step is not None
-        found.append(Overrule(from_step=step, manoeuvre=overrule))  # type: ignore[arg-type]
+        found.append(_overrule_of(overrule, step))
     if leave_out:
         found.append(LeaveOut(actors=leave_out))
     if futures:
@@ -336,6 +336,14 @@ def interventions_of(
     if step is not None and not found:
         raise UsageError(f"{option} is given without a change", fix="also give --futures, --agent or --set")
     return found
+
+
+def _overrule_of(text: str, step: int) -> Overrule:
+    """Return the intervention of ``HOW`` or ``ID=HOW``."""
+    agent, _, how = text.rpartition("=")
+    if how not in get_args(Manoeuvre):
+        raise UsageError(f"--overrule {text!r} is no manoeuvre", fix=one_of(how, get_args(Manoeuvre)))
+    return Overrule(from_step=step, manoeuvre=how, agent=agent)  # type: ignore[arg-type]
 
 
 def _handover_to_same(bundle: Bundle, step: int, changes: Mapping[str, str], option: str) -> HandOver:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
 from crashhunt.cli._common import (
     DONE,
@@ -24,7 +24,6 @@ from crashhunt.cli._common import (
     run_trusted,
     shown_progress,
 )
-from crashhunt.trial import Manoeuvre
 
 if TYPE_CHECKING:
     import argparse
@@ -78,10 +77,10 @@ def add_whatif(commands: Commands) -> None:
         help="after step K, give the simulator's random generators a new seed, which is different in each run",
     )  # fmt: skip
     whatif.add_argument(
-        "--overrule", metavar="HOW", choices=get_args(Manoeuvre), default="",
+        "--overrule", metavar="HOW", default="",
         help="from step K on, override the agent: brake; left or right (change lanes, and brake); keep_lane; or "
         "keep_speed. Or let a reference driver correct unsafe speeds (reference_speed), unsafe lane changes "
-        "(reference_lanes) or both (reference)",
+        "(reference_lanes) or both (reference). If there are several agents, write ID=HOW",
     )  # fmt: skip
     whatif.add_argument(
         "--leave-out",

@@ -75,6 +75,10 @@ def test_time_outside_the_trial_is_refused_with_the_times_inside(seconds):
             [Overrule(from_step=4, manoeuvre="brake"), LeaveOut(actors=("x",)), Reseed(from_step=4)],
         ),
         (
+            {"overrule": "bus=keep_lane", "from_step": 4},
+            [Overrule(from_step=4, manoeuvre="keep_lane", agent="bus")],
+        ),
+        (
             {"more": (Reseed(from_step=9),), "changes": {"gap_m": "9"}},
             [Reseed(from_step=9), SetArguments(changes={"gap_m": "9"})],
         ),
@@ -91,6 +95,7 @@ def test_options_request_interventions(options, expected):
         ({"arguments": {"speed": "5"}}, "--arg speed has no effect without --agent", "give --agent"),
         ({"futures": True}, "--futures needs a step", "give --from-step K or --before"),
         ({"overrule": "brake"}, "--overrule brake needs a step", "give --from-step K or --before"),
+        ({"overrule": "bus=brakes", "from_step": 4}, "--overrule 'bus=brakes' is no manoeuvre", "give one of brake"),
         ({"agent": "a:B", "changes": {"speed": "5"}}, "--set and --agent contradict each other", "by --arg"),
         ({"agent": "=a:B"}, "is not of the form MODULE:NAME", "ID=MODULE:NAME"),
         ({"agent": "ego="}, "is not of the form MODULE:NAME", "ID=MODULE:NAME"),
