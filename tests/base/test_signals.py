@@ -14,9 +14,12 @@ from crashhunt.base.signals import (
     InterruptedCodeError,
     block_signals,
     blocked_signals,
+    describe_death,
     ended_by_signals,
     interrupted_after,
+    interruptible,
     is_interrupt,
+    is_sent_from_outside,
     stop_requests,
 )
 
@@ -117,6 +120,33 @@ def test_code_that_takes_too_long_is_interrupted_even_where_it_catches_every_exc
     thread.start()
     thread.join()
     assert passed == ["in a thread"]
+
+
+def test_ctrl_c_at_a_question_is_raised_and_later_ones_are_collected():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with stop_requests() as asked:
+            with pytest.raises(KeyboardInterrupt), interruptible():
+                signal.raise_signal(signal.SIGINT)
+            assert asked == []
+            signal.raise_signal(signal.SIGINT)
+            assert asked == [signal.SIGINT]
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(
+    ("exit_code", "words", "is_from_outside"),
+    [
+        (0, "exited with 0", False), (9, "exited with 9", False), (-9, "was killed by SIGKILL", True),
+        (-15, "was killed by SIGTERM", True), (-11, "was killed by SIGSEGV", False),
+        (-40, "was killed by signal 40", False),
+    ],
+)  # fmt: skip
+def test_death_of_a_process_has_the_name_of_its_signal(exit_code, words, is_from_outside):
+    assert describe_death(exit_code) == words
+    assert is_sent_from_outside(exit_code) is is_from_outside
 
 
 def test_no_handler_runs_while_signals_are_blocked():

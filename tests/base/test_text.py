@@ -23,6 +23,7 @@ from crashhunt.base.text import (
     in_lines,
     one_line,
     out_of,
+    unescape_letters,
     visible,
 )
 
@@ -146,6 +147,18 @@ def test_question_of_trust_has_one_line_for_who_made_an_archive(tmp_path, monkey
 def test_trials_are_a_share_of_the_planned_ones_only_where_they_are_fewer():
     assert [out_of(3, 8), out_of(8, 8), out_of(9, 8), out_of(0, 0), out_of(3, 0)] == ["3 of 8", "8 of 8", "9", "0", "3"]
     assert out_of(3, 8, "/") == "3/8"
+
+
+@pytest.mark.parametrize(
+    ("stack", "text"),
+    [
+        ("stra\\xdfe/\\u6f22.py", "straße/漢.py"), ("\\U0001f697", "🚗"), ("a\\x0ab \\x7f", "a\\x0ab \\x7f"),
+        ("\\x80", "\x80"), ("\\ud7ff\\ud800\\udfff\\ue000", "\ud7ff\\ud800\\udfff\ue000"),
+        ("\\U0010ffff\\U00110000", "\U0010ffff\\U00110000"), ("\\xd", "\\xd"),
+    ],
+)  # fmt: skip
+def test_letters_of_a_stack_are_shown_and_what_is_none_stays_escaped(stack, text):
+    assert unescape_letters(stack) == text
 
 
 def test_one_step_is_no_plural():
