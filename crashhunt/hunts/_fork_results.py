@@ -7,7 +7,6 @@ from the start confirms the crash, because the bundle of the run can be replayed
 from __future__ import annotations
 
 import math
-from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -17,7 +16,7 @@ from crashhunt.base.temporary import remove_at_once
 from crashhunt.crashes import list_near_misses
 from crashhunt.hunts._reports import BranchReport, ProbeReport, RareReport
 from crashhunt.hunts._verification import Found
-from crashhunt.results import BRANCHES, PROBES
+from crashhunt.results import BRANCHES, PROBES, sums_of_branches, sums_of_probes
 from crashhunt.statistics import crashed_copies, rare_watch
 from crashhunt.trial import Branches, Stress, in_turn
 
@@ -43,24 +42,15 @@ def verify_branches(copies: VerificationRuns) -> BranchReport | None:
         The report; None for a hunt without branches.
     """
     ledger = copies.again.ledger
-    if not copies.again.setup.settings.branch:
+    sums = sums_of_branches(ledger, ledger.facts())
+    if sums is None:
         return None
-    sums: Counter[str] = Counter()
     why_unanswered = ""
     found: list[tuple[int, Branch]] = []  # the likeliest of each trial only: a hunt may have a million trials
     for plain in ledger.plain_results():
         if not (data := plain.get("branches")):
             continue
         one = Branches.from_json(data)
-        sums.update(
-            trials=1,
-            moments=one.moments,
-            branches=one.asked,
-            steps=one.steps,
-            skipped=one.left_out,
-            crashed=len(one.crashes),
-            not_fully_asked=one.unanswered > 0,
-        )
         why_unanswered = why_unanswered or one.why_unanswered
         if one.crashes:
             found.append((plain["spec"]["number"], max(one.crashes, key=_log_likelihood)))
@@ -74,14 +64,7 @@ def verify_branches(copies: VerificationRuns) -> BranchReport | None:
     ]
     crashes, not_finished = copies.crashes(specs, layout.BRANCHES, "branches")
     return BranchReport(
-        trials=sums["trials"],
-        moments=sums["moments"],
-        branches=sums["branches"],
-        steps=sums["steps"],
-        skipped=sums["skipped"],
-        crashed=sums["crashed"],
-        crashed_trials=len(found),
-        not_fully_asked=sums["not_fully_asked"],
+        sums=sums,
         why_unanswered=why_unanswered,
         run_again=0 if copies.is_stopped else len(specs),
         not_finished=not_finished,
@@ -120,10 +103,10 @@ def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
         The report; None for a hunt without probes.
     """
     ledger = copies.again.ledger
-    if not copies.again.setup.settings.probe:
+    sums = sums_of_probes(ledger, ledger.facts())
+    if sums is None:
         return None
     margins: list[float] = []
-    sums: Counter[str] = Counter()
     why_unasked = ""
     found: list[tuple[float, int]] = []
     for plain in ledger.plain_results():
@@ -133,9 +116,7 @@ def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
         if stress.margin is not None:
             margins.append(stress.margin)
         else:
-            sums["not_fully_asked"] += 1
             why_unasked = why_unasked or stress.why_unasked
-        sums.update(probes=stress.probes, steps=stress.steps, skipped=stress.left_out)
         if stress.disturbance is not None:
             found.append((stress.least, plain["spec"]["number"]))
     kept = copies.kept.get(layout.PROBES, {})
@@ -148,12 +129,9 @@ def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
     crashes, not_finished = copies.crashes(specs, layout.PROBES, "probes")
     asked = {result.spec.number: result.stress for result in results}
     return ProbeReport(
+        sums=sums,
         margins=tuple(margins),
-        not_fully_asked=sums["not_fully_asked"],
         why_unasked=why_unasked,
-        probes=sums["probes"],
-        steps=sums["steps"],
-        skipped=sums["skipped"],
         run_again=0 if copies.is_stopped else len(specs),
         not_finished=not_finished,
         crashes=crashes,
@@ -311,7 +289,7 @@ def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport
             estimate, estimate=None, estimated=None, estimated_disturbed=None, why_not=why, why_not_disturbed=why,
             more_roots=None,
         )  # fmt: skip
-    return RareReport(estimate=estimate, verified=verified, not_finished=not_finished, crashes=crashes)
+    return RareReport(estimate=estimate, run_again=verified, not_finished=not_finished, crashes=crashes)
 
 
 def _crash_of_copy(result: TrialResult, copy: ForcedCopy) -> Found:

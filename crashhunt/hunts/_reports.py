@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, Group
     from crashhunt.ledger import KindData
     from crashhunt.plans import HuntSettings
-    from crashhunt.results import VersionCounts
+    from crashhunt.results import BranchSums, ProbeSums, VersionCounts
     from crashhunt.statistics import CrashRate, RareEstimate
     from crashhunt.trial import Disturbance
 
@@ -74,12 +74,10 @@ class ProbeReport:
     """The result of the robustness probes of a hunt.
 
     Args:
+        sums: counts of all trials.
         margins: the robustness margin of each trial whose probes all have a result.
-        not_fully_asked: number of further trials in which at least one probe has no result.
-        why_unasked: why a probe has no result in the first trial of ``not_fully_asked``; empty without such a trial.
-        probes: number of forks that were run.
-        steps: number of simulated steps of the forks.
-        skipped: number of probes that were skipped because the forks had used up their steps.
+        why_unasked: why a probe has no result in the first trial in which not all probes have one; empty without such a
+            trial.
         run_again: number of crashes with the mildest disturbance that were run from the start.
         not_finished: number of runs from the start that did not reach their end, for example because they were killed.
         crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
@@ -87,12 +85,9 @@ class ProbeReport:
             have drawn further disturbances.
     """
 
+    sums: ProbeSums
     margins: tuple[float, ...]
-    not_fully_asked: int
     why_unasked: str
-    probes: int
-    steps: int
-    skipped: int
     run_again: int
     not_finished: int
     crashes: tuple[Bundle, ...]
@@ -100,18 +95,16 @@ class ProbeReport:
 
     def to_json(self) -> JsonObject:
         """Return the result in the form that ``run --json`` prints."""
+        sums = self.sums
         return {
-            "trials": len(self.margins),
-            "not_fully_asked": self.not_fully_asked,
-            "least": min(self.margins, default=None),
+            "trials": sums["trials"],
+            "not_fully_asked": sums["not_fully_asked"],
+            "least": sums["least"],
             "median": statistics.median(self.margins) if self.margins else None,
-            "probes": self.probes,
-            "steps": self.steps,
-            "left_out": self.skipped,
-            "run_again": self.run_again,
-            "not_finished": self.not_finished,
-            "confirmed": len(self.crashes),
-            "crashes": [bundle.summary() for bundle in self.crashes],
+            "probes": sums["probes"],
+            "steps": sums["steps"],
+            "left_out": sums["left_out"],
+            **_verified(self),
         }
 
 
@@ -120,29 +113,15 @@ class BranchReport:
     """The result of the branches of a hunt.
 
     Args:
-        trials: number of trials in which branches were possible.
-        moments: number of steps after which forks continued.
-        branches: number of forks.
-        steps: number of simulated steps of the forks.
-        skipped: number of branches that were skipped because the forks had used up their steps.
-        crashed: number of branches that crashed.
-        crashed_trials: number of trials with a branch that crashed.
-        not_fully_asked: number of trials in which a branch has no result.
-        why_unanswered: why a branch has no result in the first trial of ``not_fully_asked``; empty if there is no such
-            trial.
+        sums: counts of all trials.
+        why_unanswered: why a branch has no result in the first trial in which not all branches have one; empty without
+            such a trial.
         run_again: number of crashed branches that were run from the start: the likeliest branch of each trial.
         not_finished: number of runs from the start that did not reach their end, for example because they were killed.
         crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
     """
 
-    trials: int
-    moments: int
-    branches: int
-    steps: int
-    skipped: int
-    crashed: int
-    crashed_trials: int
-    not_fully_asked: int
+    sums: BranchSums
     why_unanswered: str
     run_again: int
     not_finished: int
@@ -150,20 +129,8 @@ class BranchReport:
 
     def to_json(self) -> JsonObject:
         """Return the result in the form that ``run --json`` prints."""
-        return {
-            "trials": self.trials,
-            "moments": self.moments,
-            "branches": self.branches,
-            "steps": self.steps,
-            "left_out": self.skipped,
-            "crashed": self.crashed,
-            "crashed_trials": self.crashed_trials,
-            "not_fully_asked": self.not_fully_asked,
-            "run_again": self.run_again,
-            "not_finished": self.not_finished,
-            "confirmed": len(self.crashes),
-            "crashes": [bundle.summary() for bundle in self.crashes],
-        }
+        verified = _verified(self)
+        return {**{name: count for name, count in self.sums.items() if name not in verified}, **verified}
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,26 +139,20 @@ class RareReport:
 
     Args:
         estimate: estimate of the crash probability per trial.
-        verified: number of crashes found by forks that were run again from the start. The crashes with the greatest
+        run_again: number of crashes found by forks that were run again from the start. The crashes with the greatest
             weights are chosen.
-        not_finished: number of runs from the start, requested for ``verified``, that did not finish.
+        not_finished: number of runs from the start, requested for ``run_again``, that did not finish.
         crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
     """
 
     estimate: RareEstimate
-    verified: int
+    run_again: int
     not_finished: int
     crashes: tuple[Bundle, ...]
 
     def to_json(self) -> JsonObject:
         """Return the result in the form that ``run --json`` prints."""
-        return {
-            **self.estimate.to_json(),
-            "run_again": self.verified,
-            "not_finished": self.not_finished,
-            "confirmed": len(self.crashes),
-            "crashes": [bundle.summary() for bundle in self.crashes],
-        }
+        return {**self.estimate.to_json(), **_verified(self)}
 
     @property
     def lines(self) -> list[str]:
@@ -228,8 +189,8 @@ class RareReport:
             lines.append(
                 f"  {spent}; plain trials alone need about {format_number(found.plain_equivalent_steps)} steps"
             )
-        if self.verified:
-            lines.append(f"  of the {self.verified} weightiest crashes, {len(self.crashes)} came again from the start")
+        if self.run_again:
+            lines.append(f"  of the {self.run_again} weightiest crashes, {len(self.crashes)} came again from the start")
         lines += self._certain_lines
         lines.append("  the estimate omits failures that no copy has met; the certain bounds include them")
         return lines
@@ -243,6 +204,16 @@ class RareReport:
         crashed = f"{found.plain_crashes} of {found.plain} plain trials crashed"
         bounds = f"at least {format_number(low)}, at most {format_number(high)}"
         return [f"  certain: {bounds} ({format_percent(found.confidence)}; {crashed})"]
+
+
+def _verified(report: ProbeReport | BranchReport | RareReport) -> JsonObject:
+    """Return the runs of crashes of forks from the start, in the form that ``run --json`` prints."""
+    return {
+        "run_again": report.run_again,
+        "not_finished": report.not_finished,
+        "confirmed": len(report.crashes),
+        "crashes": [bundle.summary() for bundle in report.crashes],
+    }
 
 
 def _between(low: float, high: float) -> str:

@@ -644,10 +644,10 @@ def describe_types_by_version(versions: Mapping[str, Mapping[str, Mapping[int, i
 def describe_probes(report: HuntReport) -> list[str]:
     """Return as text the robustness margins of trials, and the crashes of forks that reproduce from the start."""
     found = report.probes
-    if found is None or not (found.margins or found.not_fully_asked):
+    if found is None or not (found.margins or found.sums["not_fully_asked"]):
         return []
-    steps = f"{found.steps} steps, in addition to {report.trial_steps} steps of trials"
-    enough = _skipped(found.skipped)
+    steps = f"{found.sums['steps']} steps, in addition to {report.trial_steps} steps of trials"
+    enough = _skipped(found.sums["left_out"])
     lines = ["Robustness margin: no trial was fully probed."]
     if found.margins:
         safe = sum(margin == 1.0 for margin in found.margins)
@@ -655,8 +655,8 @@ def describe_probes(report: HuntReport) -> list[str]:
         said = f"{safe} of them crashed under no plausible disturbance"
         many = count_of(len(found.margins), "trial")
         lines = [f"Robustness margin of {many}: least {least:.2f}, median {median:.2f}; {said}."]
-    lines += _not_fully_asked(found.not_fully_asked, found.why_unasked)
-    lines.append(f"  {count_of(found.probes, 'probe')} took {steps}{enough}")
+    lines += _not_fully_asked(found.sums["not_fully_asked"], found.why_unasked)
+    lines.append(f"  {count_of(found.sums['probes'], 'probe')} took {steps}{enough}")
     if found.run_again:
         lines.append(
             f"  crashes by the mildest disturbance that reproduce from the start: {len(found.crashes)} of "
@@ -670,15 +670,16 @@ def describe_probes(report: HuntReport) -> list[str]:
 def describe_branches(report: HuntReport) -> list[str]:
     """Return as text the results of branches, and which of their crashes reproduce from the start."""
     found = report.branches
-    if found is None or not found.trials:
+    if found is None or not found.sums["trials"]:
         return []
-    enough = _skipped(found.skipped)
-    moments = f"{count_of(found.moments, 'moment')} of {count_of(found.trials, 'trial')}"
-    crashed = f"{found.crashed} crashed, of {count_of(found.crashed_trials, 'trial')}"
+    sums = found.sums
+    enough = _skipped(sums["left_out"])
+    moments = f"{count_of(sums['moments'], 'moment')} of {count_of(sums['trials'], 'trial')}"
+    crashed = f"{sums['crashed']} crashed, of {count_of(sums['crashed_trials'], 'trial')}"
     lines = [
-        f"Branches: {found.branches} forks with other disturbances, from {moments}; {crashed}.",
-        f"  they took {found.steps} steps, in addition to {report.trial_steps} steps of trials{enough}",
-        *_not_fully_asked(found.not_fully_asked, found.why_unanswered),
+        f"Branches: {sums['branches']} forks with other disturbances, from {moments}; {crashed}.",
+        f"  they took {sums['steps']} steps, in addition to {report.trial_steps} steps of trials{enough}",
+        *_not_fully_asked(sums["not_fully_asked"], found.why_unanswered),
     ]
     if found.run_again:
         unfinished = _not_finished(found.not_finished)

@@ -233,6 +233,18 @@ class Rows:
     def note(self, **facts):
         self.noted.append(facts)
 
+    def facts(self):
+        return {}
+
+
+@pytest.fixture(autouse=True)
+def sums(monkeypatch):
+    """The sums that ledgers have of all trials; None for a hunt without copies."""
+    found = SimpleNamespace(probes="sums of probes", branches="sums of branches")
+    monkeypatch.setattr(_fork_results, "sums_of_probes", lambda ledger, facts: found.probes)
+    monkeypatch.setattr(_fork_results, "sums_of_branches", lambda ledger, facts: found.branches)
+    return found
+
 
 def at(step, strength=4.0):
     return Disturbance(step, "ahead", "brake", strength, 2.0, "ego")
@@ -247,11 +259,11 @@ def branched(number, *likelihoods, **more):
     return trial(number, branches=Branches(crashes=found, **more))
 
 
-def test_branches_are_summed_and_the_likeliest_of_each_trial_runs_from_the_start():
+def test_branches_are_summed_and_the_likeliest_of_each_trial_runs_from_the_start(sums):
     ledger = Rows(
-        branched(0, moments=1, asked=2, steps=3, left_out=4),
-        branched(1, -9.0, -2.0, moments=10, asked=20, steps=30, left_out=40),
-        branched(2, None, moments=100, asked=200, steps=300, left_out=400, unanswered=1, why_unanswered="killed"),
+        branched(0),
+        branched(1, -9.0, -2.0),
+        branched(2, None, unanswered=1, why_unanswered="killed"),
         branched(3, -1.0, unanswered=2, why_unanswered="another reason"),
         trial(4),
     )
@@ -260,14 +272,13 @@ def test_branches_are_summed_and_the_likeliest_of_each_trial_runs_from_the_start
     assert copies.asked == [([3, 1, 2], "branches", "branches")]
     assert [one.spec.disturbances for one in copies.found] == [(at(2, 1.0),), (at(2, 2.0),), (at(2, 1.0),)]
     assert {(one.outcome, one.step, one.spec.origin) for one in copies.found} == {("collision", 5, "branch")}
-    assert (report.trials, report.moments, report.branches) == (4, 111, 222)
-    assert (report.steps, report.skipped, report.crashed, report.crashed_trials) == (333, 444, 4, 3)
-    assert (report.not_fully_asked, report.why_unanswered) == (2, "killed")
+    assert (report.sums, report.why_unanswered) == ("sums of branches", "killed")
     assert (report.run_again, report.not_finished) == (3, 1)
     assert [bundle.result.spec.number for bundle in report.crashes] == [3, 2]
-    assert verify_branches(Ends(ledger, branch=False)) is None
     stopped = verify_branches(Ends(ledger, branch=True, stopped=True))
-    assert (stopped.run_again, stopped.crashes, stopped.crashed) == (0, (), 4)
+    assert (stopped.run_again, stopped.crashes) == (0, ())
+    sums.branches = None
+    assert verify_branches(Ends(ledger, branch=False)) is None
 
 
 def test_ten_likeliest_branches_run_and_those_that_are_kept_come_first():
@@ -288,11 +299,11 @@ def probed(number, margin, least=None, **more):
     return trial(number, stress=Stress(margin, **planned, **more))
 
 
-def test_probes_are_summed_and_the_mildest_run_from_the_start():
+def test_probes_are_summed_and_the_mildest_run_from_the_start(sums):
     ledger = Rows(
-        probed(0, 1.0, probes=1, steps=2, left_out=3),
-        probed(1, 0.5, 0.5, probes=10, steps=20, left_out=30),
-        probed(2, None, probes=100, steps=200, left_out=300, why_unasked="killed"),
+        probed(0, 1.0),
+        probed(1, 0.5, 0.5),
+        probed(2, None, why_unasked="killed"),
         probed(3, 0.25, 0.25),
         probed(4, None, why_unasked="another reason"),
         probed(5, 0.75, 0.75),
@@ -305,16 +316,16 @@ def test_probes_are_summed_and_the_mildest_run_from_the_start():
     assert {(one.outcome, one.step, one.spec.origin) for one in copies.found} == {("collision", 6, "probe")}
     assert {one.spec.disturbances for one in copies.found} == {(at(4),)}
     assert report.margins == (1.0, 0.5, 0.25, 0.75, 0.875)
-    assert (report.not_fully_asked, report.why_unasked) == (2, "killed")
-    assert (report.probes, report.steps, report.skipped) == (111, 222, 333)
+    assert (report.sums, report.why_unasked) == ("sums of probes", "killed")
     assert (report.run_again, report.not_finished) == (3, 2)
     assert [bundle.result.spec.number for bundle in report.crashes] == [3, 5]
     assert report.by == (at(4), at(4))
-    assert verify_probes(Ends(ledger, probe="")) is None
     assert verify_probes(Ends(ledger, probe="4s", stopped=True)).run_again == 0
     kept = Ends(ledger, probe="4s", kept={"probes": {6: "bundle"}})
     verify_probes(kept)
     assert kept.asked[0][0] == [6, 3, 1]
+    sums.probes = None
+    assert verify_probes(Ends(ledger, probe="")) is None
 
 
 def test_disturbance_of_a_probe_has_its_actual_values():
@@ -343,7 +354,9 @@ def test_disturbance_of_a_probe_has_its_actual_values():
         ({"probe": "", "branch": False}, None),
     ],
 )
-def test_confirmed_crashes_of_forks_are_noted(settings, confirmed):
+def test_confirmed_crashes_of_forks_are_noted(sums, settings, confirmed):
+    sums.probes = settings["probe"] or None
+    sums.branches = settings["branch"] or None
     ledger = Rows(branched(1, -2.0), probed(2, 0.5, 0.5), probed(3, 0.75, 0.75))
     copies = Ends(ledger, unfinished=1, fails=(3,), **settings)
     probes, branches = verify_fork_results(copies)
@@ -392,7 +405,7 @@ def test_weightiest_copies_of_rare_mode_run_from_the_start(weighty):
         ((at(2, 2.0),), "collision", 7), ((at(2, 1.5),), "collision", 7),
     ]  # fmt: skip
     assert {(one.spec.forcing, one.spec.origin) for one in copies.found} == {(None, "rare")}
-    assert (report.verified, report.not_finished, len(report.crashes)) == (2, 0, 2)
+    assert (report.run_again, report.not_finished, len(report.crashes)) == (2, 0, 2)
     assert report.estimate.estimate == 0.1
     assert verify_rare(Ends(Rows(), rare=False)) is None
 
@@ -419,7 +432,7 @@ def test_estimate_of_rare_mode_is_withheld_where_runs_contradict_it(weighty, opt
         found.more_roots is None,
     ]
     assert empty == [bool(why)] * 4
-    assert report.verified == (0 if options.get("stopped") else 2)
+    assert report.run_again == (0 if options.get("stopped") else 2)
 
 
 @pytest.fixture

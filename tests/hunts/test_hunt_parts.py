@@ -878,25 +878,24 @@ def test_columns_of_a_table_have_the_kinds_of_their_arguments():
 
 def test_report_of_copies_has_each_count_under_its_name(tmp_path):
     crash = SimpleNamespace(summary=lambda: "crash")
-    branches = BranchReport(
-        trials=1, moments=2, branches=3, steps=4, skipped=5, crashed=6, crashed_trials=7, not_fully_asked=8,
-        why_unanswered="killed", run_again=9, not_finished=10, crashes=(crash, crash),
-    )  # fmt: skip
+    counted = {"trials": 1, "moments": 2, "branches": 3, "steps": 4, "left_out": 5, "crashed": 6, "crashed_trials": 7,
+               "not_fully_asked": 8}  # fmt: skip
+    earlier = {"run_again": None, "confirmed": None}
+    branches = BranchReport({**counted, **earlier}, "killed", run_again=9, not_finished=10, crashes=(crash, crash))
     assert branches.to_json() == {
-        "trials": 1, "moments": 2, "branches": 3, "steps": 4, "left_out": 5, "crashed": 6, "crashed_trials": 7,
-        "not_fully_asked": 8, "run_again": 9, "not_finished": 10, "confirmed": 2, "crashes": ["crash", "crash"],
+        **counted, "run_again": 9, "not_finished": 10, "confirmed": 2, "crashes": ["crash", "crash"]
     }  # fmt: skip
+    assert list(branches.to_json())[-4:] == ["run_again", "not_finished", "confirmed", "crashes"]
+    sums = {"trials": 3, "not_fully_asked": 1, "least": 0.25, "probes": 2, "steps": 3, "left_out": 4}
     probes = ProbeReport(
-        margins=(0.5, 0.25, 1.0), not_fully_asked=1, why_unasked="killed", probes=2, steps=3, skipped=4, run_again=5,
-        not_finished=6, crashes=(crash,), by=(),
+        {**sums, **earlier, "trial": 8, "crashed_trials": 9}, margins=(0.5, 0.25, 1.0), why_unasked="killed",
+        run_again=5, not_finished=6, crashes=(crash,), by=(),
     )  # fmt: skip
     assert probes.to_json() == {
-        "trials": 3, "not_fully_asked": 1, "least": 0.25, "median": 0.5, "probes": 2, "steps": 3, "left_out": 4,
-        "run_again": 5, "not_finished": 6, "confirmed": 1, "crashes": ["crash"],
+        **sums, "median": 0.5, "run_again": 5, "not_finished": 6, "confirmed": 1, "crashes": ["crash"]
     }  # fmt: skip
-    none = replace(probes, margins=()).to_json()
-    assert (none["trials"], none["least"], none["median"]) == (0, None, None)
-    rare = RareReport(SimpleNamespace(to_json=lambda: {"estimate": 0.1}), verified=3, not_finished=1, crashes=(crash,))
+    assert replace(probes, margins=()).to_json()["median"] is None
+    rare = RareReport(SimpleNamespace(to_json=lambda: {"estimate": 0.1}), run_again=3, not_finished=1, crashes=(crash,))
     assert rare.to_json() == {
         "estimate": 0.1, "run_again": 3, "not_finished": 1, "confirmed": 1, "crashes": ["crash"],
     }  # fmt: skip
