@@ -10,6 +10,8 @@ from hypothesis import assume, given, strategies as st
 from scenes import scene
 
 from crashhunt.analysis import _driver_runs
+from crashhunt.crashes import DriverRun
+from crashhunt.trial import Outcome
 
 angles = st.floats(-math.pi, math.pi)
 FOLLOWS = {"is_disputed": False, "same_way": True, "follower": "ego", "changers": ()}
@@ -71,3 +73,57 @@ def test_vehicle_is_outside_the_path_beyond_half_of_both_widths_on_any_circle(an
 
     assert was(8) is (abs(aside) * math.cos(arc / 2) > 2.0)
     assert not was(10)  # more than 10 s ago
+
+
+def seen(gap_m, closing_mps, **more):
+    """What a run reports of a model that perceived a risk after step 7."""
+    end = {"last_gap_m": gap_m, "last_closing_mps": closing_mps, "least_gap_m": 1.5}
+    return {"first": 7, "gap_m": 20.0, "speed_mps": 12.0, "actor_speed_mps": 8.0, **end, **more}
+
+
+@pytest.mark.parametrize(
+    ("ending", "outcome", "report", "prevented", "why_not"),
+    [
+        ("avoided", Outcome.SURVIVED, seen(9.0, 9.0), True, ""),
+        ("avoided", Outcome.SURVIVED, seen(9.0, 9.0, in_junction=True), None, "the paths of both vehicles meet in a"),
+        ("avoided", Outcome.SURVIVED, {}, None, "the model perceived no risk"),
+        ("hit", Outcome.COLLISION, seen(0.0, 9.0), False, ""),
+        ("unclear", Outcome.SURVIVED, seen(8.0, 4.0), True, ""),  # 1 m/s² suffices: 4² / (2 * 8)
+        ("unclear", Outcome.FINISHED, seen(8.0, -9.0), True, ""),  # it falls back
+        ("unclear", Outcome.SURVIVED, seen(7.9, 4.0), None, "the run ends before the outcome is clear"),
+        ("unclear", Outcome.SURVIVED, seen(0.0, 0.0), None, "the run ends before the outcome is clear"),
+        ("unclear", Outcome.OFF_ROAD, seen(8.0, 0.0), None, "the run ends before the outcome is clear"),
+        ("other", Outcome.COLLISION, seen(8.0, 0.0), None, "another crash follows"),
+        ("diverged", Outcome.SURVIVED, seen(8.0, 0.0), None, "the trial was not bit-identical"),
+        ("impossible", Outcome.SURVIVED, seen(8.0, 0.0), None, "the vehicle stops harder than any vehicle can"),
+    ],
+)
+def test_model_prevents_a_collision_only_if_the_end_of_its_run_shows_it(
+    monkeypatch, ending, outcome, report, prevented, why_not
+):
+    rerun = SimpleNamespace(bundle=SimpleNamespace(result="crash"), recorded="as recorded")
+    result = SimpleNamespace(outcome=outcome, failure=None)
+    known = {("crash", "as recorded", 3, id(result), "run"): ending}
+    monkeypatch.setattr(_driver_runs, "ending_of", lambda was, of, since, now, run: known[was, of, since, id(now), run])
+    found = _driver_runs._answer(rerun, "fsm", 3, SimpleNamespace(result=result, recording="run", responses=(report,)))
+    facts = {"perceived_step": 7, "gap_m": 20.0, "speed_mps": 12.0, "other_speed_mps": 8.0} if report else {}
+    assert found.why_not.startswith(why_not)
+    assert bool(found.why_not) is bool(why_not)
+    assert found == DriverRun(
+        model="fsm", prevented=prevented, why_not=found.why_not, margin_m=1.5 if prevented else None, **facts
+    )
+
+
+@pytest.mark.parametrize(
+    ("outcome", "failure", "recording", "responses", "why_not"),
+    [
+        (Outcome.INVALID, SimpleNamespace(message="no model"), "run", ({},), "no model"),
+        (Outcome.INVALID, None, "run", ({},), "the trial cannot run"),
+        (Outcome.SURVIVED, None, None, ({},), "the run reported nothing"),
+        (Outcome.SURVIVED, None, "run", None, "the run reported nothing"),
+    ],
+)
+def test_run_without_a_report_is_no_answer(outcome, failure, recording, responses, why_not):
+    result = SimpleNamespace(outcome=outcome, failure=failure)
+    ended = SimpleNamespace(result=result, recording=recording, responses=responses)
+    assert _driver_runs._answer(None, "fsm", 3, ended) == DriverRun(model="fsm", why_not=why_not)
