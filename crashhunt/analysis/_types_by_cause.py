@@ -65,7 +65,7 @@ def find_cause(
         reference = find_omission(rerun, most=_REFERENCE_RUNS, parallel=parallel, stopped=stopped, tell=lambda: None)
         found = replace(found, reference=reference)
     if found.why is None and (found.reference is None or found.reference.omission is None):
-        new = judge(bundle, options, runs=1, why=_WHY_RUNS, parallel=parallel, stopped=stopped)
+        new = judge(bundle, options, runs=1, why=_WHY_RUNS, drivers=False, parallel=parallel, stopped=stopped)
         found = replace(found, why=new.why)
     return cause_of(bundle, found), with_judgement(bundle, found)
 

@@ -83,7 +83,7 @@ def test_only_missing_runs_are_made_and_factors_are_removed_only_without_an_omis
         return Reference(omission=omission)
 
     def judge(bundle, options, **words):
-        assert (bundle, options, words["runs"]) == (crash, None, 1)
+        assert (bundle, options, words["runs"], words["drivers"]) == (crash, None, 1, False)
         made.append("why")
         return Judgement(why="found")
 
