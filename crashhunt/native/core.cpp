@@ -948,7 +948,7 @@ struct Part {
         for (Py_ssize_t row = 0; row < PyList_GET_SIZE(whose); row++) {
             numbers.push_back(PyLong_AsLongLong(PyList_GET_ITEM(whose, row)));
         }
-        if (PyErr_Occurred() || !actors || widths.size() != actors || numbers.size() != actors || own < -1 ||
+        if (PyErr_Occurred() || widths.size() != actors || numbers.size() != actors || own < -1 ||
             (own >= 0 && static_cast<size_t>(own) >= actors)) {
             return false;
         }
@@ -958,7 +958,7 @@ struct Part {
         }
         held = true;
         const size_t length = static_cast<size_t>(buffer.len);
-        scenes = length / (32 * actors);
+        scenes = buffer.ndim == 2 ? static_cast<size_t>(buffer.shape[0]) : 0; // also where nobody is in them
         return buffer.itemsize == 8 && buffer.format && strchr(buffer.format, 'd') && length == scenes * 32 * actors &&
                known();
     }

@@ -186,12 +186,12 @@ def test_the_one_that_is_near_enough_leaves_out_those_further_away():
 def test_scenes_without_the_agent_count_and_others_keep_their_numbers():
     frame = np.array([[0.0, 0.0, 9.0, 0.0, 0.0, 0.0, 5.0, 5.0]] * 2)
     part = (frame, 1, [5.0] * 2, [2.0] * 2, [7, 4])
-    absent = (frame, -1, *part[2:])
-    _, places = core.may_be_near([absent, part], 50.0, 10.0, math.inf, math.inf, 0.0, False)
-    assert np.frombuffer(places, np.int64).reshape(2, -1).tolist() == [[2, 2, 3, 3], [0, 0, 2, 2]]
-    (_, steps), (_, others) = core.tracks([absent, part], 1, 20.0, 0.0, 0.0, 0.0)
-    assert np.frombuffer(steps, np.int64).tolist() == [2, 3]
-    assert np.frombuffer(others, np.int64).reshape(2, -1).tolist() == [[0, 1], [7, 7]]
+    for absent in ((frame, -1, *part[2:]), (np.zeros((2, 0)), -1, [], [], [])):
+        _, places = core.may_be_near([absent, part, absent], 50.0, 10.0, math.inf, math.inf, 0.0, False)
+        assert np.frombuffer(places, np.int64).reshape(2, -1).tolist() == [[2, 2, 3, 3], [0, 0, 2, 2]]
+        (_, steps), (_, others) = core.tracks([absent, part, absent], 1, 20.0, 0.0, 0.0, 0.0)
+        assert np.frombuffer(steps, np.int64).tolist() == [2, 3]
+        assert np.frombuffer(others, np.int64).reshape(2, -1).tolist() == [[0, 1], [7, 7]]
 
 
 def test_a_part_that_is_not_whole_is_left_to_python():
