@@ -352,23 +352,25 @@ def _needed_braking(way: _Way, track: Track, others: Others, ahead: Array) -> tu
     deep = 2 * (track.half_length[others.sample] + others.half_length * turn + others.half_width * np.sqrt(1 - turn**2))
     at = others.sample[order]
     block[at], depth[at], who[at] = (way.along[others.sample] + ahead)[order], deep[order], others.who[order]
-    needed, blocker, met = np.zeros(count), np.full(count, -1), np.zeros(count, bool)
     spacing = float(np.diff(track.time).min()) if count > 1 else _BLIND_S
-    for later in range(1, min(count, int(_BLIND_S / spacing) + 1)):
-        here, there = slice(0, count - later), slice(later, count)
-        seconds = track.time[there] - track.time[here]
-        gone = way.speed[here] * seconds
-        room = block[there] - way.along[here]
-        met[here] |= (gone >= room) & (gone <= room + depth[there])
-        short = met[here] & (gone > room)
-        safe = np.maximum(room, 1e-3)
-        brake = 2 * (gone - safe) / seconds**2
-        # An actor that stands before then must stop within the room.
-        brake = np.where(brake * seconds > way.speed[here], way.speed[here] ** 2 / (2 * safe), brake)
-        brake = np.where(short & np.isfinite(room), np.minimum(brake, _MAX_BRAKING_MPS2), 0.0)
-        more = brake > needed[here]
-        needed[here], blocker[here] = np.where(more, brake, needed[here]), np.where(more, who[there], blocker[here])
-    return needed, blocker
+    later = np.arange(1, min(count, int(_BLIND_S / spacing) + 1))[:, None]
+    if not len(later):
+        return np.zeros(count), np.full(count, -1)
+    # Rows are the later samples, columns the samples from which the agent would have to brake.
+    there = np.arange(count) + later
+    known = there < count
+    np.minimum(there, count - 1, out=there)
+    seconds = np.where(known, track.time[there] - track.time, 1.0)
+    gone, room = way.speed * seconds, block[there] - way.along
+    met = np.logical_or.accumulate(known & (gone >= room) & (gone <= room + depth[there]), axis=0)
+    safe = np.maximum(room, 1e-3)
+    brake = 2 * (gone - safe) / seconds**2
+    # An actor that stands before then must stop within the room.
+    brake = np.where(brake * seconds > way.speed, way.speed**2 / (2 * safe), brake)
+    short = known & met & (gone > room) & np.isfinite(room) & (brake > 0.0)
+    brake = np.where(short, np.minimum(brake, _MAX_BRAKING_MPS2), 0.0)
+    needed: Array = brake.max(axis=0)
+    return needed, np.where(needed > 0.0, who[there[brake.argmax(axis=0), np.arange(count)]], -1)
 
 
 # Rear criticality: how critical actors were that closed in on an agent from behind, which the agent cannot prevent.
