@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 14
+_INTERFACE = 15
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -383,12 +383,13 @@ class Core(Protocol):
         """Return an observation of an agent with this number of values."""
 
     def LaneBlock(  # noqa: N802 - a class
-        self, paths: Sequence[tuple[object, int, int] | None], middle_x: float, middle_y: float, window: int, /,
+        self, paths: Sequence[tuple[object, object, int, int] | None], middle_x: float, middle_y: float, window: int, /,
     ) -> _LaneBlock:  # fmt: skip
         """Return candidates of lanes.
 
         Args:
-            paths: The rows of each path, and the first and the last row that can be the nearest; None without a lane.
+            paths: The rows of each path, its places, and the first and the last row that can be the nearest; None
+                without a lane.
             middle_x: x of the middle of the square, in m.
             middle_y: y of the middle of the square, in m.
             window: Number of rows among which the nearest row is, wherever in the square the vehicle is.

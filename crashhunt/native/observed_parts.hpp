@@ -36,8 +36,8 @@ struct Held {
 // The candidates of the lanes around a vehicle, as _Block of sumo/_road_readers.py, with the rows where they are.
 struct CandidateLane {
     Held rows; // of a LanePath; not held where there is no lane
-    int64_t count = 0, begin = 0, last = 0;
-    std::vector<double> x, y, squared; // of the points among which the nearest is
+    int64_t count = 0, begin = 0;
+    std::vector<double> points; // all x, all y, all squared distances of the points among which the nearest is
 };
 struct Lanes {
     std::deque<CandidateLane> lanes;
@@ -50,40 +50,43 @@ PyTypeObject *lane_block_type = nullptr;
 const size_t LANE_COLUMNS = 6; // of a row of a LanePath, which has one more
 
 // The points among which the nearest one is while the vehicle is in the square; as _block_of.
-bool set_window(CandidateLane &lane, PyObject *rows, int64_t start, int64_t last, const Lanes &lanes, int64_t window) {
-    if (!lane.rows.hold(rows)) {
+bool set_window(CandidateLane &lane, PyObject *rows, PyObject *places, int64_t start, int64_t last, const Lanes &lanes,
+                int64_t window) {
+    Held points;
+    if (!lane.rows.hold(rows) || !points.hold(places)) {
         return false;
     }
     lane.count = static_cast<int64_t>(lane.rows.length(0));
-    if (lane.rows.length(1) != LANE_COLUMNS + 1 || start < 0 || last < start || last >= lane.count || window < 1) {
+    if (lane.rows.length(1) != LANE_COLUMNS + 1 || points.length(0) != 2 || points.length(1) != lane.rows.length(0) ||
+        start < 0 || last < start || last >= lane.count || window < 1) {
         PyErr_SetString(PyExc_ValueError, "these are not the points of a lane");
         return false;
     }
-    const double *numbers = lane.rows.numbers();
-    const auto x = [&](int64_t row) { return numbers[static_cast<size_t>(row) * (LANE_COLUMNS + 1) + 1]; };
-    const auto y = [&](int64_t row) { return numbers[static_cast<size_t>(row) * (LANE_COLUMNS + 1) + 2]; };
+    const double *x = points.numbers(), *y = x + lane.count;
     int64_t nearest = start;
     double least = HUGE_VAL;
     for (int64_t row = start; row <= last; row++) {
-        const double dx = x(row) - lanes.middle_x, dy = y(row) - lanes.middle_y, squared = dx * dx + dy * dy;
+        const double dx = x[row] - lanes.middle_x, dy = y[row] - lanes.middle_y, squared = dx * dx + dy * dy;
         if (squared < least) {
             least = squared;
             nearest = row;
         }
     }
     lane.begin = std::max(start, std::min(nearest - window / 2, last + 1 - window));
-    lane.last = last;
-    for (int64_t row = lane.begin; row <= std::min(lane.begin + window - 1, last); row++) {
-        lane.x.push_back(x(row) - lanes.middle_x);
-        lane.y.push_back(y(row) - lanes.middle_y);
-        lane.squared.push_back(lane.x.back() * lane.x.back() + lane.y.back() * lane.y.back());
+    const size_t count = static_cast<size_t>(std::min(lane.begin + window - 1, last) + 1 - lane.begin);
+    lane.points.resize(3 * count);
+    double *to_x = lane.points.data(), *to_y = to_x + count, *squared = to_y + count;
+    for (size_t point = 0; point < count; point++) {
+        to_x[point] = x[static_cast<size_t>(lane.begin) + point] - lanes.middle_x;
+        to_y[point] = y[static_cast<size_t>(lane.begin) + point] - lanes.middle_y;
+        squared[point] = to_x[point] * to_x[point] + to_y[point] * to_y[point];
     }
     return true;
 }
 
-// LaneBlock([(rows, start, last) | None], middle_x, middle_y, window)
+// LaneBlock([(rows, places, start, last) | None], middle_x, middle_y, window)
 PyObject *lane_block_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
-    PyObject *paths, *rows;
+    PyObject *paths, *rows, *places;
     double middle_x, middle_y;
     Py_ssize_t window, start, last;
     if (!PyArg_ParseTuple(arguments, "O!ddn", &PyList_Type, &paths, &middle_x, &middle_y, &window)) {
@@ -99,8 +102,9 @@ PyObject *lane_block_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
     for (Py_ssize_t number = 0; number < PyList_GET_SIZE(paths); number++) {
         PyObject *path = PyList_GET_ITEM(paths, number);
         CandidateLane &lane = (lanes.lanes.emplace_back(), lanes.lanes.back());
-        if (path != Py_None && (!PyTuple_CheckExact(path) || !PyArg_ParseTuple(path, "Onn", &rows, &start, &last) ||
-                                !set_window(lane, rows, start, last, lanes, window))) {
+        if (path != Py_None && (!PyTuple_CheckExact(path) ||
+                                !PyArg_ParseTuple(path, "OOnn", &rows, &places, &start, &last) ||
+                                !set_window(lane, rows, places, start, last, lanes, window))) {
             if (!PyErr_Occurred()) {
                 PyErr_SetString(PyExc_TypeError, "a candidate is a tuple or None");
             }
@@ -623,9 +627,9 @@ struct NearLanes : Written {
         other_lanes.clear();
         for (size_t number = 0; number < lanes.lanes.size(); number++) {
             const CandidateLane &lane = lanes.lanes[number];
-            const double *px = lane.x.data(), *py = lane.y.data(), *ps = lane.squared.data();
-            const size_t window = lane.x.size();
-            distances.resize(window);
+            const size_t window = lane.points.size() / 3;
+            const double *px = lane.points.data(), *py = px + window, *ps = py + window;
+            distances.assign(window + 4, HUGE_VAL);
             double *const away = distances.data();
             for (size_t point = 0; point < window; point++) {
                 double squared = px[point] * to_x;
@@ -633,10 +637,13 @@ struct NearLanes : Written {
                 squared += ps[point];
                 away[point] = squared;
             }
-            double least = HUGE_VAL;
-            for (size_t point = 0; point < window; point++) {
-                least = std::min(least, away[point]);
+            double four[4] = {HUGE_VAL, HUGE_VAL, HUGE_VAL, HUGE_VAL}; // four at a time, as the processor can
+            for (size_t point = 0; point < window; point += 4) {
+                for (size_t place = 0; place < 4; place++) {
+                    four[place] = std::min(four[place], away[point + place]);
+                }
             }
+            const double least = std::min(std::min(four[0], four[1]), std::min(four[2], four[3]));
             if (number >= 3) {
                 nearest_points.push_back(0);
                 if (least <= limit) {

@@ -83,6 +83,7 @@ class GraphLane:
     links: list[LaneLink] = field(default_factory=list)
     entries: list[tuple[str, LaneLink]] = field(default_factory=list)
     lines: LaneLines | None = None
+    line_m: float | None = None
 
     @property
     def is_internal(self) -> bool:
@@ -168,6 +169,12 @@ class LaneGraph:
         if lane.lines is None:
             lane.lines = lane_lines(lane.data.shape or ((0.0, 0.0),), lane.data.width_m)
         return lane.lines
+
+    def line_length(self, lane: GraphLane) -> float:
+        """Return the length of a lane's centre line, in m."""
+        if lane.line_m is None:
+            lane.line_m = float(np.hypot(*np.diff(self.lines(lane).center, axis=0).T).sum())
+        return lane.line_m
 
     def open_lanes(self, edge: str, vehicle_class: str) -> list[GraphLane]:
         """Return the lanes of an edge that a class of vehicles may use."""

@@ -34,12 +34,14 @@ class LanePath(NamedTuple):
 
     Args:
         rows: 1, x, y, heading, width, speed limit and index of the lane of each point, shape (N, 7).
+        places: x and y of each point, shape (2, N).
         begin: the first row on the last metres before the lane for which the path was made.
         first: the row at the start of this lane.
         last: the last row on this lane.
     """
 
     rows: Array
+    places: Array
     begin: int
     first: int
     last: int
@@ -131,7 +133,7 @@ class LanePaths:
         rows = np.column_stack((np.ones(count), place, np.arctan2(step[:, 1], step[:, 0]), data))
         last = min(count - 1, first + math.ceil((end - start) / grid - 1e-9))
         begin = max(0, first - math.ceil(CENTER_BEHIND_M / grid))
-        return LanePath(rows, begin, first, last)
+        return LanePath(rows, np.ascontiguousarray(place.T), begin, first, last)
 
 
 class NearLanes:
@@ -148,7 +150,7 @@ class NearLanes:
         ahead = partial(straight_ahead, graph, vehicle_class=vehicle_class)
         behind = partial(straight_behind, graph, vehicle_class=vehicle_class)
         self.paths = LanePaths(graph, sampling, ahead, behind)
-        self._squares: dict[tuple[int, int], list[tuple[float, str]]] = {}
+        self._squares: dict[tuple[int, int], list[tuple[float, str, LanePath]]] = {}
 
     def prepare(self) -> None:
         """Find the lanes of all squares and their paths, so that trials in forks of this process need not."""
@@ -161,12 +163,14 @@ class NearLanes:
                     self.lanes(square)
                 self.paths.path(lane)
 
-    def lanes(self, square: tuple[int, int]) -> list[tuple[float, str]]:
-        """Return the lanes near a square, the nearest first: distance from its middle in m, id."""
+    def lanes(self, square: tuple[int, int]) -> list[tuple[float, str, LanePath]]:
+        """Return the lanes near a square, the nearest first: distance from its middle in m, id, path."""
         found = self._squares.get(square)
         if found is None:
             x, y = ((number + 0.5) * SQUARE_M for number in square)
-            found = self._squares[square] = self._graph.near(x, y, NEAR_M + SQUARE_M, self._class)
+            near = self._graph.near(x, y, NEAR_M + SQUARE_M, self._class)
+            found = [(distance, name, self.paths.path(self._graph.lanes[name])) for distance, name in near]
+            self._squares[square] = found
         return found
 
 
@@ -178,8 +182,7 @@ def _within(lanes: Iterable[GraphLane], graph: LaneGraph, reach_m: float) -> lis
         if total >= reach_m:
             break
         found.append(lane)
-        center = graph.lines(lane).center
-        total += float(np.hypot(*np.diff(center, axis=0).T).sum())
+        total += graph.line_length(lane)
     return found
 
 

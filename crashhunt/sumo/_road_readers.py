@@ -116,7 +116,7 @@ class LanesReader(Reader):
         self._move_to(place, (column, row))
         if self._in_core is None:
             paths = [
-                None if one is None else (one.rows, one.begin if number < 3 else one.first, one.last)
+                None if one is None else (one.rows, one.places, one.begin if number < 3 else one.first, one.last)
                 for number, one in enumerate(self._candidates(place))
             ]
             self._in_core = core.LaneBlock(paths, *self._middle, self._window)
@@ -150,7 +150,7 @@ class LanesReader(Reader):
         taken = {one.id for one in (lane, *sides) if one is not None}
         near = [one for one in near if one[1] not in taken]
         limit = near[min(len(near), self._lanes - 3) - 1][0] + 2 * SQUARE_M if near else 0.0
-        around += [self._near.paths.path(graph.lanes[name]) for distance, name in near if distance <= limit]
+        around += [path for distance, _, path in near if distance <= limit]
         return around
 
     def _own_paths(self, place: Place) -> LanePaths:
