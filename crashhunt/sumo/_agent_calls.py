@@ -41,14 +41,14 @@ _SPEED_COMMANDS = {"vehicle.setSpeed", "vehicle.setSpeedMode", "vehicle.slowDown
 
 commanded_elsewhere: set[str] = set()
 """The vehicles whose speed a user's code commands in this episode."""
-_refused: list[ActionError] = []
+refused_calls: list[ActionError] = []
 """The error of the first call of an agent that was refused, until the next step or episode."""
 
 
 def forget_calls() -> None:
     """Forget the calls of the last episode."""
     commanded_elsewhere.clear()
-    _refused.clear()
+    refused_calls.clear()
 
 
 def guard_against_agents() -> None:
@@ -71,12 +71,12 @@ def _guarded(name: str, function: Callable[..., object]) -> Callable[..., object
                 shown = name.replace(_STEP, "simulationStep").replace("simulation.close", "close")
                 message = f"the agent called libsumo's {shown}, which changes the simulation"
                 error = ActionError(message, fix="return an action; agents may only read the simulation")
-                _refused[:] = _refused or [error]
+                refused_calls[:] = refused_calls or [error]
                 raise error
             if name in _SPEED_COMMANDS:
                 _note_command(name, *given, **named)
-        if _refused and name == _STEP:
-            raise _refused.pop()
+        if refused_calls and name == _STEP:
+            raise refused_calls.pop()
         return function(*given, **named)
 
     return call
