@@ -474,14 +474,18 @@ class ContactRecord:
     def _changed_s(self, actor: str) -> float | None:
         if actor in self.jumpers:
             return 0.0
-        through = self.until_contact(actor)
         left = self.lanes.left_sideways(self.before, actor)
-        since = left or 0
-        if self.lanes.left_sideways(through[since:], actor) or any(
-            self.lanes.reaches_over(scenes[since:], actor) for scenes in (through, self.before)
-        ):
+        if self.lanes.left_sideways(self.until_contact(actor)[left or 0 :], actor) or self.is_changing(actor):
             return float(self.times[-1])
         return None if left is None else self.time_s - self.before[left].time_s
+
+    def is_changing(self, actor: str) -> bool:
+        """Return whether an actor reached into the next lane at the contact, with its centre still in its own lane."""
+        since = self.lanes.left_sideways(self.before, actor) or 0
+        through = self.until_contact(actor)[since:]
+        return not self.lanes.left_sideways(through, actor) and any(
+            self.lanes.reaches_over(scenes, actor) for scenes in (through, self.before[since:])
+        )
 
     def reached_in_s(self, jumper: str) -> float:
         """Return for how long before the contact the other actor had reached into the lane that an actor jumped to."""

@@ -111,10 +111,13 @@ def describe_contact(contact: ContactRecord, omission: Omission | None = None) -
     if changer in contact.jumpers:
         return f"{changer} {lane} into {partner}{gap}"
     what = _what_touched(contact)
-    when = contact.ago(since) if since is not None else "just before"
+    if contact.is_changing(changer):
+        lane = f"was changing to the {side} lane" if side else "was changing lanes"
+    else:
+        lane += f" {contact.ago(since) if since is not None else 'just before'}"
     if what.startswith(f"{changer} "):
-        return f"{changer} {lane} {when} and {what.removeprefix(f'{changer} ')}{gap}"
-    return f"{changer} {lane} {when}, and {what}{gap}"
+        return f"{changer} {lane} and {what.removeprefix(f'{changer} ')}{gap}"
+    return f"{changer} {lane}, and {what}{gap}"
 
 
 def _what_touched(contact: ContactRecord) -> str:

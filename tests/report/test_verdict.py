@@ -130,6 +130,19 @@ def test_gradual_lane_change_reports_its_side_and_the_gap_at_that_time(side, wor
     )
 
 
+@pytest.mark.parametrize(("side", "word"), [(-1, "left"), (1, "right")])
+def test_lane_change_under_way_at_the_contact_is_not_called_complete(side, word):
+    """The ego drifts for 2 s, and its centre is still in its own lane when it touches the vehicle alongside."""
+
+    def poses(time_s):
+        return [(12 * time_s, side * (1.99 - 0.8 * max(-2.0, time_s)), 0.0, 12.0), (12 * time_s, 0.0, 0.0, 12.0)]
+
+    borders = [(np.array([(-200.0, y - 1.6), (200.0, y - 1.6)]), np.array([(-200.0, y + 1.6), (200.0, y + 1.6)]))
+               for y in (-3.2, 0.0, 3.2)]  # fmt: skip
+    record = replace(contact(poses), lanes=LaneMap(borders, (0.0, 0.0)))
+    assert describe_contact(record).startswith(f"ego was changing to the {word} lane and touched the side of x")
+
+
 def story(judgement=None, escape=None, poses=None):
     record = contact(poses or (lambda time_s: [(20 * time_s, 0.0, 0.0, 20.0), (4.9 + 12 * time_s, 0.0, 0.0, 12.0)]))
     result = SimpleNamespace(escape=escape, summary="ego drove into x at step 40")
