@@ -209,7 +209,7 @@ def judge(
     runs: int = 60,
     why: int = 0,
     reference: int = 0,
-    drivers: bool,
+    drivers: bool = False,
     parallel: int = 1,
     watch: Watch | None = None,
     stopped: Callable[[], bool] = lambda: False,

@@ -618,7 +618,8 @@ def _part(do: Callable[P, T]) -> Callable[P, T]:
 
 def _simulating() -> Callable[[], None]:
     # The wrappers of libsumo and of `guard_against_agents` around it take 4 of the 75 µs of a step in the core.
-    listening, step_alone = libsumo._stepManager, sumo.simulation_step.__wrapped__
+    listening = libsumo._stepManager
+    step_alone = getattr(sumo.simulation_step, "__wrapped__", sumo.simulation_step)
 
     def step() -> None:
         try:

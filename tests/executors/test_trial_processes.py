@@ -143,7 +143,7 @@ def test_copies_of_a_trial_are_those_that_the_settings_ask_for(process, monkeypa
     crash_on = (Outcome.COLLISION,)
     _, names, there, _ = copies()
     assert (names, there) == ([], [False] * 3)
-    found, names, there, ((every_s, on, delay, budget, notify),) = copies(probe_s=2.0)
+    found, names, there, ((every_s, on, delay, budget, notify, _),) = copies(probe_s=2.0)
     assert (names, there) == (["Prober"], [True, False, False])
     assert (every_s, on, delay, budget) == (2.0, crash_on, found._delay, _trial_process.BUDGET)
     notify("later")
