@@ -361,7 +361,7 @@ class SumoSimulator:
         setup, form = self._scenario.agents[agent], self._forms[agent]
         if motion := self._driving.moving.get(agent):
             most = motion.model.max_deceleration
-            how = "the maximum of its vehicle type, in its lane"
+            how = "the maximum of its vehicle type, and steering to the middle of its lane"
             return FullBraking(motion.brake(), how, deceleration=most, choose=motion.brake)
         if form == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")

@@ -311,6 +311,7 @@ def test_full_braking_stops_the_vehicle_in_its_lane_in_a_bend(start, form):
     simulator._driving.moving["ego"] = motion
     simulator.actions["ego"].check = motion.check if motion.is_planned else None
     speed, steps = motion.state.speed, 0
+    assert simulator.full_braking("ego").how.endswith("steering to the middle of its lane")
     while motion.state.speed > 0:
         step(simulator.full_braking("ego").choose())
         steps += 1
