@@ -241,18 +241,18 @@ def test_learning_takes_at_most_a_millisecond_after_100_000_trials(kind):
 
 
 @pytest.mark.nightly
-def test_learning_takes_at_most_a_millisecond_where_every_third_trial_is_a_crash_of_another_kind():
+def test_learning_takes_no_longer_after_many_crashes_of_other_kinds():
     """Each of them has strategies begin anew."""
     space = {("ego", f"x{index}"): Range(0.0, 1.0) for index in range(10)}
-    sampler, luck, spent = GuidedSampler(space), np.random.default_rng(1), 0.0
+    sampler, luck, spent = GuidedSampler(space), np.random.default_rng(1), [0.0, 0.0, 0.0]
     for number in range(3000):
         began = time.process_time()
         spec = spec_of(number, ask(sampler, number))
-        spent += time.process_time() - began
+        spent[number // 1000] += time.process_time() - began
         hit = Collision("ego", "collider", "ego", lane=f"road{luck.integers(1000)}e_0") if luck.random() < 0.3 else None
         outcome = Outcome.COLLISION if hit else Outcome.SURVIVED
         result = TrialResult(spec, outcome, danger=float(luck.random()) * 0.99, collision=hit)
         began = time.process_time()
         sampler.tell(result)
-        spent += time.process_time() - began
-    assert spent < 3.0
+        spent[number // 1000] += time.process_time() - began
+    assert spent[2] < 3 * spent[0]
