@@ -28,6 +28,7 @@ _MIN_CROSSING_ANGLE_RAD = math.radians(
     30
 )  # lines that differ by more cross each other, where lanes lie over each other
 _MOVED_M = 0.4  # sideways; less is drifting within a lane
+_MAX_JUMP_TURN_RAD = math.radians(10)  # within a step that is no turn
 _OVER_M = 0.1
 _MOVES_M = 0.01  # sideways in a step; who moves less does not change lanes yet
 _ROUNDING_M = 1e-6  # far more than the error of a distance
@@ -258,7 +259,9 @@ class LaneMap:
     ) -> bool:
         point, heading = after
         place = lane.place(point)
-        if not place.inside or abs(place.aside_m) <= lane.half_width:
+        if not place.inside:
+            return self._has_jumped(lane, before, after)
+        if abs(place.aside_m) <= lane.half_width:
             return False
         if _is_along(place, heading) and self._is_in_parallel_lane(lane, point, heading):
             return True
@@ -269,6 +272,22 @@ class LaneMap:
             return self.is_against((float(point[0]), float(point[1])), heading) is True
         # It has overtaken on the opposite lane and returns; otherwise, it turns off.
         return _is_along(place, heading + math.pi) and self._is_in_parallel_lane(lane, point, heading)
+
+    def _has_jumped(
+        self, lane: _Lane, before: tuple[NDArray[np.float64], float], after: tuple[NDArray[np.float64], float]
+    ) -> bool:
+        """Return whether an actor changed lanes in the step in which it drove over the end of its lane.
+
+        Straight ahead, another lane leads on; otherwise the road shifts there.
+        """
+        turn = math.remainder(after[1] - before[1], math.tau)
+        heading = before[1] + turn / 2  # a chord of an arc has no sideways part
+        way = np.array([math.cos(heading), math.sin(heading)])
+        move = after[0] - before[0]
+        across = abs(float(move[1] * way[0] - move[0] * way[1]))
+        if abs(turn) >= _MAX_JUMP_TURN_RAD or across <= lane.half_width:
+            return False
+        return self._is_in_parallel_lane(lane, before[0] + float(move @ way) * way, heading)
 
     def _is_in_parallel_lane(self, lane: _Lane, point: NDArray[np.float64], heading: float) -> bool:
         """Return whether a point lies in another lane that leads in the same direction."""

@@ -89,6 +89,9 @@ def test_who_turns_off_or_leaves_at_the_end_of_a_lane_does_not_change_lanes():
     assert not lanes.leaves_sideways(drive_along(way), "ego")
     ahead = [(float(x), 0.0, 0.0) for x in range(50, 60)] + [(62.0, 3.2, 0.0), (70.0, 3.2, 0.0)]
     assert not lanes.leaves_sideways(drive_along(ahead), "ego")
+    # Where a lane leads straight on, it has changed lanes in the step over the border.
+    lanes = LaneMap([lane(*straight), lane(*beyond), lane((60, 0), (120, 0))], (60, 0))
+    assert lanes.leaves_sideways(drive_along(ahead), "ego")
 
 
 def test_who_leaves_the_road_does_not_change_lanes():
