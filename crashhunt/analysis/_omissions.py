@@ -130,7 +130,8 @@ class _Search:
                 replaced.append(candidate)
         if len({str(one["faculty"]) for one in candidates}) > 1:
             earliest = min(candidates, key=lambda one: int(one["first"]))
-            replaced += [earliest] if earliest not in replaced else []
+            if earliest not in replaced:
+                replaced.append(earliest)
         for candidate in replaced:
             found = self._try(candidate, "both")
             if found is not None:

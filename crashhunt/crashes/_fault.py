@@ -287,7 +287,7 @@ def _right_of_way(case: ContactRecord) -> FaultFinding | None:
     if float(case.way(goes).speeds.min()) < STANDS_MPS or case.drifted(yields) or case.drifted(goes):
         return None  # who had stood in the junction may have been let through
     if case.is_over_side(goes):
-        return None  # in its lane, it might have passed
+        return None  # inside its lane, it might not have been hit
     if float(case.way(yields).speeds[case.times <= _CLEARS_S].max(initial=0.0)) < STANDS_MPS:
         return None  # who has stood there for so long could be seen
     if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKING_SPEED_MPS:

@@ -395,7 +395,8 @@ class TranslatesMotion(Protocol):
 
     Counterfactual runs with a reference driver need this translation if agents act by acceleration and steering.
 
-    Contract: no method changes the simulation.
+    Contract: no method changes the simulation. But after `action_with`, the vehicle may not be where the agent's next
+    trajectories begin: the simulator then follows them as well as the vehicle can, instead of refusing them.
     """
 
     def is_steered(self, agent: str) -> bool:

@@ -322,8 +322,10 @@ class FreeMotion:
         """Return the state after a step."""
         if self._form == "trajectory":
             points = self._in_map(np.array(values))
-            after = self._pursue(points) if self._pursues else self._on_trajectory(points)
-            return self._pursue(points) if self._is_overruled and self._refusal(after) is not None else after
+            after = None if self._pursues else self._on_trajectory(points)
+            if after is None or (self._is_overruled and self._refusal(after) is not None):
+                return self._pursue(points)
+            return after
         if self._form == "target_pose":
             x, y, heading, time_s = values
             _, x, y, heading, _ = self._in_map(np.array([[0.0, x, y, heading, 0.0]]))[0].tolist()
