@@ -958,7 +958,7 @@ struct Part {
         }
         held = true;
         const size_t length = static_cast<size_t>(buffer.len);
-        scenes = buffer.ndim == 2 ? static_cast<size_t>(buffer.shape[0]) : 0; // also where nobody is in them
+        scenes = buffer.ndim == 2 ? static_cast<size_t>(buffer.shape[0]) : 0; // also of scenes without actors
         return buffer.itemsize == 8 && buffer.format && strchr(buffer.format, 'd') && length == scenes * 32 * actors &&
                known();
     }

@@ -359,13 +359,13 @@ class Reversed(road.RoadNetwork):
 
 
 class Empty(behavior.IDMVehicle):
-    """Is as good as nobody wherever highway-env asks whether there is one ahead."""
+    """Is false wherever highway-env asks whether a vehicle is ahead."""
 
     def __len__(self):
         return 0
 
 
-class Nobody(behavior.IDMVehicle):
+class FalseVehicle(behavior.IDMVehicle):
     def __bool__(self):
         return False
 
@@ -377,7 +377,9 @@ def reversed_network():
 
 
 @pytest.mark.parametrize(
-    "given", [{"network": reversed_network()}, {"kind": Empty}, {"kind": Nobody}], ids=["network", "empty", "false"]
+    "given",
+    [{"network": reversed_network()}, {"kind": Empty}, {"kind": FalseVehicle}],
+    ids=["network", "empty", "false"],
 )
 def test_road_of_a_users_own_is_driven_as_by_highway_env(given):
     slow, fast = driven(lambda: small_road(**given))
