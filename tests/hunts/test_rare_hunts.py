@@ -357,7 +357,10 @@ def test_a_hunt_in_rare_mode_is_the_same_with_any_number_of_workers_and_resumed(
     whole = crashhunt.run(tmp_path / "whole", 1, 60, 60, **options)
     crashhunt.run(tmp_path / "again", 3, 33, 60, **options)
     again = crashhunt.run(tmp_path / "again", 2, 60, 60, **options)
-    assert estimate_of(whole) == estimate_of(again)
+    expected = estimate_of(whole)
+    # The estimate of a hunt whose TRIALS was changed is withheld where its interval is.
+    expected |= {"estimate": None, "why_not": f"TRIALS was changed after results were known, and {expected['why_not']}"}
+    assert estimate_of(again) == expected
     assert whole.rare.run_again == len(whole.rare.crashes) > 0
     assert whole.rare.estimate.roots == 12
     with closing(Ledger(tmp_path / "whole" / "ledger.sqlite")) as ledger:
