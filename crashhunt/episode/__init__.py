@@ -29,15 +29,9 @@ if TYPE_CHECKING:
         options_of as options_of,
         ready_recorder as ready_recorder,
     )
+    from ._parts import Parts as Parts, require_origin as require_origin, seal as seal, stage_of as stage_of
     from ._probes import BUDGET as BUDGET, BUDGET_BESIDE as BUDGET_BESIDE, Prober as Prober
-    from ._run_episode import (
-        Parts as Parts,
-        require_origin as require_origin,
-        run_episode as run_episode,
-        seal as seal,
-        seed_everything as seed_everything,
-        stage_of as stage_of,
-    )
+    from ._run_episode import run_episode as run_episode, seed_everything as seed_everything
     from ._trial_signals import INFO_KEY as INFO_KEY, SIGNALS as SIGNALS, TrialSignals as TrialSignals
     from ._worker_settings import WorkerSettings as WorkerSettings, answer_file as answer_file, scratch_of as scratch_of
 

@@ -6,14 +6,15 @@ import inspect
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self
 
 from crashhunt.base.errors import InternalError, InvalidEpisodeError
 from crashhunt.base.foreign_code import Boundary, ForeignError, Party, is_at_boundary, is_ours, supports
-from crashhunt.base.forks import Copy, Held, SuspendedFork, held, shared_memory
+from crashhunt.base.forks import held, shared_memory
 from crashhunt.episode._blame import guarded_check, guarded_reset, guarded_scene, guarded_step
 from crashhunt.episode._disturbance_injection import DisturbanceInjector
 from crashhunt.episode._failures import Ending, close_agent
+from crashhunt.episode._forks import Forkable
 from crashhunt.episode._observers import agent_seed, callbacks_for, observation_restorers, options_of
 from crashhunt.episode._trial_signals import TrialSignals
 from crashhunt.oracles import ChecksEnd, Finding, Oracle, ReadsSignals, SeesMap, TrafficEvents, merge_findings
@@ -28,73 +29,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
-    from crashhunt.base.json_types import Plain
     from crashhunt.episode._observers import Observer
     from crashhunt.simulators import Info, Observations, Simulator, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Scene
-
-
-# Forks of a running episode, which are forks of its process.
-
-C = TypeVar("C")
-
-
-class Forkable:
-    """The part of an `Episode` that forks the episode."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._held = Held()
-        self._on_copied: list[Callable[[], None]] = []
-
-    def _is_running(self) -> bool:
-        raise NotImplementedError
-
-    def _detach_observers(self) -> None:
-        raise NotImplementedError
-
-    def fork(self, work: Callable[[Self], Plain], *, observed: bool = True) -> Copy:
-        """Fork this process between two steps; the fork continues exactly as the original process would.
-
-        Args:
-            work: Function that runs in the fork, which then ends; it may fork again. The return value of the function
-                is sent to the original process.
-            observed: Whether observers are still called in the fork. Recordings of the observers in the fork then go to
-                other files.
-
-        Raises:
-            CannotForkError: The process has resources that a fork cannot copy, such as threads.
-        """
-        return self._copied(Copy, work, observed=observed)
-
-    def suspend_fork(self, work: Callable[..., Plain]) -> SuspendedFork:
-        """Leave a suspended fork. For each request, a fork of the suspended fork resumes here, without observers.
-
-        Args:
-            work: Function that runs in the resumed fork, with the request as its argument.
-
-        Raises:
-            CannotForkError: As for `fork`.
-        """
-        return self._copied(SuspendedFork, work, observed=False)
-
-    def _copied(
-        self, make: Callable[[Callable[..., Plain], Held], C], work: Callable[..., Plain], *, observed: bool
-    ) -> C:
-        if not self._is_running():
-            raise RuntimeError("only a running episode can be forked")
-
-        def run_copy(*asked: Plain) -> Plain:
-            for tell in self._on_copied if observed else ():
-                tell()
-            if not observed:
-                self._detach_observers()
-            return work(self, *asked)
-
-        copy = make(run_copy, self._held)
-        self._held = replace(self._held, shared=None)  # the check is expensive, so it runs only once
-        return copy
 
 
 MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]

@@ -1,19 +1,19 @@
-"""Runs forks of an episode: decides which run again, which have no result, and when no more are run."""
+"""Forks of an episode: makes them, and decides which run again, which have no result, and when no more are run."""
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
+from crashhunt.base.forks import CannotForkError, Copy, Held, NoAnswer, NoProcessError, SuspendedFork
 from crashhunt.base.text import encodable, one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from crashhunt.base.json_types import Plain
-    from crashhunt.episode._episode import Episode
     from crashhunt.trial import TrialResult
 
 
@@ -136,6 +136,70 @@ def _shortened(reason: NoAnswer) -> NoAnswer:
     return NoAnswer(encodable(one_line(reason.why[:_MAX_REASON_LENGTH])), reason.is_from_outside)
 
 
+# Forks of a running episode, which are forks of its process.
+
+C = TypeVar("C")
+
+
+class Forkable:
+    """The part of an `Episode` that forks the episode."""
+
+    steps: int  # number of completed steps
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._held = Held()
+        self._on_copied: list[Callable[[], None]] = []
+
+    def _is_running(self) -> bool:
+        raise NotImplementedError
+
+    def _detach_observers(self) -> None:
+        raise NotImplementedError
+
+    def fork(self, work: Callable[[Self], Plain], *, observed: bool = True) -> Copy:
+        """Fork this process between two steps; the fork continues exactly as the original process would.
+
+        Args:
+            work: Function that runs in the fork, which then ends; it may fork again. The return value of the function
+                is sent to the original process.
+            observed: Whether observers are still called in the fork. Recordings of the observers in the fork then go to
+                other files.
+
+        Raises:
+            CannotForkError: The process has resources that a fork cannot copy, such as threads.
+        """
+        return self._copied(Copy, work, observed=observed)
+
+    def suspend_fork(self, work: Callable[..., Plain]) -> SuspendedFork:
+        """Leave a suspended fork. For each request, a fork of the suspended fork resumes here, without observers.
+
+        Args:
+            work: Function that runs in the resumed fork, with the request as its argument.
+
+        Raises:
+            CannotForkError: As for `fork`.
+        """
+        return self._copied(SuspendedFork, work, observed=False)
+
+    def _copied(
+        self, make: Callable[[Callable[..., Plain], Held], C], work: Callable[..., Plain], *, observed: bool
+    ) -> C:
+        if not self._is_running():
+            raise RuntimeError("only a running episode can be forked")
+
+        def run_copy(*asked: Plain) -> Plain:
+            for tell in self._on_copied if observed else ():
+                tell()
+            if not observed:
+                self._detach_observers()
+            return work(self, *asked)
+
+        copy = make(run_copy, self._held)
+        self._held = replace(self._held, shared=None)  # the check is expensive, so it runs only once
+        return copy
+
+
 # The first copy of a running episode: after one step it is known whether there can be any.
 
 
@@ -150,11 +214,11 @@ class FirstCopy:
         self._refused = refused
         self._tried = False
 
-    def is_due(self, episode: Episode) -> bool:
+    def is_due(self, episode: Forkable) -> bool:
         """Return whether the check has not been done yet."""
         return not self._tried and episode.steps > 0
 
-    def ask(self, episode: Episode) -> None:
+    def ask(self, episode: Forkable) -> None:
         """Check that the episode can be forked."""
         try:
             episode.fork(lambda _copy: {}, observed=False).end()

@@ -31,7 +31,7 @@ _NOT_THE_TRAFFIC = ("gui",)
 _CALLERS_OF_AGENTS = {
     "crashhunt.episode._episode": ("_act", "_make"),
     "crashhunt.episode._fast_path": ("step", "resume_after"),
-    "crashhunt.episode._run_episode": ("agent",),
+    "crashhunt.episode._parts": ("agent",),
     "crashhunt.episode._action_override": ("act", "reset", "close"),
     "crashhunt.episode._failures": ("close_agent",),
 }

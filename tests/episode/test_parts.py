@@ -13,7 +13,7 @@ import pytest
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.plugins import CurrentFolder, locate
-from crashhunt.episode import Parts, WorkerSettings, _run_episode as _run, require_origin, seal
+from crashhunt.episode import Parts, WorkerSettings, _parts, require_origin, seal
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators import ObservationLayout, parse_parts
 from crashhunt.trial import Signature
@@ -49,7 +49,7 @@ def made(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "meta_path", [one for one in sys.meta_path if not isinstance(one, CurrentFolder)])
     # Later tests in this process replace functions of crashhunt, which is then taken for an agent's doing.
-    monkeypatch.setattr(_run, "record_originals", lambda: None)
+    monkeypatch.setattr(_parts, "record_originals", lambda: None)
     before = set(sys.modules)
 
     def make(module="snapshot_agent", **more):
@@ -167,7 +167,7 @@ def test_a_module_of_the_snapshot_may_come_from_nowhere_else(made, tmp_path):
 
 def test_a_strangers_code_is_confined_to_its_scratch_folder(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(_run, "confine", lambda folder, readable: asked.append((folder, list(readable))))
+    monkeypatch.setattr(_parts, "confine", lambda folder, readable: asked.append((folder, list(readable))))
     monkeypatch.setattr(os, "environ", dict(os.environ))
     monkeypatch.chdir(tmp_path)
     scratch = tmp_path / "scratch"

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from crashhunt.episode._run_episode import MAX_RECURSION_LIMIT, bound_recursion
+from crashhunt.episode._parts import MAX_RECURSION_LIMIT, bound_recursion
 
 
 @pytest.fixture(autouse=True)

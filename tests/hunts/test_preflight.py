@@ -70,7 +70,7 @@ def test_key_of_info_of_another_agent_can_be_required(tmp_path):
 
 def test_constructor_that_needs_more_than_it_is_given_is_not_blamed_on_a_line_of_crashhunt():
     failure = result(0, "missing 1 required positional argument: 'a'", kind="TypeError")
-    called = f'Traceback:\n  File "{layout.PACKAGE}/episode/_run_episode.py", line 272, in agent\n'
+    called = f'Traceback:\n  File "{layout.PACKAGE}/episode/_parts.py", line 272, in agent\n'
     failed = replace(failure, failure=replace(failure.failure, traceback=called))
     with pytest.raises(ArgumentError, match="missing 1 required") as caught:
         Preflight(settings_of(speed="15"), 1).filter_setup_failures(failed)
