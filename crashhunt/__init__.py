@@ -24,14 +24,8 @@ from crashhunt.base.doors import offer_lazily
 from crashhunt.base.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from crashhunt.api import (
-        judge as judge,
-        prepare as prepare,
-        replay as replay,
-        run as run,
-        shrink as shrink,
-        what_if as what_if,
-    )
+    from crashhunt.api import prepare as prepare, run as run
+    from crashhunt.crash_api import judge as judge, replay as replay, shrink as shrink, what_if as what_if
     from crashhunt.highway.accelerator import accelerate as accelerate
     from crashhunt.hunts import Hunt as Hunt
     from crashhunt.results import load as load

@@ -43,6 +43,7 @@ _TESTS_ELSEWHERE = {
     # Tests of the accelerator compare it with highway-env through the simulator.
     "highway/accelerator": ("on_highway/accelerator/test_*.py", "on_highway/test_dynamic_*.py"),
     "api.py": ("test_python_calls.py", "e2e/test_api.py"),
+    "crash_api.py": ("test_python_calls.py", "e2e/test_api.py"),
     "base/codec.py": ("base/test_codec.py", "trial/test_result.py"),
     "base/doors.py": ("test_public_face.py",),
     "base/errors.py": ("base/test_exception_text.py", "requirements/test_language.py"),
