@@ -54,6 +54,14 @@ def test_the_lane_is_what_the_simulator_states_of_the_agent():
     view.agent_lanes = {"ego": "b_2"}
     (hit,) = hits(Overlap(), view)
     assert hit.lane == "b_2"
+    # It touches the other after 3 m, and jumps to the next lane at the end of the step.
+    before, after = (
+        scene(("ego", 0, 0, 0, 10), ("other", 8, 0, 0, 0)),
+        scene(("ego", 10, 3.2, 0, 10), ("other", 8, 0, 0, 0)),
+    )
+    before.agent_lanes, after.agent_lanes, after.time_s, after.swept = {"ego": "b_0"}, {"ego": "b_1"}, 1.0, True
+    (hit,) = hits(Overlap(), before, after)
+    assert (hit.lane, hit.x, hit.y) == ("b_0", pytest.approx(3), 0)
     (hit,) = hits(OffRoad(), scene(*REAR_END, off_road=("other", "gone", "ego"), lanes=("a_0", "a_1"), time_s=2.0))
     assert facts(hit)[:5] == ("ego", "alone", "ego", "", 5)
     assert (hit.kind, hit.lane, hit.seen_by, hit.time_s) == ("off_road", "a_0", ("off_road",), 2)
