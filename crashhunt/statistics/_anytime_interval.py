@@ -194,7 +194,7 @@ class RateTest:
             return
         part = self.bets.most_exposure / _GRID_PARTS
         place = min(int(exposure / part), _GRID_PARTS - 1)
-        upper = min(1.0, exposure / part - place)
+        upper = exposure / part - place  # above 1 by rounding only
         for point, share in ((place, 1.0 - upper), (place + 1, upper)):
             if share > 0:
                 self._units[events, point * part] += share * times

@@ -353,8 +353,6 @@ class RateCounter:
         self.test.add(0, 1.0, trials - crashes)
 
     def _exposure(self, trial: TrialFacts) -> float:
-        if self._per == "trial":
-            return 1.0
         driven = exposure_of(trial, self._per)
         if driven is None:
             self.why_not = self.why_not or f"trial {trial.number} has no driven distance and time"
