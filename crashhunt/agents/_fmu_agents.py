@@ -22,7 +22,7 @@ import numpy as np
 
 from crashhunt.agents._library_agents import Action, Parts
 from crashhunt.agents._protocol import ForeignFactory
-from crashhunt.base.errors import PluginError, ProgramError
+from crashhunt.base.errors import ArgumentError, PluginError, ProgramError
 from crashhunt.base.programs import fmu_files
 from crashhunt.base.text import listed, one_line
 from crashhunt.simulators import PARTS
@@ -40,6 +40,7 @@ _INTEGERS: Final = ("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16"
 _REALS: Final = ("Real", "Float32", "Float64")
 _MAX_SHOWN_CHARACTERS: Final = 300
 _SEED: Final = "seed"
+_WIDTH_OF_INTEGERS: Final = 2**32 - 1
 _TABLE_KEYS: Final = ("inputs", "action")
 
 
@@ -92,7 +93,11 @@ class FmuFactory(ForeignFactory):
 
         Options may choose other observations and actions than the scenario, so the simulator is not used.
         """
-        return self._read({}).signature()
+        model = self._read({})
+        try:
+            return model.signature()
+        except ArgumentError as error:
+            raise self._refusal(f"{error.where}: {error.message}", error.fix) from None
 
     def load(self, files: Mapping[str, str], scratch: Path) -> None:
         """Extract the FMU into a folder, unless this has been done.
@@ -223,7 +228,7 @@ class _Model:
             if one.name == _SEED or not _NAME.fullmatch(one.name) or one.dimensions:
                 continue
             kind = _kind(one)
-            text = f"{one.min}:{one.max}" if one.min and one.max and kind in ("int", "float") else ""
+            text = f"{one.min}:{one.max}" if _is_bounded(one) else ""
             distribution = parse_spec(text, kind, where=f"its parameter {one.name}") if text else None
             default = None if one.start is None else _value(one, one.start)
             found[one.name] = Argument(
@@ -500,6 +505,14 @@ def _method(variable: _Variable, version: int) -> str:
     if variable.type == "Enumeration":
         return "Integer" if version == 2 else "Int64"
     return variable.type
+
+
+def _is_bounded(variable: _Variable) -> bool:
+    """Return whether a number has a minimum and a maximum, and not only INF or the limits of its type."""
+    kind = _kind(variable)
+    if kind not in ("int", "float") or not variable.min or not variable.max:
+        return False
+    return float(variable.max) - float(variable.min) < (_WIDTH_OF_INTEGERS if kind == "int" else math.inf)
 
 
 def _kind(variable: _Variable) -> Kind:

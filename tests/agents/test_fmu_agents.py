@@ -15,7 +15,7 @@ from programs import COMPILER, DRIVER
 
 pytest.importorskip("fmpy", reason="FMPy is not installed", exc_type=ImportError)
 
-from built_fmus import COLUMNS, build_fmu
+from built_fmus import COLUMNS, build_fmu, described_by_fmi_2
 
 from crashhunt.agents import FmuFactory
 from crashhunt.base import forks
@@ -100,6 +100,23 @@ def test_parameters_are_arguments_with_their_units_and_bounds(tmp_path):
     assert (speed.default, speed.unit, speed.distribution) == (12.0, "m/s", Range(8.0, 20.0))
     assert (arguments["harm"].default, arguments["harm"].distribution) == (0, None)
     assert arguments.keys() == {"speed", "harm"}
+
+
+@pytest.mark.parametrize("bounds", [("-1.7976931348623157E308", "1.7976931348623157E308"), ("-INF", "INF")])
+def test_limits_of_a_type_are_no_range_of_a_parameter(tmp_path, bounds):
+    fmu = build_fmu(tmp_path, 2, description=described_with_bounds(*bounds))
+    assert signature_of(FmuFactory(f"fmu:{fmu}")).arguments["speed"].distribution is None
+
+
+def test_bounds_in_the_wrong_order_are_refused_with_the_name_of_the_fmu(tmp_path):
+    fmu = build_fmu(tmp_path, 2, description=described_with_bounds("20.0", "8.0"))
+    with pytest.raises(PluginError, match=f"^'fmu:{fmu}': its parameter speed: the range '20.0:8.0' begins above"):
+        FmuFactory(f"fmu:{fmu}").declared_signature()
+
+
+def described_with_bounds(low, high):
+    described = described_by_fmi_2("kinematics[{row}].{column}", "target_speed")
+    return described.replace('min="8.0" max="20.0"', f'min="{low}" max="{high}"')
 
 
 def test_the_parts_that_inputs_need_are_observed(tmp_path):
