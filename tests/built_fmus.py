@@ -97,7 +97,8 @@ int fmi3GetInt32(void *c, const reference *r, size_t n, int32_t *v, size_t k) {
     return 0;
 }
 int fmi3DoStep(void *c, double t, double h, bool p, bool *e, bool *s, bool *a, double *l) {
-    *e = *s = *a = false;
+    *e = *a = false;
+    *s = ((instance *)c)->v[101] == 6;
     *l = t + h;
     return step(c);
 }

@@ -69,7 +69,7 @@ class _Instance(Protocol):
     def setupExperiment(self) -> None: ...  # noqa: N802
     def enterInitializationMode(self) -> None: ...  # noqa: N802
     def exitInitializationMode(self) -> None: ...  # noqa: N802
-    def doStep(self, currentCommunicationPoint: float, communicationStepSize: float) -> object: ...  # noqa: N802, N803
+    def doStep(self, currentCommunicationPoint: float, communicationStepSize: float) -> Any: ...  # noqa: N802, N803
     def terminate(self) -> None: ...
     def freeInstance(self) -> None: ...  # noqa: N802
 
@@ -431,7 +431,9 @@ class FmuAgent:
             self._set_inputs()
             wiring.action.clear()
             began = time.monotonic()
-            instance.doStep(step * self._step_length_s, self._step_length_s)  # type: ignore[union-attr]
+            ended = instance.doStep(step * self._step_length_s, self._step_length_s)  # type: ignore[union-attr]
+            if self._model.version == 3 and ended[1]:
+                raise ProgramError(f"{self._name}: the FMU asks to end the simulation in step {step + 1}")
             for group in wiring.outputs:
                 self._get(group)
             if self._limit_s is not None and time.monotonic() > began + self._limit_s:

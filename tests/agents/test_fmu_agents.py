@@ -135,6 +135,12 @@ def test_a_failure_is_an_error_that_names_the_agent_and_the_function(tmp_path, v
     agent.close()
 
 
+def test_an_fmu_that_asks_to_end_the_simulation_is_an_error_of_the_agent(tmp_path):
+    agent = agent_of(build_fmu(tmp_path, 3), harm=6)
+    with pytest.raises(ProgramError, match=r"^ego: the FMU asks to end the simulation in step 1$"):
+        agent.act(observations()[0])
+
+
 def test_an_action_that_is_not_a_number_is_left_to_the_check_of_all_agents(tmp_path):
     with pytest.raises(ActionError):
         SpeedAndLaneChange().encode(agent_of(build_fmu(tmp_path, 2), harm=2).act(observations()[0]))
