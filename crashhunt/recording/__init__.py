@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._blackbox import (
-        BlackBox as BlackBox,
+    from ._blackbox import BlackBox as BlackBox, Phase as Phase, is_evidence as is_evidence
+    from ._blackbox_file import (
         BlackBoxFile as BlackBoxFile,
         BlackBoxHeader as BlackBoxHeader,
-        Phase as Phase,
         digest_of as digest_of,
-        is_evidence as is_evidence,
         read_black_box as read_black_box,
         read_header as read_header,
     )

@@ -20,7 +20,7 @@ from crashhunt.base.codec import known_values
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import open_at_once
-from crashhunt.recording._blackbox import Record
+from crashhunt.recording._blackbox_file import Record
 from crashhunt.recording._foxglove import MESSAGES, NAMESPACE, LogWriter, messages_of, to_ns, write_views
 from crashhunt.recording._reading import Prologue
 from crashhunt.recording._recording import Compact, Recording

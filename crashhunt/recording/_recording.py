@@ -13,7 +13,8 @@ import numpy as np
 
 from crashhunt.base.errors import BundleError
 from crashhunt.base.text import format_time, one_of
-from crashhunt.recording._blackbox import Records, digest_of, is_evidence
+from crashhunt.recording._blackbox import is_evidence
+from crashhunt.recording._blackbox_file import Records, digest_of
 from crashhunt.recording._reading import Prologue, Reading, StepRecord
 from crashhunt.recording._values import is_opaque
 from crashhunt.recording.records import RECORD_TYPES
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.recording._blackbox import Record
+    from crashhunt.recording._blackbox_file import Record
     from crashhunt.recording._reading import AgentChannel
     from crashhunt.trial import Disturbance
     from crashhunt.world import Actor, Scene

@@ -11,7 +11,7 @@ import pytest
 
 from crashhunt.base.errors import BundleError, RecorderError
 from crashhunt.recording import BlackBox, BlackBoxFile, Phase, Tag, read_black_box, read_header
-from crashhunt.recording._blackbox import Record, Records
+from crashhunt.recording._blackbox_file import Record, Records
 from crashhunt.world import Actor, Roster, Scene
 
 ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "passenger", 5.0, 2.0)))

@@ -18,7 +18,7 @@ from crashhunt.recording import (
     read_log,
     write_log,
 )
-from crashhunt.recording._blackbox import Record
+from crashhunt.recording._blackbox_file import Record
 from crashhunt.recording.records._scene_record import encode_lanes, encode_roster
 from crashhunt.world import Actor, Roster, Scene
 

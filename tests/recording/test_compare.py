@@ -21,7 +21,7 @@ from crashhunt.recording import (
     first_divergence,
     values_around,
 )
-from crashhunt.recording._blackbox import Record
+from crashhunt.recording._blackbox_file import Record
 from crashhunt.trial import Disturbance
 from crashhunt.world import Actor, Contact, Event, Roster, Scene
 

@@ -23,7 +23,7 @@ from crashhunt.recording import (
     encode_disturbance,
     read_black_box,
 )
-from crashhunt.recording._blackbox import Record, Records
+from crashhunt.recording._blackbox_file import Record, Records
 from crashhunt.recording._log import read_log, write_log
 from crashhunt.recording.records._scene_record import encode_roster
 from crashhunt.trial import Disturbance

@@ -22,7 +22,7 @@ from crashhunt.recording import (
     encode_notes,
     encode_spines,
 )
-from crashhunt.recording._blackbox import Record
+from crashhunt.recording._blackbox_file import Record
 from crashhunt.world import Actor, Contact, Event, Roster, Scene
 
 AGENTS = (

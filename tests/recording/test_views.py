@@ -28,7 +28,7 @@ from crashhunt.recording import (
     read_obstacles,
     write_log,
 )
-from crashhunt.recording._blackbox import Record
+from crashhunt.recording._blackbox_file import Record
 from crashhunt.recording._foxglove import MESSAGES
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Actor, Event, Lane, Roster, Scene
