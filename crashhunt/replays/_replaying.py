@@ -301,9 +301,7 @@ class _NotSetUpError(CrashhuntError):
     """The replay ran, but ended before its first step."""
 
 
-def _run(
-    rerun: Rerun, stopped: Callable[[], bool] = lambda: False, executors: SharedReruns | None = None
-) -> ReplayReport:
+def _run(rerun: Rerun, stopped: Callable[[], bool], executors: SharedReruns | None = None) -> ReplayReport:
     """Run the trial and compare it with the recording.
 
     Raises:

@@ -85,6 +85,20 @@ def test_a_process_that_was_killed_from_outside_runs_twice_again(ends, capsys):
     assert ends.jobs[-1]["pause_before"] == 30  # the crash comes first
 
 
+def test_process_is_confined_before_it_makes_anything(monkeypatch, tmp_path):
+    def confine(settings):
+        raise CrashhuntError(f"{settings} is confined")
+
+    job = {"settings": "a stranger's", "spec": SPEC.to_json(), "stop_at": 5}
+    (tmp_path / layout.JOB).write_text(json.dumps(job))
+    monkeypatch.setattr(_debugger.sys, "argv", ["", str(tmp_path)])
+    monkeypatch.setattr(_debugger, "WorkerSettings", SimpleNamespace(from_json=lambda data: data))
+    monkeypatch.setattr(_debugger, "Parts", None)
+    monkeypatch.setattr(_debugger, "seal", confine)
+    _debugger.main()
+    assert json.loads((tmp_path / layout.ANSWER).read_text())["error"]["message"] == "a stranger's is confined"
+
+
 def test_at_a_debugger_nothing_runs_again_by_itself(ends):
     ends.codes, ends.answers = [-signal.SIGKILL], [None]
     with pytest.raises(CrashhuntError):
