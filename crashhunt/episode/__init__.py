@@ -14,9 +14,8 @@ if TYPE_CHECKING:
     from ._blame import has_users_code as has_users_code, internal_error as internal_error
     from ._branches import Brancher as Brancher
     from ._competent_driver import CompetentDriver as CompetentDriver
-    from ._episode import Episode as Episode, Reset as Reset
+    from ._episode import Episode as Episode, FastEpisode as FastEpisode, Reset as Reset
     from ._failures import are_functions_replaced as are_functions_replaced
-    from ._fast_path import FastEpisode as FastEpisode
     from ._forced_onsets import OnsetForcer as OnsetForcer
     from ._forks import FirstCopy as FirstCopy, ForkRunner as ForkRunner
     from ._observers import (

@@ -1,4 +1,14 @@
-"""One episode: the only place where agent, simulator and oracle interact."""
+"""One episode: the only place where agent, simulator and oracle interact.
+
+`Episode` runs each part of each step in Python. `FastEpisode` is an `Episode` with the same results, bit by bit, whose
+uneventful steps on SUMO run in the compiled core, each in one call. `FastEpisode` is the only class that knows the
+core. After a step of the core, the simulator and the attributes of the episode hold an older state. Reading a public
+attribute first updates them to the state of the core.
+
+Reason: on the scenario ``loop``, trials of 600 steps take 1.20 times the CPU time if the core runs no steps (median of
+7 alternating pairs). A subclass takes 1.02 times the CPU time of ``if`` statements in `Episode`, a difference within
+the noise.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +24,21 @@ from crashhunt.base.forks import held, shared_memory
 from crashhunt.episode._blame import guarded_check, guarded_reset, guarded_scene, guarded_step
 from crashhunt.episode._disturbance_injection import DisturbanceInjector
 from crashhunt.episode._failures import Ending, close_agent
+from crashhunt.episode._fast_path import FastPath, make_fast_path
 from crashhunt.episode._forks import Forkable
 from crashhunt.episode._observers import agent_seed, callbacks_for, observation_restorers, options_of
 from crashhunt.episode._trial_signals import TrialSignals
-from crashhunt.oracles import ChecksEnd, Finding, Oracle, ReadsSignals, SeesMap, TrafficEvents, merge_findings
+from crashhunt.native import ANSWERED, ASK, DONE, SIMULATED
+from crashhunt.oracles import (
+    ChecksEnd,
+    Finding,
+    Oracle,
+    ReadsSignals,
+    RequirementOracle,
+    SeesMap,
+    TrafficEvents,
+    merge_findings,
+)
 from crashhunt.simulators import CountsSetUp, HasMap, SupportsReseeding
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec, in_turn
 
@@ -468,3 +489,150 @@ def _require_reseeding(simulator: Simulator) -> None:
         raise InvalidEpisodeError("the simulator cannot re-seed its random generators")
     if simulator.why_no_reseeding:
         raise InvalidEpisodeError(simulator.why_no_reseeding)
+
+
+class FastEpisode(Episode):
+    """An `Episode` whose uneventful steps run in the compiled core, with bit-identical results."""
+
+    _fast: FastPath | None = None
+    _take: Callable[[Mapping[str, Agent]], int] | None = None
+    """Runs a step in the core; None where steps run in Python."""
+    _is_behind = False
+    """Whether the core has run steps whose state is not read yet."""
+    _requirements: Sequence[RequirementOracle] = ()
+    """The requirements, which read their signals after each step of the core."""
+
+    @property
+    def observations(self) -> Observations:
+        self._catch_up()
+        return self._observations
+
+    @property
+    def rewards(self) -> Mapping[str, float]:
+        self._catch_up()
+        return self._rewards
+
+    @property
+    def terminations(self) -> Mapping[str, bool]:
+        self._catch_up()
+        return self._terminations
+
+    @property
+    def scene(self) -> Scene | None:
+        self._catch_up()
+        return self._scene
+
+    def step(self, given: Mapping[str, NDArray[np.generic]] = ASK_ALL) -> TrialResult | None:
+        """Run a step like `Episode.step`, in the core if possible."""
+        if self._take is None or given:
+            self._catch_up()
+            return super().step(given)
+        try:
+            come = self._take(self.agents)
+        except BaseException as error:
+            return self._fail_in_core(error)
+        if come:
+            return self._finish_step(come)
+        self._is_behind = True
+        self.steps += 1
+        return self._watch_requirements()
+
+    def look_ahead(self) -> tuple[str, float, float] | None:
+        """Return name, gap and speed of the vehicle ahead, in a step of the core."""
+        assert self._fast is not None
+        return self._fast.at_once.core.ahead()
+
+    def _watch_requirements(self) -> TrialResult | None:
+        """Let the requirements read a step of the core, mostly without its scene."""
+        if not self._requirements:
+            return None
+        assert self._fast is not None
+        try:
+            self.live = self._fast.at_once.core.state()
+            violated = [one.watch() for one in self._requirements]
+        except BaseException as error:
+            return self._break(error)
+        finally:
+            self.live = None
+        if True not in violated:
+            return None
+        for one in self._requirements:
+            one.hold()
+        return self._show_step()
+
+    def _catch_up(self) -> None:
+        """Update the episode to the state of the core."""
+        if self._is_behind and self._fast is not None:
+            self._is_behind = False
+            self._observations, self._rewards, self._terminations, *_ = self._fast.at_once.catch_up()
+            self._scene = self.simulator.scene()
+
+    def _finish_step(self, come: int) -> TrialResult | None:
+        """Complete a step that the core has passed to Python because of an event."""
+        fast = self._fast
+        assert fast is not None
+        try:
+            come, actions = fast.resume_after(come, self.agents)
+        except BaseException as error:
+            return self._fail_in_core(error)
+        if come in (DONE, ASK):
+            self._is_behind = True
+            self.steps += 1
+            return self._show_step() if come == ASK else self._watch_requirements()
+        self._catch_up()
+        if actions is None:
+            return super().step()
+        try:
+            for tell in self._on_action if come == ANSWERED else ():
+                tell(0, actions[self.names[0]])
+        except BaseException as error:
+            return self._break(error)
+        return self._complete(actions, fast.at_once.finish if come == SIMULATED else self._advance)
+
+    def _show_step(self) -> TrialResult | None:
+        """Call observers and oracles for a step that the core has recorded."""
+        try:
+            scene = self.scene
+            assert scene is not None
+            for show in self._on_scene[1:]:
+                show(self.steps, scene, tuple(self._rewards.values()))
+            finding = self._find(scene)
+            if finding is None and self.steps < self._max_steps:
+                return None
+            return self._judge(finding, self._rewards, {})
+        except BaseException as error:
+            return self._break(error)
+
+    def _fail_in_core(self, error: BaseException) -> TrialResult:
+        """End the episode with an exception that has passed through the core.
+
+        Raises:
+            RecorderError: the disk is full.
+        """
+        fast = self._fast
+        assert fast is not None
+        if fast.cannot_record:
+            return self._break(error)
+        if fast.is_resuming:
+            return self._fail_in_simulator(error)
+        if fast.is_encoding:
+            return self._fail_in_conversion(error, self.names[0])
+        if not fast.at_once.core.simulating:
+            return self._fail(Outcome.AGENT_ERROR, error, self.names[0], place="act")
+        return self._fail_in_simulator(error)
+
+    def _set_up(self) -> TrialResult | None:
+        result = super()._set_up()
+        if result is None and self._disturbed is None:
+            self._fast = make_fast_path(self.simulator, self._observers, self._oracles, self._max_steps, self._encoders)
+            self._take = None if self._fast is None else self._fast.at_once.core.take
+            self._requirements = [one for one in self._oracles if type(one) is RequirementOracle]
+        return result
+
+    def _add(self, result: TrialResult) -> TrialResult:
+        self._take = None
+        return super()._add(result)
+
+    def _detach_observers(self) -> None:
+        self._take = None
+        super()._detach_observers()

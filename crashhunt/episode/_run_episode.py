@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.episode._fast_path import FastEpisode
+from crashhunt.episode._episode import FastEpisode
 from crashhunt.episode._observers import Nearness, Recorder
 from crashhunt.trial import CRASHES
 

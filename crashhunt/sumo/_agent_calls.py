@@ -29,8 +29,8 @@ _READING = ("get", "is", "has", "convert", "domain", "subscribe", "unsubscribe",
 """Beginnings of the names of functions that change nothing."""
 _NOT_THE_TRAFFIC = ("gui",)
 _CALLERS_OF_AGENTS = {
-    "crashhunt.episode._episode": ("_act", "_make"),
-    "crashhunt.episode._fast_path": ("step", "resume_after"),
+    "crashhunt.episode._episode": ("step", "_act", "_make"),
+    "crashhunt.episode._fast_path": ("resume_after",),
     "crashhunt.episode._parts": ("agent",),
     "crashhunt.episode._action_override": ("act", "reset", "close"),
     "crashhunt.episode._failures": ("close_agent",),

@@ -119,7 +119,7 @@ _TESTS_ELSEWHERE = {
     "crashes/_encounter.py": ("crashes/test_danger_course.py", "crashes/test_visible.py"),
     "envs": ("envs/test_*.py",),
     "episode/_action_override.py": ("episode/test_reference_driver.py",),
-    "episode/_episode.py": ("episode/test_episode*.py", "episode/test_fork.py"),
+    "episode/_episode.py": ("episode/test_episode*.py", "episode/test_fork.py", "native/test_usual_steps.py"),
     "episode/_fast_path.py": ("native/test_usual_steps.py", "episode/test_episode*.py"),
     "episode/_branches.py": ("episode/test_branching.py",),
     "guide": ("e2e/test_guide.py", "base/test_json_schema.py"),
