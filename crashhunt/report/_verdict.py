@@ -97,27 +97,33 @@ def describe_contact(contact: ContactRecord, omission: Omission | None = None) -
         omission: the lane change that caused the contact according to runs; None if there is no such lane change.
     """
     changers = contact.lane_changers(_CHANGE_S) if contact.same_way else ()
-    if len(changers) != 1:
-        return _what_touched(contact)
+    what = _what_touched(contact)
+    began = [since for changer in changers if (since := contact.changed_s(changer)) is not None]
+    if not changers or any(contact.turned(since) > _MAX_MERGE_ANGLE_RAD for since in began):
+        return what  # in a bend or a roundabout, lanes lead apart and together
+    if len(changers) == 2:
+        return f"{', '.join(_lane_change(contact, changer) for changer in changers)}, and {what}"
     (changer,) = changers
-    partner, since = contact.partner(changer), contact.changed_s(changer)
-    if since is not None and contact.turned(since) > _MAX_MERGE_ANGLE_RAD:
-        return _what_touched(contact)  # in a bend or a roundabout, lanes lead apart and together
+    partner = contact.partner(changer)
     is_cause = omission is not None and (omission.instead, omission.actor) == ("changed lanes", partner)
     gap = _gap_of(omission) if omission is not None and is_cause else _gap_at(contact, changer)
-    side = _side(contact, changer)
-    lane = f"changed to the {side} lane" if side else "changed lanes"
     gap = f"; {gap}" if gap else ""
+    change = _lane_change(contact, changer)
     if changer in contact.jumpers:
-        return f"{changer} {lane} into {partner}{gap}"
-    what = _what_touched(contact)
-    if contact.is_changing(changer):
-        lane = f"was changing to the {side} lane" if side else "was changing lanes"
-    else:
-        lane += f" {contact.ago(since) if since is not None else 'just before'}"
+        return f"{change} into {partner}{gap}"
     if what.startswith(f"{changer} "):
-        return f"{changer} {lane} and {what.removeprefix(f'{changer} ')}{gap}"
-    return f"{changer} {lane}, and {what}{gap}"
+        return f"{change} and {what.removeprefix(f'{changer} ')}{gap}"
+    return f"{change}, and {what}{gap}"
+
+
+def _lane_change(contact: ContactRecord, changer: str) -> str:
+    """Return which actor changed lanes, to which side, and how long before the contact."""
+    side, since = _side(contact, changer), contact.changed_s(changer)
+    lane = f"to the {side} lane" if side else "lanes"
+    if changer not in contact.jumpers and contact.is_changing(changer):
+        return f"{changer} was changing {lane}"
+    when = "" if changer in contact.jumpers else f" {contact.ago(since) if since is not None else 'just before'}"
+    return f"{changer} changed {lane}{when}"
 
 
 def _what_touched(contact: ContactRecord) -> str:

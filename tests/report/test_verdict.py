@@ -143,6 +143,22 @@ def test_lane_change_under_way_at_the_contact_is_not_called_complete(side, word)
     assert describe_contact(record).startswith(f"ego was changing to the {word} lane and touched the side of x")
 
 
+def test_verdict_names_the_lane_changes_of_both_into_one_lane():
+    """The ego drifts to the right, and x is in the lane on its right from 0.2 s before the contact on."""
+
+    def poses(time_s):
+        x_aside = 0.0 if time_s > -0.25 else -3.2
+        return [(20 * time_s, 1.0 - 0.8 * max(-2.0, time_s), 0.0, 20.0), (4.9 + 12 * time_s, x_aside, 0.0, 12.0)]
+
+    borders = [(np.array([(-200.0, y - 1.6), (200.0, y - 1.6)]), np.array([(-200.0, y + 1.6), (200.0, y + 1.6)]))
+               for y in (-3.2, 0.0, 3.2)]  # fmt: skip
+    record = replace(contact(poses), lanes=LaneMap(borders, (0.0, 0.0)))
+    assert describe_contact(record) == (
+        "ego changed to the right lane 0.7 s before, x changed to the left lane 0.2 s before, and ego drove into the "
+        "back of x at 20.0 m/s against 12.0 m/s"
+    )
+
+
 def story(judgement=None, escape=None, poses=None):
     record = contact(poses or (lambda time_s: [(20 * time_s, 0.0, 0.0, 20.0), (4.9 + 12 * time_s, 0.0, 0.0, 12.0)]))
     result = SimpleNamespace(escape=escape, summary="ego drove into x at step 40")
