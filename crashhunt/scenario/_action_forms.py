@@ -184,9 +184,10 @@ _TRACKER = ActionSetting(
 _VISIBLE = ActionSetting(
     name="visible",
     default="front",
-    choices=("front", "outline"),
-    help="the part of the vehicle that others react to: outline includes the part in other lanes than its front's. "
-    "Hunts set outline, unless the form has this setting",
+    choices=("front", "outline", "whole"),
+    help="the part of the vehicle that others react to: whole includes the part in other lanes than its front's. "
+    "outline is of earlier trials: vehicles ahead do not react to this part. Hunts set whole, unless the form has this "
+    "setting",
 )
 
 ACTIONS: dict[str, ActionDescription] = {
@@ -284,7 +285,7 @@ def action_settings(name: str | None, where: str = "") -> dict[str, float | str]
     return values
 
 
-def with_visible_outline(name: str | None) -> str | None:
+def with_visible_whole(name: str | None) -> str | None:
     """Return a form of actions whose vehicle other vehicles see as a whole, unless the form names another choice.
 
     Without the setting, a form means what it meant before the setting existed, so recorded trials keep their meaning.
@@ -298,11 +299,11 @@ def with_visible_outline(name: str | None) -> str | None:
     front = f":{_VISIBLE.name}={_VISIBLE.default}"
     if f":{_VISIBLE.name}=" in name:
         return name.replace(front, "")
-    return f"{name}:{_VISIBLE.name}=outline"
+    return f"{name}:{_VISIBLE.name}=whole"
 
 
 def with_stated_choice(name: str) -> str:
-    """Return the form that `with_visible_outline` turns into a recorded form of actions."""
+    """Return the form that `with_visible_whole` turns into a recorded form of actions."""
     is_stated = not name or not can_be_in_two_lanes(name) or f":{_VISIBLE.name}=" in name
     return name if is_stated else f"{name}:{_VISIBLE.name}={_VISIBLE.default}"
 

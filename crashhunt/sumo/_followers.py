@@ -9,7 +9,8 @@ It looks along all lanes that the outline touches, and along the lanes that lead
 blocked receives an upper bound of its speed: the speed that its own car-following model chooses behind a vehicle at
 that place (``getFollowSpeed``). SUMO lowers it for vehicles ahead, lights and junctions. There is no bound if the
 vehicle cannot be faster in this step, or if SUMO already reports the agent's vehicle as its leader at that place.
-Vehicles next to such a part, or behind it without a safe gap, do not change to its lane.
+Vehicles next to such a part, or behind it without a safe gap, do not change to its lane. Nor do vehicles ahead of it,
+if the agent's vehicle would have no safe gap behind them: SUMO's own lane changes have the same rule.
 
 If a disturbance sets the speed of a vehicle, the vehicle receives the smaller speed. Commands that also set SUMO's
 speed mode take precedence (``ignore_priority``, ``keep_speed``), and so does a user's code that sets a speed.
@@ -112,13 +113,19 @@ class Followers:
         controlled: all agents, which are never bounded.
         graph: function that returns the lanes of the network.
         step_length_s: step length, in s.
+        unseen_ahead: agents whose part vehicles ahead of it ignore when they change lanes.
     """
 
     def __init__(
-        self, agents: Collection[str], controlled: Collection[str], graph: Callable[[], LaneGraph], step_length_s: float
+        self,
+        agents: Collection[str],
+        controlled: Collection[str],
+        graph: Callable[[], LaneGraph],
+        step_length_s: float,
+        unseen_ahead: Collection[str] = (),
     ) -> None:
         self.agents, self._controlled, self._read_graph = agents, controlled, graph
-        self._dt = step_length_s
+        self._dt, self._unseen_ahead = step_length_s, unseen_ahead
         self._squares: dict[tuple[int, int], list[Piece]] = {}
         self._parts: dict[str, tuple[tuple[float, ...], dict[str, _Part]]] = {}
         self._speed_modes = VehicleCommand.speed_modes  # of the vehicles that are bounded
@@ -372,10 +379,18 @@ class Followers:
                 aside = sumo.vehicle_getWidth(vehicle) / 2 + _SIDE_GAP_M
                 reach = part.reach(-aside, aside)
                 place = sumo.vehicle_getLanePosition(vehicle)
-                if reach is None or place - sumo.vehicle_getLength(vehicle) > reach[1]:
+                if reach is None:
                     continue
-                safe = sumo.vehicle_getSecureGap(vehicle, sumo.vehicle_getSpeed(vehicle), part.speed, decel, agent)
-                if reach[0] - place < safe + sumo.vehicle_getMinGap(vehicle):
+                speed, ahead = sumo.vehicle_getSpeed(vehicle), place - sumo.vehicle_getLength(vehicle) - reach[1]
+                if ahead <= 0.0:
+                    gap, behind = reach[0] - place, vehicle
+                    safe = sumo.vehicle_getSecureGap(vehicle, speed, part.speed, decel, agent)
+                elif agent not in self._unseen_ahead:
+                    gap, behind = ahead, agent
+                    safe = sumo.vehicle_getSecureGap(agent, part.speed, speed, sumo.vehicle_getDecel(vehicle), vehicle)
+                else:
+                    continue
+                if gap < safe + sumo.vehicle_getMinGap(behind):
                     yield vehicle
 
 

@@ -124,8 +124,14 @@ class SumoSimulator:
         self._lateral = self._drifts or moves or "lateral-resolution" in options or "lanechange.duration" in options
         net = scenario.folder / scenario.table(SumoSetup).net
         self._driving = Driving(scenario.agents, scenario.step_length_s, net)
-        outlined = [agent for agent, one in scenario.agents.items() if one.action_settings.get("visible") == "outline"]
-        self._followers = Followers(outlined, scenario.agents, lambda: self._parts.graph, scenario.step_length_s)
+        visible = {agent: one.action_settings.get("visible", "front") for agent, one in scenario.agents.items()}
+        self._followers = Followers(
+            [agent for agent, part in visible.items() if part != "front"],
+            scenario.agents,
+            lambda: self._parts.graph,
+            scenario.step_length_s,
+            unseen_ahead=[agent for agent, part in visible.items() if part == "outline"],
+        )
         self._followers.prepare()
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s, self._driving)
         self._loading = Loading(fix_link_order=scenario.table(SumoSetup).fix_link_order is not False)

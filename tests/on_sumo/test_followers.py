@@ -17,7 +17,7 @@ from crashhunt.disturbances import parse_fixed
 from crashhunt.envs._env_episodes import Episodes
 from crashhunt.oracles import Overlap
 from crashhunt.plans._choices import chosen_actions
-from crashhunt.scenario import argument_values, load_scenario, with_action, with_stated_choice, with_visible_outline
+from crashhunt.scenario import argument_values, load_scenario, with_action, with_stated_choice, with_visible_whole
 from crashhunt.simulators import MotionState
 from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._followers import Followers, Piece, _Part
@@ -25,7 +25,7 @@ from crashhunt.sumo.maps._road_network import NetworkLane
 from crashhunt.trial import Signature
 
 EMPTY = {"intersection": {"priority_demand": 1, "minor_demand": 1}, "motorway": {"demand": 1}}
-SEEN = pytest.mark.parametrize("visible", ["front", "outline"])
+SEEN = pytest.mark.parametrize("visible", ["front", "whole"])
 
 
 @pytest.fixture
@@ -119,7 +119,7 @@ def test_vehicle_that_drives_straight_on_stops_behind_the_tail_of_ego_that_turns
     assert libsumo.vehicle.getLaneID("ego") == ":center_11_0"
     hits = [(hit.collider, hit.victim) for hit in drive.hits]
     assert hits == ([("car", "ego")] if visible == "front" else [])
-    assert libsumo.vehicle.getSpeed("car") > 10.0 or visible == "outline"
+    assert libsumo.vehicle.getSpeed("car") > 10.0 or visible == "whole"
     assert libsumo.vehicle.getPosition("car")[0] < -6.0
 
 
@@ -135,7 +135,7 @@ def test_truck_that_turns_stops_before_the_front_of_ego_that_waits_to_turn(begin
 
 def test_long_lane_change_slows_the_vehicle_in_the_next_lane_before_the_front_is_there(begin):
     slowed = {}
-    for visible in ("front", "outline"):
+    for visible in ("front", "whole"):
         drive = begin("intersection", visible)
         drive.add("car", "west-north", "from-west_1", 38.0, 13.0, setMaxSpeed=13.0)
         drive.put((-200.0, -3.2), math.atan2(3.2, 4.0 * 8.0), 8.0)  # a change over 4 s
@@ -145,7 +145,7 @@ def test_long_lane_change_slows_the_vehicle_in_the_next_lane_before_the_front_is
             lanes.append(libsumo.vehicle.getLaneID("ego"))
         entered = lanes.index("from-west_1")
         slowed[visible] = next(step for step, speed in enumerate(speeds) if speed < 12.9) - entered
-    assert slowed["outline"] < -2
+    assert slowed["whole"] < -2
     assert slowed["front"] >= 0
 
 
@@ -169,6 +169,29 @@ def test_vehicle_does_not_change_to_the_lane_of_the_tail_next_to_it(begin, visib
     assert libsumo.vehicle.getLaneChangeMode("car") == 1621  # SUMO's default
 
 
+def test_vehicle_ahead_changes_to_the_lane_of_a_part_at_the_gaps_at_which_sumo_changes_to_the_lane_of_the_front(begin):
+    changes = {}
+    for visible, aside in (("whole", 0.0), ("whole", 1.0), ("outline", 1.0)):
+        least = changes[visible, aside] = set()
+        for gap in range(1, 50, 3):
+            drive = begin("motorway", visible)
+            road = libsumo.vehicle.getRoadID("ego")
+            middle, left = (libsumo.lane.getShape(f"{road}_{lane}")[0][1] for lane in (1, 2))
+            drive.add("slow", "through", f"{road}_0", 350.0, 10.0, setMaxSpeed=10.0, setLaneChangeMode=0)
+            drive.add("car", "through", f"{road}_0", 320.0, 14.0, setMaxSpeed=35.0)
+            for _ in range(40):
+                rear = libsumo.vehicle.getPosition("car")[0] - libsumo.vehicle.getLength("car")
+                y = middle + aside * ((left - middle) / 2 + 0.1)  # half of ego is in the middle lane
+                drive.put((rear - gap, y), 0.0, 20.0)
+                drive.step()
+                assert libsumo.vehicle.getLaneIndex("ego") == 1 + aside
+                if libsumo.vehicle.getLaneIndex("car") == 1:
+                    least.add(gap)
+                    break
+    assert changes["whole", 0.0] == changes["whole", 1.0] != set()
+    assert 1 in changes["outline", 1.0] - changes["whole", 1.0]
+
+
 def test_vehicle_below_a_bridge_does_not_brake_for_ego_on_it(tmp_path):
     shutil.copy(Path(__file__).with_name("nets") / "bridge.net.xml", tmp_path)
     (tmp_path / "r.rou.xml").write_text(
@@ -177,7 +200,7 @@ def test_vehicle_below_a_bridge_does_not_brake_for_ego_on_it(tmp_path):
     )
     (tmp_path / "scenario.toml").write_text(
         'schema = 1\nsimulator = "sumo"\n[sumo]\nnet = "bridge.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\n'
-        'edges = ["bridge", "down"]\ndepart_pos = "58"\naction = "acceleration_steering:visible=outline"\n'
+        'edges = ["bridge", "down"]\ndepart_pos = "58"\naction = "acceleration_steering:visible=whole"\n'
     )
     with closing(SumoSimulator(load_scenario(tmp_path), tmp_path)) as simulator:
         drive = Drive(simulator, {}, keeps=["low"])
@@ -189,7 +212,7 @@ def test_vehicle_below_a_bridge_does_not_brake_for_ego_on_it(tmp_path):
 
 def test_traffic_is_bit_identical_while_ego_is_inside_its_lane(begin):
     seen = []
-    for visible in ("front", "outline"):
+    for visible in ("front", "whole"):
         drive = begin("motorway", visible, demand=2500)
         states = []
         for _ in range(150):
@@ -280,23 +303,23 @@ def test_outline_in_a_lane_agrees_with_points_of_the_outline():
 
 
 def test_new_hunts_choose_the_outline_for_forms_that_can_be_in_two_lanes():
-    found = {form: with_visible_outline(form) for form in ("trajectory:frame=ego", "speed_and_lateral", "meta", None)}
+    found = {form: with_visible_whole(form) for form in ("trajectory:frame=ego", "speed_and_lateral", "meta", None)}
     assert found == {
-        "trajectory:frame=ego": "trajectory:frame=ego:visible=outline",
-        "speed_and_lateral": "speed_and_lateral:visible=outline", "meta": "meta", None: None,
+        "trajectory:frame=ego": "trajectory:frame=ego:visible=whole",
+        "speed_and_lateral": "speed_and_lateral:visible=whole", "meta": "meta", None: None,
     }  # fmt: skip
-    for name in ("acceleration_steering", "trajectory:visible=outline:frame=ego", "meta", ""):
-        assert with_visible_outline(with_stated_choice(name)) == name
+    for name in ("acceleration_steering", "trajectory:visible=whole:frame=ego", "meta", ""):
+        assert with_visible_whole(with_stated_choice(name)) == name
     drifts = "speed_and_lane:lane_change_duration_s=3"
-    assert with_visible_outline(drifts) == f"{drifts}:visible=outline"
-    assert with_visible_outline("speed_and_lane") == "speed_and_lane"
+    assert with_visible_whole(drifts) == f"{drifts}:visible=whole"
+    assert with_visible_whole("speed_and_lane") == "speed_and_lane"
 
 
 @pytest.mark.parametrize(
     ("form", "recorded"),
     [
         ("", None),
-        ("acceleration_steering", "acceleration_steering:visible=outline"),
+        ("acceleration_steering", "acceleration_steering:visible=whole"),
         ("acceleration_steering:visible=front", "acceleration_steering"),
     ],
 )
@@ -304,5 +327,5 @@ def test_hunt_records_what_others_see_and_an_environment_has_the_same(form, reco
     signatures = {"ego": Signature({}, open=True, given=())}
     assert chosen_actions(form, load_scenario("intersection"), signatures).get("ego") == recorded
     episodes = Episodes("intersection", "ego", form)
-    assert episodes._simulator._followers.agents == (["ego"] if "outline" in str(recorded) else [])
+    assert episodes._simulator._followers.agents == (["ego"] if "whole" in str(recorded) else [])
     episodes.close()

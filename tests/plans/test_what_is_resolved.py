@@ -542,8 +542,8 @@ def test_difference_of_forms_of_actions_names_what_resumes_the_hunt():
     def acting(form):
         return replace(settings, agents={"ego": replace(settings.agents["ego"], action=form)})
 
-    before, now = acting("trajectory"), acting("trajectory:visible=outline")
-    says = "agents.ego.action was trajectory:visible=front and is now trajectory:visible=outline"
+    before, now = acting("trajectory"), acting("trajectory:visible=whole")
+    says = "agents.ego.action was trajectory:visible=front and is now trajectory:visible=whole"
     assert before.differences(now) == [says]
     assert before.differences(before) == []
     assert before.differences(acting("of_a_later_version"))[0].endswith("is now of_a_later_version")

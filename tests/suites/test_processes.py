@@ -257,7 +257,7 @@ def test_the_request_of_settings_results_in_the_same_settings():
     assert plan(again)[1] == settings
     for actions, asked in (
         (("trajectory", "trajectory"), "trajectory:visible=front"), (("meta", None), ""),
-        (("meta", "trajectory:visible=outline"), ""),
+        (("meta", "trajectory:visible=whole"), ""),
     ):  # fmt: skip
         agents = {name: replace(settings.agents["ego"], action=one) for name, one in zip("ab", actions, strict=True)}
         assert _rerun._request_of(replace(settings, agents=agents)).action == asked
