@@ -10,13 +10,7 @@ if TYPE_CHECKING:
         Bundle as Bundle,
         CrashSummary as CrashSummary,
         authenticate_bundle as authenticate_bundle,
-        changing as changing,
-        files_of as files_of,
         is_bundle_made_here as is_bundle_made_here,
-        names_of_actions as names_of_actions,
-        read_bundle as read_bundle,
-        read_lights as read_lights,
-        read_params as read_params,
         snapshot_of as snapshot_of,
         with_lights as with_lights,
         write_bundle as write_bundle,
@@ -116,10 +110,16 @@ if TYPE_CHECKING:
         unreadable_notes as unreadable_notes,
     )
     from ._saved_crashes import (
+        changing as changing,
         crash_folders as crash_folders,
+        files_of as files_of,
         find_bundle as find_bundle,
         list_bundles as list_bundles,
         list_near_misses as list_near_misses,
+        names_of_actions as names_of_actions,
+        read_bundle as read_bundle,
+        read_lights as read_lights,
+        read_params as read_params,
     )
 
 offer_lazily(__name__)

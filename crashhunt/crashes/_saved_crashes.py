@@ -1,18 +1,40 @@
-"""Finds the crashes that a hunt has saved, and the crash that the user names."""
+"""Reads the crashes that a hunt has saved, and finds the crash that the user names."""
 
 from __future__ import annotations
 
+import fcntl
+import os
 import re
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.codec import known_part, typed_where_there
 from crashhunt.base.errors import BundleError
+from crashhunt.base.integrity import FILES, changed_file, digest_of_data, read_object, typed
+from crashhunt.base.older_versions import HOW_TO_READ
 from crashhunt.base.text import listed, near_path, one_of
-from crashhunt.crashes._bundle import Bundle, read_bundle
+from crashhunt.crashes._bundle import _DAMAGE_FIX, SCHEMA, Bundle
+from crashhunt.trial import (
+    Collision,
+    Disturbance,
+    Escape,
+    Failure,
+    TrialResult,
+    TrialSpec,
+    check_disturbances,
+    check_parts,
+    outcome_of,
+)
+from crashhunt.world import ClosestApproach, Event, Paths
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.base.integrity import FileEntry
+    from crashhunt.base.json_types import Plain
 
 
 def list_bundles(directory: Path) -> list[Bundle]:
@@ -129,3 +151,219 @@ def _named(bundles: Sequence[Bundle], crash: str, directory: Path) -> Bundle:
             raise BundleError(f"{crash!r} matches several crashes", fix=fix, where=str(directory))
     fix = one_of(crash, (bundle.id for bundle in bundles))
     raise BundleError(f"there is no crash {crash!r}", fix=fix, where=str(directory))
+
+
+# How a bundle is read: ``crash.json``, whose integrity is checked first, and the files that it lists.
+
+
+def refuse_damaged(data: JsonObject) -> None:
+    """Raise an error if the description of a crash has changed since it was written.
+
+    Raises:
+        ValueError: the description has changed.
+    """
+    typed(data, {"integrity": str, "files": FILES})
+    said = data.pop("integrity")
+    if digest_of_data(data) != said:
+        raise ValueError("the file has changed since it was written")
+    for name, entry in data["files"].items():
+        typed(entry, {"size": int, "blake2b": str})
+        if "/" in name or name in ("", ".", ".."):
+            raise ValueError(f"the file {name!r} is not in the folder of the bundle")
+
+
+def files_of(folder: Path) -> dict[str, FileEntry]:
+    """Return the recorded size and digest of each file of a crash or kept trial; empty if the record cannot be read."""
+    for name in (layout.CRASH, layout.PARAMS):
+        with suppress(OSError, ValueError):
+            data: JsonObject = read_object(folder / name, dict)
+            refuse_damaged(data)
+            return dict(data["files"])
+    return {}
+
+
+def read_params(folder: Path) -> list[str]:
+    """Return the names of a trial's saved files that have changed since they were written."""
+    try:
+        data: JsonObject = read_object(folder / layout.PARAMS, dict)
+        refuse_damaged(data)
+        return [
+            f"{name} {wrong}" for name, entry in data["files"].items() if (wrong := changed_file(folder / name, entry))
+        ]
+    except (OSError, ValueError) as error:
+        return [f"params.json: {error.strerror if isinstance(error, OSError) else error}"]
+
+
+_MAX_OLDER_SCHEMA = 5  # from before format version 1, as schema 1 without ``integrity``
+_SCALAR = bool | float | str | None
+_REQUIRED_KEYS: Plain = {
+    **dict.fromkeys(("trial", "seed", "max_steps", "step"), int),
+    **dict.fromkeys(("outcome", "digest", "snapshot"), str),
+}
+_TYPES: Plain = {
+    "hunt_seed": int,
+    "arguments": dict[str, dict[str, _SCALAR]],
+    "scenario_arguments": dict[str, _SCALAR],
+    "sim_time_s": float,
+    "confirmed": bool | None,
+    "divergence": dict | None,
+    "disturbed": bool,
+    **dict.fromkeys(("log_likelihood", "danger"), float | None),
+    "only": list[str] | None,
+    "robustness": dict[str, float | None] | None,
+    **dict.fromkeys(("why_unconfirmed", "why_no_escape"), str),
+    "script": dict | None,
+    "authentication_code": str,
+}
+_PARTS: Mapping[str, type] = {
+    "collision": Collision, "failure": Failure, "escape": Escape, "event": Event, "closest_approach": ClosestApproach,
+}  # fmt: skip
+_KEYS = {
+    *_REQUIRED_KEYS, *_TYPES, *_PARTS, "schema", "id", "category", "summary", "events", "versions", "files",
+    "integrity", "disturbances", "planned_disturbances",
+}  # fmt: skip
+
+
+def read_lights(bundle: Bundle) -> JsonObject:
+    """Return the lights and routes of a bundle; empty if it has none, or if the file has changed."""
+    path, entry = bundle.path / layout.LIGHTS, bundle.files.get(layout.LIGHTS)
+    if entry is None or changed_file(path, entry):
+        return {}
+    with suppress(OSError, ValueError):
+        found: JsonObject = read_object(path, dict)
+        return found
+    return {}
+
+
+def names_of_actions(bundle: Bundle, agent: str) -> tuple[str, ...]:
+    """Return the name of each discrete action of an agent, such as ``SLOWER``, by number; empty if unknown.
+
+    The replay that confirms a crash writes them in the file of the lights: the log has the numbers only.
+    """
+    found = read_lights(bundle).get("actions")
+    names = found.get(agent) if isinstance(found, dict) else None
+    return tuple(map(str, names)) if isinstance(names, list) else ()
+
+
+def read_bundle(path: Path) -> Bundle:
+    """Read a crash bundle from its folder.
+
+    Raises:
+        BundleError: the folder is not a crash bundle, or the bundle is damaged.
+    """
+    file = path / layout.CRASH
+    try:
+        data: JsonObject = read_object(file, dict)
+        typed(data, {"schema": int})
+        if 1 < data["schema"] <= _MAX_OLDER_SCHEMA or (data["schema"] == SCHEMA and "integrity" not in data):
+            raise BundleError("the crash is older than format version 1", fix=HOW_TO_READ, where=str(file))
+        if data["schema"] != SCHEMA:
+            raise BundleError(
+                f"schema version {data['schema']} is not supported (supported: {SCHEMA})",
+                fix="use the version of crashhunt that wrote the trial",
+                where=str(file),
+            )
+        refuse_damaged(data)
+        return _bundle(path, data)
+    except OSError as error:
+        raise BundleError(
+            f"the folder contains no crash bundle: {error.strerror}",
+            fix="give another folder, or run crashhunt check to see what can be recovered",
+            where=str(file),
+        ) from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        raise BundleError(f"crash.json is damaged: {reason}", fix=_DAMAGE_FIX, where=str(file)) from None
+
+
+def as_stored(bundle: Bundle) -> Bundle:
+    """Return a bundle as it is on the disk now; the given bundle if it cannot be read, or contains another crash.
+
+    A hunt that runs may confirm a crash while a command judges it. Each of the two writes the whole ``crash.json``.
+    """
+    try:
+        stored = read_bundle(bundle.path)
+    except BundleError:
+        return bundle
+    is_same = (stored.id, stored.result.digest) == (bundle.id, bundle.result.digest)
+    return stored if is_same else bundle
+
+
+@contextmanager
+def changing(bundle: Bundle) -> Iterator[Bundle]:
+    """Yield a bundle as it is on the disk now, to be changed and written; other processes wait until it is written."""
+    folder: int | None = None
+    with suppress(OSError):  # a hunt has deleted the bundle, or the file system has no locks
+        folder = os.open(bundle.path, os.O_RDONLY | os.O_CLOEXEC)
+        fcntl.flock(folder, fcntl.LOCK_EX)
+    try:
+        yield as_stored(bundle)
+    finally:
+        if folder is not None:
+            os.close(folder)
+
+
+def _bundle(path: Path, data: JsonObject) -> Bundle:
+    typed(data, _REQUIRED_KEYS)
+    typed_where_there(data, _TYPES)
+    hit, failure, event, escape = data.get("collision"), data.get("failure"), data.get("event"), data.get("escape")
+    closest = data.get("closest_approach", {})
+    check_parts(closest, hit, failure, escape, event)
+    for disturbances in (data.get("planned_disturbances"), data.get("disturbances")):
+        check_disturbances(disturbances)
+    typed({"events": data.get("events")}, {"events": dict[str, int] | None})
+    if not 0 <= data["seed"] < 2**31 or min(data["trial"], data["step"]) < 0 or data["max_steps"] < 1:
+        numbers = ", ".join(f"{name} = {data[name]}" for name in ("trial", "seed", "step", "max_steps"))
+        raise ValueError(f"one of these numbers is out of range: {numbers}")
+    if not re.fullmatch(r"\w+", data["snapshot"]):
+        raise ValueError(f"snapshot {data['snapshot']!r} is not the name of a snapshot")
+    spec = TrialSpec(
+        number=data["trial"],
+        seed=data["seed"],
+        arguments=data.get("arguments", {}),
+        scenario_arguments=data.get("scenario_arguments", {}),
+        max_steps=data["max_steps"],
+        disturbances=tuple(map(Disturbance.from_json, data.get("planned_disturbances") or ())),
+        only=tuple(only) if (only := data.get("only")) is not None else None,
+        script=Paths.from_json(script) if (script := data.get("script")) else None,
+    )
+    result = TrialResult(
+        spec,
+        outcome_of(data),
+        steps=data["step"],
+        sim_time_s=data.get("sim_time_s", 0.0),
+        digest=data["digest"],
+        closest=ClosestApproach.from_json(closest),
+        collision=Collision.from_json(hit) if hit else None,
+        failure=Failure.from_json(failure) if failure else None,
+        escape=Escape.from_json(escape) if escape else None,
+        event=Event.from_json(event) if event else None,
+        events=data.get("events"),
+        disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
+        log_likelihood=data.get("log_likelihood"),
+        danger=data.get("danger"),
+        robustness=data.get("robustness"),
+        why_no_escape=data.get("why_no_escape", ""),
+    )
+    return Bundle(
+        path=path,
+        result=result,
+        hunt_seed=data.get("hunt_seed", 0),
+        snapshot=data["snapshot"],
+        confirmed=data.get("confirmed"),
+        divergence=data.get("divergence"),
+        files=data["files"],
+        added=_added(data),
+        why_unconfirmed=data.get("why_unconfirmed", ""),
+        authentication_code=data.get("authentication_code", ""),
+    )
+
+
+def _added(data: JsonObject) -> dict[str, object]:
+    """Return the JSON keys that a later version of crashhunt added to the crash and its parts."""
+    added: dict[str, object] = {name: value for name, value in data.items() if name not in _KEYS}
+    for name, kind in _PARTS.items():
+        _, rest = known_part(kind, data.get(name))
+        if rest:
+            added[name] = rest
+    return added

@@ -34,7 +34,7 @@ from crashhunt.crashes import (
     write_bundle,
     write_trial,
 )
-from crashhunt.crashes._bundle import as_stored
+from crashhunt.crashes._saved_crashes import as_stored
 from crashhunt.hunts import _verification
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.trial import Collision, Escape, Failure, Outcome, TrialResult, TrialSpec
