@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
+import re
+from collections.abc import Collection, Mapping
 from dataclasses import MISSING, fields
-from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, ParamSpec, Protocol, TypeVar
 
 from crashhunt.base.errors import CallError
+from crashhunt.base.foreign_code import describe_value
 from crashhunt.base.older_versions import removed_fix
 from crashhunt.base.text import one_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -114,9 +118,50 @@ def _refuse(name: str, signature: inspect.Signature, args: tuple[object, ...], k
             fix = removed_fix(keyword) or one_of(keyword, known, give="it takes", none="no keywords")
             raise CallError(f"{name}() has no argument {keyword!r}", fix=fix)
     try:
-        signature.bind(*args, **kwargs)
+        given = signature.bind(*args, **kwargs).arguments
     except TypeError as problem:
         raise CallError(f"{name}(): {problem}", fix=f"call {name}{_shown(signature)}") from None
+    for argument, value in given.items():
+        parameter = signature.parameters[argument]
+        for one in value if parameter.kind is parameter.VAR_POSITIONAL else (value,):
+            if fix := _fix_of(str(parameter.annotation), one):
+                raise CallError(f"{name}(): {argument} is {describe_value(one)}", fix=fix)
+
+
+def _fix_of(annotation: str, value: object) -> str:
+    """Return what to give instead of a value that is no path, table, list or object; empty if the value is fine.
+
+    The functions check numbers and texts themselves.
+    """
+    heads = re.sub(r"\[.*?\]", "", annotation).split(" | ")
+    if not set(heads) <= _FIXES.keys() or heads in _UNCHECKED:
+        return ""
+    if heads[0] == "Sequence":
+        of_texts = "[str]" in annotation
+        is_fine = (
+            isinstance(value, Collection)
+            and not isinstance(value, str | bytes)
+            and (not of_texts or all(isinstance(one, str) for one in value))
+        )
+    else:
+        is_fine = isinstance(value, tuple(_KINDS[head] for head in heads if head in _KINDS))
+    is_fine = is_fine or not {kind.__name__ for kind in type(value).__mro__}.isdisjoint(heads)
+    if is_fine or (value is None and "None" in heads):
+        return ""
+    return _FIXES["str" if heads[0] == "Path" and "str" in heads else heads[0]]
+
+
+_UNCHECKED: Final = (["str"], ["str", "None"], ["Bundle"])
+_KINDS: Final[Mapping[str, Any]] = {"Mapping": Mapping, "Path": os.PathLike, "str": str}
+_FIXES: Final = {
+    "Bundle": "give the path of a hunt or a crash, or a crash of a hunt that crashhunt.load returned",
+    "Mapping": "give a dictionary",
+    "None": "",
+    "Path": "give a pathlib.Path",
+    "Sequence": "give a list",
+    "SnapshotOptions": "give crashhunt.snapshots.SnapshotOptions(…)",
+    "str": "give a path",
+}
 
 
 def _keywords(signature: inspect.Signature) -> dict[str, None]:

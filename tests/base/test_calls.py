@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import pytest
 
+import crashhunt
 from crashhunt.base.calls import called_with, clear_calls, clear_constructor
 from crashhunt.base.errors import CallError
 from crashhunt.base.progress import watched
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
 
 
 @clear_constructor
@@ -84,3 +90,40 @@ def test_progress_is_reported_after_each_item():
         told.extend(item)
     assert told == ["a", (1, 5), "b", (2, 5)]
     assert [*watched("ab", 5, None)] == ["a", "b"]
+
+
+@clear_calls()
+def open_hunt(place: Path | str, *, table: Mapping[str, int] | None = None, words: Sequence[str] = ()):
+    return place, table, words
+
+
+@pytest.mark.parametrize(
+    ("call", "message", "fix"),
+    [
+        (lambda: open_hunt(5), "open_hunt(): place is 5", "give a path"),
+        (lambda: open_hunt(None), "open_hunt(): place is None", "give a path"),
+        (lambda: open_hunt("h", table=[1]), "open_hunt(): table is [1]", "give a dictionary"),
+        (lambda: open_hunt("h", words=5), "open_hunt(): words is 5", "give a list"),
+        (lambda: open_hunt("h", words="stop"), "open_hunt(): words is 'stop'", "give a list"),
+        (lambda: open_hunt("h", words=["stop", 5]), "open_hunt(): words is ['stop', 5]", "give a list"),
+        (lambda: crashhunt.load(5), "load(): directory is 5", "give a path"),
+        (lambda: crashhunt.replay(5), "replay(): crash is 5", "give the path of a hunt or a crash, or a crash of"),
+        (lambda: crashhunt.compare("h", 5), "compare(): directories is 5", "give a path"),
+        (
+            lambda: crashhunt.prepare("h", 1, 1, 1, snapshot=5),
+            "prepare(): snapshot is 5",
+            "give crashhunt.snapshots.SnapshotOptions(…)",
+        ),
+        (lambda: crashhunt.prepare("h", 1, 1, 1, command=5), "prepare(): command is 5", "give a list"),
+    ],
+)
+def test_value_that_is_no_path_table_or_list_is_refused(call, message, fix):
+    with pytest.raises(CallError) as refused:
+        call()
+    assert refused.value.message == message
+    assert refused.value.fix.startswith(fix)
+
+
+def test_values_of_the_annotated_types_are_accepted():
+    assert open_hunt(Path("h"), table={"a": 1}, words={"stop"}) == (Path("h"), {"a": 1}, {"stop"})
+    assert open_hunt("h", table=None) == ("h", None, ())
