@@ -396,7 +396,7 @@ class TranslatesMotion(Protocol):
     Counterfactual runs with a reference driver need this translation if agents act by acceleration and steering.
 
     Contract: no method changes the simulation. But after `action_with`, the vehicle may not be where the agent's next
-    trajectories begin: the simulator then follows them as well as the vehicle can, instead of refusing them.
+    trajectory or pose expects it: the simulator then follows it as well as the vehicle can, instead of refusing it.
     """
 
     def is_steered(self, agent: str) -> bool:

@@ -35,6 +35,7 @@ _OVER_M = 1.0  # a vehicle so far over the side of its lane is in the way of the
 _RECENT_LANES = 4  # looked at before SUMO is asked for the lane below a point
 _LOOK_S, _MIN_LOOK_M = 0.5, 4.0  # how far ahead a vehicle that keeps its lane looks
 _MAX_LANES_AHEAD = 10
+_CATCH_UP_S = 1.0  # in which a vehicle makes up for its distance from a pose that it cannot reach in time
 _MAX_GAP_M = 5.0  # distance of a pursued trajectory from the vehicle
 _OBSTACLES = ("building", "obstacle")  # types of polygons
 _STANDING_M = 0.01  # a vehicle that moves by less in a step does not turn
@@ -66,6 +67,7 @@ class FreeMotion:
         self._vehicle, self._form, self._dt, self._area = vehicle, form, step_length_s, area
         self._is_relative = settings.get("frame") == "ego"
         self._is_overruled = False
+        self._aim: tuple[float, float] | None = None  # the position of the last target pose
         self._pursues = settings.get("tracker") == "pure_pursuit"
         self._half, self._half_width = sumo.vehicle_getLength(vehicle) / 2, sumo.vehicle_getWidth(vehicle) / 2
         self._ahead = 2 * self._half * REFERENCE_SHARES[str(settings.get("reference_point", "center"))]
@@ -97,6 +99,7 @@ class FreeMotion:
         """Move the vehicle by an encoded action; return whether it stays on the road and hits no obstacle."""
         self.events.clear()
         state = self._next(action.tolist())
+        self._aim = self._pose(action.tolist())[:2] if self._form == "target_pose" else None
         if self._arrives(state):
             sumo.vehicle_remove(self._vehicle, _ARRIVED)
             return True
@@ -157,14 +160,14 @@ class FreeMotion:
         """Check that the vehicle can follow an encoded trajectory or target pose in the next step.
 
         Raises:
-            ActionError: the vehicle would jump, turn on the spot, drive backwards, or has no point to follow. A
-                trajectory of an agent that was overruled may be anywhere.
+            ActionError: the vehicle would jump, turn on the spot, drive backwards, or has no point to follow. Poses
+                of an agent that was overruled may be anywhere.
         """
         state, values, dt = self.state, action.tolist(), self._dt
         if self._form == "trajectory" and values[-1][0] < dt:
             message = f"the trajectory ends {values[-1][0]:g} s from now, before the step of {dt:g} s"
             raise ActionError(message, fix="return points beyond the end of the step")
-        if self._form == "trajectory" and self._is_overruled:
+        if self._is_overruled:
             return
         if self._pursues:
             gap = min(math.dist(point[1:3], (state.x, state.y)) for point in self._in_map(action).tolist())
@@ -208,8 +211,7 @@ class FreeMotion:
     def action_with(self, action: NDArray[np.generic] | None, *, speed_mps: float | None, keeps_lane: bool) -> object:
         """Return the action with another speed after the step, or with the steering that keeps the lane.
 
-        From then on, the vehicle may not be where the agent's plans begin: it pursues a trajectory that it cannot
-        follow.
+        From then on, the vehicle may not be where the agent's plans begin: it pursues poses that it cannot reach.
         """
         self._is_overruled = True
         after = self.state if action is None else self._next(action.tolist())
@@ -327,15 +329,39 @@ class FreeMotion:
                 return self._pursue(points)
             return after
         if self._form == "target_pose":
-            x, y, heading, time_s = values
-            _, x, y, heading, _ = self._in_map(np.array([[0.0, x, y, heading, 0.0]]))[0].tolist()
-            return self._towards(x, y, heading, time_s)
+            (x, y, heading), time_s = self._pose(values), values[3]
+            after, model = self._towards(x, y, heading, time_s), self.model
+            can = -model.max_deceleration <= after.acceleration <= model.max_acceleration
+            if self._is_overruled and not (can and self._refusal(after) is None):
+                return self._pursue_pose(x, y, heading, time_s)
+            return after
         if self._form == "throttle_brake_steering":
             throttle, brake, share = values
             acceleration = throttle * self.model.max_acceleration - brake * self.model.max_deceleration
             return self.model.step(self.state, acceleration, share * MAX_STEERING_RAD, self._dt)
         acceleration, steering = values
         return self.model.step(self.state, acceleration, steering, self._dt)
+
+    def _pose(self, values: list[float]) -> tuple[float, float, float]:
+        """Return the pose of the centre that a target pose means, in the frame of the map."""
+        x, y, heading = self._in_map(np.array([[0.0, *values[:3], 0.0]]))[0, 1:4].tolist()
+        return x, y, heading
+
+    def _pursue_pose(self, x: float, y: float, heading: float, time_s: float) -> MotionState:
+        """Return the state after a step of a bicycle model that follows a pose which it cannot reach in time.
+
+        The vehicle steers to the line ahead of the pose. It takes over the speed with which the poses of the last two
+        steps move along its heading, plus what makes up for its distance within a further second.
+        """
+        state, (cos, sin) = self.state, (math.cos(self.state.heading), math.sin(self.state.heading))
+        last_x, last_y = self._aim or (x - state.speed * self._dt * cos, y - state.speed * self._dt * sin)
+        speed = max(0.0, min(self.model.max_speed, ((x - last_x) * cos + (y - last_y) * sin) / self._dt))
+        ahead = (x - state.x) * cos + (y - state.y) * sin
+        speed = max(0.0, speed + (ahead - speed * time_s) / _CATCH_UP_S)
+        on = np.arange(0.0, abs(ahead) + 2 * (_MIN_LOOK_M + _LOOK_S * state.speed))
+        line = np.broadcast_to((time_s, x, y, heading, speed), (len(on), 5)).copy()
+        line[:, 1:3] += np.outer(on, (math.cos(heading), math.sin(heading)))
+        return self._pursue(line)
 
     def _pursue(self, points: NDArray[np.float64]) -> MotionState:
         """Return the state after a step of a bicycle model that steers to a point ahead on a trajectory.

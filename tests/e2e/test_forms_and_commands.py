@@ -9,7 +9,7 @@ from crashhunt.scenario import ACTIONS
 pytest.importorskip("libsumo")
 
 # One blind driver for each form: it accelerates along its straight lane until it hits the vehicle ahead.
-AGENT = """
+AGENT = '''
 import numpy as np
 
 ANSWERS = {
@@ -41,7 +41,20 @@ class Blind:
 
     def act(self, observation):
         return self.answer(float(observation["ego"][self.speed]), self.top)
-"""
+
+
+class Planned(Blind):
+    """Plans all its poses at the start: it accelerates by 2 m/s², whatever happens."""
+
+    def reset(self, seed):
+        self.poses = None
+
+    def act(self, observation):
+        x, y, heading, speed = observation["ego"][:4].tolist()
+        if self.poses is None:
+            self.poses = ((x + speed * t + t * t, y, heading, 0.1) for t in np.arange(0.1, 99.0, 0.1))
+        return next(self.poses)
+'''
 RELATIVE = ("trajectory", "target_pose")
 WITHOUT_LANE_CHANGES = (
     "speed_and_lateral", "acceleration_steering", "throttle_brake_steering", "trajectory", "target_pose",
@@ -95,6 +108,16 @@ def outcome(shell, form, operation):
     assert done.code == 0, (done.out, done.err)
     assert "Traceback" not in done.err
     return ""
+
+
+def test_agent_that_was_overruled_is_not_blamed_for_poses_that_are_due_in_the_next_step(shell):
+    (shell.folder / "blind.py").write_text(AGENT)
+    words = ("--scenario", "motorway", "--agent", "blind:Planned", "--action", "target_pose", "--seed", "3")
+    shell.crashhunt("run", "h", "1", "1", "300", *words)
+    found = shell.crashhunt("whatif", "h", "--before", "3", "--overrule", "reference", "--json").json
+    assert not found["outcomes"].get("agent_error"), found
+    (judged,) = shell.crashhunt("judge", "h", "--runs", "1", "--why", "0", "--reference", "9", "--json").json["judged"]
+    assert judged["reference"]["omission"], judged["reference"]
 
 
 @pytest.mark.nightly

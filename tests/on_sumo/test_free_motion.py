@@ -342,8 +342,9 @@ def test_reference_driver_corrects_steering_out_of_the_lane(start, form):
     assert simulator.motion_of("ego", kept).speed_mps == pytest.approx(motion.state.speed - 0.2, abs=1e-6)
 
 
-def test_vehicle_of_an_overruled_agent_pursues_a_trajectory_that_begins_elsewhere(start):
-    simulator, step = start("trajectory", "motorway")
+@pytest.mark.parametrize("form", ["trajectory", "target_pose"])
+def test_vehicle_of_an_overruled_agent_pursues_poses_elsewhere(start, form):
+    simulator, step = start(form, "motorway")
     encode, motion = simulator.actions["ego"].encode, simulator._driving.moving["ego"]
     begin = motion.state
     cos, sin = math.cos(begin.heading), math.sin(begin.heading)
@@ -352,7 +353,7 @@ def test_vehicle_of_an_overruled_agent_pursues_a_trajectory_that_begins_elsewher
         """3 m ahead of where the vehicle would be, and 0.5 m to the left."""
         along = 3.0 + begin.speed * 0.1 * steps
         x, y = begin.x + along * cos - 0.5 * sin, begin.y + along * sin + 0.5 * cos
-        return [(0.1, x, y, begin.heading, begin.speed)]
+        return [(0.1, x, y, begin.heading, begin.speed)] if form == "trajectory" else (x, y, begin.heading, 0.1)
 
     with pytest.raises(ActionError, match="moves the vehicle by"):
         encode(plan(1))
@@ -362,6 +363,12 @@ def test_vehicle_of_an_overruled_agent_pursues_a_trajectory_that_begins_elsewher
     dx, dy = motion.state.x - begin.x, motion.state.y - begin.y
     assert dy * cos - dx * sin == pytest.approx(0.5, abs=0.05)
     assert motion.state.speed == pytest.approx(begin.speed, abs=0.5)
+    if form == "target_pose":  # a pose without a speed: the vehicle gets there as fast as it can, and never turns back
+        assert dx * cos + dy * sin == pytest.approx(3.0 + begin.speed * 5.9, abs=0.5)
+        for _ in range(80):
+            step(encode((begin.x, begin.y, begin.heading, 0.1)))
+        assert motion.state.speed == 0.0
+        assert motion.state.heading == pytest.approx(begin.heading, abs=0.02)
 
 
 @pytest.mark.parametrize("side", [1, -1])
