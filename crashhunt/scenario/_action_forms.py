@@ -252,7 +252,7 @@ def canonical_action(name: str | None) -> str:
     return _OLDER_NAMES.get(form, form)
 
 
-def action_settings(name: str | None, where: str = "") -> dict[str, float | str]:
+def action_settings(name: str | None, where: str = "action") -> dict[str, float | str]:
     """Return the value of every setting of a form of actions, such as ``trajectory:frame=ego``.
 
     Args:

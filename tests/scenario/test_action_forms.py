@@ -60,3 +60,8 @@ def test_setting_that_does_not_exist_or_fit_is_refused(name, message, fix):
     with pytest.raises(UsageError, match=message) as caught:
         action_settings(name, where="--action")
     assert fix in caught.value.fix
+
+
+def test_unknown_setting_of_a_recorded_form_names_the_action():
+    with pytest.raises(UsageError, match="^action: trajectory:visible is 'of_a_later_version'"):
+        action_settings("trajectory:visible=of_a_later_version")
