@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
+from types import SimpleNamespace
 
 import pytest
 from single_threaded import answer_of
+
+from crashhunt.episode import OnsetForcer
+from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
@@ -60,3 +64,21 @@ def test_root_with_a_copy_that_hangs_or_dies_is_incomplete(ask):
     outcome, left, asked, again, forced = found["dies"]
     assert (outcome, left, asked, again) == ("survived", 0, False, True)  # a resumed hunt runs it again
     assert forced["why_unanswered"] == "a copy was killed by SIGKILL"
+
+
+END = {"step": 40, "within": 1.0, "branched": 10}
+
+
+@pytest.mark.parametrize(("answer", "why", "again"), [
+    ({"lost": "a copy was killed", "is_from_outside": True}, "a copy was killed", True),
+    ({"lost": "a copy failed", "is_from_outside": False}, "a copy failed", False),
+    ({"ends": [END | {"outcome": "simulator_error"}]}, "a copy ended by simulator_error", False),
+    ({"ends": [END | {"outcome": "invalid"}]}, "a copy ended by invalid", False),
+])  # fmt: skip
+def test_root_whose_copy_says_too_little_is_incomplete(answer, why, again):
+    forcer = OnsetForcer(("brake=0.05",), CRASHES, 1.0, lambda _: None)
+    forcer._onsets = SimpleNamespace(following=lambda _: None, survival=0.5, masses={})
+    forcer.fork_runner.run = lambda _: answer
+    forcer._follow(None, None)
+    forced = forcer.result(TrialResult(TrialSpec(0, 1, {}, {}, 99), Outcome.SURVIVED)).forced
+    assert (forced.unanswered, forced.why_unanswered, forced.may_be_asked_again, forced.copies) == (1, why, again, ())
