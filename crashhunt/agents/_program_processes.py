@@ -220,6 +220,7 @@ class AttachedProgram:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.has_answered = (folder / _FORMAT).exists()  # in an earlier trial
         self.pid = int((folder / _PID).read_text(encoding="ascii"))
         self.returncode: int | None = None
         output = os.open(folder / _OUTPUT, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)

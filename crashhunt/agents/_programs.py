@@ -310,8 +310,8 @@ class _Process:
 
     @property
     def is_reused(self) -> bool:
-        """Whether the program may have driven in earlier trials."""
-        return self._attached is not None
+        """Whether the program has answered in an earlier trial."""
+        return self._attached is not None and self._attached.has_answered
 
     def start(self) -> None:
         """Start the program.
@@ -374,10 +374,11 @@ class _Process:
         """
         data, expected = self._encoded(message), _ANSWERS[message["type"]]
         answer = self.exchange(data, expected, shown, limit_s)
-        if expected == "ready" and answer.get("format") == "msgpack":
-            self._use_msgpack()
-            if self._attached is not None:
-                self._attached.keep_format("msgpack")
+        if expected == "ready":
+            if answer.get("format") == "msgpack":
+                self._use_msgpack()
+            if self._attached is not None and not self._attached.has_answered:
+                self._attached.keep_format("json" if self._packer is None else "msgpack")
         elif expected == "act" and self._is_forked:
             self._keep(data, answer.get("action"))
         return answer

@@ -85,6 +85,14 @@ def test_a_program_that_does_not_answer_a_second_hello_is_refused_with_the_fix(t
         trial(program, locator, tmp_path)
 
 
+def test_reuse_is_no_reason_for_a_program_that_fails_at_its_first_hello(tmp_path, reused):
+    locator = f"exec:{write_program(tmp_path)} exits hello"
+    program = reused(locator)
+    with pytest.raises(ProgramError, match="exited with 3 instead of answering hello") as failed:
+        trial(program, locator, tmp_path, kind="exits")
+    assert "reuse" not in failed.value.fix
+
+
 @pytest.mark.parametrize(
     ("harm", "message"),
     [
