@@ -14,11 +14,11 @@ from crashhunt.crashes import crash_folders, fault_of, most_dangerous, preventab
 from crashhunt.dashboard._catalog import is_inside, unreadable, unreadable_below
 from crashhunt.dashboard._hunt_page import read_tail
 from crashhunt.ledger import Ledger, has_begun
-from crashhunt.recording import read_lanes
+from crashhunt.recording import read_lanes, read_obstacles
 from crashhunt.report import Story, lineage_of, player_data
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
@@ -50,6 +50,7 @@ class CrashList:
         self._entries: dict[str, _Entry] = {}
         self._analysed: dict[str, tuple[tuple[int, int], JsonObject]] = {}
         self._lanes: dict[str, list[list[float]]] = {}
+        self._obstacles: dict[str, list[list[float]]] = {}
         self._lock = threading.RLock()
         self._thread: threading.Thread | None = None
 
@@ -212,8 +213,9 @@ class CrashList:
         """Return the roads around the crashes, and the places of crashes and near misses.
 
         Returns:
-            ``lanes``: for each lane, x and y of its two borders in m, right and then left. ``points``: for each crash
-            its identifier, x and y in m, type, and whether it is a near miss.
+            ``lanes``: for each lane, x and y of its two borders in m, right and then left. ``obstacles``: for each
+            obstacle, such as a building, x and y of its outline. ``points``: for each crash its identifier, x and y in
+            m, type, and whether it is a near miss.
         """
         with self._lock:
             rows = self.rows()["crashes"]
@@ -221,23 +223,30 @@ class CrashList:
             for name in [row["id"] for row in rows if not row["damaged"]][:_MAX_MAP_LOGS]:
                 if name not in self._lanes and (path := self.log(name)) is not None:
                     try:
-                        borders = read_lanes(path)
+                        borders, outlines = read_lanes(path), read_obstacles(path)
                     except (BundleError, OSError, ValueError):
-                        borders = []
-                    self._lanes[name] = [
-                        [round(float(value), 2) for side in (right, left[::-1]) for point in side for value in point]
-                        for right, left in borders
-                        if len(right) > 1
-                    ]
-            unique = {tuple(lane): None for name in folders for lane in self._lanes.get(name, ())}
+                        borders, outlines = [], []
+                    self._lanes[name] = [_flat(*right, *left[::-1]) for right, left in borders if len(right) > 1]
+                    self._obstacles[name] = [_flat(*outline) for outline in outlines if len(outline) > 2]
             return {
-                "lanes": [list(lane) for lane in list(unique)[:_MAX_LANES]],
+                "lanes": _unique(self._lanes, folders),
+                "obstacles": _unique(self._obstacles, folders),
                 "points": [
                     {name: row.get(name) for name in ("id", "x", "y", "type", "near_miss", "outcome")}
                     for row in rows
                     if row.get("x") is not None
                 ],
             }
+
+
+def _flat(*points: Iterable[float]) -> list[float]:
+    return [round(float(value), 2) for point in points for value in point]
+
+
+def _unique(lines: Mapping[str, list[list[float]]], names: Iterable[str]) -> list[list[float]]:
+    """Return the lines of crashes, each once."""
+    unique = {tuple(line): None for name in names for line in lines.get(name, ())}
+    return [list(line) for line in list(unique)[:_MAX_LANES]]
 
 
 def _is_near_miss(folder: Path) -> bool:

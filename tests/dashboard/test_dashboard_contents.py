@@ -390,7 +390,10 @@ def test_map_has_each_lane_once_and_the_places_that_are_known(crashes, tmp_path,
         return [(right, left), ([(1.0, 1.0)], [(1.0, 2.0)])]  # and one without a length
 
     monkeypatch.setattr(_crashes, "read_lanes", lanes)
+    building = [(0.0, 9.0), (5.004, 9.0), (5.0, 14.0)]
+    monkeypatch.setattr(_crashes, "read_obstacles", lambda path: [building, [(0.0, 9.0), (5.0, 9.0)]])
     found = crashes.map()
+    assert found["obstacles"] == [[0.0, 9.0, 5.0, 9.0, 5.0, 14.0]]
     assert found["lanes"] == [[0.0, 0.0, 10.0, 0.0, 10.0, 4.0, 0.0, 4.0]]
     assert found["points"][0] == {"id": "000001-collision", "x": 1.23, "y": -5.68, "type": None, "near_miss": False,
                                   "outcome": "collision"}  # fmt: skip

@@ -383,19 +383,22 @@ function densityOf(crashed) {
 function drawMap() {
   $("where-section").hidden = !road || !road.points.length;
   if ($("where-section").hidden) return;
-  const x = [], y = [];
-  for (const lane of road.lanes) {
-    for (let place = 0; place < lane.length; place += 2) { x.push(lane[place]); y.push(lane[place + 1]); }
-    x.push(lane[0], null);
-    y.push(lane[1], null);
-  }
+  const areas = (outlines, more) => {
+    const x = [], y = [];
+    for (const outline of outlines) {
+      for (let place = 0; place < outline.length; place += 2) { x.push(outline[place]); y.push(outline[place + 1]); }
+      x.push(outline[0], null);
+      y.push(outline[1], null);
+    }
+    return { type: "scatter", mode: "lines", x, y, fill: "toself", hoverinfo: "skip", showlegend: false, ...more };
+  };
   const crashed = road.points.filter((one) => !one.near_miss), near = road.points.filter((one) => one.near_miss), types = [...new Set(crashed.map((one) => one.type ?? one.outcome))].sort();
   $("near-box").hidden = !near.length;
   /* Plotly cuts a legend that is wider than the chart. */
   const wrapped = (text) => ($("map").clientWidth < 600 ? text.replace(/(.{20,34})\s/g, "$1<br>") : text);
   /* Plotly draws a density below the roads, so they are translucent then. */
   const isDense = $("density").checked && crashed.length > 1;
-  const traces = [{ type: "scatter", mode: "lines", x, y, fill: "toself", fillcolor: css("--road") + (isDense ? "55" : ""), line: { color: css("--mark"), width: 1 }, hoverinfo: "skip", showlegend: false }];
+  const traces = [areas(road.obstacles, { fillcolor: css("--building"), line: { width: 0 } }), areas(road.lanes, { fillcolor: css("--road") + (isDense ? "55" : ""), line: { color: css("--mark"), width: 1 } })];
   if (isDense) traces.push({ type: "heatmap", ...densityOf(crashed), colorscale: [[0, "rgba(0,0,0,0)"], [1, css("--crash")]], opacity: 0.7, showscale: false, hoverinfo: "skip", zsmooth: "best" });
   /* One dot for each place and type, with its number of crashes. */
   const places = (own) => [...Map.groupBy(own, (one) => `${Math.round(one.x)} ${Math.round(one.y)}`).values()];
