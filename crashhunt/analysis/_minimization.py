@@ -35,7 +35,7 @@ _MAX_CONFIRMATIONS = 3  # of what is left of a flaky crash
 _DISK_FIX = "free some space and run the same command again, which reuses the results of finished trials"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Shrunk(Serializable):
     """The result of a minimization.
 
@@ -59,15 +59,15 @@ class Shrunk(Serializable):
     verdict: Verdict
     ended: Ended
     small: Bundle | None = None
-    why: str = ""
-    actors: tuple[int, int] = (0, 0)
-    agents: tuple[int, int] = (0, 0)
-    trials: int = 0
-    steps: int = 0
+    why: str
+    actors: tuple[int, int]
+    agents: tuple[int, int]
+    trials: int
+    steps: int
     removed: tuple[str, ...] = ()
     changed: Mapping[str, tuple[Value | None, Value | None]] = field(default_factory=dict)
     steps_cut: int = 0
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
 
     json_keys = (
         "crash=bundle.id", "path=small.path", "verdict", "ended", "why", "signature_kept", "confirmed=after.confirmed",

@@ -36,8 +36,8 @@ class Ran:
     """
 
     same: bool
-    steps: int = 0
-    digest: str = ""
+    steps: int
+    digest: str
 
 
 class Runs:

@@ -285,7 +285,6 @@ class Trials:
         """Register the result of a trial, which is already in the ledger or will be written next."""
         number = result.spec.number
         if number in self._running_again:
-            self._running_again.discard(number)
             return
         self._open.discard(number)
         if self._sampler.learns:

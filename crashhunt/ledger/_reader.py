@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 import sqlite3
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict, cast
 
@@ -304,14 +304,10 @@ class LedgerReader:
     def intact_turns(self) -> list[Turn]:
         """Return the intact proposals, even if other proposals are damaged."""
         found: list[Turn] = []
-        try:
+        with suppress(HuntDirectoryError):  # the table cannot be read on
             for row in self._select(f"{self._shape.select('proposals')} ORDER BY turn"):
-                try:
+                with suppress(HuntDirectoryError):
                     found.append(self._turn(row))
-                except HuntDirectoryError:
-                    continue
-        except HuntDirectoryError:  # the table cannot be read on
-            pass
         return found
 
     def facts(self) -> Facts:

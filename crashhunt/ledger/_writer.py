@@ -246,7 +246,6 @@ class Ledger(LedgerReader):
         if self._writable:
             with suppress(sqlite3.Error, HuntDirectoryError):  # on a full disk it stays without
                 self._note(SEAL, self._make_seal())
-            self._writable = False
         self._database.close()
 
     def _insert(self, row: Row) -> None:

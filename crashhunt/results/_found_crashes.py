@@ -541,8 +541,7 @@ def prune_bundles(
     Raises:
         HuntDirectoryError: the ledger cannot be written.
     """
-    excess = kinds.drop_excess(keep, final=final) if kinds is not None and keep else []
-    if not excess or kinds is None:
+    if kinds is None or not keep or not (excess := kinds.drop_excess(keep, final=final)):
         return crashes
     ledger.note(**kinds.dropped_facts())
     for bundle in excess:
