@@ -389,7 +389,7 @@ def prepare_ours() -> None:
 
 def _rehearse() -> None:
     """Rehearse trials once, which fills the caches of all forks: another rehearsal in each of them costs 36 ms."""
-    rehearsal = importlib.import_module("crashhunt.executors._rehearsal")
+    rehearsal = importlib.import_module("crashhunt.executors._preparation")
     with tempfile.TemporaryDirectory() as folder:
         rehearsal.rehearse_trial(Path(folder), lambda _: None)
     rehearsal._rehearse = lambda _: None  # where the code of a snapshot is the same, see `_put_back`

@@ -23,10 +23,9 @@ import socket
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NoReturn, cast
+from typing import TYPE_CHECKING, NoReturn, cast
 
 from crashhunt.agents import ProgramFactory, offer_reused
 from crashhunt.base import layout
@@ -34,15 +33,15 @@ from crashhunt.base.codec import prepare
 from crashhunt.base.errors import DISK, CrashhuntError
 from crashhunt.base.exceptions import message_of
 from crashhunt.base.forks import ended
-from crashhunt.base.plugins import locate, registered
+from crashhunt.base.plugins import locate
 from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill, resume
 from crashhunt.base.programs import is_native
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.base.temporary import SharedMemoryWatch
-from crashhunt.episode import Parts, WorkerSettings, require_origin, seal, stage_of
+from crashhunt.episode import WorkerSettings, require_origin, seal, stage_of
 from crashhunt.executors._host_conditions import HostConditions
-from crashhunt.executors._rehearsal import rehearse_trial
+from crashhunt.executors._preparation import Imported, import_nothing, import_parts
 from crashhunt.executors._supervisor import be_supervisor
 from crashhunt.executors._time_limits import ImportWatch, import_died
 from crashhunt.executors._trial_process import TrialProcess
@@ -54,8 +53,7 @@ if TYPE_CHECKING:
 
     from crashhunt.agents import ReusedProgram
     from crashhunt.base.json_types import ErrorData
-    from crashhunt.executors._protocol import ForkServerJob, FromForkServer, FromZygote, KillTrial, ToForkServer
-    from crashhunt.executors._trial_process import Job
+    from crashhunt.executors._protocol import ForkServerJob, FromForkServer, FromZygote, Job, KillTrial, ToForkServer
 
 _MAX_MESSAGE_BYTES = 1 << 16  # bytes; an order to start a supervisor is some hundred
 _ORPHANS_EVERY_S = 0.5  # looking for what dead trials left behind walks all of /proc
@@ -297,89 +295,6 @@ def _send(control: socket.socket, message: FromForkServer | ErrorData) -> None:
 
 
 # The zygote of a slot: every trial runs in a fork of the zygote, which ends with the trial. The zygote runs no trial.
-
-
-@dataclass(frozen=True, slots=True)
-class Imported:
-    """The result of the preparation that is made once, before the processes of trials are forked.
-
-    Args:
-        parts: the imported parts; None if each trial imports its agents itself.
-        makes_simulator: whether the zygote creates the simulator; if not, each trial creates its own simulator.
-    """
-
-    parts: Parts | None
-    makes_simulator: bool
-
-
-_NOTHING_IMPORTED: Final = Imported(None, makes_simulator=False)
-
-
-def import_parts(
-    settings: WorkerSettings, report: Callable[[str], None], *, rehearses: bool = False
-) -> Imported | None:
-    """Import the modules that trials need, and check whether a zygote may create the simulator.
-
-    Args:
-        settings: settings of the hunt.
-        report: function called before each import, as in `Parts.load`, and with an empty text at the end.
-        rehearses: whether to rehearse a trial, which is worth its 20 ms if many trials follow.
-
-    Returns:
-        The result; None if this process can no longer be forked.
-
-    Raises:
-        CrashhuntError: a module cannot be imported.
-    """
-    parts = Parts(settings)
-    if rehearses:
-        rehearse_trial(settings.scratch, report)
-    parts.load(report)
-    if not _can_be_forked():
-        return None
-    report("the simulator cannot be made")
-    makes_simulator = settings.scenario.backend.forkable or _is_forkable_with(parts)
-    report("")
-    return Imported(parts, makes_simulator=makes_simulator)
-
-
-def import_nothing(settings: WorkerSettings) -> Imported:
-    """Import only the library of the simulator, because trials import their agents themselves.
-
-    Raises:
-        CrashhuntError: the library cannot be imported.
-    """
-    if settings.scenario.simulator in registered("simulators"):
-        locate("simulators", settings.scenario.simulator)
-    return _NOTHING_IMPORTED
-
-
-def _is_forkable_with(parts: Parts) -> bool:
-    """Return whether a process can still be forked after it has created the simulator; a fork of this process tries it.
-
-    The check is needed because an environment may start threads, which a fork does not have.
-    """
-    pid = os.fork()
-    if pid == 0:
-        code = 1
-        try:
-            parts.simulator()
-            code = 0 if _can_be_forked() else 1
-        finally:
-            os._exit(code)
-    forkable = ended(pid) == 0
-    end_descendants()
-    return forkable
-
-
-def _can_be_forked() -> bool:
-    """Return whether this process can be forked after its imports: it has no other threads and uses no GPU."""
-    try:
-        threads = len(os.listdir("/proc/self/task"))  # noqa: PTH208 - how many is enough
-    except OSError:
-        threads = len(sys._current_frames())
-    torch = sys.modules.get("torch")
-    return threads == 1 and not (torch is not None and torch.cuda.is_initialized())
 
 
 def be_zygote(control: socket.socket, settings: WorkerSettings, imported: Imported) -> NoReturn:

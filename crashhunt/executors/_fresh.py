@@ -25,9 +25,10 @@ from crashhunt.base.processes import children_of, die_with
 from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
-from crashhunt.executors._fork_server import be_zygote, import_nothing, import_parts
+from crashhunt.executors._fork_server import be_zygote
 from crashhunt.executors._host_conditions import HostConditions
 from crashhunt.executors._postmortem import TrialAttempt, hung, result_of_death, where_it_is
+from crashhunt.executors._preparation import import_nothing, import_parts
 from crashhunt.executors._protocol import Notes, snapshot_environment
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError, with_escape
 from crashhunt.executors._time_limits import (

@@ -7,14 +7,16 @@ and line of each call, if it is installed and the agent's library has debug info
 from __future__ import annotations
 
 import ctypes
+import faulthandler
 import importlib.util
 import os
 import re
 import shutil
+import signal
 import subprocess
 from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
 from crashhunt.base.binaries import is_of_system
 
@@ -109,3 +111,20 @@ def _function(name: str) -> str:
     """Return the name of a function without parameters and spaces, as `File … in NAME` has it."""
     short = _PARAMETERS.sub("", name.replace("(anonymous namespace)::", "")).replace(" ", "")
     return short or "?"
+
+
+_FATAL_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE)
+
+
+def record_stack(file: TextIO) -> None:
+    """Have this process write its Python stack to a file when it dies of a signal, and at each SIGUSR1.
+
+    pygame, which highway-env imports, aborts at fatal signals, so a process would die of SIGABRT instead of SIGSEGV.
+    Its handlers are in C, so `signal.getsignal` does not see them. A handler in Python stays.
+    """
+    faulthandler.disable()
+    for number in _FATAL_SIGNALS:
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.SIG_DFL)
+    faulthandler.enable(file)
+    faulthandler.register(signal.SIGUSR1, file)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import shutil
 from contextlib import suppress
@@ -20,7 +22,7 @@ from crashhunt.base.text import NOTICE_TOPIC
 from crashhunt.plans import ChoosesParallelism as ChoosesParallelism, executor_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.episode import WorkerSettings
@@ -200,6 +202,60 @@ class FromZygote(TypedDict, total=False):
     ended: int
     unfit: bool
     notices: list[str]
+
+
+class Job(TypedDict):
+    """The job that the process of a trial receives.
+
+    ``folder`` is the folder of the trial, and ``reserved`` the size of its black box in bytes. ``wants_map``
+    requests the map in any case. ``tries_copy`` requests a test whether the trial can be forked.
+    """
+
+    spec: JsonObject
+    folder: str
+    reserved: int
+    wants_map: bool
+    tries_copy: bool
+
+
+CHECKSUM_BYTES = 16  # in front of a report
+
+
+class Report(TypedDict):
+    """The report that the process of a trial writes at its end.
+
+    ``result`` does not contain the specification, which the supervisor knows. ``notices`` are texts for the user.
+    """
+
+    result: Mapping[str, object]
+    notices: list[str]
+    map: NotRequired[str]
+    entered: NotRequired[list[str]]
+    responses: NotRequired[list[JsonObject]]
+    braking: NotRequired[Mapping[str, object] | None]
+    lights: NotRequired[Mapping[str, object]]
+
+
+class FaultReport(TypedDict):
+    """The report that the process of a trial writes if crashhunt itself failed in this process."""
+
+    fault: ErrorData
+
+
+def encode_report(report: Report | FaultReport, *, dumps: Callable[[object], str] = json.dumps) -> bytes:
+    """Return a report as bytes, after its checksum.
+
+    Args:
+        report: the report to encode.
+        dumps: function that converts data to JSON text.
+    """
+    text = dumps(report).encode()
+    return checksum_of(text) + text
+
+
+def checksum_of(text: bytes) -> bytes:
+    """Return the checksum in front of a report."""
+    return hashlib.blake2b(text, digest_size=CHECKSUM_BYTES).digest()
 
 
 # Notices for the user on how trials were run: each notice once.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import faulthandler
-import hashlib
 import io
 import json
 import logging
@@ -15,7 +13,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, NotRequired, TextIO, TypedDict
+from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
@@ -47,7 +45,8 @@ from crashhunt.episode import (
     ready_recorder,
     run_episode,
 )
-from crashhunt.executors._native_stack import record_native_stack
+from crashhunt.executors._native_stack import record_native_stack, record_stack
+from crashhunt.executors._protocol import FaultReport, Job, Report, encode_report
 from crashhunt.recording import BlackBox
 from crashhunt.simulators import (
     HasMap,
@@ -62,11 +61,9 @@ from crashhunt.snapshots import Snapshot, describe_unsaved
 from crashhunt.trial import Outcome, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from crashhunt.agents import Agent
-    from crashhunt.base.codec import JsonObject
-    from crashhunt.base.json_types import ErrorData
     from crashhunt.episode import ForkRunner, Reset, WorkerSettings
     from crashhunt.simulators import Simulator
     from crashhunt.trial import TrialResult, Value
@@ -77,76 +74,6 @@ _EXCLUDED_FROM_HERE_WORDS = " are left out from here on: "
 
 # Bound here, before any agent is imported that could replace them.
 _dumps, _leave, _open, _dup2, _close = json.dumps, os._exit, os.open, os.dup2, os.close
-
-_FATAL_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE)
-
-
-def record_stack(file: TextIO) -> None:
-    """Have this process write its Python stack to a file when it dies of a signal, and at each SIGUSR1.
-
-    pygame, which highway-env imports, aborts at fatal signals, so a process would die of SIGABRT instead of SIGSEGV.
-    Its handlers are in C, so `signal.getsignal` does not see them. A handler in Python stays.
-    """
-    faulthandler.disable()
-    for number in _FATAL_SIGNALS:
-        if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, signal.SIG_DFL)
-    faulthandler.enable(file)
-    faulthandler.register(signal.SIGUSR1, file)
-
-
-class Job(TypedDict):
-    """The job that the process of a trial receives.
-
-    ``folder`` is the folder of the trial, and ``reserved`` the size of its black box in bytes. ``wants_map``
-    requests the map in any case. ``tries_copy`` requests a test whether the trial can be forked.
-    """
-
-    spec: JsonObject
-    folder: str
-    reserved: int
-    wants_map: bool
-    tries_copy: bool
-
-
-CHECKSUM_BYTES = 16  # in front of a report
-
-
-class Report(TypedDict):
-    """The report that the process of a trial writes at its end.
-
-    ``result`` does not contain the specification, which the supervisor knows. ``notices`` are texts for the user.
-    """
-
-    result: Mapping[str, object]
-    notices: list[str]
-    map: NotRequired[str]
-    entered: NotRequired[list[str]]
-    responses: NotRequired[list[JsonObject]]
-    braking: NotRequired[Mapping[str, object] | None]
-    lights: NotRequired[Mapping[str, object]]
-
-
-class FaultReport(TypedDict):
-    """The report that the process of a trial writes if crashhunt itself failed in this process."""
-
-    fault: ErrorData
-
-
-def encode_report(report: Report | FaultReport, *, dumps: Callable[[object], str] = json.dumps) -> bytes:
-    """Return a report as bytes, after its checksum.
-
-    Args:
-        report: the report to encode.
-        dumps: function that converts data to JSON text.
-    """
-    text = dumps(report).encode()
-    return checksum_of(text) + text
-
-
-def checksum_of(text: bytes) -> bytes:
-    """Return the checksum in front of a report."""
-    return hashlib.blake2b(text, digest_size=CHECKSUM_BYTES).digest()
 
 
 class TrialProcess:

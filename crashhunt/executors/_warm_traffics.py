@@ -31,7 +31,8 @@ from crashhunt.trial import TrialSpec
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from crashhunt.executors._trial_process import Job, TrialProcess
+    from crashhunt.executors._protocol import Job
+    from crashhunt.executors._trial_process import TrialProcess
     from crashhunt.simulators import Info, Observations, Simulator
 
     Wait = Callable[[int | None, Callable[[], None]], None]

@@ -215,7 +215,7 @@ _TESTS_ELSEWHERE = {
     "testing/_disturbance_contract.py": ("disturbances/test_rates.py",),
     "testing/_last_avoidable_step_check.py": ("e2e/test_escapes.py",),
     "testing/_survives.py": ("e2e/test_survives.py",),
-    "executors/_rehearsal.py": ("executors/test_zygotes.py",),
+    "executors/_preparation.py": ("executors/test_zygotes.py",),
     "analysis/_avoidability.py": ("analysis/test_judged_crash.py", "test_python_calls.py", "e2e/test_judging.py"),
     "analysis/_causes.py": ("analysis/test_judged_crash.py", "e2e/test_judging.py"),
     "analysis/_omissions.py": ("analysis/test_judged_crash.py",),

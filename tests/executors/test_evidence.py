@@ -11,9 +11,8 @@ from hypothesis import given, settings as examples, strategies as st
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import Parts, WorkerSettings, run_episode
-from crashhunt.executors._postmortem import agent_in_stack
-from crashhunt.executors._supervisor import _fault_of, check_report
-from crashhunt.executors._trial_process import encode_report
+from crashhunt.executors._postmortem import _fault_of, agent_in_stack, check_report
+from crashhunt.executors._protocol import encode_report
 from crashhunt.recording import BlackBox, BlackBoxFile, read_header
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import Outcome, TrialSpec

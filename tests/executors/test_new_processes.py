@@ -17,7 +17,7 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import WorkerSettings, answer_file, scratch_of
-from crashhunt.executors import PoolExecutor, _fresh, _pool, _protocol
+from crashhunt.executors import PoolExecutor, _fork_server_link, _fresh, _pool, _protocol
 from crashhunt.executors._fresh import FreshProcessExecutor
 from crashhunt.executors._postmortem import TrialAttempt
 from crashhunt.executors._supervisor import EndedTrial, LostTrialError, UnfitZygoteError
@@ -464,12 +464,16 @@ def test_fork_server_is_started_with_its_job(settings, monkeypatch, snapshot):
         def end(self):
             started.append("ended")
 
-    monkeypatch.setattr(_pool, "Kept", Kept)
-    monkeypatch.setattr(_pool, "snapshot_environment", lambda given: {"OF": "snapshot"})
-    link = _pool.ForkServerLink(settings, late=True, deaths=1, snapshot=snapshot)
+    monkeypatch.setattr(_fork_server_link, "Kept", Kept)
+    monkeypatch.setattr(_fork_server_link, "snapshot_environment", lambda given: {"OF": "snapshot"})
+    link = _fork_server_link.ForkServerLink(settings, late=True, deaths=1, snapshot=snapshot)
     ((module, job, environment, inherited),) = started
     assert module == "crashhunt.executors._fork_server"
-    assert job == {"settings": settings.to_json(), "sys_path": [] if snapshot else _pool.sys.path, "late": True}
+    assert job == {
+        "settings": settings.to_json(),
+        "sys_path": [] if snapshot else _fork_server_link.sys.path,
+        "late": True,
+    }
     assert (environment == {"OF": "snapshot"}) is snapshot
     assert environment.get("PYTHONHASHSEED") == (None if snapshot else "0")
     assert inherited
@@ -477,7 +481,7 @@ def test_fork_server_is_started_with_its_job(settings, monkeypatch, snapshot):
     assert not link.control.getblocking()
     link._kept.process = SimpleNamespace(wait=lambda timeout_s: 1)
     link.unfit, made = True, []
-    monkeypatch.setattr(_pool, "ForkServerLink", lambda given, **more: made.append((given, more)) or "next")
+    monkeypatch.setattr(_fork_server_link, "ForkServerLink", lambda given, **more: made.append((given, more)) or "next")
     assert link.restart() == "next"
     assert made == [(settings, {"late": True, "deaths": 1, "snapshot": snapshot})]
     assert started[-1] == "ended"

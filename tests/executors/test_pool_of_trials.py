@@ -10,7 +10,7 @@ import pytest
 
 from crashhunt.episode import WorkerSettings
 from crashhunt.errors import CrashhuntError
-from crashhunt.executors import PoolExecutor, _pool
+from crashhunt.executors import PoolExecutor, _fork_server_link
 from crashhunt.executors._postmortem import TrialAttempt
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
@@ -94,14 +94,14 @@ def test_fork_server_that_is_killed_starts_again_twice(tmp_path, monkeypatch, co
         return code
 
     ended = []
-    link = _pool.ForkServerLink.__new__(_pool.ForkServerLink)
+    link = _fork_server_link.ForkServerLink.__new__(_fork_server_link.ForkServerLink)
     link._settings, link._late, link._snapshot, link._importing = "settings", False, True, ""
     link.deaths, link.unfit = deaths, False
     link._log = tmp_path / "log"
     link._log.write_text("first\nno memory\n")
     link._kept = SimpleNamespace(process=SimpleNamespace(wait=wait), end=lambda: ended.append(True))
     link.control = SimpleNamespace(close=lambda: None)
-    monkeypatch.setattr(_pool, "ForkServerLink", lambda *words, **more: (words, more))
+    monkeypatch.setattr(_fork_server_link, "ForkServerLink", lambda *words, **more: (words, more))
     if says:
         with pytest.raises(CrashhuntError) as caught:
             link.restart()

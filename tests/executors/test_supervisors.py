@@ -19,8 +19,8 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HostError
 from crashhunt.episode import Parts, WorkerSettings, run_episode, scratch_of
 from crashhunt.executors import _supervisor, _time_limits
+from crashhunt.executors._protocol import encode_report
 from crashhunt.executors._supervisor import EndedTrial, LostTrialError, Supervisor, UnfitZygoteError
-from crashhunt.executors._trial_process import encode_report
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import CRASHES, Collision, Outcome, TrialResult, TrialSpec

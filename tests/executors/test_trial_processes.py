@@ -381,8 +381,8 @@ def test_output_of_a_trial_is_in_its_folder(process, monkeypatch, tmp_path):
     found._stack = (tmp_path / "null").open("w")
     monkeypatch.setattr(_trial_process, "_dup2", lambda *given, **more: redirected.append((given[1], more)))
     monkeypatch.setattr(_trial_process, "_close", lambda descriptor: closed.append(descriptor) or os.close(descriptor))
-    monkeypatch.setattr(_trial_process.faulthandler, "enable", lambda file: handled.append(file))
-    monkeypatch.setattr(_trial_process.faulthandler, "register", lambda number, file: handled.append((number, file)))
+    monkeypatch.setattr("faulthandler.enable", lambda file: handled.append(file))
+    monkeypatch.setattr("faulthandler.register", lambda number, file: handled.append((number, file)))
     folder = tmp_path / "trial"
     folder.mkdir()
     with found._stack:

@@ -15,8 +15,8 @@ import pytest
 from crashhunt.base import forks
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import stage_of
-from crashhunt.executors import _fork_server, _fresh, _rehearsal, _time_limits, _warm_traffics
-from crashhunt.executors._fork_server import Imported
+from crashhunt.executors import _fork_server, _fresh, _preparation, _time_limits, _warm_traffics
+from crashhunt.executors._preparation import Imported
 from crashhunt.executors._time_limits import ImportKilledError
 from crashhunt.executors._warm_traffics import WarmTraffics
 from crashhunt.trial import TrialSpec
@@ -816,7 +816,7 @@ def test_rehearsal_comes_before_the_imports_and_leaves_nothing(tmp_path, monkeyp
     settings = SimpleNamespace(scenario=SimpleNamespace(backend=SimpleNamespace(forkable=True)), scratch=tmp_path)
     parts = SimpleNamespace(load=lambda report: report(f"a module, {len(rehearsed)} rehearsals"))
     rehearsed = []
-    run = _rehearsal.run_episode
+    run = _preparation.run_episode
 
     def run_episode(*given, **options):
         rehearsed.append(given)
@@ -824,10 +824,10 @@ def test_rehearsal_comes_before_the_imports_and_leaves_nothing(tmp_path, monkeyp
             raise RuntimeError("whatever it is")
         return run(*given, **options)
 
-    monkeypatch.setattr(_rehearsal, "run_episode", run_episode)
-    monkeypatch.setattr(_fork_server, "Parts", lambda _: parts)
-    monkeypatch.setattr(_fork_server, "_can_be_forked", lambda: True)
-    assert _fork_server.import_parts(settings, said.append, rehearses=True) is not None
+    monkeypatch.setattr(_preparation, "run_episode", run_episode)
+    monkeypatch.setattr(_preparation, "Parts", lambda _: parts)
+    monkeypatch.setattr(_preparation, "_can_be_forked", lambda: True)
+    assert _preparation.import_parts(settings, said.append, rehearses=True) is not None
     assert said[:2] == ["Gymnasium cannot be imported", f"a module, {1 if fails else 10} rehearsals"]
     assert not list(tmp_path.iterdir())
 
@@ -840,16 +840,16 @@ def test_imports_decide_who_makes_the_simulator(monkeypatch, forkable, forks_wel
     backend = SimpleNamespace(forkable=forkable)
     settings = SimpleNamespace(scenario=SimpleNamespace(backend=backend, simulator="toy"))
     parts = SimpleNamespace(load=lambda report: report("a module"))
-    monkeypatch.setattr(_fork_server, "Parts", lambda given: parts if given is settings else None)
-    monkeypatch.setattr(_fork_server, "_is_forkable_with", lambda given: forks_well if given is parts else None)
-    monkeypatch.setattr(_fork_server, "_can_be_forked", lambda: True)
-    assert _fork_server.import_parts(settings, said.append) == Imported(parts, makes_simulator=makes)
+    monkeypatch.setattr(_preparation, "Parts", lambda given: parts if given is settings else None)
+    monkeypatch.setattr(_preparation, "_is_forkable_with", lambda given: forks_well if given is parts else None)
+    monkeypatch.setattr(_preparation, "_can_be_forked", lambda: True)
+    assert _preparation.import_parts(settings, said.append) == Imported(parts, makes_simulator=makes)
     assert said == ["a module", "the simulator cannot be made", ""]
-    monkeypatch.setattr(_fork_server, "_can_be_forked", lambda: False)
-    assert _fork_server.import_parts(settings, said.append) is None
+    monkeypatch.setattr(_preparation, "_can_be_forked", lambda: False)
+    assert _preparation.import_parts(settings, said.append) is None
     located = []
-    monkeypatch.setattr(_fork_server, "locate", lambda *given: located.append(given))
-    assert _fork_server.import_nothing(settings) == Imported(None, makes_simulator=False)
+    monkeypatch.setattr(_preparation, "locate", lambda *given: located.append(given))
+    assert _preparation.import_nothing(settings) == Imported(None, makes_simulator=False)
     settings.scenario.simulator = "mine:Simulator"
-    _fork_server.import_nothing(settings)
+    _preparation.import_nothing(settings)
     assert located == [("simulators", "toy")]
