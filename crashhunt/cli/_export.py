@@ -16,6 +16,14 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
 
 _FORMATS = {"commonroad": ".xml", "openscenario": ".xosc"}
+_WRITTEN_BY = {
+    **{suffix: f"add --as {form}" for form, suffix in _FORMATS.items()},
+    ".gif": "use crashhunt replay --gif FILE",
+    ".html": "use crashhunt report --output FILE",
+    ".mcap": "copy the crash's log.mcap",
+    ".mp4": "use crashhunt replay --video FILE",
+}
+"""What writes a file whose name ends like this."""
 
 
 def add_export(commands: Commands) -> None:
@@ -53,11 +61,10 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
         return _convert(options)
     if options.recorded_agent:
         raise UsageError("--recorded-agent has no effect without --as", fix=f"add --as {' or '.join(_FORMATS)}")
-    form = next((form for form, suffix in _FORMATS.items() if options.file.suffix == suffix), "")
-    if form:
+    if options.file.suffix in _WRITTEN_BY:
         raise UsageError(
             f"{options.file}: without --as, export writes a zip file",
-            fix=f"add --as {form}, or name it {options.file.with_suffix('.zip')}",
+            fix=f"{_WRITTEN_BY[options.file.suffix]}, or name it {options.file.with_suffix('.zip')}",
         )
     from crashhunt.crashes import export_crash
 

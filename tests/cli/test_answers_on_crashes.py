@@ -505,6 +505,10 @@ def test_whatif_asks_for_the_change_that_is_named(opened, monkeypatch, capsys, s
             ["export", "h", "a.xosc"],
             "a.xosc: without --as, export writes a zip file; add --as openscenario, or name it",
         ),
+        (
+            ["export", "h", "a.gif"],
+            "a.gif: without --as, export writes a zip file; use crashhunt replay --gif FILE, or",
+        ),
         (["export", "h", "a.zip", "--recorded-agent"], "--recorded-agent has no effect without --as; add --as common"),
         (["export", "h", "a.zip", "--as", "commonroad"], "a.zip: --as commonroad writes a .xml file; name it a.xml"),
         (["logs", "h", "--errors-only", "--type", "run"], "--errors-only and --type run contradict each other"),
