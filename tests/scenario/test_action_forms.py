@@ -63,5 +63,5 @@ def test_setting_that_does_not_exist_or_fit_is_refused(name, message, fix):
 
 
 def test_unknown_setting_of_a_recorded_form_names_the_action():
-    with pytest.raises(UsageError, match="^action: trajectory:visible is 'of_a_later_version'"):
+    with pytest.raises(UsageError, match=r"^action: trajectory:visible is 'of_a_later_version'"):
         action_settings("trajectory:visible=of_a_later_version")
