@@ -12,7 +12,7 @@ from crashhunt.base.plugins import is_foreign, locate, registered
 from crashhunt.base.text import aligned
 from crashhunt.requirements import TRAFFIC_RULES
 from crashhunt.scenario import ACTIONS, installed_backends, load_scenario, shipped_scenarios
-from crashhunt.simulators import MODIFIERS, PARTS, parse_parts
+from crashhunt.simulators import MODIFIERS, ON, PARTS, parse_parts
 from crashhunt.trial import signature_of, without_folder
 
 if TYPE_CHECKING:
@@ -154,6 +154,8 @@ def list_observations() -> list[ListingEntry]:
             continue
         shape = [length for one in parse_parts([name], where="") for length in one.shape] if name in PARTS else []
         columns = part.values_of_last_axis
+        described = [(one, one.meaning) for one in columns]
+        described += [(one, f"with relation={ON} only: {one.meaning}") for one in part.relation]
         found.append(
             {
                 "name": name,
@@ -170,9 +172,9 @@ def list_observations() -> list[ListingEntry]:
                         "range": column.range,
                         "low": column.low,
                         "high": column.high,
-                        "help": column.meaning,
+                        "help": meaning,
                     }
-                    for column in columns
+                    for column, meaning in described
                 ],
             }
         )

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     )
     from ._observation_parts import (
         MODIFIERS as MODIFIERS,
+        ON as ON,
         PARTS as PARTS,
         REACH_M as REACH_M,
         REFERENCE_SHARES as REFERENCE_SHARES,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -103,6 +103,8 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
         for text in given:
             setting, value = _parse_setting(part, text, where)
             settings[setting] = value
+        if settings.get("relation"):
+            part = replace(part, columns=part.columns + part.relation)
         found[name] = RequestedPart(part, settings)
     parts = tuple(one for one in found.values() if one.part.name not in MODIFIERS)
     if found and not parts:

@@ -93,6 +93,7 @@ class Part:
         measured: Columns that the disturbance ``noisy_observation`` changes; ``x`` and ``y`` relative to the position
             of the controlled vehicle.
         dtype: Data type of the values.
+        relation: The columns that the setting ``relation`` adds.
     """
 
     name: str
@@ -103,6 +104,7 @@ class Part:
     settings: tuple[Setting, ...] = ()
     measured: tuple[str, ...] = ()
     dtype: str = "<f8"
+    relation: tuple[Column, ...] = ()
 
     @property
     def values_of_last_axis(self) -> tuple[Column, ...]:
@@ -151,6 +153,9 @@ def _time(name: str, meaning: str) -> Column:
 
 REACH_M = 120.0
 """Largest distance at which a part shows actors, because scenes contain the actors within 150 m at least."""
+
+OFF, ON = "false", "true"
+"""The choices of a setting that adds columns."""
 
 KINEMATICS = "kinematics"
 """The word for the default observation, which is no `Dict` of parts."""
@@ -252,8 +257,22 @@ PARTS: Mapping[str, Part] = {
             settings=(
                 Setting("rows", 32, 1, 1000, "", "number of rows"),
                 Setting("radius", 100.0, 1.0, REACH_M, "m", "largest distance of the centres"),
+                Setting(
+                    "relation", 0, 0, 1, "", "adds columns about the actors' lanes, followed as far as ``radius``",
+                    (OFF, ON),
+                ),
             ),
             measured=("x", "y", "vx", "vy", "acceleration", "length", "width", "ahead", "lane_offset"),
+            relation=(
+                _flag("left", "1 if ``same_lane`` is 0, and the actor's lane is to the left of the vehicle's lane on "
+                      "the same road, or of lanes that the route continues to; also if its lane leads to such lanes "
+                      "only, or if only such lanes lead to it"),
+                _flag("right", "as ``left``, to the right"),
+                _flag("oncoming", "1 if the actor drives towards the vehicle on these roads, or on a road back between "
+                      "the same junctions that is at most 5 m away"),
+                _flag("crossing", "1 if the actor's lane is inside a junction of the route, or leads into it, on a "
+                      "path that crosses or joins the vehicle's path there; or if it is a pedestrian crossing there"),
+            ),
         ),
         Part(
             name="lanes",

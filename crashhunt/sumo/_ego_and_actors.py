@@ -21,15 +21,13 @@ from crashhunt.simulators import (
     wrapped,
 )
 from crashhunt.sumo._reader_protocol import NO_VALUE, Reader
+from crashhunt.sumo._relations import PathAhead, Relations
 from crashhunt.world import PERSON, VehicleData, is_person
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     from crashhunt.native import Draft
-    from crashhunt.sumo._lane_graph import LaneGraph
     from crashhunt.sumo._reader_protocol import Moment, ReaderSetup
     from crashhunt.world import Actor
 
@@ -122,6 +120,9 @@ class ActorsReader(Reader):
         self._actors: tuple[Actor, ...] = ()
         self._who: tuple[list[float], list[str]] = [], []
         self._rows: list[int] = []  # the core may change them, and the speeds
+        self._relations: Relations | None = None
+        if setup.settings["relation"]:
+            self._relations = Relations(self._path, setup.graph, setup.conflicts, setup.settings["radius"])
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -139,7 +140,7 @@ class ActorsReader(Reader):
         """Write the columns of ``actors``."""
         scene = moment.scene
         self.enter(scene.roster.actors)
-        is_usual = not (scene.heights or moment.hidden or self._setup.graph.is_left_hand)
+        is_usual = not (scene.heights or moment.hidden or self._setup.graph.is_left_hand or self._relations)
         facts = self._path.update(moment.lane).facts
         if not (is_usual and draft.actors(place, self._who, self._limits, (self._speeds, self._rows), facts)):
             draft.put_array(place, self.observe(moment))
@@ -150,7 +151,9 @@ class ActorsReader(Reader):
         headings, speeds, actors = scene.headings, scene.speeds, scene.roster.actors
         own_x, own_y = center_of(scene, row)
         own_cos, own_sin = cos(headings[row]), sin(headings[row])
-        path = self._path.update(moment.lane)
+        path, relations = self._path.update(moment.lane), self._relations
+        if relations is not None:
+            relations.update(own_x, own_y, headings[row])
         found, last_speeds = [], dict(self._speeds)
         self._speeds.clear()
         near = self._actors_near(moment)
@@ -162,14 +165,15 @@ class ActorsReader(Reader):
             self._speeds[actor.id] = speed
             ahead = (x - own_x) * own_cos + (y - own_y) * own_sin
             indicator = _indicator(signals)
-            found.append(
-                (
-                    1.0, x, y, wrapped(heading), speed * cos(heading), speed * sin(heading), acceleration,
-                    actor.length, actor.width, kind_number(actor.kind),
-                    float(path.has(lane) or (ahead < 0.0 and path.is_entered_from(lane))),
-                    ahead, offset, float(bool(signals & _BRAKE_LIGHT)), indicator,
-                )
+            is_same = lane in path.lanes or (ahead < 0.0 and path.is_entered_from(lane))
+            values: tuple[float, ...] = (
+                1.0, x, y, wrapped(heading), speed * cos(heading), speed * sin(heading), acceleration,
+                actor.length, actor.width, kind_number(actor.kind), float(is_same),
+                ahead, offset, float(bool(signals & _BRAKE_LIGHT)), indicator,
             )  # fmt: skip
+            if relations is not None:
+                values += relations.of(lane, x, y, heading, is_same=is_same)
+            found.append(values)
         self._actors, self._rows[:] = actors, [other for _, other, _, _ in near]
         rows = np.zeros(self._setup.shape)
         if found:
@@ -198,66 +202,3 @@ def _indicator(signals: int) -> float:
     if signals & _HAZARD or (signals & _LEFT and signals & _RIGHT):
         return 2.0
     return 1.0 if signals & _LEFT else -1.0 if signals & _RIGHT else 0.0
-
-
-class PathAhead:
-    """The lanes that a vehicle's route continues to, and whether other lanes lead into the vehicle's lane.
-
-    Args:
-        vehicle: Identifier of the vehicle.
-        graph: The lanes of the network.
-        reach_m: Length of the path, in m.
-    """
-
-    def __init__(self, vehicle: str, graph: LaneGraph, reach_m: float) -> None:
-        self._vehicle, self._graph, self._reach_m = vehicle, graph, reach_m
-        self._paths: dict[tuple[str, int, str], frozenset[str]] = {}
-        self._entered: dict[str, dict[str, bool]] = {}  # by the vehicle's lane, and the other lane
-        self._lane = ""
-        self._lanes: frozenset[str] = frozenset()
-
-    def update(self, lane: str) -> PathAhead:
-        """Set the vehicle's lane after the last step."""
-        key = lane, sumo.vehicle_getRouteIndex(self._vehicle), sumo.vehicle_getRouteID(self._vehicle)
-        found = self._paths.get(key)
-        if found is None:
-            edges = sumo.vehicle_getRoute(self._vehicle)[max(key[1], 0) :]
-            found = self._paths[key] = frozenset(self._reached(lane, frozenset(edges)))
-        self._lane, self._lanes = lane, found
-        self._entered.setdefault(lane, {})
-        return self
-
-    def has(self, lane: str) -> bool:
-        """Return whether a lane is the vehicle's lane or a lane that its route continues to."""
-        return lane in self._lanes
-
-    def is_entered_from(self, lane: str) -> bool:
-        """Return whether a lane leads into the vehicle's lane within the reach."""
-        known = self._entered[self._lane]
-        found = known.get(lane)
-        if found is None:
-            found = known[lane] = self._lane in self._reached(lane)
-        return found
-
-    @property
-    def facts(self) -> tuple[frozenset[str], Callable[[str], bool]]:
-        """The lanes that the route continues to, and `is_entered_from`."""
-        return self._lanes, self.is_entered_from
-
-    def _reached(self, lane: str, edges: frozenset[str] | None = None) -> set[str]:
-        """Return the lanes that can be reached from a lane, within the reach and on the given edges."""
-        waiting, reached = [(lane, 0.0)], {lane}
-        while waiting:
-            current, done = waiting.pop()
-            for to in self._graph.successors(current) if done <= self._reach_m else ():
-                if to in reached or (edges is not None and not self._stays_on(to, edges)):
-                    continue
-                reached.add(to)
-                waiting.append((to, done + self._graph.length(to)))
-        return reached
-
-    def _stays_on(self, lane: str, edges: frozenset[str]) -> bool:
-        """Return whether a lane belongs to one of the edges, or leads to one of them inside a junction."""
-        if not lane.startswith(":"):
-            return lane.rpartition("_")[0] in edges
-        return any(self._stays_on(to, edges) for to in self._graph.successors(lane))

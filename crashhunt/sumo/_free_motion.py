@@ -202,7 +202,7 @@ class FreeMotion:
         """Return what an encoded action does: the speed after the step, and whether the vehicle leaves its lane."""
         after = self._next(action.tolist())
         path = self._path(_LOOK_S * after.speed)
-        aside, direction = _offset_from(path, after.x, after.y)
+        aside, direction = offset_from(path, after.x, after.y)
         moves = after.speed * math.sin(after.heading - direction) * _LOOK_S
         border = sumo.lane_getWidth(sumo.vehicle_getLaneID(self._vehicle)) / 2 - _OVER_M if path else math.inf
         leaves = abs(aside + moves) > border and moves * (aside + moves) > 0
@@ -576,7 +576,7 @@ def _words_of(ahead: float, left: float) -> str:
     return f"its {'front' if ahead > 0 else 'rear'} {side} corner" if abs(ahead) == 1.0 else f"its {side} side"
 
 
-def _offset_from(path: Sequence[tuple[float, float]], x: float, y: float) -> tuple[float, float]:
+def offset_from(path: Sequence[tuple[float, float]], x: float, y: float) -> tuple[float, float]:
     """Return how far a point is to the left of the nearest part of a path, in m, and the direction of this part."""
     nearest = (math.inf, 0.0, 0.0)
     for (ax, ay), (bx, by) in pairwise(path):

@@ -109,6 +109,7 @@ class LaneGraph:
         self.rules = network.rules
         self.lanes: dict[str, GraphLane] = {}
         self.edges: dict[str, list[GraphLane]] = {}
+        self._ends = {edge.id: edge.ends for edge in network.edges.values()}
         for edge in (*network.edges.values(), *network.inside.values()):
             lanes = [
                 GraphLane(id=f"{edge.id}_{index}", edge=edge.id, index=index, data=lane)
@@ -185,6 +186,24 @@ class LaneGraph:
         index = lane.index + (-change if self.is_left_hand else change)
         lanes = self.edges[lane.edge]
         return lanes[index] if 0 <= index < len(lanes) else None
+
+    def opposite(self, edge: str, median_m: float) -> list[GraphLane]:
+        """Return the lanes of the roads that lead back between the junctions of a road, next to it.
+
+        Args:
+            edge: the road.
+            median_m: largest distance between the two directions, half way along the road, in m.
+        """
+        if edge not in self._ends:
+            return []
+        own, found = self.edges[edge][-1], []
+        middle = self.lines(own).center[len(self.lines(own).center) // 2]
+        for other in (one for one, ends in self._ends.items() if ends == self._ends[edge][::-1]):
+            inner = self.edges[other][-1]
+            away = float(np.hypot(*(self.lines(inner).center - middle).T).min())
+            if away <= median_m + (own.data.width_m + inner.data.width_m) / 2:
+                found += self.edges[other]
+        return found
 
     def may_change(self, lane: GraphLane, change: int, vehicle_class: str) -> bool:
         """Return whether a class of vehicles may change to the left (1) or right (-1), by the lanes and the marking."""

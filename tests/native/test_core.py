@@ -618,6 +618,7 @@ class _StopsAndGoes:
         ("loop", WRITTEN_AGAIN),
         ("motorway", ("actors:rows=3:radius=60", "lanes:lanes=2:points=9:spacing=3.3", "route:points=200", "ego")),
         ("loop-two-agents", ("ego", "actors", "lanes:lanes=30:behind=0")),
+        ("intersection", ("ego", "actors:relation=true", "speed_limit")),
         ("loop", ("ego", "actors", "grid:rows=9:columns=9", "history:steps=2")),
         ("motorway", ("ego", "actors", "occlusion")),
     ],

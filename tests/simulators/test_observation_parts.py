@@ -58,6 +58,14 @@ def test_columns_are_those_of_the_documented_table():
     assert set(PARTS) - set(words) == {"lidar2d", "grid", "image", "actor_ids", "time_to_switch"}
 
 
+def test_relation_adds_columns_behind_the_others():
+    plain, wide = (layout_of(word) for word in ("actors:rows=2", "actors:rows=2:relation=true"))
+    names = [*wide.columns["actors"]]
+    assert names == [*plain.columns["actors"], "left", "right", "oncoming", "crossing"]
+    assert wide.shapes["actors"] == wide.space["actors"].shape == (2, len(names))
+    assert wide.describe()["actors"]["columns"] == names
+
+
 @given(
     st.lists(st.sampled_from(sorted(set(PARTS) - {"image", "grid"})), min_size=1, max_size=4, unique=True), st.data()
 )
@@ -180,10 +188,12 @@ def test_history_stacks_the_last_observations_with_the_present_one_last():
             parse_parts(wrong, where="--observe")
 
 
-def test_predictions_along_lanes_are_refused_where_there_are_no_lanes():
-    words = ("predictions:along=lanes",)
+@pytest.mark.parametrize("word", ["predictions:along=lanes", "actors:relation=true"])
+def test_what_needs_the_lanes_of_actors_is_refused_where_there_are_no_lanes(word):
+    setting, _, value = word.partition("=")
     with pytest.raises(
-        UsageError, match=r"agents\.ego\.observation: predictions:along is 'lanes', which this simulator does not have"
+        UsageError, match=rf"agents\.ego\.observation: {setting} is '{value}', which this simulator does not have"
     ):
-        SceneObserver({"ego": AgentSetup(observation=words)})
+        SceneObserver({"ego": AgentSetup(observation=(word,))})
+    SceneObserver({"ego": AgentSetup(observation=("actors:relation=false",))})
     SceneObserver({"ego": AgentSetup(observation=("predictions:along=heading",))})

@@ -58,11 +58,13 @@ class Edge:
         id: SUMO's id of the road.
         name: name of the street; empty if the map has none.
         lanes: lanes from right to left in right-hand traffic.
+        ends: ids of the junctions from which and to which it leads; empty inside junctions.
     """
 
     id: str
     name: str
     lanes: tuple[NetworkLane, ...]
+    ends: tuple[str, str] = ("", "")
 
     def admits(self, vehicle_class: str) -> bool:
         """Return whether vehicles of a class may use a lane of the road."""
@@ -235,7 +237,8 @@ def _edge(element: ET.Element) -> Edge:
                 change_down=_classes(lane, "changeRight"),
             )
         )
-    return Edge(element.get("id", ""), element.get("name", ""), tuple(lanes))
+    ends = element.get("from", ""), element.get("to", "")
+    return Edge(element.get("id", ""), element.get("name", ""), tuple(lanes), ends=ends)
 
 
 def _classes(element: ET.Element, attribute: str) -> frozenset[str] | None:
