@@ -61,11 +61,3 @@ def test_a_hunt_stops_on_what_an_oracle_of_ones_own_sees(own):
     assert '"categories": {' in (page := (own.folder / "h" / "report.html").read_text())
     assert '"too_fast": "traffic crash"' in page
     assert own.crashhunt("check", "h").code == 0
-
-
-@pytest.mark.nightly  # by day, oracles/test_choice.py, and a chosen oracle above
-def test_near_misses_are_found_in_sumo(shell):
-    words = ["loop", "2", "30", "300", "--oracle", "too-close:gap_m=1.5", "--seed", "1", "--json"]
-    crash = shell.crashhunt("run", *words).json["crashes"][0]
-    assert crash["outcome"] == "too_close"
-    assert crash["confirmed"] is True

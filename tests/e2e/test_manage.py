@@ -14,8 +14,6 @@ from contextlib import closing
 import pytest
 from conftest import CRASHHUNT, keeps_going, wait_for
 
-from crashhunt.statistics import RateTest
-
 KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
 
 
@@ -167,41 +165,3 @@ def test_the_shortest_few_of_a_kind_are_kept(toy, made_once):
     assert f"{len(crashes)} crashes of 1 type" in told.out
     shutil.rmtree(next(folder.iterdir()))  # one that is missing is not one that was given up
     assert "crashed, and its bundle is missing" in toy.crashhunt("check", "k", expect=1).out
-
-
-def rate_of_none(trials):
-    """The upper end for no crash in so many trials."""
-    test = RateTest()
-    test.add(0, 1, trials)
-    return test.interval().high
-
-
-@pytest.mark.nightly  # by day, statistics/test_comparison.py and test_gate.py
-def test_which_of_two_agents_crashes_less(toy):
-    for name, speed in (("fast", "14"), ("slow", "4")):
-        words = (*KEEP, "--keep", "1", "--arg", f"speed={speed}", "--set", "gap_m=20:30")
-        toy.crashhunt("run", name, "2", "9", "99", *words)
-    shutil.copytree(toy.folder / "fast", toy.folder / "again")  # the same trials
-    found = toy.crashhunt("compare", "fast", "slow", "again", "--json", "--html", "c.html").json
-    fast, slow, again = found["hunts"]
-    assert fast["crashes"] == again["crashes"] > 7  # eight decide
-    assert (slow["crashes"], slow["crash_rate"], slow["median_steps_to_crash"]) == (0, 0.0, None)
-    assert slow["interval"][0] == 0.0
-    assert slow["interval"][1] == pytest.approx(rate_of_none(9))  # as `crashhunt rate` reports it
-    against_slow, against_again = found["pairs"]
-    assert (against_slow["only_first"], against_slow["only_second"]) == (fast["crashes"], 0)
-    assert against_slow["p_value"] == pytest.approx(2 * 0.5 ** fast["crashes"])
-    assert against_slow["verdict"].startswith("slow crashes less")
-    assert against_slow["answer"] == "second"
-    assert against_slow["evidence"] > 20
-    assert against_slow["difference"]["high"] < 0
-    assert against_again["difference"]["low"] < 0 < against_again["difference"]["high"]
-    assert (against_again["both"], against_again["p_value"]) == (fast["crashes"], 1.0)
-    assert "the difference may be 0" in against_again["verdict"]
-    page = (toy.folder / "c.html").read_text()
-    assert "slow crashes less" in page
-    assert "<figcaption>scenario.gap_m</figcaption>" in page
-    assert "http" not in page
-    (head, *lines) = toy.crashhunt("compare", "fast", "slow", "--csv").out.splitlines()
-    assert head.startswith("dir,state,trials,crashes,crash_rate,rate_low,rate_high")
-    assert len(lines) == 2

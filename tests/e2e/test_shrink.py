@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import signal
 import time
-from pathlib import Path
 
 import pytest
 
@@ -26,18 +24,6 @@ def hunt(toy, made_once, monkeypatch):
     made_once(hunted, toy)
     monkeypatch.chdir(toy.folder)
     return toy
-
-
-@pytest.mark.nightly  # by day, test_shrink_bundle.py shrinks one
-def test_a_crash_becomes_smaller_and_replays(shell):
-    """A crash that an older version recorded, so that no hunt is needed."""
-    shutil.copytree(Path(__file__).parent / "frozen" / "version-1" / "hunt", shell.folder / "h")
-    words = ("--crash", "0", "--trust", "--budget", "12", "--parallel", "1")
-    told = shell.crashhunt("shrink", "h", *words, "--json").json
-    assert (told["verdict"], told["confirmed"], told["signature_kept"]) == ("shrunk", True, True)
-    assert "ego.speed" in told["changed"]
-    replayed = shell.crashhunt("replay", told["path"], "--trust", "--json").json
-    assert (replayed["verdict"], replayed["steps_replayed"]) == ("reproduced", told["steps_after"])
 
 
 @pytest.mark.nightly

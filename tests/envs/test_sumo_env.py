@@ -292,17 +292,6 @@ def test_reseeded_copies_differ_and_can_be_repeated(branching):
     assert (one, other) == (same, again)
 
 
-@pytest.mark.nightly  # by day, the end of the test of copies above
-def test_a_copy_that_dies_is_named_and_costs_no_other(branching):
-    env, made = branching
-    made += (copies := env.branch(2))
-    pid = copies[0]._episodes.pid
-    os.kill(pid, signal.SIGKILL)
-    with pytest.raises(SimulatorError, match=rf"^copy 1 of 2 of the environment \(process {pid}\) ended; make a new"):
-        copies[0].step((15.0, 0))
-    assert drive(copies[1]) == drive(env)
-
-
 def test_what_cannot_be_branched_is_refused_in_one_line(own, monkeypatch):
     here = SumoEnv("loop")
     with pytest.raises(UsageError, match="process of its own can be branched; make it with process=True"):
