@@ -113,7 +113,7 @@ def test_several_crashes_in_one_film(toy):
     ("agent", "where"),
     [
         ("Segfaults", ("--set", "vehicles=10")),
-        pytest.param("HangsHoldingTheInterpreter", ("--scenario", "toy", "--timeout", "1"), marks=pytest.mark.nightly),
+        ("HangsHoldingTheInterpreter", ("--scenario", "toy", "--timeout", "1")),
     ],
 )
 def test_a_crash_that_kills_the_process_is_filmed_up_to_it(toy, agent, where):

@@ -7,12 +7,11 @@ loop-two-agents, intersection and all of highway-env's.
 
 from __future__ import annotations
 
-import json
 import tomllib
 from pathlib import Path
 
 import pytest
-from conftest import mostly_nightly, one_in, rewritten
+from conftest import mostly_nightly, one_in
 
 import crashhunt
 from crashhunt.crashes import list_bundles, names_of_actions
@@ -162,10 +161,6 @@ def test_a_mistake_in_a_highway_scenario_is_one_line(shell, table, says):
 def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     words = ("--scenario", "highway", "--agent", "keep-lane", "--arg", "speed=30", "--seed", "1", "--deterministic")
     shell.crashhunt("run", "h", "2", "20", "150", *words)
-    (facts,) = shell.folder.glob("h/snapshots/*/environment.json")
-    rewritten(facts.parent, facts.name, json.dumps(json.loads(facts.read_text()) | {"cpu": "Abacus"}))
-    (warning,) = shell.crashhunt("replay", "h", "--json").json["warnings"]
-    assert "the processor was 'Abacus'" in warning
     done = shell.crashhunt("replay", "h", "--scenario", "motorway", expect=None)
     assert "the scenario was highway and is motorway" in done.out
     assert "it crashes there as well" in done.out or "does not show a fix" in done.out
@@ -173,14 +168,7 @@ def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     assert told["verdict"] in ("changed", "not_comparable")
     assert told["divergence"] is None
     assert crashhunt.replay(shell.folder / "h", scenario="motorway").verdict == told["verdict"]
-    for more, says in (
-        ("--from-log", "recorded actions belong to the recorded scenario"),
-        ("--scenario=loop-two-agents", "2 controlled"),
-        ("--frames=f", "a film cannot be combined with --scenario, because it needs the scenario of the crash"),
-        ("--until=3", "--until cannot be combined with --scenario, because it needs the scenario"),
-    ):
-        refused = shell.crashhunt("replay", "h", "--scenario", "motorway", more, expect=2)
-        assert says in refused.err
+    assert "2 controlled" in shell.crashhunt("replay", "h", "--scenario", "loop-two-agents", expect=2).err
 
 
 STRANGE = [

@@ -13,7 +13,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
-from conftest import mostly_nightly, wait_for
+from conftest import wait_for
 
 from crashhunt.base.processes import children_of
 
@@ -43,11 +43,10 @@ def left_in(folder: Path) -> list[int]:
 
 
 STOPS = [(number, whom) for number in (signal.SIGTERM, signal.SIGHUP) for whom in ("every process", "the group")]
-BY_DAY = [(signal.SIGHUP, "every process")]
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("number", "whom"), mostly_nightly(STOPS, BY_DAY))
+@pytest.mark.parametrize(("number", "whom"), STOPS)
 def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, whom):
     words = ("run", "h", "2", "8", "30", *FINE, *SLOW, "--json")
     process = toy.start(*words, start_new_session=True)

@@ -9,7 +9,7 @@ import zipfile
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import Shell, mostly_nightly
+from conftest import Shell
 from test_replay import hunted_on_sumo
 
 from crashhunt.base.sandbox import landlock_version
@@ -91,7 +91,7 @@ files.FIXED_OPTIONS.pop("device.ssm.file", None)
 
 @pytest.mark.nightly  # by day, base/test_sandbox.py, and executors/test_zygotes.py seals
 @pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
-@pytest.mark.parametrize("attack", mostly_nightly(["netstate-dump", "C", "a detector"], ["netstate-dump"]))
+@pytest.mark.parametrize("attack", ["netstate-dump", "C", "a detector"])
 def test_the_kernel_alone_holds_what_has_got_past_all_else(crash, tmp_path, monkeypatch, attack):
     victim = tmp_path / "victim"
     victim.write_text("mine")

@@ -288,14 +288,8 @@ for form in forms:
 """
 
 
-NIGHT = [("here", ["continuous"]), ("own", ["meta"])]
-
-
 @pytest.mark.nightly  # by day, test_episodes.py has the checker
-@pytest.mark.parametrize(
-    ("where", "forms"),  # by day, the contract above has the continuous form
-    [("here", ["meta"]), *(pytest.param(*case, marks=pytest.mark.nightly) for case in NIGHT)],
-)
+@pytest.mark.parametrize(("where", "forms"), [("here", ["meta"]), ("here", ["continuous"]), ("own", ["meta"])])
 def test_the_gymnasium_environment_passes_gymnasiums_own_checker(where, forms):
     command = [sys.executable, "-c", ENVIRONMENT, where, *forms]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
