@@ -8,18 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines, one_line
-from crashhunt.cli._common import (
-    add_build,
-    add_crash,
-    add_json,
-    add_trust,
-    answer,
-    build_limit_s,
-    check_trust,
-    opened_crash,
-    run_trusted,
-    say,
-)
+from crashhunt.cli._common import add_build, add_crash, add_json, answer, build_limit_s, opened_crash, say
+from crashhunt.cli._trust import add_trust, check_trust, run_trusted
 
 if TYPE_CHECKING:
     import argparse

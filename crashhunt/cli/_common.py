@@ -11,19 +11,19 @@ import sys
 from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias
 
 from crashhunt.base import layout
-from crashhunt.base.errors import FULL, CrashhuntError, UntrustedError, UsageError
+from crashhunt.base.errors import FULL, CrashhuntError, UsageError
 from crashhunt.base.files import cannot_write
 from crashhunt.base.integrity import MAX_INTEGER
 from crashhunt.base.older_versions import removed_fix
 from crashhunt.base.programs import is_program
-from crashhunt.base.text import command_line, did_you_mean, one_line, one_of, visible
+from crashhunt.base.text import command_line, did_you_mean, one_of, visible
 from crashhunt.plans import hunt_options
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from _typeshed import SupportsWrite
     from rich.console import Console
@@ -44,7 +44,6 @@ OUTPUT_CLOSED: Final = 141
 """As a shell says it after SIGPIPE: neither 0 nor 1, because the reader of the output has not seen the answer."""
 
 
-T = TypeVar("T")
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 """What a command is added to; argparse has no other name for it."""
 
@@ -297,15 +296,6 @@ def number(text: str) -> float:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
 
 
-def add_trust(parser: argparse.ArgumentParser) -> None:
-    """Add the option ``--trust``, which is the same for every command that runs code of a crash."""
-    parser.add_argument(
-        "--trust", action="store_true",
-        help="run the code of a hunt or crash from another machine without asking; crashhunt trust DIR trusts this "
-        "code permanently",
-    )  # fmt: skip
-
-
 def add_parallel(parser: argparse._ActionsContainer, what: str = "trials that run at a time") -> None:
     """Add the option ``--parallel``.
 
@@ -369,65 +359,6 @@ def build_limit_s(options: argparse.Namespace) -> float:
     if not options.build_timeout:
         raise UsageError("--build-timeout is ''", fix="give a time, such as 10m")
     return duration_s(options.build_timeout, "--build-timeout")
-
-
-def run_trusted(
-    run: Callable[[bool | None], T],
-    bundle: Bundle,
-    archive: Archive | None,
-    options: argparse.Namespace,
-    *,
-    path: Path | None = None,
-) -> T:
-    """Call a function that runs the code of a crash; if the code is not trusted, ask the user once for each origin.
-
-    Args:
-        run: function called with True if the code is trusted, or with None to determine it. The function raises
-            `UntrustedError` before any code runs.
-        bundle: the crash whose code runs.
-        archive: the archive that contained the crash; None if there was none.
-        options: the options ``trust``, ``json`` and ``directory`` of the command line.
-        path: path as the user named it; by default ``directory``.
-
-    Raises:
-        UntrustedError: the code is not trusted, and there is no terminal for a question, or the user declines.
-    """
-    from crashhunt.crashes import refuse_untrusted, snapshot_of, trust_snapshot
-
-    place = path or options.directory
-    try:
-        return run(True if options.trust or (archive is not None and archive.made_here) else None)
-    except UntrustedError:
-        made_by = f"{archive.made_by} on {archive.made_at}" if archive is not None else ""
-        refusal = refuse_untrusted(bundle, where=str(place), made_by=made_by)
-        if snapshot_of(bundle).faults() or not ask_to_trust(refusal, as_json=options.json):
-            raise refusal from None
-    trust_snapshot(snapshot_of(bundle), place)
-    return run(True)
-
-
-def check_trust(bundle: Bundle, trusted: bool | None) -> None:
-    """Refuse a crash that is not trusted, for use in `run_trusted` before code that does not check the trust itself.
-
-    Raises:
-        UntrustedError: the crash is neither made here nor trusted.
-    """
-    from crashhunt.crashes import is_bundle_trusted, refuse_untrusted
-
-    if not trusted and not is_bundle_trusted(bundle):
-        raise refuse_untrusted(bundle)
-
-
-def ask_to_trust(refusal: UntrustedError, *, as_json: bool) -> bool:
-    """Ask whether the user trusts the code from now on; return False without a terminal."""
-    from crashhunt.base.signals import interruptible
-
-    if as_json or not (sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()):
-        return False
-    print(one_line(f"{refusal.where}: {refusal.message}"), file=sys.stderr)  # an archive names its maker as it likes
-    print("Trust this code from now on and run it? [y/N] ", end="", file=sys.stderr, flush=True)
-    with interruptible():
-        return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 # The bar of `film`, `export` and whatever takes its time; what a hunt shows while it runs is in `report`.

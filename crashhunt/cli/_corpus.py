@@ -15,16 +15,14 @@ from crashhunt.cli._common import (
     add_ci_options,
     add_json,
     add_parallel,
-    add_trust,
-    check_trust,
     crash_id,
     opened_crash,
     refuse_below,
-    run_trusted,
     say,
     shown_progress,
     tell,
 )
+from crashhunt.cli._trust import add_trust, check_trust, run_trusted
 
 if TYPE_CHECKING:
     import argparse

@@ -16,13 +16,12 @@ from crashhunt.cli._common import (
     THE_ANSWER_IS_NO,
     add_ci_options,
     add_json,
-    add_trust,
-    check_trust,
     integer,
     refuse_below,
     say,
     tell,
 )
+from crashhunt.cli._trust import add_trust, check_trust
 
 if TYPE_CHECKING:
     import argparse

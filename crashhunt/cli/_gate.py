@@ -23,7 +23,6 @@ from crashhunt.cli._common import (
     add_json,
     add_options,
     add_parallel,
-    add_trust,
     build_limit_s,
     chosen_options,
     duration_s,
@@ -33,6 +32,7 @@ from crashhunt.cli._common import (
     say,
     tell,
 )
+from crashhunt.cli._trust import add_trust
 
 if TYPE_CHECKING:
     import argparse

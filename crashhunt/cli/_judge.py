@@ -13,14 +13,12 @@ from crashhunt.cli._common import (
     add_crash,
     add_json,
     add_parallel,
-    add_trust,
-    check_trust,
     integer,
     opened_crash,
-    run_trusted,
     say,
     shown_progress,
 )
+from crashhunt.cli._trust import add_trust, check_trust, run_trusted
 
 if TYPE_CHECKING:
     import argparse

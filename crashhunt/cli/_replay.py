@@ -20,15 +20,14 @@ from crashhunt.cli._common import (
     WordsWithCommas,
     add_crash,
     add_json,
-    add_trust,
     integer,
     number,
     opened_crash,
     pairs,
-    run_trusted,
     say,
     shown_progress,
 )
+from crashhunt.cli._trust import add_trust, run_trusted
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:

@@ -18,12 +18,12 @@ from crashhunt.cli._common import (
     add_json,
     add_options,
     add_parallel,
-    add_trust,
     answer,
     chosen_options,
     say,
 )
 from crashhunt.cli._suite import run_with_trust, states_watcher
+from crashhunt.cli._trust import add_trust
 
 if TYPE_CHECKING:
     import argparse

@@ -11,15 +11,14 @@ from crashhunt.cli._common import (
     add_crash,
     add_json,
     add_parallel,
-    add_trust,
     answer,
     duration_s,
     integer,
     opened_crash,
     refuse_below,
-    run_trusted,
     shown_progress,
 )
+from crashhunt.cli._trust import add_trust, run_trusted
 
 if TYPE_CHECKING:
     import argparse

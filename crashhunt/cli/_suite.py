@@ -14,8 +14,6 @@ from crashhunt.cli._common import (
     add_json,
     add_options_of_machine,
     add_parallel,
-    add_trust,
-    ask_to_trust,
     chosen_of_machine,
     chosen_runs,
     integer,
@@ -24,6 +22,7 @@ from crashhunt.cli._common import (
 )
 from crashhunt.cli._crashes import add_known, checked_cases, compare_with_corpus
 from crashhunt.cli._status import show_states, state_words, states_console, states_table
+from crashhunt.cli._trust import add_trust, ask_to_trust
 
 if TYPE_CHECKING:
     import argparse

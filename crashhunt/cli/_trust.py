@@ -1,22 +1,24 @@
-"""``crashhunt trust``."""
+"""``crashhunt trust``, and the question before a command runs foreign code."""
 
 from __future__ import annotations
 
 import json
+import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError, HuntDirectoryError, UsageError
-from crashhunt.base.text import command_line, near_path
+from crashhunt.base.errors import BundleError, HuntDirectoryError, UntrustedError, UsageError
+from crashhunt.base.text import command_line, near_path, one_line
 from crashhunt.cli._common import add_json, say
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Callable
 
     from crashhunt.cli._common import Commands
-    from crashhunt.crashes import TrustedOrigin
+    from crashhunt.crashes import Archive, Bundle, TrustedOrigin
 
 
 def add_trust_command(commands: Commands) -> None:
@@ -105,3 +107,76 @@ def _trust_place(place: Path) -> list[TrustedOrigin]:
 
 def _line(origin: TrustedOrigin) -> str:
     return f"{origin.id}  {origin.trusted_at}  {command_line(origin.path)}: {origin.runs}"
+
+
+# The question before a command runs the code of a crash that was not made on this machine.
+
+T = TypeVar("T")
+
+
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--trust``, which is the same for every command that runs code of a crash."""
+    parser.add_argument(
+        "--trust", action="store_true",
+        help="run the code of a hunt or crash from another machine without asking; crashhunt trust DIR trusts this "
+        "code permanently",
+    )  # fmt: skip
+
+
+def run_trusted(
+    run: Callable[[bool | None], T],
+    bundle: Bundle,
+    archive: Archive | None,
+    options: argparse.Namespace,
+    *,
+    path: Path | None = None,
+) -> T:
+    """Call a function that runs the code of a crash; if the code is not trusted, ask the user once for each origin.
+
+    Args:
+        run: function called with True if the code is trusted, or with None to determine it. The function raises
+            `UntrustedError` before any code runs.
+        bundle: the crash whose code runs.
+        archive: the archive that contained the crash; None if there was none.
+        options: the options ``trust``, ``json`` and ``directory`` of the command line.
+        path: path as the user named it; by default ``directory``.
+
+    Raises:
+        UntrustedError: the code is not trusted, and there is no terminal for a question, or the user declines.
+    """
+    from crashhunt.crashes import refuse_untrusted, snapshot_of, trust_snapshot
+
+    place = path or options.directory
+    try:
+        return run(True if options.trust or (archive is not None and archive.made_here) else None)
+    except UntrustedError:
+        made_by = f"{archive.made_by} on {archive.made_at}" if archive is not None else ""
+        refusal = refuse_untrusted(bundle, where=str(place), made_by=made_by)
+        if snapshot_of(bundle).faults() or not ask_to_trust(refusal, as_json=options.json):
+            raise refusal from None
+    trust_snapshot(snapshot_of(bundle), place)
+    return run(True)
+
+
+def check_trust(bundle: Bundle, trusted: bool | None) -> None:
+    """Refuse a crash that is not trusted, for use in `run_trusted` before code that does not check the trust itself.
+
+    Raises:
+        UntrustedError: the crash is neither made here nor trusted.
+    """
+    from crashhunt.crashes import is_bundle_trusted, refuse_untrusted
+
+    if not trusted and not is_bundle_trusted(bundle):
+        raise refuse_untrusted(bundle)
+
+
+def ask_to_trust(refusal: UntrustedError, *, as_json: bool) -> bool:
+    """Ask whether the user trusts the code from now on; return False without a terminal."""
+    from crashhunt.base.signals import interruptible
+
+    if as_json or not (sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()):
+        return False
+    print(one_line(f"{refusal.where}: {refusal.message}"), file=sys.stderr)  # an archive names its maker as it likes
+    print("Trust this code from now on and run it? [y/N] ", end="", file=sys.stderr, flush=True)
+    with interruptible():
+        return sys.stdin.readline().strip().lower() in ("y", "yes")

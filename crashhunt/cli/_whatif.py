@@ -13,7 +13,6 @@ from crashhunt.cli._common import (
     add_crash,
     add_json,
     add_parallel,
-    add_trust,
     answer,
     duration_s,
     integer,
@@ -21,9 +20,9 @@ from crashhunt.cli._common import (
     opened_crash,
     pairs,
     refuse_below,
-    run_trusted,
     shown_progress,
 )
+from crashhunt.cli._trust import add_trust, run_trusted
 
 if TYPE_CHECKING:
     import argparse

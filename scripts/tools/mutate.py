@@ -110,7 +110,7 @@ _TESTS_ELSEWHERE = {
         "cli/test_answers.py",
         "e2e/test_manage.py",
     ),
-    "cli/_trust.py": ("e2e/test_foreign_hunts.py",),
+    "cli/_trust.py": ("cli/test_common.py", "e2e/test_foreign_hunts.py"),
     "cli/_whatif.py": ("e2e/test_what_if.py",),
     "corpus": ("corpus/test_*.py", "e2e/test_corpus.py"),
     "corpus/_bisection.py": ("e2e/test_bisect.py",),

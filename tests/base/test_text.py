@@ -131,13 +131,13 @@ def test_refusal_reports_in_one_line_who_made_an_archive(tmp_path, capsys, monke
 
 
 def test_question_of_trust_has_one_line_for_who_made_an_archive(tmp_path, monkeypatch):
-    from crashhunt.cli import _common
+    from crashhunt.cli import _trust
 
     terminal = StringIO()
     terminal.isatty = lambda: True
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: True, readline=lambda: "n\n"))
-    assert not _common.ask_to_trust(untrusted(tmp_path), as_json=False)
+    assert not _trust.ask_to_trust(untrusted(tmp_path), as_json=False)
     described, question = terminal.getvalue().splitlines()
     assert "Trust it: yes made it, and this would run its code" in described
     assert question == "Trust this code from now on and run it? [y/N] "

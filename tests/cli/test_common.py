@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.signals import stop_requests
-from crashhunt.cli import _common, make_parser
+from crashhunt.cli import _common, _trust, make_parser
 from crashhunt.cli._common import Parser
 from crashhunt.errors import HuntDirectoryError, UntrustedError, UsageError
 
@@ -145,7 +145,7 @@ def asked(monkeypatch, answer, *, terminal=True, stdin=True):
     monkeypatch.setattr(sys, "stdin", Terminal(answer) if stdin else None)
     monkeypatch.setattr(sys, "stderr", Terminal())
     refusal = UntrustedError("not trusted", fix="trust it", where="place")
-    return _common.ask_to_trust(refusal, as_json=False), sys.stderr.getvalue()
+    return _trust.ask_to_trust(refusal, as_json=False), sys.stderr.getvalue()
 
 
 def test_trust_is_asked_for_at_a_terminal_only(monkeypatch):
@@ -155,7 +155,7 @@ def test_trust_is_asked_for_at_a_terminal_only(monkeypatch):
     assert asked(monkeypatch, "y\n", terminal=False) == (False, "")
     assert asked(monkeypatch, "y\n", stdin=False) == (False, "")
     asked(monkeypatch, "y\n")
-    assert _common.ask_to_trust(UntrustedError("not trusted", fix="trust it"), as_json=True) is False
+    assert _trust.ask_to_trust(UntrustedError("not trusted", fix="trust it"), as_json=True) is False
 
 
 def test_interrupt_at_the_question_for_trust_is_not_only_collected(monkeypatch):
@@ -171,7 +171,7 @@ def test_interrupt_at_the_question_for_trust_is_not_only_collected(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     with stop_requests() as stops:
         with pytest.raises(KeyboardInterrupt):
-            _common.ask_to_trust(UntrustedError("not trusted", fix="trust it"), as_json=False)
+            _trust.ask_to_trust(UntrustedError("not trusted", fix="trust it"), as_json=False)
         os.kill(os.getpid(), signal.SIGINT)
         assert stops == [signal.SIGINT]
 
@@ -194,22 +194,22 @@ def test_code_runs_after_trust_and_not_before(monkeypatch, faults, answer):
         "crashhunt.crashes.refuse_untrusted",
         lambda bundle, **more: made.append(more) or UntrustedError("refused", fix="trust it"),
     )
-    monkeypatch.setattr(_common, "ask_to_trust", lambda refusal, as_json: answer)
+    monkeypatch.setattr(_trust, "ask_to_trust", lambda refusal, as_json: answer)
     options = argparse.Namespace(trust=False, json=False, directory=Path("h"))
     archive = SimpleNamespace(made_here=False, made_by="x", made_at="y")
     if answer and not faults:
-        assert _common.run_trusted(run, "bundle", archive, options) == "done"
+        assert _trust.run_trusted(run, "bundle", archive, options) == "done"
         assert (calls, trusted) == ([None, True], [(snapshot, Path("h"))])
     else:
         with pytest.raises(UntrustedError, match="refused"):
-            _common.run_trusted(run, "bundle", archive, options, path=Path("p"))
+            _trust.run_trusted(run, "bundle", archive, options, path=Path("p"))
         assert (calls, trusted) == ([None], [])
     assert made == [{"where": "h" if answer and not faults else "p", "made_by": "x on y"}]
     calls.clear()
     options.trust = True
-    assert _common.run_trusted(run, "bundle", None, options) == "done"
+    assert _trust.run_trusted(run, "bundle", None, options) == "done"
     options.trust, archive.made_here = False, True
-    assert _common.run_trusted(run, "bundle", archive, options) == "done"
+    assert _trust.run_trusted(run, "bundle", archive, options) == "done"
     assert calls == [True, True]
 
 
@@ -218,10 +218,10 @@ def test_code_of_a_stranger_is_refused_where_it_is_checked(monkeypatch):
     monkeypatch.setattr("crashhunt.crashes.is_bundle_trusted", lambda bundle: bundle in known)
     monkeypatch.setattr("crashhunt.crashes.refuse_untrusted", lambda bundle: UntrustedError("refused", fix="x"))
     with pytest.raises(UntrustedError):
-        _common.check_trust("bundle", None)
-    _common.check_trust("bundle", True)
+        _trust.check_trust("bundle", None)
+    _trust.check_trust("bundle", True)
     known.append("bundle")
-    _common.check_trust("bundle", None)
+    _trust.check_trust("bundle", None)
 
 
 def test_progress_is_shown_on_a_terminal_if_no_json_is_printed(monkeypatch):
