@@ -72,11 +72,7 @@ class FreeMotion:
         self._half, self._half_width = sumo.vehicle_getLength(vehicle) / 2, sumo.vehicle_getWidth(vehicle) / 2
         self._ahead = 2 * self._half * REFERENCE_SHARES[str(settings.get("reference_point", "center"))]
         heading = math.radians(90.0 - sumo.vehicle_getAngle(vehicle))
-        x, y = sumo.vehicle_getPosition(vehicle)
-        self.state = MotionState(
-            x=x - self._half * math.cos(heading), y=y - self._half * math.sin(heading), heading=heading,
-            speed=sumo.vehicle_getSpeed(vehicle),
-        )  # fmt: skip
+        self.place(*sumo.vehicle_getPosition(vehicle), heading, sumo.vehicle_getSpeed(vehicle))
         self.model = BicycleModel(
             wheelbase=WHEELBASE_SHARE * 2 * self._half,
             max_acceleration=sumo.vehicle_getAccel(vehicle),
@@ -94,6 +90,11 @@ class FreeMotion:
         """The lane that the outline is inside, but for 0.1 m; empty if there is none, or it is not known yet."""
         self._is_over_kerb: bool | None = None  # not known yet
         sumo.vehicle_setSpeedMode(vehicle, 0)  # SUMO would otherwise report a speed within its own limits
+
+    def place(self, x: float, y: float, heading: float, speed: float) -> None:
+        """Set where the motion begins: the middle of the front bumper in m, the heading in rad, the speed in m/s."""
+        x, y = x - self._half * math.cos(heading), y - self._half * math.sin(heading)
+        self.state = MotionState(x=x, y=y, heading=heading, speed=speed)
 
     def apply(self, action: NDArray[np.generic]) -> bool:
         """Move the vehicle by an encoded action; return whether it stays on the road and hits no obstacle."""

@@ -224,6 +224,9 @@ class SumoSimulator:
             raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
         self.agents = list(self._setups)
         self._driving.begin(self.agents)
+        for path in script.agents if script is not None else ():
+            if path.actor.id in self._driving.moving:  # SUMO reports the new position only after the next step
+                self._driving.moving[path.actor.id].place(*path.states[0][:4])
         self._followers.begin()
         for agent, motion in self._driving.moving.items():
             form = self.actions[agent]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -83,3 +86,24 @@ def test_where_an_agent_is_to_begin_must_be_known(simulator, recorded):
     for wrong in (paths_of(recorded[0][3:], ("ego",)),):
         with pytest.raises(InvalidEpisodeError, match="is unknown"):
             driven(simulator, script=wrong)
+
+
+@pytest.mark.parametrize("form", ["acceleration_steering", "target_pose"])
+def test_vehicle_that_moves_freely_begins_where_it_was(tmp_path, form):
+    scenario = load_scenario("loop")
+    agents = {"ego": replace(scenario.agents["ego"], action=form)}
+    with closing(SumoSimulator(replace(scenario, agents=agents), tmp_path)) as simulator:
+
+        def drive(steps, **options):
+            arguments = {**argument_values(simulator._scenario), "vehicles": 12}
+            simulator.reset(seed=3, options={"arguments": arguments, **options})
+            yield simulator.scene()
+            for _ in range(steps):
+                motion = simulator._driving.moving["ego"]
+                simulator.step({"ego": simulator.actions["ego"].encode(motion._action(0.5, 0.001))})
+                yield simulator.scene()
+
+        scenes = [*drive(STEPS)]
+        script = paths_of(scenes, ("ego",)).cut(BEGIN, STEPS, simulator.step_length_s).placing()
+        for one, other in zip(scenes[BEGIN:], drive(STEPS - BEGIN, script=script), strict=True):
+            assert np.allclose(told(one, "ego")[:4], told(other, "ego")[:4], atol=1e-6)
