@@ -61,11 +61,9 @@ class WarmTraffics:
     Args:
         limit: maximum number of suspended processes.
         notify: function called with texts for the user.
-        worth_s: a suspended process is kept only if its warm-up took at least this wall time, in s.
     """
 
-    def __init__(self, limit: int, notify: Callable[[str], None], *, worth_s: float = _MIN_WARM_UP_S) -> None:
-        self._worth_s = worth_s
+    def __init__(self, limit: int, notify: Callable[[str], None]) -> None:
         self._limit = limit
         self._notify = notify
         self._suspended: OrderedDict[str, _Suspended] = OrderedDict()  # the most recently used is the last
@@ -139,7 +137,7 @@ class WarmTraffics:
             os.close(answers)
         made = self._suspended[key] = _Suspended(pid=pid, requests=ours, answers=theirs, used=self._trials)
         said = made.ask(b"", wait)
-        if said is not None and said.get("took_s", 0.0) >= self._worth_s:
+        if said is not None and said.get("took_s", 0.0) >= _MIN_WARM_UP_S:
             return made
         self._drop(key)
         if said is not None and "took_s" in said:

@@ -36,15 +36,12 @@ if TYPE_CHECKING:
 # The table of crash types. `crashhunt.crashes` decides which crashes are of one type, and in which order.
 
 
-def describe_groups(
-    groups: Sequence[Group], known: Mapping[Signature, str] | None = None, *, by_cause: int | None = None
-) -> str:
+def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> str:
     """Return one line for each crash type, with its shortest crash.
 
     Args:
         groups: the groups of crashes, one for each crash type.
         known: name of the corpus case for each known crash type; None if no corpus was given.
-        by_cause: number of crash types by cause; None if the hunt does not count causes.
     """
     if not groups:
         return "No crash was saved."
@@ -68,7 +65,7 @@ def describe_groups(
             ]
         )
     count = sum(group.count for group in groups)
-    words = f"{count_of(count, 'crash')} of {describe_types(len(groups), by_cause)}"
+    words = f"{count_of(count, 'crash')} of {describe_types(len(groups), None)}"
     saved = sum(len(group.bundles) for group in groups)
     if saved < count:
         words += f" ({saved} of {count} have a bundle{', and faults are of these' if faults else ''})"
@@ -118,7 +115,7 @@ _SOURCE_WORDS = {
 }
 
 
-def describe_hunt(report: HuntReport, program: str = "crashhunt", *, has_dashboard: bool = False) -> str:
+def describe_hunt(report: HuntReport, *, has_dashboard: bool = False) -> str:
     """Return the result of a hunt as text that fits a screen.
 
     A single crash is described with its cause, its directory and the command that replays it. Of several crashes, the
@@ -179,21 +176,21 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt", *, has_dashboa
             lines += ["", *_describe_crash(bundle)]
         if len(crashes) > _MAX_BLOCKS:
             lines += ["", f"{_MAX_BLOCKS} of {report.tally.found} crashes shown; all are in {_crash_folder(report)}"]
-    lines += _near_misses(report, program)
+    lines += _near_misses(report)
     lines += ["", counts] if has_types else []
     if report.copied is not None:
         lines += ["", *_describe_crash(report.copied)]
-        lines += ["", f"Replay it:  {command_line(program, 'replay', report.copied.path)}"]
+        lines += ["", f"Replay it:  {command_line('crashhunt', 'replay', report.copied.path)}"]
     if report.crashes:
         chosen = ["--crash", crashes[0].id] if len(crashes) > 1 else []
-        replay = command_line(program, "replay", report.directory, *chosen)
+        replay = command_line("crashhunt", "replay", report.directory, *chosen)
         lines += [f"Replay one:  {replay}"] if has_types else ["", f"Replay it:  {replay}"]
-        lines += [f"Show one:    {command_line(program, 'show', report.directory, *chosen)}"] if has_types else []
+        lines += [f"Show one:    {command_line('crashhunt', 'show', report.directory, *chosen)}"] if has_types else []
     if has_types:
-        lines.append(f"Show types:  {command_line(program, 'crashes', report.directory)}")
+        lines.append(f"Show types:  {command_line('crashhunt', 'crashes', report.directory)}")
     if has_dashboard and report.crashes:
         space = " " * has_types  # the labels before it are longer then
-        lines.append(f"Look at it: {space}{command_line(program, 'dashboard', report.directory)}")
+        lines.append(f"Look at it: {space}{command_line('crashhunt', 'dashboard', report.directory)}")
     return in_lines(lines)
 
 
@@ -237,7 +234,7 @@ def _listed(crashes: list[str]) -> str:
     return f"{', '.join(crashes[:_MAX_LISTED])}{more}"
 
 
-def _near_misses(report: HuntReport, program: str) -> list[str]:
+def _near_misses(report: HuntReport) -> list[str]:
     """Return the saved near misses as text, one line each."""
     if not report.near_misses:
         return []
@@ -251,7 +248,7 @@ def _near_misses(report: HuntReport, program: str) -> list[str]:
     if len(report.near_misses) > _MAX_SHOWN:
         lines.append(f"  {_MAX_SHOWN} of {len(report.near_misses)} near misses shown")
     first = report.near_misses[0].id
-    return [*lines, f"Replay one:  {command_line(program, 'replay', report.directory, '--crash', first)}"]
+    return [*lines, f"Replay one:  {command_line('crashhunt', 'replay', report.directory, '--crash', first)}"]
 
 
 def _describe_events(report: HuntReport) -> list[str]:

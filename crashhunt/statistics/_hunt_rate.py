@@ -155,7 +155,6 @@ def rate_of_trials(
     facts: Facts,
     trials: Iterable[JsonObject],
     held_out: HeldOutTraffics,
-    confidence: float = 95.0,
 ) -> CrashRate:
     """Return the same rate per trial as `measure_rates`, without parts, from trials that the caller reads.
 
@@ -165,7 +164,6 @@ def rate_of_trials(
         facts: facts from the hunt's ledger.
         trials: JSON data of all trials, in the order of their numbers.
         held_out: rule for the traffic that counts.
-        confidence: confidence, in percent, of the certain interval, which is valid after any number of trials.
     """
     rule = counting_rule(settings, facts, held_out)
     sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")
@@ -173,7 +171,7 @@ def rate_of_trials(
         for unit in sequence.add(facts_of_plain(data, settings.crash_on)):
             counter.add(unit)
     return make_rate(
-        str(directory), "trial", counter, sequence, confidence=confidence,
+        str(directory), "trial", counter, sequence,
         why_no_interval=why_no_interval(settings, facts), why_no_estimate=_why_no_estimate(settings, facts, sequence),
     )  # fmt: skip
 

@@ -106,9 +106,9 @@ def warm(copies):
     """Makes suspended processes for so many traffics; `notes` are the texts for the user."""
     made = []
 
-    def make(limit, **more):
+    def make(limit):
         copies.notes = []
-        found = WarmTraffics(limit, copies.notes.append, **more)
+        found = WarmTraffics(limit, copies.notes.append)
         found.prepare("trial", "simulator")
         made.append(found)
         return found
@@ -171,9 +171,8 @@ def test_warm_up_that_is_short_ends_the_search_for_one(warm, copies):
     assert len(copies.made) == 1
     assert copies.ended == [100]
     assert copies.notes == []
-    traffics = warm(2, worth_s=0.001)
-    copies.answers = [FAST, RAN]
-    assert traffics.run(job(0), copies.wait) == (77, 0)
+    copies.answers = [{"took_s": 0.02}, RAN]
+    assert warm(2).run(job(0), copies.wait) == (77, 0)
     assert warm(0).run(job(0), copies.wait) is None
     unprepared = WarmTraffics(2, copies.notes.append)
     assert unprepared.run(job(0), copies.wait) is None
