@@ -75,7 +75,7 @@ END = {"step": 40, "within": 1.0, "branched": 10}
     ({"ends": [END | {"outcome": "simulator_error"}]}, "a copy ended by simulator_error", False),
     ({"ends": [END | {"outcome": "invalid"}]}, "a copy ended by invalid", False),
 ])  # fmt: skip
-def test_root_whose_copy_says_too_little_is_incomplete(answer, why, again):
+def test_root_with_a_copy_without_result_is_incomplete(answer, why, again):
     forcer = OnsetForcer(("brake=0.05",), CRASHES, 1.0, lambda _: None)
     forcer._onsets = SimpleNamespace(following=lambda _: None, survival=0.5, masses={})
     forcer.fork_runner.run = lambda _: answer
