@@ -188,9 +188,10 @@ class FreeMotion:
         most = (state.speed + _MAX_ACCELERATION_MPS2 * dt) * dt + _MAX_SLIDE_M
         least = (state.speed - _MAX_BRAKING_MPS2 * dt) * dt - _MAX_SLIDE_M
         if not least <= moved <= most:
-            message = f"the {self._words} moves the vehicle by {moved:.2f} m in a step of {dt:g} s"
-            fix = f"return a pose between {max(0.0, least):.2f} and {most:.2f} m away"
-            return ActionError(message, fix=f"{fix}; positions are those of {self._point}")
+            message = f"the {self._words} moves the vehicle by {moved:.3f} m in a step of {dt:g} s"
+            least, most = math.ceil(max(0.0, least) * 100) / 100, math.floor(most * 100) / 100
+            fix = f"return a pose between {least:.2f} and {most:.2f} m away; positions are those of {self._point}"
+            return ActionError(message, fix=fix)
         turned = math.remainder(after.heading - state.heading, math.tau)
         if abs(turned) > _MAX_YAW_RATE_RADPS * dt + _MAX_TURN_RAD:
             message = f"the {self._words} turns the vehicle by {turned:.2f} rad in a step of {dt:g} s"

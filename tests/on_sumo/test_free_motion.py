@@ -225,8 +225,8 @@ def test_a_reported_collision_of_a_free_vehicle_counts_only_if_the_outlines_touc
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        (lambda x, y, h, v: [[0.1, x + 5, y, h, v]], r"the trajectory moves the vehicle by 5.00 m in a step of 0.1 s"),
-        (lambda x, y, h, v: [[0.1, x, y, h, v]], r"moves the vehicle by 0.00 m"),
+        (lambda x, y, h, v: [[0.1, x + 5, y, h, v]], r"the trajectory moves the vehicle by 5.000 m in a step of 0.1 s"),
+        (lambda x, y, h, v: [[0.1, x, y, h, v]], r"moves the vehicle by 0.000 m"),
         (lambda x, y, h, v: [[0.1, x + v / 10, y, h + 0.5, v]], r"turns the vehicle by 0.50 rad"),
         (lambda x, y, h, v: [[0.05, x + v / 20, y, h, v]], r"the trajectory ends 0.05 s from now"),
         (lambda x, y, h, v: [[0.2, x, y, h, v], [0.1, x, y, h, v]], "time of point 1 of the trajectory is 0.1 s"),
