@@ -441,7 +441,7 @@ class Progress:
             branched=self.branched,
             not_fully_asked=self.not_fully_asked,
             search=self.searching.status(),
-            rate=self.running_rate(),
+            rate=self.running_rate(now=phase == "done"),
             trials_left_s=None if self.ends_at is None else max(0.0, self.ends_at - time.time()),
             progress=self.phase,
             steps=self.steps_here,

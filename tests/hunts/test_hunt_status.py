@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -93,6 +94,13 @@ def test_least_robust_trial_and_crashed_branches_are_counted():
     )  # fmt: skip
     assert progress.stressed is weak
     assert (progress.branched, progress.not_fully_asked) == (0, 1)
+
+
+def test_rate_on_the_last_screen_counts_every_trial():
+    progress = Progress()
+    progress.counted = SimpleNamespace(running=lambda *, now: {"trials": 2 if now else 1})
+    rates = [progress.status(phase, 2, has_disturbances=False).rate for phase in ("hunting", "done")]
+    assert rates == [{"trials": 1}, {"trials": 2}]
 
 
 def test_time_limit_of_a_hunt_counts_down_to_zero():
