@@ -27,6 +27,7 @@ from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import internal_error, scratch_of
 from crashhunt.executors._postmortem import MAX_ATTEMPTS, check_report, damaged, died, hung, read_ends, read_map
 from crashhunt.executors._time_limits import START_UP_S, PauseMeter, has_hung
+from crashhunt.executors._trial_folder import TrialFolder
 from crashhunt.recording import BlackBoxFile, Recording, read_black_box
 from crashhunt.simulators import FullBraking
 from crashhunt.trial import Escape, TrialResult, TrialSpec
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
 
 _LOOK_EVERY_S = 0.1  # whether a trial hangs
 _CHUNK_BYTES = 1 << 16  # bytes at a time
-_MAX_RESTORED_OUTPUT_BYTES = 64 << 20  # bytes of a run.log that are written again where an agent has removed the file
 
 
 class LostTrialError(Exception):
@@ -101,10 +101,8 @@ class Supervisor:
         self._received = bytearray()
         self._zygote_pid = 0  # once it is ready
         self.retires = False
-        self._box: BlackBoxFile | None = None
-        self._output = self._stack = -1
-        self._folder: Path | None = None
-        self._made = self._trials = 0
+        self._folder = TrialFolder(settings.scratch, self._check_host)
+        self._trials = 0
 
     def run(self, spec: TrialSpec) -> EndedTrial:
         """Run a trial, and return its result. The scratch folder of the trial remains if the trial is kept.
@@ -134,7 +132,7 @@ class Supervisor:
 
     def _run(self, spec: TrialSpec) -> EndedTrial:
         self._await_zygote()
-        box, folder = self._prepare(spec)
+        box, folder = self._folder.prepare(spec.number)
         given_at = time.monotonic()
         self._trials += 1
         job: Job = {
@@ -152,14 +150,14 @@ class Supervisor:
         wall_s = max(ended.result.wall_s, time.monotonic() - given_at)
         result = replace(ended.result, worker=os.getpid(), wall_s=wall_s)
         if result.kept:
-            self._folder = None  # it belongs to the hunt now; the next trial gets another one
+            self._folder.release()
         return replace(ended, result=result, notices=notices)
 
     def _judge(self, spec: TrialSpec, box: BlackBoxFile, said: FromZygote, *, was_killed: bool) -> EndedTrial:
         """Determine the result of a trial whose process has ended."""
         scratch, code, pid = self._settings.scratch, said["ended"], said["pid"]
-        is_there = self._is_whole(scratch_of(scratch, spec.number))
-        self._restore(spec)
+        is_there = self._folder.is_whole(scratch_of(scratch, spec.number))
+        self._folder.restore(spec.number)
         header = box.header()
         report = box.read_report(header) if header is not None else b""
         is_whole = box.is_reusable()
@@ -249,7 +247,7 @@ class Supervisor:
         header = box.header()
         begun = header is not None and header.pid != os.getpid()
         limit_s = self._settings.timeout_s + paused_s
-        has_words = lambda: os.fstat(self._stack).st_size > 0  # noqa: E731
+        has_words = lambda: self._folder.has_stack  # noqa: E731
         return has_hung(header, begun=begun, given_at=given_at, limit_s=limit_s, has_words=has_words)
 
     def _await_zygote(self) -> None:
@@ -296,82 +294,6 @@ class Supervisor:
         self._received = bytearray(rest)
         message: FromZygote = json.loads(line)
         return message
-
-    def _prepare(self, spec: TrialSpec) -> tuple[BlackBoxFile, Path]:
-        """Provide a scratch folder for the trial: that of the last trial, whose pages are in memory, or a new one."""
-        folder = scratch_of(self._settings.scratch, spec.number)
-        _remove(folder)  # of an earlier attempt at the same trial
-        if self._folder is None or self._box is None or not self._box.is_reusable() or not self._is_whole(self._folder):
-            self._make_folder()
-        assert self._folder is not None
-        assert self._box is not None
-        os.ftruncate(self._output, 0)
-        os.ftruncate(self._stack, 0)
-        self._box.begin(trial=spec.number, started=time.monotonic())
-        os.rename(self._folder, folder)  # noqa: PTH104 - Path.rename builds a path for nothing
-        self._folder = folder
-        return self._box, folder
-
-    def _make_folder(self) -> None:
-        if self._box is not None:
-            self._box.close()
-            os.close(self._output)
-            os.close(self._stack)
-            self._box = None
-        if self._folder is not None:
-            _remove(self._folder)
-        self._made += 1
-        folder = self._settings.scratch / f"new-{os.getpid()}-{self._made}"
-        _remove(folder)
-        self._restore_scratch()
-        folder.mkdir()
-        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-        self._output = os.open(folder / layout.RUN_LOG, flags, 0o644)
-        self._stack = os.open(folder / layout.STACK, flags, 0o644)
-        self._box = BlackBoxFile(folder / layout.BLACK_BOX)
-        self._folder = folder
-
-    def _is_whole(self, folder: Path) -> bool:
-        """Return whether a folder contains the files that this process has opened; an agent may have deleted them."""
-        assert self._box is not None
-        opened = {
-            layout.BLACK_BOX: self._box.identity,
-            layout.RUN_LOG: os.fstat(self._output),
-            layout.STACK: os.fstat(self._stack),
-        }
-        try:
-            return all(os.path.samestat(os.stat(folder / name), found) for name, found in opened.items())  # noqa: PTH116
-        except OSError:
-            return False
-
-    def _restore(self, spec: TrialSpec) -> None:
-        """Restore the scratch folder of a trial: the files of this process, and no other file."""
-        folder = scratch_of(self._settings.scratch, spec.number)
-        if self._is_whole(folder):
-            for entry in os.scandir(folder):
-                if entry.name not in (layout.BLACK_BOX, layout.RUN_LOG, layout.STACK):
-                    _remove(folder / entry.name)  # the next trial gets this folder
-            return
-        _remove(folder)
-        self._restore_scratch()
-        folder.mkdir()
-        assert self._box is not None
-        self._box.copy_to(folder / layout.BLACK_BOX)
-        for name, descriptor in ((layout.RUN_LOG, self._output), (layout.STACK, self._stack)):
-            (folder / name).write_bytes(os.pread(descriptor, _MAX_RESTORED_OUTPUT_BYTES, 0))
-
-    def _restore_scratch(self) -> None:
-        """Create the scratch folder again if an agent has deleted it, but not the directory of a deleted hunt."""
-        if not self._settings.scratch.is_dir():
-            self._check_host()
-            self._settings.scratch.mkdir(parents=True)
-
-
-def _remove(path: Path) -> None:
-    if path.is_symlink() or path.is_file():
-        path.unlink(missing_ok=True)
-    elif path.exists():
-        shutil.rmtree(path, ignore_errors=True)
 
 
 def be_supervisor(

@@ -135,6 +135,7 @@ _TESTS_ELSEWHERE = {
     "executors/_postmortem.py": ("executors/test_evidence.py",),
     "executors/_protocol.py": ("executors/test_pool_of_trials.py",),
     "executors/_supervisor.py": ("executors/test_killed_trials.py", "executors/test_warm_traffics.py"),
+    "executors/_trial_folder.py": ("executors/test_supervisors.py", "executors/test_killed_trials.py"),
     "executors/_time_limits.py": ("executors/test_last_words.py",),
     "executors/_trial_process.py": ("executors/test_harms.py", "executors/test_warm_traffics.py"),
     "executors/ray": (

@@ -272,7 +272,7 @@ def test_time_limit_of_a_trial_begins_with_its_own_recording(settings, zygote, m
     asked = []
     monkeypatch.setattr(_supervisor, "has_hung", lambda header, **given: asked.append((header, given)) or True)
     supervisor = Supervisor(settings, zygote.ours)
-    supervisor._stack = os.open(tmp_path / "stack", os.O_RDWR | os.O_CREAT)
+    supervisor._folder._stack = os.open(tmp_path / "stack", os.O_RDWR | os.O_CREAT)
     try:
         for header in (None, SimpleNamespace(pid=os.getpid()), SimpleNamespace(pid=PID)):
             assert supervisor._has_hung(SimpleNamespace(header=lambda found=header: found), 5.0)
@@ -280,17 +280,17 @@ def test_time_limit_of_a_trial_begins_with_its_own_recording(settings, zygote, m
         assert [given["begun"] for _, given in asked] == [False, False, True]
         given = asked[-1][1]
         assert (given["given_at"], given["limit_s"], given["has_words"]()) == (5.0, settings.timeout_s, False)
-        os.write(supervisor._stack, b"File")
+        os.write(supervisor._folder._stack, b"File")
         assert given["has_words"]()
     finally:
-        os.close(supervisor._stack)
+        os.close(supervisor._folder._stack)
 
 
 def test_modules_of_an_agent_are_those_that_nothing_else_uses(settings, zygote):
     agents = {name: AgentSetup(agent=agent) for name, agent in
               {"a": "mine:Agent", "b": "shared:Agent", "c": "keep-lane"}.items()}  # fmt: skip
     scenario = SimpleNamespace(agents=agents, modules=lambda: ("shared",))
-    supervisor = Supervisor(SimpleNamespace(scenario=scenario), zygote.ours)
+    supervisor = Supervisor(SimpleNamespace(scenario=scenario, scratch=None), zygote.ours)
     assert supervisor._modules() == {"a": "mine"}
 
 
