@@ -23,6 +23,7 @@ from crashhunt.recording import (
     Phase,
     Prologue,
     Tag,
+    digest_of,
     encode_actors,
     encode_disturbance,
     encode_events,
@@ -368,7 +369,7 @@ class Recorder(Observer):
     def end(self, result: TrialResult) -> TrialResult:
         """Record the end of the episode, and add the digest of the recording to the result."""
         self._box.mark(Phase.DONE)
-        digest = self._box.digest() if result.outcome is not Outcome.INVALID else ""
+        digest = digest_of(self._box.evidence()) if result.outcome is not Outcome.INVALID else ""
         return replace(result, digest=digest, events=None if self._events is None else dict(self._events))
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 16
+_INTERFACE = 15
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -500,9 +500,6 @@ class Core(Protocol):
             heading, half the length and half the width. The int64 column for the agent is the number of each scene. The
             int64 columns for the other actors are the index of the scene and the number of the actor.
         """
-
-    def digest(self, parts: list[memoryview], /) -> bytes | None:
-        """Return the trace digest of some bytes, as hashlib computes it; None without AVX-512."""
 
     def least_change(self, earlier: Columns, later: Columns, /) -> float | None:
         """Return the least change of speed of any actor between two scenes (m/s); 0 in an empty scene."""

@@ -1550,7 +1550,6 @@ PyObject *write_step(PyObject *, PyObject *const *given, Py_ssize_t count) {
 
 #define FAST(function) reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function)), METH_FASTCALL
 
-#include "trace_digest.hpp"
 #include "observed_parts.hpp"
 #include "fast_step.hpp"
 
@@ -1602,7 +1601,6 @@ PyMethodDef functions[] = {
     {"may_be_near", FAST(may_be_near), "Return who may have a part in the closest approach."},
     {"tracks", FAST(tracks), "Return the way of an agent, and who was near it."},
     {"write_array", FAST(write_array), "Write the record of an array; return where it ends."},
-    {"digest", digest, METH_O, "Return the trace digest of buffers; None where the processor has no AVX-512."},
     {"write_step", FAST(write_step), "Write the record of a step; return where it ends."},
     {nullptr, nullptr, 0, nullptr},
 };

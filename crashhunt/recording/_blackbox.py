@@ -279,12 +279,6 @@ class BlackBox:
         self._stop_core()
         return memoryview(self._map)[FIRST : self._offset]
 
-    def digest(self) -> str:
-        """Return the trace digest of the records written until now."""
-        parts = self.evidence()
-        found = None if self._core is None else self._core.digest(parts)
-        return digest_of(parts) if found is None else found.hex()
-
     def evidence(self) -> list[memoryview]:
         """The bytes of those records that belong to the digest."""
         self._stop_core()

@@ -17,7 +17,7 @@ from crashhunt.episode import run_episode
 from crashhunt.native import _core, core_for, why_not
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.oracles._included_oracles import _within_reach
-from crashhunt.recording import BlackBox, digest_of
+from crashhunt.recording import BlackBox
 from crashhunt.scenario import ObservationSetup, argument_values, load_scenario
 from crashhunt.simulators import Kinematics
 from crashhunt.sumo import SumoSetup
@@ -460,19 +460,6 @@ def test_the_record_of_an_array_is_the_same(tmp_path, array):
         found.append((bytes(box.committed()), bytes(box._map[:64]), box._offset))
         box.close()
     assert found[0] == found[1]
-
-
-pieces = some.sampled_from([0, 1, 127, 128, 129, 255, 256, 257, 384]) | some.integers(0, 2000)
-
-
-@given(some.lists(pieces, max_size=6), some.integers(0, 2**32))
-def test_the_digest_is_that_of_hashlib(lengths, seed):
-    made = np.random.default_rng(seed)
-    parts = [made.bytes(length) for length in lengths]
-    found = core.digest(parts)
-    if found is None:
-        pytest.skip("this processor has no AVX-512")
-    assert found.hex() == digest_of(parts)
 
 
 def test_it_is_used_only_where_it_is_known(monkeypatch):
