@@ -72,7 +72,8 @@ class FreeMotion:
         self._half, self._half_width = sumo.vehicle_getLength(vehicle) / 2, sumo.vehicle_getWidth(vehicle) / 2
         self._ahead = 2 * self._half * REFERENCE_SHARES[str(settings.get("reference_point", "center"))]
         heading = math.radians(90.0 - sumo.vehicle_getAngle(vehicle))
-        self.place(*sumo.vehicle_getPosition(vehicle), heading, sumo.vehicle_getSpeed(vehicle))
+        x, y = sumo.vehicle_getPosition(vehicle)
+        self.place(x, y, heading, sumo.vehicle_getSpeed(vehicle))
         self.model = BicycleModel(
             wheelbase=WHEELBASE_SHARE * 2 * self._half,
             max_acceleration=sumo.vehicle_getAccel(vehicle),
