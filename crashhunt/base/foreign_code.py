@@ -53,12 +53,9 @@ def members(faculty: Any) -> tuple[str, ...]:
     found: dict[str, None] = {}
     for base in faculty.__mro__:
         if base not in (Protocol, Generic, object):
-            found |= dict.fromkeys(name for name in (*vars(base), *_annotated(base)) if not name.startswith("_"))
+            names = *vars(base), *vars(base).get("__annotations__", {})
+            found |= dict.fromkeys(name for name in names if not name.startswith("_"))
     return tuple(found)
-
-
-def _annotated(base: type) -> tuple[str, ...]:
-    return tuple(vars(base).get("__annotations__", {}))
 
 
 # Boundaries around calls.

@@ -97,7 +97,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         sys.stdout.reconfigure(errors="backslashreplace")  # not every terminal knows every letter; as on stderr
     try:
         code = _run(words)
-        _flush()
+        sys.stdout.flush()
     except BrokenPipeError as error:
         code = OUTPUT_CLOSED
         if _is_output_closed():
@@ -214,10 +214,6 @@ def _explained(error: Exception) -> CrashhuntError:
     where = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
     fix = "set CRASHHUNT_TRACEBACK=1 to see the traceback; if none of your modules is to blame, please report it"
     return CrashhuntError(f"this should not happen: {in_words(error)}", fix=fix, where=where)
-
-
-def _flush() -> None:
-    sys.stdout.flush()
 
 
 def _is_output_closed() -> bool:

@@ -58,11 +58,7 @@ class _FailedError(Exception):
 def _how_to_look(item: pytest.Item) -> str:
     from crashhunt.base.text import command_line
 
-    case = item.path.parent
-    place = case.relative_to(item.config.invocation_params.dir) if _is_below(case, item) else case
+    case, folder = item.path.parent, item.config.invocation_params.dir
+    place = case.relative_to(folder) if case.is_relative_to(folder) else case
     run = command_line("crashhunt", "corpus", "run", place, "--keep", "out")
     return f"look at it: {run} && {command_line('crashhunt', 'show', f'out/{case.name}')}"
-
-
-def _is_below(path: Path, item: pytest.Item) -> bool:
-    return path.is_relative_to(item.config.invocation_params.dir)

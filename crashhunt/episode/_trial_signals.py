@@ -322,7 +322,7 @@ class _SceneReader:
             "priority_arrival_s": lambda: self._priority()[1],
             "speed_limit": self._speed_limit,
             "red_light_m": self._red_light,
-            "clearance_m": self._clearance,
+            "clearance_m": lambda: float(approaches([self._scene.frame], self._agent)[1][0]),
             "lane": self._lane_number,
             "lane_offset_m": lambda: self._nearest_lane()[1],
         }
@@ -412,9 +412,6 @@ class _SceneReader:
     def _red_light(self) -> float:
         nearest = self._nearest("red light")
         return math.inf if nearest is None else nearest.gap_m
-
-    def _clearance(self) -> float:
-        return float(approaches([self._scene.frame], self._agent)[1][0])
 
     def _lane_number(self) -> float | None:
         lane = self._scene.agent_lanes.get(self._agent) or self._nearest_lane()[0]

@@ -72,7 +72,8 @@ def main() -> None:
     job: ForkServerJob = json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
     if job["sys_path"]:
         sys.path[:] = job["sys_path"]
-    _ignore_signals()
+    for number in _IGNORED_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     adopt_orphans()
     try:
         settings = WorkerSettings.from_json(job["settings"])
@@ -282,11 +283,6 @@ def _parse_request(data: bytes) -> FromForkServer:
         elif "importing" in message:
             said["importing"] = str(message["importing"])
     return said
-
-
-def _ignore_signals() -> None:
-    for number in _IGNORED_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
 
 
 def _send(control: socket.socket, message: FromForkServer | ErrorData) -> None:

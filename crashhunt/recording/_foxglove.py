@@ -217,7 +217,7 @@ def _write_scenes(log: LogWriter, recording: Recording, scenes: Sequence[Scene],
         agent: transforms.transforms.add(parent_frame_id="map", child_frame_id=agent) for agent in recording.agents
     }
     pose = PoseInFrame(frame_id="map")
-    parties = _parties(crash)
+    parties = (crash.collision.collider, crash.collision.victim) if crash and crash.collision else ()
     lifetime_ns = round(recording.prologue.step_length_s * 1.1e9)
     for scene in scenes:
         time_ns = to_ns(scene.time_s)
@@ -331,10 +331,6 @@ def _write_crash(log: LogWriter, recording: Recording, scene: Scene, crash: Tria
     for angle in np.linspace(0, 2 * np.pi, 32, endpoint=False).tolist():
         ring.points.add(x=x + 5 * math.cos(angle), y=y + 5 * math.sin(angle), z=z + 0.1)
     log.write("/scene/crash", SceneUpdate, SceneUpdate(entities=[entity]).SerializeToString(), time_ns)
-
-
-def _parties(crash: TrialResult | None) -> tuple[str, ...]:
-    return (crash.collision.collider, crash.collision.victim) if crash and crash.collision else ()
 
 
 def _color(name: str) -> Color:

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 OPAQUE_SHAPE: Final = (-1,)
 """The shape, in the prologue of a recording, of arrays that hold the text of a value; each has its own length."""
-OPAQUE_DTYPE: Final = "|u1"
 
 _PLAIN_DTYPES: Final = frozenset("biufcSUMm")
 _DIGEST_BYTES: Final = 16

@@ -47,7 +47,7 @@ def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | No
         return "No crash was saved."
     hunts = {bundle.hunt for group in groups for bundle in group.bundles}
     faults = any(group.fault for group in groups)
-    prevented = [_describe_prevented(group) for group in groups]
+    prevented = [list_preventing(group.preventable_by) for group in groups]
     rows = [["crashes", "type", *(["at fault"] if faults else []), "shortest"]]
     rows[0] += [*(["known as"] if known is not None else []), *(["preventable"] if any(prevented) else []), "steps"]
     for group, answers in zip(groups, prevented, strict=True):
@@ -70,11 +70,6 @@ def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | No
     if saved < count:
         words += f" ({saved} of {count} have a bundle{', and faults are of these' if faults else ''})"
     return "\n".join([f"{words}:", "", *aligned(rows, left=range(1, len(rows[0]) - 1))])
-
-
-def _describe_prevented(group: Group) -> str:
-    """Return which models of a competent driver would have prevented the shortest crash; empty if it is not judged."""
-    return list_preventing(group.preventable_by)
 
 
 def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGroup]]) -> str:

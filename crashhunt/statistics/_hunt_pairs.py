@@ -285,9 +285,8 @@ class PairedHunts:
             if not all(self._held_out.has(int(one.tags[0])) for one, _ in pair):
                 self.trained_on += 1
                 continue
-            if self._counts is not None:
-                base, head = self.folders
-                pair = tuple((self._counted(base, one), self._counted(head, two)) for one, two in pair)
+            base, head = self.folders
+            pair = tuple((self._counted(base, one), self._counted(head, two)) for one, two in pair)
             self._test.add(pair)
             watch.test.add(pair)
             for both in pair:

@@ -80,7 +80,7 @@ class LanesReader(Reader):
         place = self._setup.places.find(moment)
         if place is None:
             return np.zeros(self._setup.shape)
-        self._move_to(place, _square_of(place))
+        self._move_to(place, (math.floor(place.x / SQUARE_M), math.floor(place.y / SQUARE_M)))
         if self._block is None:
             self._block = _block_of(self._candidates(place), *self._middle, np.arange(self._window))
         block = self._block
@@ -168,10 +168,6 @@ class LanesReader(Reader):
                 partial(straight_behind, self._graph, vehicle_class=vehicle_class, preferred=before),
             )
         return found
-
-
-def _square_of(place: Place) -> tuple[int, int]:
-    return math.floor(place.x / SQUARE_M), math.floor(place.y / SQUARE_M)
 
 
 def _sampling_of(request: RequestedPart) -> Sampling:

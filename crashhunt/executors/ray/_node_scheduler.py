@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.executors.ray._messages import Figures, Submitted
@@ -178,11 +178,9 @@ def shares(free: Mapping[str, int], wanted: int | None) -> dict[str, int]:
         return left
     found: dict[str, int] = {}
     for _ in range(min(wanted, sum(left.values()))):
-        node = max(_remaining_s(left), key=lambda node: (left[node], -found.get(node, 0)))
+        node = max(
+            (one for one, count in left.items() if count > 0), key=lambda node: (left[node], -found.get(node, 0))
+        )
         left[node] -= 1
         found[node] = found.get(node, 0) + 1
     return found
-
-
-def _remaining_s(left: Mapping[str, int]) -> Iterable[str]:
-    return (node for node, count in left.items() if count > 0)
