@@ -1,4 +1,4 @@
-"""Runs from the start after the last trial: of crashes of forks, and of the most critical trials without a crash.
+"""Runs of crashes of forks from the start, after the last trial.
 
 The results of the branches and robustness probes of all trials are summed up. A fork shows only a possible crash. A run
 from the start confirms the crash, because the bundle of the run can be replayed.
@@ -11,9 +11,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.temporary import remove_at_once
-from crashhunt.crashes import list_near_misses
 from crashhunt.hunts._reports import BranchReport, ProbeReport, RareReport
 from crashhunt.hunts._verification import Found
 from crashhunt.results import BRANCHES, PROBES, sums_of_branches, sums_of_probes
@@ -23,9 +20,8 @@ from crashhunt.trial import Branches, Stress, in_turn
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from crashhunt.crashes import Bundle
     from crashhunt.hunts._next_trials import Trials
-    from crashhunt.hunts._verification import TrialReruns, VerificationRuns
+    from crashhunt.hunts._verification import VerificationRuns
     from crashhunt.trial import Branch, Disturbance, ForcedCopy, TrialResult
 
 
@@ -295,53 +291,3 @@ def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport
 def _crash_of_copy(result: TrialResult, copy: ForcedCopy) -> Found:
     spec = replace(result.spec, disturbances=copy.disturbances, forcing=None, origin="rare")
     return Found(spec, copy.crash, copy.step)
-
-
-# The most dangerous trials without a crash, kept as bundles of their own.
-#
-# They are run once more for that, each in a fresh process, after the last trial: so a hunt is no slower by them until
-# then, a hunt of before can be asked for them, and what is kept is known to happen again.
-
-
-def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
-    """Save bundles of the most critical trials of a hunt, and delete other bundles; return them in this order.
-
-    Args:
-        again: object that runs trials of the hunt again. The settings of the hunt contain the number of bundles to
-            keep; if this is 0, existing bundles are not changed. For each trial that could not be kept, a line with the
-            reason is added to the notes of the hunt.
-    """
-    directory, ledger, keep = again.setup.place.path, again.ledger, again.setup.settings.run.near_misses
-    if not keep or again.is_stopped:
-        return ()
-    numbers = ledger.most_dangerous(keep, again.setup.code.newest)
-    if not numbers and ledger.numbers_of(("survived", "finished")):
-        again.progress.notes.append(
-            "no near miss is kept, because no trial without a crash has a criticality above 0, or because the scenario "
-            "defines no criticality"
-        )
-    wanted = {number: result for number in numbers if (result := ledger.result(number)) is not None}
-    for bundle in list_near_misses(directory):
-        result = wanted.get(bundle.result.spec.number)
-        if result is not None and result.digest == bundle.result.digest:
-            del wanted[bundle.result.spec.number]
-        else:
-            remove_at_once(bundle.path)
-    if wanted:
-        again.phases.begin("near misses", len(wanted))
-    try:
-        for one in again.run([result.spec for result in wanted.values()], layout.NEAR_MISSES):
-            again.phases.advance()
-            now, was = one.result, wanted[one.result.spec.number]
-            if now.was_killed_from_outside:
-                what = f"trial {now.spec.number}, a near miss, was {now.summary}"
-                again.progress.notes.append(f"{what}: it has no bundle until the same command is run again")
-            elif was.is_identical_run(now):
-                one.write(was, confirmed=True)
-            else:
-                again.progress.failed.append(now)
-                what = f"trial {now.spec.number}, a near miss, differs when replayed in a new process"
-                again.progress.notes.append(f"{what}: it has no bundle")
-    except CrashhuntError as error:
-        again.progress.notes.append(f"near misses could not be run again: {error}")
-    return tuple(list_near_misses(directory))

@@ -16,12 +16,13 @@ from crashhunt.base.temporary import release_shared_memory
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
 from crashhunt.executors import make_executor, read_map
-from crashhunt.hunts._fork_results import ForkCrashes, keep_near_misses, verify_fork_results, verify_rare
+from crashhunt.hunts._audits import Audit, PendingAudits
+from crashhunt.hunts._fork_results import ForkCrashes, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import Trials, Unanswered, result_lag, trials_under_way
 from crashhunt.hunts._preflight import Preflight, WorkerNotices, is_hopeless, unusable_value, why_invalid
 from crashhunt.hunts._progress import PhaseClock, Progress, RemainingTime
 from crashhunt.hunts._reports import HuntReport
-from crashhunt.hunts._verification import Audit, Confirmation, PendingAudits, TrialReruns, VerificationRuns, is_settled
+from crashhunt.hunts._verification import Confirmation, TrialReruns, VerificationRuns, is_settled, keep_near_misses
 from crashhunt.plans import core_of, disturber_apart, sampler_of
 from crashhunt.reruns import SharedReruns
 from crashhunt.results import (

@@ -9,7 +9,7 @@ from contextlib import closing
 import pytest
 
 from crashhunt.episode import WorkerSettings, scratch_of
-from crashhunt.hunts._verification import Audit
+from crashhunt.hunts._audits import Audit
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 

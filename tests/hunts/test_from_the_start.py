@@ -9,10 +9,9 @@ import pytest
 
 from crashhunt.base.errors import SimulatorError
 from crashhunt.disturbances import disturber_of, parse_rates
-from crashhunt.hunts import _fork_results
+from crashhunt.hunts import _fork_results, _verification
 from crashhunt.hunts._fork_results import (
     ForkCrashes,
-    keep_near_misses,
     likeliest,
     mildest,
     verify_branches,
@@ -21,7 +20,7 @@ from crashhunt.hunts._fork_results import (
     verify_rare,
 )
 from crashhunt.hunts._progress import PhaseClock, Progress
-from crashhunt.hunts._verification import Found, VerificationRuns
+from crashhunt.hunts._verification import Found, VerificationRuns, keep_near_misses
 from crashhunt.trial import (
     KILLED,
     Branch,
@@ -440,8 +439,8 @@ def near(tmp_path, monkeypatch):
     """Near misses of a hunt of trials 0 to 5, of which bundles of 1 and 9 are there."""
     kept = [SimpleNamespace(result=trial(number), path=tmp_path / f"{number}") for number in (1, 9)]
     removed, written = [], []
-    monkeypatch.setattr(_fork_results, "list_near_misses", lambda directory: list(kept))
-    monkeypatch.setattr(_fork_results, "remove_at_once", removed.append)
+    monkeypatch.setattr(_verification, "list_near_misses", lambda directory: list(kept))
+    monkeypatch.setattr(_verification, "remove_at_once", removed.append)
 
     def make(run, keep=3, stops=()):
         phases = []

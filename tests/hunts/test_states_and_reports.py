@@ -20,9 +20,9 @@ from crashhunt.base import layout
 from crashhunt.episode import WorkerSettings
 from crashhunt.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.hunts import _running_hunt, check, salvage
+from crashhunt.hunts._audits import Audit
 from crashhunt.hunts._next_trials import Unanswered, find_unanswered
 from crashhunt.hunts._progress import Progress
-from crashhunt.hunts._verification import Audit
 from crashhunt.ledger import Ledger
 from crashhunt.plans import RunSettings
 from crashhunt.results import find_hunts, find_searches, hunt_state, is_hunt, load
@@ -362,7 +362,7 @@ def test_salvage_refuses_a_directory_that_has_something_and_names_what_cannot_be
 def test_audit_that_is_closed_leaves_no_process(tmp_path, monkeypatch):
     closed = []
     executor = SimpleNamespace(close=lambda: closed.append(True))
-    monkeypatch.setattr("crashhunt.hunts._verification.FreshProcessExecutor", lambda settings: executor)
+    monkeypatch.setattr("crashhunt.hunts._audits.FreshProcessExecutor", lambda settings: executor)
     toy = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
     settings = WorkerSettings(scenario=toy, oracles=(), crash_on=(), scratch=tmp_path, timeout_s=9.0)
     Audit(settings, []).close()

@@ -14,9 +14,10 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import NodeFigures
-from crashhunt.hunts import _progress, _verification
+from crashhunt.hunts import _audits, _progress, _verification
+from crashhunt.hunts._audits import Audit, PendingAudits, _finish
 from crashhunt.hunts._progress import PhaseClock, Progress, RemainingTime, StrategyTally
-from crashhunt.hunts._verification import Audit, Found, Judged, PendingAudits, TrialReruns, VerificationRuns, _finish
+from crashhunt.hunts._verification import Found, Judged, TrialReruns, VerificationRuns
 from crashhunt.plans import RunSettings
 from crashhunt.recording import Divergence
 from crashhunt.scenario import AgentSetup, Scenario
@@ -257,10 +258,10 @@ def audit(tmp_path, monkeypatch):
             return None
         return Divergence(step=4, agent="ego", field="x", recorded=recorded, replayed=replayed)
 
-    monkeypatch.setattr(_verification, "FreshProcessExecutor", Executor)
-    monkeypatch.setattr(_verification, "read_black_box", read)
-    monkeypatch.setattr(_verification, "Recording", lambda content: content)
-    monkeypatch.setattr(_verification, "first_divergence", divergence)
+    monkeypatch.setattr(_audits, "FreshProcessExecutor", Executor)
+    monkeypatch.setattr(_audits, "read_black_box", read)
+    monkeypatch.setattr(_audits, "Recording", lambda content: content)
+    monkeypatch.setattr(_audits, "first_divergence", divergence)
     scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
     settings = WorkerSettings(scenario=scenario, oracles=(), crash_on=(), scratch=tmp_path, audit=1.0)
 
