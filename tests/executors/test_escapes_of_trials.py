@@ -8,7 +8,7 @@ import pytest
 
 from crashhunt import crashes
 from crashhunt.base.errors import BundleError
-from crashhunt.executors import _supervisor
+from crashhunt.executors import _supervisor, _trial_folder
 from crashhunt.executors._supervisor import LostTrialError, with_escape
 from crashhunt.trial import Collision, Escape, Outcome, TrialResult, TrialSpec
 
@@ -101,6 +101,6 @@ def test_whatever_lies_in_the_way_is_removed_and_what_a_link_leads_to_is_not(tmp
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "inner").write_text("x")
     for name in ("link", "broken", "file", "folder", "gone"):
-        _supervisor._remove(tmp_path / name)
+        _trial_folder._remove(tmp_path / name)
     assert [path.name for path in tmp_path.iterdir()] == ["kept"]
     assert (tmp_path / "kept" / "inner").exists()

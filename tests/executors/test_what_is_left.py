@@ -16,7 +16,7 @@ from episodes import Episode, write
 from crashhunt.base import layout
 from crashhunt.episode import scratch_of
 from crashhunt.errors import PluginError, UsageError
-from crashhunt.executors import _fork_server, _postmortem, _protocol, _time_limits
+from crashhunt.executors import _fork_server, _postmortem, _preparation, _protocol, _time_limits
 from crashhunt.executors._postmortem import TrialAttempt
 from crashhunt.executors._protocol import Notes
 from crashhunt.recording import Phase
@@ -274,9 +274,8 @@ def test_time_of_a_trial_begins_when_its_process_has_it_and_has_begun(began_ago_
 
 
 def test_a_simulator_that_starts_threads_is_not_forked_once_it_is_there(monkeypatch):
-    monkeypatch.setattr(
-        _fork_server, "end_descendants", lambda: None
-    )  # the children of a zygote, and not of this process
+    # The function ends the children of a zygote, and must not end those of this process.
+    monkeypatch.setattr(_preparation, "end_descendants", lambda: None)
 
     def with_threads():
         threading.Thread(target=time.sleep, args=(30,), daemon=True).start()
@@ -284,9 +283,9 @@ def test_a_simulator_that_starts_threads_is_not_forked_once_it_is_there(monkeypa
     def fails():
         raise OSError("no window")
 
-    assert _fork_server._is_forkable_with(SimpleNamespace(simulator=lambda: None))
-    assert not _fork_server._is_forkable_with(SimpleNamespace(simulator=with_threads))
-    assert not _fork_server._is_forkable_with(SimpleNamespace(simulator=fails))
+    assert _preparation._is_forkable_with(SimpleNamespace(simulator=lambda: None))
+    assert not _preparation._is_forkable_with(SimpleNamespace(simulator=with_threads))
+    assert not _preparation._is_forkable_with(SimpleNamespace(simulator=fails))
 
 
 @pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE])
