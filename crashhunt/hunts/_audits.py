@@ -1,7 +1,7 @@
 """The audit: a sample of trials that did not crash is run again, and must be bit-identical.
 
-A crash is confirmed in a fresh process anyway. A trial without one that depends on the trials before it in its worker,
-on a thread or on the clock would go unnoticed, and with it the crash that it did not have.
+A crash is confirmed in a new process anyway. A trial without a crash may depend on the trials before it in its worker,
+on a thread or on the clock. Without an audit, that would go unnoticed, and so would the crash that it did not have.
 """
 
 from __future__ import annotations

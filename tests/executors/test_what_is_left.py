@@ -16,7 +16,7 @@ from episodes import Episode, write
 from crashhunt.base import layout
 from crashhunt.episode import scratch_of
 from crashhunt.errors import PluginError, UsageError
-from crashhunt.executors import _fork_server, _postmortem, _preparation, _protocol, _time_limits
+from crashhunt.executors import _postmortem, _preparation, _protocol, _time_limits
 from crashhunt.executors._postmortem import TrialAttempt
 from crashhunt.executors._protocol import Notes
 from crashhunt.recording import Phase
