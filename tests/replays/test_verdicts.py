@@ -177,9 +177,11 @@ def test_of_several_replays_the_first_that_deviates_is_shown(replays):
     shown = _replay.replay(BUNDLE, ReplayOptions(times=4))
     assert shown.verdict == "diverged"
     assert shown.verdicts == {"reproduced": 2, "diverged": 1, "fixed": 1}
+    replays.ends = [report("fixed")]
+    assert (shown.agreed, _replay.replay(BUNDLE).agreed) == (2, 0)
     replays.ends = [report("reproduced")]
     written = _replay.replay(BUNDLE).to_json()
-    assert [run[0] for run in replays.runs] == [False] * 5
+    assert [run[0] for run in replays.runs] == [False] * 6
     assert replays.options[-1] == ReplayOptions()
     assert written == {
         "crash": "000004-collision", "verdict": "reproduced", "code": "snapshot", "steps_recorded": 30,
