@@ -84,6 +84,7 @@ REFUSED = {
     **{(form, "late actions"): "which cannot be delayed" for form in RELATIVE},
     **{(form, "reference driver"): "the lanes and speeds that its actions mean are" for form in WITHOUT_REFERENCE},
     ("sumo", "keep lane"): "the lane of ego cannot be held",
+    ("trajectory", "disturbances"): "would return a trajectory that does not begin where the vehicle is",
 }  # as the page reference/actions.md says; tests/on_sumo/test_declared_actions_on_sumo.py compares it by day
 
 
