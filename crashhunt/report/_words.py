@@ -320,6 +320,8 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
         sentences = [f"None of {runs} avoided it, from the first step on: neither {tried}."]
         if len(judgement.attempts) == 1:
             sentences = [f"None of {runs} avoided it {tried}, from the first step on."]
+        if others := sum(end == "other" for attempt in judgement.attempts for end in attempt.endings.values()):
+            sentences.append(f"In {others} of them, another crash happened instead.")
     elif judgement.runs:
         sentences = [f"None of {runs} avoided it, but they do not prove that it was unavoidable."]
     visible = judgement.visible_step

@@ -23,6 +23,14 @@ def test_that_braking_helped_from_the_first_step_on_is_reported_next_to_what_hel
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("others", [0, 2])
+def test_other_crashes_in_place_of_this_one_are_reported(others):
+    endings = {0: "other" if others else "hit", 1: "hit", 2: "other" if others else "hit"}
+    told = about_judgement(Judgement((Attempt("brake", 3, endings),)), str, "ego", "other")
+    assert told[0] == "None of 3 runs avoided it by braking, from the first step on."
+    assert ("In 2 of them, another crash happened instead." in told) == bool(others)
+
+
 @pytest.mark.parametrize(
     ("factor", "words"),
     [
