@@ -59,9 +59,7 @@ def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | N
 _STEPS_AROUND = 2  # steps to report before and after the first difference
 
 
-def values_around(
-    recorded: Recording, replayed: Recording, divergence: Divergence, *, reach: int = _STEPS_AROUND
-) -> list[tuple[int, object, object]]:
+def values_around(recorded: Recording, replayed: Recording, divergence: Divergence) -> list[tuple[int, object, object]]:
     """Return (step, recorded value, replayed value) of the divergent field in the steps around the divergence.
 
     The result is empty if the divergence does not concern a single value. A value is None if a recording lacks the
@@ -71,15 +69,11 @@ def values_around(
         recorded: recording of the trial.
         replayed: recording of its replay.
         divergence: the first difference of the two recordings.
-        reach: number of steps before and after the divergence.
     """
     if divergence.place is None:
         return []
-    first = max(0, divergence.step - reach)
-    return [
-        (step, _value(recorded, step, divergence), _value(replayed, step, divergence))
-        for step in range(first, divergence.step + reach + 1)
-    ]
+    steps = range(max(0, divergence.step - _STEPS_AROUND), divergence.step + _STEPS_AROUND + 1)
+    return [(step, _value(recorded, step, divergence), _value(replayed, step, divergence)) for step in steps]
 
 
 def _value(recording: Recording, number: int, divergence: Divergence) -> object:

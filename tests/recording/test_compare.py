@@ -140,13 +140,13 @@ def test_a_value_of_an_actor_is_named(column, place):
     divergence = first_divergence(recorded(), changed(2, change))
     assert divergence.place == ("scene", (place,))
     column_of = [recorded().scene(step).data[1, place] for step in range(4)]
-    assert values_around(recorded(), changed(2, change), divergence, reach=1) == [
+    assert values_around(recorded(), changed(2, change), divergence)[1:-1] == [
         (1, column_of[1], column_of[1]),
         (2, column_of[2], -1.0),
         (3, column_of[3], column_of[3]),
     ]
-    assert values_around(recorded(), changed(2, change), divergence, reach=2)[0][0] == 0
-    assert values_around(recorded(), changed(2, change), divergence, reach=2)[-1] == (4, None, None)
+    assert values_around(recorded(), changed(2, change), divergence)[0][0] == 0
+    assert values_around(recorded(), changed(2, change), divergence)[-1] == (4, None, None)
 
 
 def test_observations_come_before_actions_and_actions_before_the_scene():
@@ -176,7 +176,7 @@ def test_observations_come_before_actions_and_actions_before_the_scene():
     assert found(3, action) == (3, "ego", "action[target_speed]", 13.0, 5.0)
     divergence = first_divergence(recorded(), changed(3, action))
     assert divergence.place == ("action", (0,))
-    assert values_around(recorded(), changed(3, action), divergence, reach=2) == [
+    assert values_around(recorded(), changed(3, action), divergence) == [
         (1, 11.0, 11.0), (2, 12.0, 12.0), (3, 13.0, 5.0), (4, None, None), (5, None, None),
     ]  # fmt: skip
     assert divergence.to_json() == {
@@ -189,7 +189,7 @@ def test_observations_come_before_actions_and_actions_before_the_scene():
 
     assert found(2, observation) == (2, "other", "observation[2]", 4.0, 5.0)
     divergence = first_divergence(recorded(), changed(2, observation))
-    assert values_around(recorded(), changed(2, observation), divergence, reach=1) == [
+    assert values_around(recorded(), changed(2, observation), divergence)[1:-1] == [
         (1, 3.0, 3.0), (2, 4.0, 5.0), (3, 5.0, 5.0),
     ]  # fmt: skip
 
@@ -215,7 +215,7 @@ def test_who_acts_and_who_is_there():
     assert (divergence.step, divergence.agent, divergence.field) == (2, "other", "observation")
     assert (divergence.recorded, divergence.replayed, divergence.place) == ([2.0, 3.0, 4.0], None, None)
     assert first_divergence(without, recorded()).recorded is None
-    assert values_around(recorded(), without, divergence, reach=2) == []
+    assert values_around(recorded(), without, divergence) == []
 
     def roster(*actors):
         def change(step):
@@ -239,7 +239,7 @@ def test_who_acts_and_who_is_there():
     assert (step, agent, field, was, now) == (1, "other", "actor", str(other), str(longer))
     value = first_divergence(recorded(), changed(2, lambda step: step.scene.speeds.__setitem__(2, 5.0)))
     gone = changed(1, roster(ego, other))
-    assert values_around(recorded(), gone, value, reach=1)[0] == (1, recorded().scene(1).speeds[2], None)
+    assert values_around(recorded(), gone, value)[1] == (1, recorded().scene(1).speeds[2], None)
 
 
 def test_a_step_that_ended_within_and_lengths():
