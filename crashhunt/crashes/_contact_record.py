@@ -231,7 +231,8 @@ class ContactRecord:
         last = self.scenes[-1]
         previous = self.scenes[-2] if len(self.scenes) > 1 else None
         index = last.roster.index
-        return contact_at(previous, last, index[self.agent], index[self.other], swept=self.swept)
+        pair = index[self.agent], index[self.other]
+        return contact_at(previous, last, *pair, swept=self.swept, grazing=self.reported is not None)
 
     @property
     def collider(self) -> str:

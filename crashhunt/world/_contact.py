@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.world._geometry import center, levels, outlines, same_level, separation
@@ -207,7 +207,9 @@ def first_contact(previous: Scene | None, present: Scene, row: int, other: int) 
     return _first_touch(previous, present, pair, before, ways)
 
 
-def contact_at(previous: Scene | None, present: Scene, row: int, other: int, *, swept: bool = True) -> Touch:
+def contact_at(
+    previous: Scene | None, present: Scene, row: int, other: int, *, swept: bool = True, grazing: bool = False
+) -> Touch:
     """Return the contact of two actors that are known to have collided, computed as in `first_contact`.
 
     Args:
@@ -217,6 +219,7 @@ def contact_at(previous: Scene | None, present: Scene, row: int, other: int, *, 
         other: row of the second actor in the present scene.
         swept: whether actors drive along curves, as in `Scene`. If False, actors move in straight lines without jumps,
             and the time is an estimate.
+        grazing: whether a contact counts that is so slight that the estimated ways between the scenes leave it open.
 
     Returns:
         The contact. If the outlines do not touch, as in some collisions reported by simulators, the positions at the
@@ -226,6 +229,10 @@ def contact_at(previous: Scene | None, present: Scene, row: int, other: int, *, 
     before = _rows_before(previous, present, pair)
     ways = _ways(previous, present, pair, before, bends=swept)
     found = _first_touch(previous, present, pair, before, ways)
+    if found is None and grazing:
+        for way in chain.from_iterable(ways):
+            way.slack = 0.0
+        found = _first_touch(previous, present, pair, before, ways)
     return found or _touch(previous, present, pair, before, ways, (1.0, *_nearest(ways)))
 
 

@@ -163,6 +163,21 @@ def test_lane_change_after_the_contact_has_no_part_in_it(view, step_s, speed, sl
     assert not touch.is_sideways
 
 
+@settings(max_examples=examples(60), deadline=None)
+@given(view=VIEWS, step_s=STEPS, speed=st.floats(5.0, 20.0), deep=st.floats(0.01, 0.3))
+def test_slight_contact_before_a_lane_change_counts_if_a_simulator_has_reported_it(view, step_s, speed, deep):
+    """Alone, the ways between the scenes leave it open; without the report, only the lane change remains."""
+    behind, ahead = Mover(0, 0, 0, speed, jump=3.2), Mover(5.0, 0, 0, 0.0)
+    before, after = scenes(view, behind, ahead, step_s, 1.0 - deep / (speed * step_s))
+    assert first_contact(before, after, 0, 1) is None
+    touch, back = (contact_at(before, after, *rows, grazing=True) for rows in ((0, 1), (1, 0)))
+    assert (touch.face, touch.other_face, touch.drives_into, back.drives_into) == ("front", "rear", True, False)
+    assert touch.time_s == pytest.approx(100.0, abs=1e-6)
+    assert (touch.jumps, touch.gap_m) == (False, pytest.approx(0.0, abs=1e-6))
+    unreported = contact_at(before, after, 0, 1)
+    assert (unreported.share, unreported.jumps) == (1.0, True)
+
+
 @settings(max_examples=examples(150), deadline=None)
 @given(
     view=VIEWS, step_s=STEPS, phase=PHASES, angle=st.floats(1.1, 2.0), side=st.sampled_from((1, -1)),
