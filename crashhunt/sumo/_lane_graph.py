@@ -110,6 +110,9 @@ class LaneGraph:
         self.lanes: dict[str, GraphLane] = {}
         self.edges: dict[str, list[GraphLane]] = {}
         self._ends = {edge.id: edge.ends for edge in network.edges.values()}
+        self._between: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+        for name, ends in self._ends.items():
+            self._between[ends].append(name)
         for edge in (*network.edges.values(), *network.inside.values()):
             lanes = [
                 GraphLane(id=f"{edge.id}_{index}", edge=edge.id, index=index, data=lane)
@@ -198,7 +201,7 @@ class LaneGraph:
             return []
         own, found = self.edges[edge][-1], []
         middle = self.lines(own).center[len(self.lines(own).center) // 2]
-        for other in (one for one, ends in self._ends.items() if ends == self._ends[edge][::-1]):
+        for other in self._between.get(self._ends[edge][::-1], ()):
             inner = self.edges[other][-1]
             away = float(np.hypot(*(self.lines(inner).center - middle).T).min())
             if away <= median_m + (own.data.width_m + inner.data.width_m) / 2:

@@ -76,6 +76,7 @@ READERS: Mapping[str, type[Reader]] = {
 }
 """The reader of each part, by name of the part; these are the parts that SUMO has."""
 
+_PARTS_WITH_CONFLICTS = frozenset({"right_of_way", "stop_line", "crossings"})
 _PARTS_WITH_OBSTACLES = frozenset({"grid", "image", "lidar2d"})
 
 
@@ -112,7 +113,7 @@ class ObservedParts:
         requests = [request for layout in self.layouts.values() for request in layout.parts.values()]
         for request in (one for one in requests if one.part.name == "lanes"):
             LanesReader.prepare(self.graph, request, USUAL_CLASS, self._near)
-        if not {"right_of_way", "stop_line", "crossings"}.isdisjoint(one.part.name for one in requests):
+        if any(one.part.name in _PARTS_WITH_CONFLICTS or one.settings.get("relation") for one in requests):
             self.conflicts.prepare()
 
     @cached_property
