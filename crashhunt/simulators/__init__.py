@@ -54,7 +54,6 @@ if TYPE_CHECKING:
         SCENE_PARTS as SCENE_PARTS,
         Setting as Setting,
     )
-    from ._obstacle_outlines import ObstacleOutlines as ObstacleOutlines
     from ._protocol import (
         FACULTIES as FACULTIES,
         ActionForm as ActionForm,
@@ -109,6 +108,7 @@ if TYPE_CHECKING:
     from ._scene_parts import (
         ActorNumbers as ActorNumbers,
         NearActor as NearActor,
+        ObstacleOutlines as ObstacleOutlines,
         Raster as Raster,
         RayCaster as RayCaster,
         center_of as center_of,
