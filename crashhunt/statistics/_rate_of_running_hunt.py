@@ -110,11 +110,7 @@ class RateWatch:
     def add_facts(self, trial: TrialFacts) -> None:
         """Add the facts of a finished trial."""
         for unit in self.sequence.add(trial):
-            self._count(unit)
-
-    def _count(self, unit: Unit) -> tuple[float, float] | None:
-        """Count a unit; return its crashes and exposure, or None if it does not count."""
-        return self.counter.add(unit)
+            self.counter.add(unit)
 
     def interval(self) -> Interval | None:
         """Return the interval that is valid at any time; None if there is no unit, or if an exposure is unknown."""
@@ -202,17 +198,16 @@ class BarWatch(RateWatch):
             self.decided_at = self.sequence.hopeless_at
             self.why_undecided = "too many trials are invalid, so more of them do not help"
 
-    def _count(self, unit: Unit) -> tuple[float, float] | None:
-        found = super()._count(unit)
-        test = self.counter.test
+    def _count(self, unit: Unit) -> None:
+        found, test = self.counter.add(unit), self.counter.test
         if self.counter.why_not:
             self.decided_at, self.why_undecided = unit[-1].number, self.counter.why_not
         if found is None or test is None or self.counter.why_not:
-            return found
+            return
         for place, factors in enumerate(self._factors(found, test)):
             self._log_capitals[place] = self._log_capitals[place] + factors
         if self.sequence.invalid_share > MAX_INVALID_SHARE:
-            return found
+            return
         if self._rejects(0, test):
             self.verdict = "below" if test.events < self.bar * test.exposure else "above"
             self.decided_at = unit[-1].number
@@ -220,7 +215,6 @@ class BarWatch(RateWatch):
             self.decided_at = unit[-1].number
             within = format_percent(_EQUAL_TOLERANCE)
             self.why_undecided = f"the rate certainly is within {within} of the bar, so more trials do not help"
-        return found
 
     def _factors(self, found: tuple[float, float], test: RateTest) -> list[Any]:
         """Return the logarithms by which a unit multiplies the capitals, for the threshold and its two bounds."""
