@@ -67,7 +67,7 @@ def test_its_snapshot_output_and_digests_are_the_same(toy):
     ):
         # Forks have in addition imported what a trial imports that ends in a collision, from the same folder.
         assert {name: files[name] for name in files_of_started} == files_of_started
-        for replaced in ("episode._failures._contents_of", "executors._rehearsal._rehearse"):  # by the tests' server
+        for replaced in ("episode._failures._contents_of", "executors._preparation._rehearse"):  # by the tests' server
             code_of_started.pop(f"crashhunt.{replaced}", None)
         assert {name: code[name] for name in code_of_started} == code_of_started
         folder = Path(files["crashhunt"][0]).parent
