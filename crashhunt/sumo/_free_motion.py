@@ -333,9 +333,9 @@ class FreeMotion:
             return after
         if self._form == "target_pose":
             (x, y, heading), time_s = self._pose(values), values[3]
-            after, model = self._towards(x, y, heading, time_s), self.model
-            can = -model.max_deceleration <= after.acceleration <= model.max_acceleration
-            if self._is_overruled and not (can and self._refusal(after) is None):
+            after = self._towards(x, y, heading, time_s)
+            is_usual = -_MAX_BRAKING_MPS2 <= after.acceleration <= _MAX_ACCELERATION_MPS2
+            if self._is_overruled and not (is_usual and self._refusal(after) is None):
                 return self._pursue_pose(x, y, heading, time_s)
             return after
         if self._form == "throttle_brake_steering":

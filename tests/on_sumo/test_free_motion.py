@@ -363,6 +363,9 @@ def test_vehicle_of_an_overruled_agent_pursues_poses_elsewhere(start, form):
     dx, dy = motion.state.x - begin.x, motion.state.y - begin.y
     assert dy * cos - dx * sin == pytest.approx(0.5, abs=0.05)
     assert motion.state.speed == pytest.approx(begin.speed, abs=0.5)
+    hard = motion.model.max_deceleration
+    braked = motion.model.step(motion.state, -hard, 0.0, 0.1).speed
+    assert motion._next(encode(motion._action(-hard, 0.0)).tolist()).speed == pytest.approx(braked)
     if form == "target_pose":  # a pose without a speed: the vehicle gets there as fast as it can, and never turns back
         assert dx * cos + dy * sin == pytest.approx(3.0 + begin.speed * 5.9, abs=0.5)
         for _ in range(80):
