@@ -22,7 +22,7 @@ from crashhunt.crashes import (
 )
 from crashhunt.crashes._contact_record import record_in
 from crashhunt.report._crash_text import _cells
-from crashhunt.report._verdict import describe_contact, verdict_of
+from crashhunt.report._verdict import describe_contact, last_avoidable, verdict_of
 from crashhunt.report._words import about_drivers, about_reference
 from crashhunt.trial import Collision, Escape
 from crashhunt.world import Actor, Roster, Scene
@@ -86,6 +86,10 @@ def jump(side, ahead_m, *, own=10.0, its=20.0, mover=0):
         (
             lambda time_s: [(10 * time_s, 0.0, 0.0, 10.0), (0.9, 2.0 + time_s, math.pi / 2, 1.0)],
             "ego drove into x, which came from the right",
+        ),
+        (
+            lambda time_s: [(0.9, 2.0 + time_s, math.pi / 2, 1.0), (10 * time_s, 0.0, 0.0, 10.0)],
+            "x, which came from the left, drove into ego",
         ),
         (
             lambda time_s: [(10 * time_s, 0.0, 0.0, 10.0), (-0.1, 0.0, math.pi, 0.0)],
@@ -239,6 +243,20 @@ def omitted(**more):
 )
 def test_verdict_reports_only_what_was_run(given, words):
     assert verdict_of(story(**given)) == words
+
+
+@pytest.mark.parametrize(("given", "found"), [
+    ({}, None),
+    ({"escape": Escape(30, 31, 6.5)}, (30, "brakes", 6.5)),
+    ({"escape": Escape(30, 31, 6.5, changed=("ego does not change lanes",))}, (30, "brakes", None)),
+    ({"escape": Escape(None, 0)}, None),
+    ({"escape": Escape(30), "judgement": Judgement((replace(attempt(25), deceleration=4.5),))}, (25, "brakes", 4.5)),
+    ({"judgement": Judgement((replace(attempt(25), manoeuvre="left", deceleration=4.5),))},
+     (25, "changes to the lane on the left and brakes", None)),
+    ({"escape": Escape(30, 31), "judgement": Judgement((attempt(-1),))}, None),
+])  # fmt: skip
+def test_last_step_that_avoids_a_crash_has_its_manoeuvre_and_deceleration(given, found):
+    assert last_avoidable(story(**given)) == found
 
 
 def test_braking_is_no_answer_where_the_agent_changed_lanes():
