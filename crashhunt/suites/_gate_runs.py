@@ -458,8 +458,8 @@ class _Run:
             return
         folders = [self._folder_of(side, self._gate.folder) for side in self._trees]
         self._cautions = tuple(
-            f"BASE and HEAD use the same file: {path} ({name}); give a path relative to the current folder, to a file "
-            "that each commit contains or builds"
+            f"BASE and HEAD use the same file: {path} ({name}); name it on the command line by a path relative to the "
+            "current folder, as a file that each commit contains or builds"
             for name, values in read_settings(paired.folders[1] / layout.HUNT).texts.items()
             for path in (files_outside(values, folders) if folders else ())
         )

@@ -138,7 +138,9 @@ def test_file_that_both_commits_share_is_a_warning(work, tmp_path):
     run._find_same_files(real)
     run._find_same_files(real)
     (caution,) = told
-    assert caution.startswith(f"BASE and HEAD use the same file: {tmp_path / 'planner'} (ego.binary); give a path")
+    assert caution.startswith(
+        f"BASE and HEAD use the same file: {tmp_path / 'planner'} (ego.binary); name it on the command line"
+    )
     run._write = lambda report: None
     assert run._gate_report().cautions == (caution,)
 
