@@ -109,6 +109,8 @@ class UsualSteps(Protocol):
         make: Callable[[Columns, float, int, str], NDArray[np.generic]],
         restore: Callable[[NDArray[np.generic]], object],
         draft: _Draft | None,
+        record: np.dtype[np.void] | None,
+        names: tuple[str, ...],
         /,
     ) -> None:
         """Set the functions for observations that consist of parts.
@@ -119,6 +121,9 @@ class UsualSteps(Protocol):
             restore: function that returns what the agent receives, from the recorded array.
             draft: what `make` writes into; None if it writes into none. The core then calls `make` only if it cannot
                 write the array from the draft again.
+            record: type of the whole array as one value, of which the agent receives the fields, as `restore` returns
+                them; None if `restore` must be called.
+            names: names of these fields.
         """
 
     def perceived(self, step: int, /) -> NDArray[np.generic] | None:

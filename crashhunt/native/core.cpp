@@ -542,11 +542,15 @@ struct Surroundings {
 };
 Surroundings around; // used again: looks are many and alike
 
-// The names of those near, as Python has them.
-PyObject *near_names() {
+// The row of each actor in the scene before; -1 of who was not in it. Empty where all are the same.
+typedef std::vector<long> Earlier;
+
+// The names of those near, as Python has them; where they are the rows of other names, these objects.
+PyObject *near_names(PyObject *others = nullptr, const Earlier *rows = nullptr) {
     PyObject *ids = PyTuple_New(static_cast<Py_ssize_t>(around.near.size()));
     for (size_t number = 0; ids && number < around.near.size(); number++) {
-        PyObject *id = text_of(around.names[around.near[number]]);
+        const long row = rows ? (*rows)[number] : -1;
+        PyObject *id = row < 0 ? text_of(around.names[around.near[number]]) : Py_NewRef(PyTuple_GET_ITEM(others, row));
         if (!id) {
             Py_CLEAR(ids);
         } else {
@@ -752,9 +756,6 @@ Rectangle outline(const Scene &scene, size_t row) {
 struct Moved {
     double x, y, aside;
 };
-
-// The row of each actor in the scene before; -1 of who was not in it. Empty where all are the same.
-typedef std::vector<long> Earlier;
 
 long earlier_row(const Earlier &earlier, size_t row) { return earlier.empty() ? static_cast<long>(row) : earlier[row]; }
 

@@ -34,6 +34,7 @@ struct Steps {
     PyObject *name = nullptr, *libsumo = nullptr, *array = nullptr, *shape = nullptr, *dtype = nullptr;
     PyObject *act = nullptr, *simulate = nullptr; // what these methods are called
     PyObject *perceive = nullptr, *restore = nullptr, *draft = nullptr; // of an observation that consists of parts
+    PyObject *whole_type = nullptr, *part_names = nullptr; // null where `restore` has to be called
     PyObject *perceived = nullptr; // what the agent would be shown after `perceived_step`
     long long perceived_step = -1;
     Vehicles *eyes = nullptr;
@@ -74,7 +75,7 @@ struct Steps {
     Steps() = default;
     Steps(const Steps &) = delete;
     ~Steps() {
-        for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, perceive, restore, draft, perceived,
+        for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, perceive, restore, draft, whole_type, part_names, perceived,
                               reinterpret_cast<PyObject *>(eyes),
                               limits, stood, reinterpret_cast<PyObject *>(sight.vehicles), sight.ids,
                               reinterpret_cast<PyObject *>(entered.vehicles), entered.ids,
@@ -245,7 +246,7 @@ struct Steps {
             return nullptr;
         }
         if (written && !whole->rest) {
-            return array_of(whole->take());
+            return whole_type ? whole->take() : array_of(whole->take());
         }
         Columns *columns = new_columns(who.vehicles, std::vector<double>(next.values));
         if (written && columns) {
@@ -258,12 +259,43 @@ struct Steps {
         return made;
     }
 
+    // Makes an array of an observation that is bytes yet, because the agent receives its parts; false with an exception.
+    bool show_array(PyObject *&place) const {
+        if (place && PyBytes_CheckExact(place)) {
+            place = array_of(place);
+        }
+        return place || !PyErr_Occurred();
+    }
+
     // Bytes as an array of NumPy's; null with an exception, as they then are.
     PyObject *array_of(PyObject *bytes) const {
         PyObject *given[] = {shape, dtype, bytes};
         PyObject *found = bytes ? PyObject_Vectorcall(array, given, 3, nullptr) : nullptr;
         Py_XDECREF(bytes);
         return found;
+    }
+
+    // What the agent receives, which is as `restore` makes it; null with an exception.
+    PyObject *received() const {
+        if (!restore) {
+            return Py_NewRef(observation);
+        }
+        if (!whole_type) {
+            return PyObject_CallOneArg(restore, observation);
+        }
+        PyObject *none = PyTuple_New(0), *given[] = {none, whole_type, observation};
+        PyObject *whole = none ? PyObject_Vectorcall(array, given, 3, nullptr) : nullptr;
+        PyObject *parts = whole ? PyDict_New() : nullptr;
+        for (Py_ssize_t number = 0; parts && number < PyTuple_GET_SIZE(part_names); number++) {
+            PyObject *name = PyTuple_GET_ITEM(part_names, number), *part = PyObject_GetItem(whole, name);
+            if (!part || PyDict_SetItem(parts, name, part) < 0) {
+                Py_CLEAR(parts);
+            }
+            Py_XDECREF(part);
+        }
+        Py_XDECREF(whole);
+        Py_XDECREF(none);
+        return parts;
     }
 
     // Who is controlled, of those in sight; false with an exception.
@@ -291,7 +323,21 @@ struct Steps {
 
     // Lets others than before be in sight; false where that is Python's to do.
     bool let_in() {
-        PyObject *names = enter && enter != Py_None ? near_names() : nullptr;
+        // Most are where they were in the list.
+        const std::vector<std::string> &were = sight.vehicles->roster->ids;
+        size_t from = 0;
+        for (size_t number : around.near) {
+            long row_before = -1;
+            for (size_t tried = 0; tried < were.size() && row_before < 0; tried++) {
+                const size_t at = (from + tried) % were.size();
+                if (were[at] == around.names[number]) {
+                    row_before = static_cast<long>(at);
+                    from = at + 1;
+                }
+            }
+            earlier.push_back(row_before);
+        }
+        PyObject *names = enter && enter != Py_None ? near_names(sight.ids, &earlier) : nullptr;
         PyObject *found = names ? PyObject_CallOneArg(enter, names) : nullptr;
         Py_XDECREF(names);
         PyObject *vehicles, *ids, *controlled;
@@ -299,27 +345,11 @@ struct Steps {
         const bool known = found && found != Py_None &&
                            PyArg_ParseTuple(found, "OO!nO!", &vehicles, &PyTuple_Type, &ids, &row, &PyDict_Type,
                                             &controlled) &&
-                           vehicles_of(vehicles) && set_sight(entered, vehicles, ids, row, controlled);
+                           vehicles_of(vehicles) && set_sight(entered, vehicles, ids, row, controlled) &&
+                           around.same(*entered.vehicles->roster);
         PyErr_Clear(); // it is said again
         Py_XDECREF(found);
-        if (!known) {
-            return false;
-        }
-        // Most are where they were in the list.
-        const std::vector<std::string> &were = sight.vehicles->roster->ids, &are = entered.vehicles->roster->ids;
-        size_t from = 0;
-        for (const std::string &id : are) {
-            long row_before = -1;
-            for (size_t tried = 0; tried < were.size() && row_before < 0; tried++) {
-                const size_t at = (from + tried) % were.size();
-                if (were[at] == id) {
-                    row_before = static_cast<long>(at);
-                    from = at + 1;
-                }
-            }
-            earlier.push_back(row_before);
-        }
-        return true;
+        return known;
     }
 
     // What has come of a step that has been simulated; negative with an exception. Everything is read before anything
@@ -529,12 +559,13 @@ template <PyObject *Steps::*first, PyObject *Steps::*second> PyObject *usual_kee
     Py_RETURN_NONE;
 }
 
-// perceive(make, restore, draft | None): an observation is an array that the first makes where it cannot be written from
-// the draft again, and the agent receives what the second returns
+// perceive(make, restore, draft | None, record, names): an observation is an array that the first makes where it cannot be
+// written from the draft again, and the agent receives what the second returns: the values with these names, where the
+// record is the type of all of them as one value
 PyObject *usual_perceive(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
-    PyObject *make, *restore, *draft;
-    if (!PyArg_ParseTuple(arguments, "OOO", &make, &restore, &draft)) {
+    PyObject *make, *restore, *draft, *record, *names;
+    if (!PyArg_ParseTuple(arguments, "OOOOO!", &make, &restore, &draft, &record, &PyTuple_Type, &names)) {
         return nullptr;
     }
     if (draft != Py_None && Py_TYPE(draft) != draft_type) {
@@ -542,6 +573,10 @@ PyObject *usual_perceive(PyObject *object, PyObject *arguments) {
     }
     keep(steps.perceive, make);
     keep(steps.restore, restore);
+    if (record != Py_None) {
+        keep(steps.whole_type, record);
+        keep(steps.part_names, names);
+    }
     if (draft != Py_None) {
         keep(steps.draft, draft);
     }
@@ -550,9 +585,9 @@ PyObject *usual_perceive(PyObject *object, PyObject *arguments) {
 
 // perceived(step) -> what the agent would be shown after a step, if that has been made; None otherwise
 PyObject *usual_perceived(PyObject *object, PyObject *number) {
-    const Steps &steps = steps_of(object);
+    Steps &steps = steps_of(object);
     const long long step = PyLong_AsLongLong(number);
-    if (step == -1 && PyErr_Occurred()) {
+    if ((step == -1 && PyErr_Occurred()) || !steps.show_array(steps.perceived)) {
         return nullptr;
     }
     return Py_NewRef(steps.perceived && step == steps.perceived_step ? steps.perceived : Py_None);
@@ -670,8 +705,7 @@ PyObject *usual_take(PyObject *object, PyObject *agents) {
     }
     // Whatever the agent does, both stay what they are for as long as it does it.
     Py_INCREF(agent);
-    PyObject *observation =
-        steps.restore ? PyObject_CallOneArg(steps.restore, steps.observation) : Py_NewRef(steps.observation);
+    PyObject *observation = steps.received();
     PyObject *answer = observation ? PyObject_CallMethodOneArg(agent, steps.act, observation) : nullptr;
     Py_DECREF(agent);
     Py_XDECREF(observation);
@@ -723,9 +757,12 @@ PyObject *usual_stop(PyObject *object, PyObject *) {
 
 // told() -> (step, observation, reward, follower, (vehicles, time_s, lanes), the same of the step before)
 PyObject *usual_told(PyObject *object, PyObject *) {
-    const Steps &steps = steps_of(object);
+    Steps &steps = steps_of(object);
     if (!steps.ready) {
         Py_RETURN_NONE;
+    }
+    if (!steps.show_array(steps.observation)) {
+        return nullptr;
     }
     return Py_BuildValue("(LOdN(OdN)(OdN))", steps.step, steps.observation, steps.reward, text_of(steps.follower),
                          steps.sight.vehicles, steps.now.time_s, text_of(steps.now.lanes), steps.before_vehicles,

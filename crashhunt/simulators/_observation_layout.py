@@ -213,6 +213,14 @@ class ObservationLayout:
         """The index of the first value of every part in the recorded array."""
         return {name: place.start for name, place, *_ in self._places}
 
+    @property
+    def record(self) -> np.dtype[np.void] | None:
+        """The recorded array as one value with a field per part; None if a part has another type of numbers."""
+        import numpy as np
+
+        is_one_type = all(dtype == self._dtype for *_, dtype in self._places)
+        return np.dtype([(name, dtype, shape) for name, _, shape, dtype in self._places]) if is_one_type else None
+
     def flat(self, arrays: Mapping[str, NDArray[np.generic]]) -> NDArray[np.generic]:
         """Return the recorded array of an observation."""
         import numpy as np

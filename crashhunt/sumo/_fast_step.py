@@ -82,6 +82,7 @@ class UsualSteps:
             draft.
         shape: Shape of the observation's array.
         restore: Function that returns what the agent receives, from such an observation.
+        record: Type of such an observation as one value, whose fields the agent receives; None if it receives others.
         instead_of: Attributes of the simulator that the core bypasses, by name.
     """
 
@@ -109,6 +110,7 @@ class UsualSteps:
         enter_parts: Callable[[Vehicles, int, Roster], None] | None,
         shape: tuple[int, ...],
         restore: Callable[[NDArray[np.generic]], object],
+        record: np.dtype[np.void] | None,
         instead_of: Mapping[str, object],
     ) -> None:
         self._core, self._agent = core, agent
@@ -122,7 +124,8 @@ class UsualSteps:
         )  # fmt: skip
         self._perceive, self._enter_parts = perceive, enter_parts
         if perceive is not None:
-            self.core.perceive(self._make_observation, restore, draft)
+            names = () if record is None else record.names or ()
+            self.core.perceive(self._make_observation, restore, draft, record, names)
         self._from_left, self._instead_of = from_left, instead_of
         self._last: StepResult = ({}, {}, {}, {}, {})
         self._rosters: dict[Vehicles, Roster] = {}  # of the scenes that `catch_up` may need

@@ -84,6 +84,7 @@ class Sight:
         self._high: bool | None = None
         self._bends = Bends(lateral=lateral)
         self._known: dict[str, Actor] = {}
+        self._reaches: dict[str, float] = {}  # of the vehicles in it, as in `Roster.reaches`: math.hypot is slow
         self.reset()
 
     def reset(self) -> None:
@@ -207,6 +208,8 @@ class Sight:
         known, actor = self._known.get, self._actor
         actors = [known(vehicle) or actor(vehicle) for vehicle in ids]
         self._roster = roster = Roster((*actors, *map(self._person, persons)) if persons else tuple(actors))
+        if not persons:
+            roster.reaches = list(map(self._reaches.__getitem__, ids))
         self._long = []
         if self._articulated:
             self._long = [row for row, vehicle in enumerate(ids) if vehicle in self._articulated]
@@ -289,6 +292,7 @@ class Sight:
             height = sumo.vehicle_getHeight(vehicle) if self._high else 0.0
             size = sumo.vehicle_getLength(vehicle), sumo.vehicle_getWidth(vehicle), height
             found = self._known[vehicle] = Actor(vehicle, kind, *size, parked=_is_parked(vehicle))
+            self._reaches[vehicle] = math.hypot(found.length, found.width / 2)
             if is_articulated(found):
                 self._articulated.add(vehicle)
         return found

@@ -513,6 +513,7 @@ class SumoSimulator:
             enter_parts=None if draft is None else partial(self._parts.enter, agent),
             shape=self._parts.layouts[agent].flat_space.shape if has_parts else self._kinematics.shape,
             restore=partial(self.restore_observation, agent),
+            record=self.observation_layouts[agent].record if has_parts else None,
             instead_of={"actions": self.actions, **own},
         )
 

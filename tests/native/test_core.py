@@ -590,10 +590,13 @@ class _StopsAndGoes:
     """Stops again and again, with which steps are handed back to Python after they have been observed."""
 
     def reset(self, seed):
-        self.steps = 0
+        self.steps, self.received = 0, []
 
     def act(self, observation):
         self.steps += 1
+        self.received.append(
+            [(name, one.shape, one.dtype, one.flags.writeable, one.tobytes()) for name, one in observation.items()]
+        )
         return (0.0 if self.steps % 50 > 20 else 12.0), 0
 
 
@@ -611,10 +614,13 @@ class _StopsAndGoes:
     ],
 )
 def test_parts_of_observations_are_the_same_bit_by_bit(run, scenario, parts):
+    agents = _StopsAndGoes(), _StopsAndGoes()
     (ours, simulator), (theirs, _) = (
-        run(scenario, native=native, steps=160, parts=parts, agent=_StopsAndGoes()) for native in (None, False)
+        run(scenario, native=native, steps=160, parts=parts, agent=agent)
+        for native, agent in zip((None, False), agents, strict=True)
     )
     assert simulator._sight.core is core
+    assert agents[0].received == agents[1].received
     assert not simulator.notices
     assert ours == theirs
     assert ours.steps > 30
