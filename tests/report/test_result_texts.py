@@ -14,7 +14,7 @@ from crashhunt.crashes import Group, Signature
 from crashhunt.hunts import AuditReport, HuntReport
 from crashhunt.plans import HuntSettings, RunSettings
 from crashhunt.recording import Phase
-from crashhunt.report import describe_hunt, describe_replay
+from crashhunt.report import describe_hunt, describe_replay, describe_versions
 from crashhunt.report._listing import describe
 from crashhunt.report._status_screen import _workers
 from crashhunt.report._words import fault_words
@@ -47,6 +47,14 @@ def test_a_hunt_without_a_crash_states_why_it_ended(because, says):
     others = {"No crash was found.", "Interrupted. Run the same command to resume."} - {says}
     assert others.isdisjoint(found)
     assert not any("Replay it" in line for line in found)
+
+
+def test_versions_of_the_code_have_their_crashes_and_the_newest_comes_first():
+    earlier = {"version": 1, "is_newest": False, "first": None, "trials": 1, "crashes": 0}
+    assert describe_versions([earlier, {"version": 2, "is_newest": True, "first": 8, "trials": 7, "crashes": 3}]) == (
+        "the code has changed: newest version 2: 3 of 7 trials crashed; version 1: 0 of 1 trial crashed; "
+        "crash types are of version 2, and its rate is of the trials from 8 on"
+    )
 
 
 def test_more_trials_than_are_planned_have_no_share():
