@@ -17,8 +17,9 @@ from crashhunt.recording import Phase
 from crashhunt.report import describe_hunt, describe_replay, describe_versions
 from crashhunt.report._listing import describe
 from crashhunt.report._status_screen import _workers
-from crashhunt.report._words import fault_words
-from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
+from crashhunt.report._words import about_disturbances, about_events, fault_words
+from crashhunt.trial import Collision, Disturbance, Outcome, TrialResult, TrialSpec
+from crashhunt.world import Event
 
 SETTINGS = HuntSettings(scenario="loop", scenario_digest="0", trials=30, max_steps=90, seed=7, run=RunSettings())
 REPORT = HuntReport(
@@ -55,6 +56,23 @@ def test_versions_of_the_code_have_their_crashes_and_the_newest_comes_first():
         "the code has changed: newest version 2: 3 of 7 trials crashed; version 1: 0 of 1 trial crashed; "
         "crash types are of version 2, and its rate is of the trials from 8 on"
     )
+
+
+def test_last_events_and_disturbances_before_a_crash_are_reported():
+    events = [Event("red_light", "ego", f"event {number}") for number in range(9)]
+    steps = [SimpleNamespace(step=number, scene=SimpleNamespace(events=(one,))) for number, one in enumerate(events)]
+    steps.append(SimpleNamespace(step=9, scene=None))
+    prologue = SimpleNamespace(step_length_s=0.5)
+    recording = SimpleNamespace(all_steps=steps, steps=9, prologue=prologue, ago=lambda step: f"{9 - step} before")
+    assert about_events(recording, 2, besides=events[8]) == [
+        f"{9 - number} before, at step {number}: event {number}." for number in range(3, 8)
+    ]
+    assert about_events(recording, 6, besides=None)[0] == "3 before, at step 6: event 6."
+    over, lasting = (Disturbance(step, "front", "brake", 2.0, 1.0, agent="ego", vehicle="x") for step in (3, 5))
+    found = about_disturbances(recording, replace(CRASH, disturbances=(over, lasting)), 6)
+    assert found[0] == "1 disturbance was over earlier."
+    assert len(found) == 2
+    assert found[1].startswith("5 before, from step 5 on: ")
 
 
 def test_more_trials_than_are_planned_have_no_share():

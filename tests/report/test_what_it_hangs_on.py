@@ -31,6 +31,17 @@ def test_other_crashes_in_place_of_this_one_are_reported(others):
     assert ("In 2 of them, another crash happened instead." in told) == bool(others)
 
 
+@pytest.mark.parametrize(("visible", "runs", "said"), [
+    (0, {0: "avoided"}, ["ego first observed other at the start."]),
+    (1, {0: "avoided"}, ["ego first observed other step 1."]),
+    (1, {}, []), (None, {0: "avoided"}, []),
+])  # fmt: skip
+def test_first_observation_is_reported_of_a_crash_with_runs(visible, runs, said):
+    judgement = Judgement((Attempt("brake", 3, runs),), visible_step=visible)
+    told = about_judgement(judgement, lambda step: f"step {step}", "ego", "other")
+    assert [sentence for sentence in told if "observed" in sentence] == said
+
+
 @pytest.mark.parametrize(
     ("factor", "words"),
     [
