@@ -31,6 +31,16 @@ def test_other_crashes_in_place_of_this_one_are_reported(others):
     assert ("In 2 of them, another crash happened instead." in told) == bool(others)
 
 
+@pytest.mark.parametrize(("end", "endings", "said"), [
+    (4, {0: "avoided", 1: "hit", 2: "hit", 3: "hit"}, "avoids it, and runs from all later steps crash."),
+    (4, {0: "avoided", 1: "hit"}, "avoids it, and a run from one step later crashes."),
+    (4, {0: "avoided", 3: "hit"}, "avoids it."), (1, {0: "avoided"}, "avoids it."),
+])  # fmt: skip
+def test_later_runs_are_reported_as_far_as_they_were_made(end, endings, said):
+    (told,) = about_judgement(Judgement((Attempt("brake", end, endings),)), str, "ego", "other")
+    assert told == f"It could be avoided until 0, by braking: a run from this step {said}"
+
+
 @pytest.mark.parametrize(("visible", "runs", "said"), [
     (0, {0: "avoided"}, ["ego first observed other at the start."]),
     (1, {0: "avoided"}, ["ego first observed other step 1."]),
@@ -47,11 +57,14 @@ def test_first_observation_is_reported_of_a_crash_with_runs(visible, runs, said)
     [
         (("seed", "", "drawn"), "other seeds, and so other traffic"),
         (("argument", "ego.speed", "drawn"), "other values of ego.speed (it was 9)"),
+        (("actor", "x", "there"), "without x (taken off the road after step 5)"),
+        (("actor", "x", "braked"), "x braked at 7; without that (it keeps its speed)"),
+        (("disturbance", "x", "brake"), "without the disturbance brake of x at 7"),
     ],
 )
 def test_factor_is_named_by_its_kind(factor, words):
     kind, name, what = factor
-    one = Factor(kind, name, what, was=9.0, runs=(LeftOut(5.0, "none"),))
+    one = Factor(kind, name, what, was=9.0, step=7, runs=(LeftOut(5.0, "none"),))
     assert about_why(Why((one,), 100), str)[1] == f"- {words}: no crash."
 
 
