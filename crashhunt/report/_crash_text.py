@@ -169,7 +169,7 @@ class Story:
             sentences.append(f"{whose} last decision was {decision}.")
             sentences += self._about_fault() if self.fault.findings else []
         if self.danger is not None:
-            words = about_danger(self.danger, touched=self.bundle.result.collision is not None and bool(self.other))
+            words = about_danger(self.danger, partner=self.other if self.bundle.result.collision is not None else "")
             sentences += [words] if words else []
         if (compact := recording.compact) is not None:
             sentences.append(

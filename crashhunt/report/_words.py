@@ -105,13 +105,14 @@ def about_nearest(encounter: Encounter, nearest: DangerousMoment) -> list[str]:
     ]
 
 
-def about_danger(course: DangerCourse, *, touched: bool = False) -> str:
+def about_danger(course: DangerCourse, *, partner: str = "") -> str:
     """Return as text the greatest criticality of the agent and of vehicles behind it, and the sums over the trial.
 
     Args:
         course: criticality of the trial over time.
-        touched: whether the agent touched another actor. In that case, "no actor was near" is never reported, because
-            an actor that jumps into another lane has no path to the contact.
+        partner: the actor that the agent touched; empty if there is none. For a touch, "no actor was near" is never
+            reported, because an actor that jumps into another lane has no path to the contact. Nor has an actor that
+            comes onto the agent's way at the contact: then the criticality towards others is that before the contact.
 
     Returns:
         A sentence; empty if there is nothing to report.
@@ -122,9 +123,11 @@ def about_danger(course: DangerCourse, *, touched: bool = False) -> str:
         ("Rear criticality", course.greatest_behind, course.behind_total, "by", "no vehicle closed in"),
     ):
         if moment.danger > 0:
+            if partner and moment is course.greatest and moment.other != partner:
+                heading += " before the contact"
             most = f"at most {moment.danger:.2f}, after step {moment.step}, {relation} {moment.other}"
             parts.append(f"{heading}: {most} ({total:.2f} over the trial).")
-        elif not touched:
+        elif not partner:
             parts.append(f"{heading}: {absent}.")
     return " ".join(parts)
 

@@ -89,7 +89,9 @@ def test_lane_change_counts_the_vehicle_behind_in_the_target_lane(turn):
     for other in (course(lane=6.4), course(heading=math.pi), course(ahead=-7.0, other_speed=9.0)):
         assert other.greatest.step != 20 or other.greatest.danger == 0.0
     calm = replace(found, greatest=found.greatest._replace(danger=0.0))
-    assert "no actor" not in about_danger(calm, touched=True)
+    assert "no actor" not in about_danger(calm, partner="ahead")
+    assert about_danger(found, partner="ahead").startswith("Criticality of ego: at most")
+    assert about_danger(found, partner="behind").startswith("Criticality of ego before the contact: at most")
     words = about_danger(calm)
     assert "no actor was on its way; ahead came nearest, 1.0 m away after step 21" in words
     assert "no actor came within 50 m" in about_danger(
