@@ -10,12 +10,13 @@ import pytest
 SCRIPTS = Path(__file__).parents[1] / "scripts" / "tools"
 
 
-@pytest.fixture
-def mutate(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    import mutate
+@pytest.fixture(scope="module")
+def mutate():
+    with pytest.MonkeyPatch.context() as patch:  # once for all tests: it reads the imports of all tests
+        patch.syspath_prepend(str(SCRIPTS))
+        import mutate
 
-    yield mutate
+        yield mutate
     for name in ("mutate", "slips", "copies"):
         sys.modules.pop(name, None)
 
