@@ -143,6 +143,7 @@ def test_files_without_an_end_are_not_opened(hunt, name):
 
 def test_a_request_that_does_not_end_loses_its_connection(hunt, monkeypatch):
     monkeypatch.setattr(_serving, "_REQUEST_S", 0.2)
+    monkeypatch.setattr(_serving, "_KEEP_ALIVE_S", 1)  # of a second request that came with the first
     with served(hunt) as dashboard:
         for begun in (
             b"",

@@ -97,7 +97,8 @@ def test_an_address_that_leads_nowhere_is_one_line(settings, argument, message):
     ],
 )
 def test_the_one_that_answers_and_is_no_cluster_is_reported_from_one(monkeypatch, answer, message):
-    monkeypatch.setattr("crashhunt.executors.ray._cluster._ANSWER_S", 0.5)
+    for limit in ("_ANSWER_S", "_PROBE_TIMEOUT_S"):
+        monkeypatch.setattr(f"crashhunt.executors.ray._cluster.{limit}", 0.5)
     with listener(answer) as address:
         with pytest.raises(UsageError) as raised:
             cluster_of(address)
