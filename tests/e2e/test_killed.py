@@ -339,11 +339,11 @@ def test_bisect_that_was_killed_leaves_no_work_tree(tmp_path, monkeypatch):
         git(tmp_path, "commit", "-qm", str(number))
 
     def ran(case, folder, tree, modules):
-        return "still" if (tree / "code").read_text().startswith("bad") else "fixed"
+        return ("still" if (tree / "code").read_text().startswith("bad") else "fixed"), ""
 
     monkeypatch.setattr(_bisect, "_run", ran)
     monkeypatch.setattr(_bisect, "add_case", lambda bundle, to: SimpleNamespace(case=SimpleNamespace(path=to)))
-    monkeypatch.setattr(_bisect, "read_settings", lambda path: SimpleNamespace(agents={}))
+    monkeypatch.setattr(_bisect, "read_settings", lambda path: SimpleNamespace(agents={}, texts={}))
 
     def bisected():
         return _bisect.bisect(SimpleNamespace(hunt=tmp_path), "main~2", bad="main", folder=tmp_path)
