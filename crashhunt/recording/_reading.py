@@ -181,6 +181,8 @@ class Reading:
 
 # What is said of a difference between two recordings: step, agent, field, both values.
 
+_MAX_SHOWN = 100  # characters of a value in a sentence: an action may be a whole trajectory
+
 
 @dataclass(frozen=True, slots=True)
 class Divergence(Serializable):
@@ -211,7 +213,9 @@ class Divergence(Serializable):
 
     def __str__(self) -> str:
         who = f"{self.agent} " if self.agent else ""
-        return f"step {self.step}, {who}{self.field}: recorded {self.recorded!r}, replayed {self.replayed!r}"
+        values = map(repr, (self.recorded, self.replayed))
+        was, now = (text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}…" for text in values)
+        return f"step {self.step}, {who}{self.field}: recorded {was}, replayed {now}"
 
 
 def first_difference(left: NDArray[np.generic], right: NDArray[np.generic]) -> tuple[int, ...]:

@@ -10,6 +10,7 @@ import pytest
 
 from crashhunt.recording import (
     AgentChannel,
+    Divergence,
     Prologue,
     Recording,
     Tag,
@@ -269,3 +270,11 @@ def test_what_is_no_value_of_any_step():
     assert (written.recorded, written.replayed) == (one.digest, Recording(records).digest)
     notes = Record(Tag.NOTES, 0, encode_notes([Event("teleport", "ego", "gone")]))
     assert first_divergence(one, Recording([*one.records[:3], notes, *one.records[3:]])) is None  # not part of it
+
+
+def test_difference_in_words_shows_the_beginning_of_a_long_action():
+    rows = [[0.1 * step, 20.0, 0.0] for step in range(60)]
+    text = str(Divergence(step=290, agent="ego", field="action", recorded=None, replayed=rows))
+    assert text.startswith("step 290, ego action: recorded None, replayed [[0.0, 20.0, 0.0], [0.1,")
+    assert len(text) < 160
+    assert text.endswith("…")
