@@ -31,10 +31,7 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.integrity import FileEntry
     from crashhunt.base.json_types import Plain
-    from crashhunt.trial import (
-        TrialResult,
-        Value,
-    )
+    from crashhunt.trial import TrialResult, Value
     from crashhunt.world import Lane
 
 

@@ -17,7 +17,13 @@ from crashhunt.base.text import one_of
 from crashhunt.episode import Episode, Observer
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
 from crashhunt.plans import disturber
-from crashhunt.scenario import argument_values, load_scenario, with_action, with_observations, with_visible_wholes
+from crashhunt.scenario import (
+    argument_values,
+    load_scenario,
+    with_action,
+    with_observations,
+    with_whole_vehicles_visible,
+)
 from crashhunt.simulators import parse_parts
 from crashhunt.sumo import SumoSimulator
 from crashhunt.trial import TrialSpec
@@ -85,7 +91,7 @@ class Episodes:
         self.agent = agent or next(iter(chosen.agents))
         if action:
             chosen = with_action(chosen, self.agent, action)
-        chosen = with_visible_wholes(chosen)
+        chosen = with_whole_vehicles_visible(chosen)
         if observation:
             parse_parts(observation, chosen.backend.observations, where="observation")
             chosen = with_observations(chosen, {self.agent: tuple(observation)})

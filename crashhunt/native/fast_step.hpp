@@ -75,8 +75,8 @@ struct Steps {
     Steps() = default;
     Steps(const Steps &) = delete;
     ~Steps() {
-        for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, perceive, restore, draft, whole_type, part_names, perceived,
-                              reinterpret_cast<PyObject *>(eyes),
+        for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, perceive, restore, draft, whole_type,
+                              part_names, perceived, reinterpret_cast<PyObject *>(eyes),
                               limits, stood, reinterpret_cast<PyObject *>(sight.vehicles), sight.ids,
                               reinterpret_cast<PyObject *>(entered.vehicles), entered.ids,
                               reinterpret_cast<PyObject *>(before_vehicles), enter, record_roster, observation, answer,

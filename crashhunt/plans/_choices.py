@@ -32,7 +32,7 @@ from crashhunt.oracles import (
     requirement_oracles,
 )
 from crashhunt.plans._code import IMPORT_S, CodeFacts
-from crashhunt.scenario import action_settings, backend_of, canonical_action, check_action, with_visible_whole
+from crashhunt.scenario import action_settings, backend_of, canonical_action, check_action, with_whole_vehicle_visible
 from crashhunt.simulators import parse_parts
 from crashhunt.trial import CRASHES, EVENTS, Outcome
 from crashhunt.world import LIMITS
@@ -76,7 +76,7 @@ def chosen_actions(
             found[agent] = signature.action
         check_action(found.get(agent, setup.action), signature.actions, setup.agent)
         action = found.get(agent, setup.action)
-        visible = with_visible_whole(action)
+        visible = with_whole_vehicle_visible(action)
         if visible is not None and visible != action:
             found[agent] = visible
     return found

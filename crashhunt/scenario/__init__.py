@@ -12,7 +12,7 @@ if TYPE_CHECKING:
         canonical_action as canonical_action,
         check_action as check_action,
         with_stated_choice as with_stated_choice,
-        with_visible_whole as with_visible_whole,
+        with_whole_vehicle_visible as with_whole_vehicle_visible,
     )
     from ._load import (
         copy_shipped_scenario as copy_shipped_scenario,
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
         with_action as with_action,
         with_observations as with_observations,
         with_recorded_load_order as with_recorded_load_order,
-        with_visible_wholes as with_visible_wholes,
+        with_whole_vehicles_visible as with_whole_vehicles_visible,
     )
 
 offer_lazily(__name__)

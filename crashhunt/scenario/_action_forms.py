@@ -285,7 +285,7 @@ def action_settings(name: str | None, where: str = "action") -> dict[str, float 
     return values
 
 
-def with_visible_whole(name: str | None) -> str | None:
+def with_whole_vehicle_visible(name: str | None) -> str | None:
     """Return a form of actions whose vehicle other vehicles see as a whole, unless the form names another choice.
 
     Without the setting, a form means what it meant before the setting existed, so recorded trials keep their meaning.
@@ -303,7 +303,7 @@ def with_visible_whole(name: str | None) -> str | None:
 
 
 def with_stated_choice(name: str) -> str:
-    """Return the form that `with_visible_whole` turns into a recorded form of actions."""
+    """Return the form that `with_whole_vehicle_visible` turns into a recorded form of actions."""
     is_stated = not name or not can_be_in_two_lanes(name) or f":{_VISIBLE.name}=" in name
     return name if is_stated else f"{name}:{_VISIBLE.name}={_VISIBLE.default}"
 

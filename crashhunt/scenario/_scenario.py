@@ -33,7 +33,7 @@ from crashhunt.base.errors import PluginError, ScenarioError
 from crashhunt.base.integrity import digest_of_file
 from crashhunt.base.plugins import load_attribute, registered
 from crashhunt.base.text import listed
-from crashhunt.scenario._action_forms import action_settings, canonical_action, with_visible_whole
+from crashhunt.scenario._action_forms import action_settings, canonical_action, with_whole_vehicle_visible
 from crashhunt.trial import Argument, Kind, kind_of, parse_spec
 
 if TYPE_CHECKING:
@@ -328,10 +328,11 @@ def with_action(scenario: Scenario, agent: str, action: str, where: str = "actio
     return replace(scenario, agents={**scenario.agents, agent: setup})
 
 
-def with_visible_wholes(scenario: Scenario) -> Scenario:
-    """Return the scenario with forms of actions whose vehicles others see as a whole; see `with_visible_whole`."""
+def with_whole_vehicles_visible(scenario: Scenario) -> Scenario:
+    """Return the scenario with the forms of actions that `with_whole_vehicle_visible` returns."""
     agents = {
-        agent: replace(setup, action=with_visible_whole(setup.action)) for agent, setup in scenario.agents.items()
+        agent: replace(setup, action=with_whole_vehicle_visible(setup.action))
+        for agent, setup in scenario.agents.items()
     }
     return replace(scenario, agents=agents) if scenario.backend.actions else scenario
 

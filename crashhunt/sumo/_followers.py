@@ -113,7 +113,7 @@ class Followers:
         controlled: all agents, which are never bounded.
         graph: function that returns the lanes of the network.
         step_length_s: step length, in s.
-        unseen_ahead: agents whose part vehicles ahead of it ignore when they change lanes.
+        ignored_ahead: agents whose parts are ignored by vehicles that change lanes ahead of them.
     """
 
     def __init__(
@@ -122,10 +122,10 @@ class Followers:
         controlled: Collection[str],
         graph: Callable[[], LaneGraph],
         step_length_s: float,
-        unseen_ahead: Collection[str] = (),
+        ignored_ahead: Collection[str] = (),
     ) -> None:
         self.agents, self._controlled, self._read_graph = agents, controlled, graph
-        self._dt, self._unseen_ahead = step_length_s, unseen_ahead
+        self._dt, self._ignored_ahead = step_length_s, ignored_ahead
         self._squares: dict[tuple[int, int], list[Piece]] = {}
         self._parts: dict[str, tuple[tuple[float, ...], dict[str, _Part]]] = {}
         self._speed_modes = VehicleCommand.speed_modes  # of the vehicles that are bounded
@@ -385,7 +385,7 @@ class Followers:
                 if ahead <= 0.0:
                     gap, behind = reach[0] - place, vehicle
                     safe = sumo.vehicle_getSecureGap(vehicle, speed, part.speed, decel, agent)
-                elif agent not in self._unseen_ahead:
+                elif agent not in self._ignored_ahead:
                     gap, behind = ahead, agent
                     safe = sumo.vehicle_getSecureGap(agent, part.speed, speed, sumo.vehicle_getDecel(vehicle), vehicle)
                 else:

@@ -130,7 +130,7 @@ class SumoSimulator:
             scenario.agents,
             lambda: self._parts.graph,
             scenario.step_length_s,
-            unseen_ahead=[agent for agent, part in visible.items() if part == "outline"],
+            ignored_ahead=[agent for agent, part in visible.items() if part == "outline"],
         )
         self._followers.prepare()
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s, self._driving)

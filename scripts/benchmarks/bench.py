@@ -396,7 +396,7 @@ def child_actions(scenario: str) -> dict[str, float]:
     from crashhunt.episode import FastEpisode, Nearness, Recorder
     from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
     from crashhunt.recording import BlackBox
-    from crashhunt.scenario import argument_values, load_scenario, with_action, with_visible_wholes
+    from crashhunt.scenario import argument_values, load_scenario, with_action, with_whole_vehicles_visible
     from crashhunt.sumo import SumoSimulator
     from crashhunt.trial import TrialSpec
 
@@ -407,7 +407,7 @@ def child_actions(scenario: str) -> dict[str, float]:
         spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments=argument_values(plain), max_steps=1000)
         for _ in range(7):
             for form in ("speed_and_lane", "acceleration", "acceleration_steering"):
-                simulator = SumoSimulator(with_visible_wholes(with_action(plain, "ego", form)), stage)
+                simulator = SumoSimulator(with_whole_vehicles_visible(with_action(plain, "ego", form)), stage)
                 box.begin(pid=os.getpid(), trial=0, started=time.monotonic())
                 with FastEpisode(
                     spec,

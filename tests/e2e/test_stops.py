@@ -42,16 +42,16 @@ def left_in(folder: Path) -> list[int]:
     return found
 
 
-STOPS = [(number, whom) for number in (signal.SIGTERM, signal.SIGHUP) for whom in ("every process", "the group")]
+STOPS = [(number, target) for number in (signal.SIGTERM, signal.SIGHUP) for target in ("every process", "the group")]
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("number", "whom"), STOPS)
-def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, whom):
+@pytest.mark.parametrize(("number", "target"), STOPS)
+def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, target):
     words = ("run", "h", "2", "8", "30", *FINE, *SLOW, "--json")
     process = toy.start(*words, start_new_session=True)
     wait_for(lambda: len(rows(toy.folder / "h")) >= 2)
-    if whom == "every process":  # as systemd and SLURM do; the workers come first
+    if target == "every process":  # as systemd and SLURM do; the workers come first
         for pid in reversed(tree(process.pid)):
             with suppress(ProcessLookupError):  # the process of a trial that has ended meanwhile
                 os.kill(pid, number)

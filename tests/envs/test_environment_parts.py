@@ -104,7 +104,7 @@ def parts(monkeypatch, tmp_path):
     replaced = {
         "load_scenario": lambda name: notes.loaded.append(name) or chosen,
         "with_action": lambda *given: notes.actions.append(given[1:]) or chosen,
-        "with_visible_wholes": lambda scenario: scenario,
+        "with_whole_vehicles_visible": lambda scenario: scenario,
         "argument_values": lambda scenario: {"cars": 3, "speed": 1.0},
         "disturber": lambda scenario, disturb, agents: (
             notes.disturbers.append((disturb, agents)) or (sampler if disturb else None)

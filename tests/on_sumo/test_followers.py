@@ -17,7 +17,13 @@ from crashhunt.disturbances import parse_fixed
 from crashhunt.envs._env_episodes import Episodes
 from crashhunt.oracles import Overlap
 from crashhunt.plans._choices import chosen_actions
-from crashhunt.scenario import argument_values, load_scenario, with_action, with_stated_choice, with_visible_whole
+from crashhunt.scenario import (
+    argument_values,
+    load_scenario,
+    with_action,
+    with_stated_choice,
+    with_whole_vehicle_visible,
+)
 from crashhunt.simulators import MotionState
 from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._followers import Followers, Piece, _Part
@@ -303,16 +309,18 @@ def test_outline_in_a_lane_agrees_with_points_of_the_outline():
 
 
 def test_new_hunts_choose_the_outline_for_forms_that_can_be_in_two_lanes():
-    found = {form: with_visible_whole(form) for form in ("trajectory:frame=ego", "speed_and_lateral", "meta", None)}
+    found = {
+        form: with_whole_vehicle_visible(form) for form in ("trajectory:frame=ego", "speed_and_lateral", "meta", None)
+    }
     assert found == {
         "trajectory:frame=ego": "trajectory:frame=ego:visible=whole",
         "speed_and_lateral": "speed_and_lateral:visible=whole", "meta": "meta", None: None,
     }  # fmt: skip
     for name in ("acceleration_steering", "trajectory:visible=whole:frame=ego", "meta", ""):
-        assert with_visible_whole(with_stated_choice(name)) == name
+        assert with_whole_vehicle_visible(with_stated_choice(name)) == name
     drifts = "speed_and_lane:lane_change_duration_s=3"
-    assert with_visible_whole(drifts) == f"{drifts}:visible=whole"
-    assert with_visible_whole("speed_and_lane") == "speed_and_lane"
+    assert with_whole_vehicle_visible(drifts) == f"{drifts}:visible=whole"
+    assert with_whole_vehicle_visible("speed_and_lane") == "speed_and_lane"
 
 
 @pytest.mark.parametrize(
