@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from crashhunt.scenario import (
     AgentSetup,
     Backend,
     Scenario,
+    _load,
     as_plain_data,
     backend_of,
     load_scenario,
@@ -122,6 +124,18 @@ def test_a_simulator_of_your_own_may_have_the_tables_of_those_that_are_known():
     assert list(scenario.modules()) == ["mine"]
     with pytest.raises(ScenarioError, match=r"the scenario has no \[GymSetup\] table"):
         scenario.table(GymSetup)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoadSetup:
+    friction: float = 1.0
+
+
+@pytest.mark.parametrize(("given", "friction"), [({}, 1.0), ({"mine": {"friction": 0.5}}, 0.5)])
+def test_table_without_required_keys_may_be_missing(monkeypatch, given, friction):
+    monkeypatch.setattr(_load, "backend_of", {"mine": Backend(table=RoadSetup)}.get)
+    scenario = scenario_from_dict({"simulator": "mine", **given}, where="here", folder=Path())
+    assert scenario.table(RoadSetup).friction == friction
 
 
 def test_a_table_that_is_missing_is_called_as_it_is_in_the_file():

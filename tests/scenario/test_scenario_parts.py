@@ -223,6 +223,20 @@ def test_unknown_keys_are_kept_only_from_a_later_version(tmp_path):
     assert scenario_from_dict(data | {"name": "mine"}, where="s", folder=tmp_path).name == "mine"
 
 
+@pytest.mark.parametrize(
+    ("agent", "joined"),
+    [
+        ({"exec": ["./planner", "--mode", "a b"]}, {"agent": "exec:/town/planner --mode 'a b'"}),
+        ({"exec": ["./planner"], "reuse": True}, {"agent": "exec:/town/planner", "reuse": True}),
+        ({"lib": "./planner.so"}, {"agent": "lib:/town/planner.so"}),
+    ],
+)
+def test_command_of_an_agent_becomes_a_locator_in_the_folder_of_the_scenario(agent, joined):
+    data = {"agents": {"ego": {"agent": agent}}}
+    _load._join_commands(data, "s.toml", Path("/town"))
+    assert data["agents"]["ego"] == joined
+
+
 def test_digest_of_a_scenario_is_that_of_files_and_settings_but_not_of_agents(town):
     was = scenario_digest(town)
     assert scenario_digest(replace(town, agents={"other": AgentSetup(agent="x", route="way")})) == was
