@@ -293,7 +293,7 @@ def _require_same_trial(asked: TrialSpec, run: TrialSpec) -> None:
     Raises:
         NotUnderstoodError: a part of the specification was ignored.
     """
-    named = attrgetter("overruled", "disturbances", "only", "handover", "reseeding")
+    named = attrgetter("overruled", "disturbances", "only", "handover", "reseeding", "digest_of_changes")
     if named(asked) != named(run):
         raise NotUnderstoodError("the snapshot contains a version of crashhunt that is too old for this command")
 

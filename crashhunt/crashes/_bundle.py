@@ -257,10 +257,7 @@ class Bundle:
             data["log_likelihood"] = plain.get("log_likelihood")
             data["disturbances"] = plain.get("disturbances", [])
             data["planned_disturbances"] = spec.get("disturbances", [])
-        if "only" in spec:
-            data["only"] = spec["only"]
-        if "script" in spec:
-            data["script"] = spec["script"]
+        data |= {name: spec[name] for name in ("only", "script", "digest_of_changes") if name in spec}
         if self.authentication_code:
             data["authentication_code"] = self.authentication_code
         whole = merged(data, self.added)

@@ -207,7 +207,7 @@ _TYPES: Plain = {
     "sim_time_s": float,
     "confirmed": bool | None,
     "divergence": dict | None,
-    "disturbed": bool,
+    **dict.fromkeys(("disturbed", "digest_of_changes"), bool),
     **dict.fromkeys(("log_likelihood", "danger"), float | None),
     "only": list[str] | None,
     "robustness": dict[str, float | None] | None,
@@ -326,6 +326,7 @@ def _bundle(path: Path, data: JsonObject) -> Bundle:
         disturbances=tuple(map(Disturbance.from_json, data.get("planned_disturbances") or ())),
         only=tuple(only) if (only := data.get("only")) is not None else None,
         script=Paths.from_json(script) if (script := data.get("script")) else None,
+        digest_of_changes=data.get("digest_of_changes", False),
     )
     result = TrialResult(
         spec,

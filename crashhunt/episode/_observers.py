@@ -67,6 +67,7 @@ if TYPE_CHECKING:
 class ObservedEpisode(Protocol):
     """The part of an `Episode` that its observers may use."""
 
+    spec: TrialSpec
     simulator: Simulator
     names: tuple[str, ...]
     agents: dict[str, Agent]
@@ -308,7 +309,8 @@ class Recorder(Observer):
             names = () if parts else columns
             channels.append(AgentChannel(agent, *shown, *_type_of(form), tuple(form.names), names, parts))
         self._box.set_up(episode.setup_steps or 0)
-        self._box.prologue(Prologue(tuple(channels), simulator.step_length_s).encode(), len(channels))
+        prologue = Prologue(tuple(channels), simulator.step_length_s, episode.spec.digest_of_changes)
+        self._box.prologue(prologue.encode(), len(channels))
 
     def making(self, number: int) -> None:
         """Record which agent is being created, because its constructor may end the process."""
@@ -369,7 +371,10 @@ class Recorder(Observer):
     def end(self, result: TrialResult) -> TrialResult:
         """Record the end of the episode, and add the digest of the recording to the result."""
         self._box.mark(Phase.DONE)
-        digest = digest_of(self._box.evidence()) if result.outcome is not Outcome.INVALID else ""
+        digest = ""
+        if result.outcome is not Outcome.INVALID:
+            of_changes = result.spec.digest_of_changes
+            digest = digest_of(self._box.evidence(), of_changes=of_changes, core=self._box.core)
         return replace(result, digest=digest, events=None if self._events is None else dict(self._events))
 
 

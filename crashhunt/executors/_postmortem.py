@@ -357,7 +357,7 @@ def check_report(
         return evidence
     if (header.trial, header.pid) != (spec.number, pid):
         return f"it says that process {header.pid} ran trial {header.trial}"
-    digest = digest_of(evidence) if records else ""
+    digest = digest_of(evidence, of_changes=spec.digest_of_changes) if records else ""
     text = report[CHECKSUM_BYTES:]
     if report[:CHECKSUM_BYTES] != checksum_of(text):
         return "its report was overwritten"

@@ -43,6 +43,8 @@ def spec_of(
     sampler: NamedSampler,
     disturber: DisturbanceSampler | None = None,
     forcing: Forcing | None = None,
+    *,
+    digest_of_changes: bool = False,
 ) -> TrialSpec:
     """Return the trial that a sampler proposes, with the disturbances that follow from the trial's seed.
 
@@ -56,7 +58,7 @@ def spec_of(
     Raises:
         CrashhuntError: the sampler failed.
     """
-    spec = _propose_trial(number, settings, sampler, disturber, forcing)
+    spec = _propose_trial(number, settings, sampler, disturber, forcing, digest_of_changes=digest_of_changes)
     assert spec is not None  # only a sampler that learns may propose no trial, and not its first
     return spec
 
@@ -67,6 +69,8 @@ def _propose_trial(
     sampler: NamedSampler,
     disturber: DisturbanceSampler | None = None,
     forcing: Forcing | None = None,
+    *,
+    digest_of_changes: bool = False,
 ) -> TrialSpec | None:
     """Return the trial as `spec_of`; None if the sampler proposes none before it receives further results."""
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
@@ -99,6 +103,7 @@ def _propose_trial(
         origin=proposal.origin,
         disturbances=_drawn(disturber, seed, settings.max_steps, forcing) if disturber is not None else (),
         forcing=forcing,
+        digest_of_changes=digest_of_changes,
     )
 
 
@@ -170,6 +175,7 @@ class Trials:
         disturber: object that draws the disturbances of trials; None if trials have no disturbances.
         forcings: object that returns the forcing of each root in rare mode; None in any other hunt.
         apart: the finished trials of other versions of the code, whose results a learning sampler does not receive.
+        digest_of_changes: whether the digests of the trials cover only the changes of observations.
         begun_with: version of the proposals that the hunt already contains; None if it contains none.
 
     Raises:
@@ -189,6 +195,7 @@ class Trials:
         unanswered: Sequence[TrialSpec] = (),
         forcings: Forcings | None = None,
         apart: Collection[int] = frozenset(),
+        digest_of_changes: bool = False,
     ) -> None:
         self._settings = settings
         self._sampler = sampler
@@ -200,6 +207,7 @@ class Trials:
         self._next = next(self._waiting, None)
         self._unanswered = deque(unanswered)
         self._forcings = forcings
+        self._digest_of_changes = digest_of_changes
         self._running_again: set[int] = set()
         self._proposed: dict[int, TrialSpec] = {}  # by a run before this one, and not ended
         self._open: set[int] = set()
@@ -244,12 +252,12 @@ class Trials:
                     break
                 self._refuse_other_version()
                 self._told += self._report_to_sampler(self._next - self._lag_of(self._next))
-                spec = _propose_trial(self._next, self._settings, self._sampler, self._disturber)
+                spec = self._propose()
                 if spec is None and self._open:
                     break
                 if spec is None:
                     self._told += self._report_to_sampler(self._next)
-                    spec = _propose_trial(self._next, self._settings, self._sampler, self._disturber)
+                    spec = self._propose()
                 if spec is None:
                     self._next = None
                     break
@@ -261,7 +269,8 @@ class Trials:
                     if min(self._open, default=self._next) < self._forcings.needed(self._next):
                         break
                     forcing = self._forcings.of(self._next)
-                spec = spec_of(self._next, self._settings, self._sampler, self._disturber, forcing)
+                drawn = self._settings, self._sampler, self._disturber, forcing
+                spec = spec_of(self._next, *drawn, digest_of_changes=self._digest_of_changes)
             found.append(spec)
             self._open.add(self._next)
             self._next = next(self._waiting, None)
@@ -290,6 +299,11 @@ class Trials:
         if self._sampler.learns:
             self._results[number] = result
             heappush(self._untold, number)
+
+    def _propose(self) -> TrialSpec | None:
+        """Return the next trial of a sampler that learns; None if it needs further results."""
+        drawn = self._settings, self._sampler, self._disturber
+        return _propose_trial(self._next or 0, *drawn, digest_of_changes=self._digest_of_changes)
 
     def _refuse_other_version(self) -> None:
         """Refuse to mix proposals of two versions, because the hunt's seed could then no longer repeat the hunt."""

@@ -123,6 +123,7 @@ class RunningHunt:
             unanswered=self.unanswered.specs,
             forcings=forcings_of(settings, ledger, self.disturber),
             apart=apart,
+            digest_of_changes=any(agent.observes_parts for agent in setup.scenario.agents.values()),
         )
         if not self.progress.is_done:
             self.trials.require_same_version()

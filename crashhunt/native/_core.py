@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 16
+_INTERFACE = 17
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -519,6 +519,9 @@ class Core(Protocol):
         self, buffer: object, offset: int, tag: int, agent: int, array: object, step: int, phase: int, /
     ) -> int | None:
         """Write the record of an array and the phase of the process; return the position after the record."""
+
+    def changes_of(self, earlier: memoryview, now: memoryview, /) -> bytes:
+        """Return where two arrays of 64-bit words differ, one bit per word, and then the changed words."""
 
 
 @cache

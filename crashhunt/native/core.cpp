@@ -1502,6 +1502,51 @@ PyObject *write_array(PyObject *, PyObject *const *given, Py_ssize_t count) {
     return PyLong_FromSize_t(static_cast<size_t>(offset) + 8 + length + padding);
 }
 
+// changes_of(earlier, now) -> bytes
+// Which words differ, as numpy.packbits writes bits, and then the words of the second that do.
+PyObject *changes_of(PyObject *, PyObject *const *given, Py_ssize_t count) {
+    Py_buffer before, now;
+    if (count != 2) {
+        PyErr_SetString(PyExc_TypeError, "changes_of takes two arrays");
+        return nullptr;
+    }
+    if (PyObject_GetBuffer(given[0], &before, PyBUF_SIMPLE) < 0) {
+        return nullptr;
+    }
+    if (PyObject_GetBuffer(given[1], &now, PyBUF_SIMPLE) < 0) {
+        PyBuffer_Release(&before);
+        return nullptr;
+    }
+    const size_t words = static_cast<size_t>(now.len) / 8, bytes = (words + 7) / 8;
+    PyObject *found = nullptr;
+    if (before.len != now.len || now.len % 8) {
+        PyErr_SetString(PyExc_ValueError, "the arrays have different lengths, or no whole words");
+    } else {
+        std::vector<char> out(bytes + 8 * words, 0);
+        const char *was = static_cast<const char *>(before.buf), *is = static_cast<const char *>(now.buf);
+        char *end = out.data() + bytes;
+        for (size_t group = 0; group < bytes; ++group) {
+            const size_t first = 8 * group, last = std::min(first + 8, words);
+            if (!memcmp(was + 8 * first, is + 8 * first, 8 * (last - first))) {
+                continue;
+            }
+            unsigned mask = 0;
+            for (size_t word = first; word < last; ++word) {
+                if (memcmp(was + 8 * word, is + 8 * word, 8)) {
+                    mask |= 128u >> (word - first);
+                    memcpy(end, is + 8 * word, 8);
+                    end += 8;
+                }
+            }
+            out[group] = static_cast<char>(mask);
+        }
+        found = PyBytes_FromStringAndSize(out.data(), end - out.data());
+    }
+    PyBuffer_Release(&before);
+    PyBuffer_Release(&now);
+    return found;
+}
+
 // write_step(buffer, offset, tag, step, time_s, rewards, columns, phase) -> end | None
 // A record of a step as BlackBox.step packs it, little-endian as every machine is for which this is built.
 PyObject *write_step(PyObject *, PyObject *const *given, Py_ssize_t count) {
@@ -1602,6 +1647,7 @@ PyMethodDef functions[] = {
     {"may_be_near", FAST(may_be_near), "Return who may have a part in the closest approach."},
     {"tracks", FAST(tracks), "Return the way of an agent, and who was near it."},
     {"write_array", FAST(write_array), "Write the record of an array; return where it ends."},
+    {"changes_of", FAST(changes_of), "Return where two arrays of words differ, and the changed words."},
     {"write_step", FAST(write_step), "Write the record of a step; return where it ends."},
     {nullptr, nullptr, 0, nullptr},
 };

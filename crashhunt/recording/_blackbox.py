@@ -279,6 +279,11 @@ class BlackBox:
         self._stop_core()
         return memoryview(self._map)[FIRST : self._offset]
 
+    @property
+    def core(self) -> Core | None:
+        """The compiled core of the recorded simulator; None without one."""
+        return self._core
+
     def evidence(self) -> list[memoryview]:
         """The bytes of those records that belong to the digest."""
         self._stop_core()

@@ -98,10 +98,12 @@ class Prologue(Serializable):
     Args:
         agents: agents in the order of their numbers.
         step_length_s: step length in s of simulation time.
+        digest_of_changes: whether the digest covers only the changes of observations.
     """
 
     agents: tuple[AgentChannel, ...]
     step_length_s: float
+    digest_of_changes: bool = field(default=False, metadata=OMIT_DEFAULT)
 
     def encode(self) -> bytes:
         """Return the payload of the record."""

@@ -217,7 +217,8 @@ class Recording:
         """The digest of the trace, in hexadecimal; for a compact recording, the digest of the complete recording."""
         if self.compact is not None and self.compact.digest:
             return self.compact.digest
-        return digest_of(record.encode() for record in self.records if is_evidence(record.tag))
+        evidence = (record.encode() for record in self.records if is_evidence(record.tag))
+        return digest_of(evidence, of_changes=self.prologue.digest_of_changes)
 
     @property
     def steps(self) -> int:

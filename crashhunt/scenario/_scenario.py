@@ -143,6 +143,11 @@ class AgentSetup:
         return action_settings(self.action)
 
     @property
+    def observes_parts(self) -> bool:
+        """Whether the agent observes parts that it or the scenario names, and not the default observation."""
+        return bool(self.observation) and self.observation != ("kinematics",)
+
+    @property
     def refused_disturbances(self) -> frozenset[str]:
         """The kinds of disturbances that would make the agent's plans begin where the vehicle is not.
 

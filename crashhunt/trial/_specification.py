@@ -129,6 +129,8 @@ class TrialSpec(Serializable):
             keep the trial's seed.
         forcing: How disturbances are forced on forks of the trial; None for no such forks. It does not affect the trial
             itself.
+        digest_of_changes: Whether the digest covers the first observation of an agent and the changes since, instead of
+            all observations.
     """
 
     number: int
@@ -145,6 +147,7 @@ class TrialSpec(Serializable):
     handover: Handover | None = field(default=None, metadata=_ESSENTIAL_METADATA)
     reseeding: Reseeding | None = field(default=None, metadata=_ESSENTIAL_METADATA)
     forcing: Forcing | None = field(default=None, metadata=OMIT_DEFAULT)
+    digest_of_changes: bool = field(default=False, metadata=_ESSENTIAL_METADATA)
 
     def to_json(self) -> JsonObject:
         """Return the specification as plain data; ``requires`` lists features that another version must know."""

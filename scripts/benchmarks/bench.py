@@ -171,7 +171,10 @@ def child_step(scenario: str, observation: str = "") -> dict[str, float]:
         simulator = SumoSimulator(chosen, stage)
         box = BlackBox(stage / "blackbox.bin")
         arguments = argument_values(chosen)
-        spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments=arguments, max_steps=steps)
+        spec = TrialSpec(
+            number=0, seed=1, arguments={}, scenario_arguments=arguments, max_steps=steps,
+            digest_of_changes=bool(observation),  # as in a hunt
+        )  # fmt: skip
 
         def whole(*, parts: bool = False) -> tuple[float, int]:
             box.begin(pid=os.getpid(), trial=0, started=time.monotonic())

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import pytest
+
+from crashhunt.crashes import read_bundle
+from crashhunt.ledger import Ledger
 
 AGENT = '''
 class Follows:
@@ -54,9 +59,19 @@ def hunt(shell):
 def test_hunt_with_parts_is_the_same_on_any_number_of_workers_and_replays(hunted):
     hunted.crashhunt("run", "other", "1", *WORDS, "--agent", "follows:Follows", "--disturb", "noisy_observation=0.5")
     assert digests(hunted, "h") == digests(hunted, "other")
+    (crash,) = (hunted.folder / "h" / "crashes").iterdir()
+    assert read_bundle(crash).result.spec.digest_of_changes
     done = hunted.crashhunt("replay", "h", "--json").json
     assert done["verdict"] == "reproduced"
     assert hunted.crashhunt("replay", "h", "--from-log", "--json").json["verdict"] == "reproduced"
+
+
+@pytest.mark.parametrize(("observed", "of_changes"), [("ego,actors:rows=6", True), ("kinematics", False)])
+def test_digest_covers_the_changes_of_parts_and_whole_default_observations(hunted, observed, of_changes):
+    words = ("--agent", "follows:Follows", "--observe", observed, "--scenario", "intersection")
+    hunted.crashhunt("run", "x", "1", "1", "5", *words, expect=None)
+    with closing(Ledger(hunted.folder / "x" / "ledger.sqlite")) as ledger:
+        assert ledger.result(0).spec.digest_of_changes is of_changes
 
 
 def test_parts_that_the_class_names_are_in_the_settings_and_in_the_log(hunted):

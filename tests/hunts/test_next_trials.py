@@ -173,6 +173,16 @@ def test_each_trial_is_drawn_from_its_number_and_the_seed_of_the_hunt():
     assert spec_of(0, other, sampler).seed not in [spec.seed for spec in specs]
 
 
+@pytest.mark.parametrize("name", ["random", "climber:Climber"])
+@pytest.mark.parametrize("of_changes", [False, True])
+def test_hunt_of_parts_gives_trials_digests_of_changes(name, of_changes, tmp_path):
+    chosen = settings(name)
+    with closing(Ledger(tmp_path / "l.sqlite", writable=True)) as ledger:
+        sampler = NamedSampler(chosen.sampler, chosen.space, points=chosen.points)
+        trials = Trials(chosen, sampler, ledger, set(), lag=2, digest_of_changes=of_changes)
+        assert {spec.digest_of_changes for spec in trials.take(2)} == {of_changes}
+
+
 @pytest.mark.parametrize("place", HUNTS, ids=[place.parent.name for place in HUNTS])
 def test_trials_of_a_hunt_of_an_older_version_are_drawn_as_they_were(place, tmp_path):
     shutil.copytree(place, tmp_path / "h")
@@ -418,7 +428,7 @@ def provided(monkeypatch):
     """Makes the trials of a hunt of six; each specification is what was asked for."""
     asked = []
 
-    def spec_of(number, settings, sampler, disturber, forcing=None):
+    def spec_of(number, settings, sampler, disturber, forcing=None, **_):
         asked.append((number, sampler, disturber, forcing))
         return SimpleNamespace(number=number, parent=None, origin="")
 
@@ -477,7 +487,7 @@ def test_root_waits_until_the_trials_that_it_learns_from_have_ended(provided):
 def test_ledger_notes_once_that_trials_have_origins(provided, monkeypatch):
     origins = {1: (None, "climb"), 3: (0, ""), 4: (None, "climb")}
 
-    def spec_of(number, *_):
+    def spec_of(number, *_, **__):
         parent, origin = origins.get(number, (None, ""))
         return SimpleNamespace(number=number, parent=parent, origin=origin)
 

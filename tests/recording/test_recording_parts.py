@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import importlib.util
 import json
 import struct
 
 import numpy as np
 import pytest
+from hypothesis import given, strategies as some
 
 from crashhunt.base.errors import BundleError
 from crashhunt.recording import (
@@ -22,7 +25,7 @@ from crashhunt.recording import (
     encode_notes,
     encode_spines,
 )
-from crashhunt.recording._blackbox_file import Record
+from crashhunt.recording._blackbox_file import Record, _with_changes_only, changes_of
 from crashhunt.world import Actor, Contact, Event, Roster, Scene
 
 AGENTS = (
@@ -135,6 +138,76 @@ def test_notes_are_no_part_of_the_digest():
     assert Recording([*START, note, step(0)]).digest == Recording([*START, step(0)]).digest
     assert Recording([*START, step(0)]).digest == digest_of(record.encode() for record in [*START, step(0)])
     assert Recording(START).digest != Recording([*START, step(0)]).digest
+
+
+# The digest of a trial whose agents observe parts: of the first observation of each agent and the changes since.
+
+compiled = importlib.import_module("_crashhunt_core") if importlib.util.find_spec("_crashhunt_core") else None
+words = some.sampled_from([b"\0" * 8, b"\0" * 7 + b"\x80", b"abcdefgh", b"\xff" * 8])  # 0.0, -0.0, a NaN
+rows = some.lists(some.tuples(some.integers(0, 1), some.lists(words, max_size=19)), max_size=12)
+
+
+def records_of(observations):
+    prologue = dataclasses.replace(PROLOGUE, digest_of_changes=True)
+    between = [Record(Tag.ACTION, 0, b"action"), step(0)]
+    seen = [Record(Tag.OBSERVATION, agent, b"".join(row)) for agent, row in observations]
+    return [Record(Tag.PROLOGUE, 0, prologue.encode()), *(one for each in seen for one in (each, *between))]
+
+
+def read_back(hashed, prologue):
+    """The observations that follow from what is hashed, with what is in between, read by another program."""
+    last, found, place = {}, [], len(prologue.encode())
+    while place < len(hashed):
+        tag, agent, length = struct.unpack_from("<BxHI", hashed, place)
+        place += 8
+        words = (length + 7) // 8
+        if tag == Tag.OBSERVATION and agent in last and len(last[agent]) == words:
+            bits = np.unpackbits(np.frombuffer(hashed, "u1", (words + 7) // 8, place))[:words].astype(bool)
+            place += (words + 7) // 8
+            values = last[agent].copy()
+            values[bits] = np.frombuffer(hashed, "<u8", bits.sum(), place)
+            place += 8 * bits.sum()
+        else:
+            values = np.frombuffer(hashed, "<u8", words, place)
+            place += 8 * words
+        if tag == Tag.OBSERVATION:
+            last[agent] = values
+        found.append(Record(tag, agent, values.tobytes()[:length]))
+    return found
+
+
+@given(rows, some.data())
+def test_every_observation_follows_from_what_a_digest_of_changes_covers(observations, data):
+    records = records_of(observations)
+    cuts = sorted(data.draw(some.lists(some.integers(0, len(records)), max_size=2)))
+    parts = [
+        b"".join(record.encode() for record in records[begin:end])
+        for begin, end in zip([0, *cuts], [*cuts, len(records)], strict=True)
+    ]
+    hashed = b"".join(map(bytes, _with_changes_only(parts, changes_of)))
+    assert read_back(hashed, records[0]) == records[1:]
+    expected = hashlib.blake2b(hashed, digest_size=16).hexdigest()
+    for core in (None, compiled):
+        assert digest_of(parts, of_changes=True, core=core) == expected
+
+
+def test_digest_of_a_recording_follows_its_prologue():
+    twice = [observed(0, 1.0, 2.0), step(0), observed(0, 1.0, 3.0), step(1)]
+    of_changes = dataclasses.replace(PROLOGUE, digest_of_changes=True)
+    for prologue in (PROLOGUE, of_changes):
+        records = [Record(Tag.PROLOGUE, 0, prologue.encode()), *START[1:], *twice]
+        encoded = [record.encode() for record in records]
+        digests = [digest_of(encoded, of_changes=changes) for changes in (False, True)]
+        assert (
+            Recording(records).digest == digests[prologue.digest_of_changes] != digests[not prologue.digest_of_changes]
+        )
+
+
+def test_a_digest_of_changes_covers_little_of_what_stays():
+    same = np.arange(2000.0)
+    records = records_of([(0, [(same + 0.5 * (same == number)).tobytes()]) for number in range(20)])
+    hashed = b"".join(map(bytes, _with_changes_only([record.encode() for record in records], changes_of)))
+    assert len(hashed) < 2000 * 8 + 20 * 500
 
 
 @pytest.mark.parametrize(
