@@ -31,8 +31,8 @@ from crashhunt.crashes import (
     with_judgement,
 )
 from crashhunt.replays import ReplayOptions, prepare, reruns_of
-from crashhunt.reruns import NotUnderstoodError, StoppedError
 from crashhunt.trial import Outcome
+from crashhunt.trial_reruns import NotUnderstoodError, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, Ending
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
-    from crashhunt.reruns import EndedRun, Reruns
     from crashhunt.trial import TrialResult
+    from crashhunt.trial_reruns import EndedRun, Reruns
 
 
 # The search for the last step from which a manoeuvre avoids a collision: which runs it asks for, and in what order.

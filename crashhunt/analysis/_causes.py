@@ -19,8 +19,8 @@ from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why, changes_of, partner, signature_of_fault
 from crashhunt.plans import read_settings
 from crashhunt.recording import has_same_scenes, read_lanes
-from crashhunt.reruns import StoppedError
 from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled
+from crashhunt.trial_reruns import StoppedError
 from crashhunt.world import first_contact
 
 if TYPE_CHECKING:
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Without
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
-    from crashhunt.reruns import EndedRun, Reruns
     from crashhunt.trial import Distribution, TrialResult, TrialSpec, Value
+    from crashhunt.trial_reruns import EndedRun, Reruns
     from crashhunt.world import Scene
 
 

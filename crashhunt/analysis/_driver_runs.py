@@ -31,8 +31,8 @@ from crashhunt.crashes import (
     visible_from,
 )
 from crashhunt.replays import ReplayOptions, prepare, reruns_of
-from crashhunt.reruns import StoppedError
 from crashhunt.trial import Outcome, Overruled
+from crashhunt.trial_reruns import StoppedError
 from crashhunt.world import is_person
 
 if TYPE_CHECKING:
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
-    from crashhunt.reruns import EndedRun
     from crashhunt.trial import TrialResult, TrialSpec
+    from crashhunt.trial_reruns import EndedRun
 
 PREVENTABILITY_RUNS = len(COMPETENT_DRIVERS)
 """The number of runs that the models need at most."""

@@ -18,8 +18,8 @@ from crashhunt.base.temporary import temporary_beside
 from crashhunt.crashes import Bundle, is_bundle_made_here, signature_of, write_bundle
 from crashhunt.plans import takes_of
 from crashhunt.replays import ReplayOptions, confirm, prepare
-from crashhunt.reruns import run_alone
 from crashhunt.trial import Outcome, Value
+from crashhunt.trial_reruns import run_alone
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -31,9 +31,9 @@ from crashhunt.crashes import (
 )
 from crashhunt.recording import has_same_scenes
 from crashhunt.replays import is_current_code, reruns_of
-from crashhunt.reruns import StoppedError
 from crashhunt.scenario import with_recorded_load_order
 from crashhunt.trial import Outcome, Overruled
+from crashhunt.trial_reruns import StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Without
     from crashhunt.replays import Rerun
-    from crashhunt.reruns import EndedRun, Reruns
     from crashhunt.trial import TrialResult, TrialSpec
+    from crashhunt.trial_reruns import EndedRun, Reruns
 
 _BEFORE_S = 10.0  # a period that ended longer before the crash has not led to it
 _EARLIER_S = (0.0, 0.5, 1.0)  # the reference driver takes over from these times before the period

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 from crashhunt.analysis._delta_debugging import as_type_of, fewest, plainest, with_argument
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.reruns import OutOfTimeError, StoppedError
 from crashhunt.trial import ALL_AGENTS, SENSOR_KINDS, with_fewer_points
+from crashhunt.trial_reruns import OutOfTimeError, StoppedError
 from crashhunt.world import paths_of
 
 if TYPE_CHECKING:

@@ -33,8 +33,8 @@ from crashhunt.base.text import format_percent
 from crashhunt.crashes import wilson
 from crashhunt.recording import first_divergence
 from crashhunt.replays import ReplayOptions, is_current_code, prepare, reruns_of, up_to
-from crashhunt.reruns import Budget, NotUnderstoodError, StoppedError
 from crashhunt.trial import ALL_AGENTS, Outcome, Reseeding
+from crashhunt.trial_reruns import Budget, NotUnderstoodError, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from crashhunt.base.progress import Watch
     from crashhunt.crashes import Bundle
     from crashhunt.replays import Code, Rerun
-    from crashhunt.reruns import EndedRun, Reruns
     from crashhunt.trial import TrialSpec
+    from crashhunt.trial_reruns import EndedRun, Reruns
 
 
 FUTURES = 50

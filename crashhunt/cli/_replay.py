@@ -362,7 +362,7 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
 def _replay_often(options: argparse.Namespace, chosen: ReplayOptions) -> int:
     """Replay one crash several times; after a Ctrl-C, report the replays that finished."""
     from crashhunt.base.signals import stop_requests
-    from crashhunt.reruns import StoppedError
+    from crashhunt.trial_reruns import StoppedError
 
     with opened_crash(options.directory, options.crash) as (bundle, archive), stop_requests() as stops:
         chosen = replace(chosen, look=_view_of(options, bundle))

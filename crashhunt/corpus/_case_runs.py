@@ -17,10 +17,10 @@ from crashhunt.corpus._cases import Case, Expectation, cases_of_type, read_case,
 from crashhunt.crashes import Bundle, is_bundle_trusted, refuse_untrusted, signature_of, snapshot_of, write_bundle
 from crashhunt.episode import WorkerSettings
 from crashhunt.plans import read_settings, with_settings, write_settings
-from crashhunt.reruns import StoppedError, call_in_threads, run_alone
 from crashhunt.scenario import load_order_change, with_recorded_load_order
 from crashhunt.snapshots import Snapshot, environment_changes, take_snapshot
 from crashhunt.trial import Outcome
+from crashhunt.trial_reruns import StoppedError, call_in_threads, run_alone
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from crashhunt.base.progress import Watch
     from crashhunt.crashes import Signature
     from crashhunt.plans import HuntSettings
-    from crashhunt.reruns import EndedRun
     from crashhunt.scenario import Scenario
+    from crashhunt.trial_reruns import EndedRun
 
 Got = Literal["still", "fixed", "changed", "cannot_run"]
 _HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)

@@ -62,7 +62,6 @@ if TYPE_CHECKING:
         danger_course as danger_course,
         last_escape as last_escape,
         most_dangerous as most_dangerous,
-        visible_from as visible_from,
     )
     from ._fault import (
         Fault as Fault,
@@ -70,6 +69,7 @@ if TYPE_CHECKING:
         stop_lines_of as stop_lines_of,
         yielding_actor as yielding_actor,
     )
+    from ._first_observed import visible_from as visible_from
     from ._judgement import (
         COMPETENT_DRIVERS as COMPETENT_DRIVERS,
         INTERRUPTED as INTERRUPTED,

@@ -2,13 +2,11 @@
 
 from crashhunt.guide._pages import (
     SECTIONS as SECTIONS,
-    FoundPage as FoundPage,
     Page as Page,
     completed as completed,
     find_page as find_page,
     for_terminal as for_terminal,
     list_pages as list_pages,
-    search_pages as search_pages,
 )
 from crashhunt.guide._reference import (
     describe_api as describe_api,
@@ -17,3 +15,4 @@ from crashhunt.guide._reference import (
     describe_keys as describe_keys,
     describe_modules as describe_modules,
 )
+from crashhunt.guide._search import FoundPage as FoundPage, search_pages as search_pages

@@ -34,7 +34,7 @@ from crashhunt.analysis import Counts, Shrunk
 from crashhunt.base.binaries import BinaryFacts
 from crashhunt.base.codec import JsonObject, Serializable, names_of_tuple, written_keys
 from crashhunt.base.json_types import ErrorData, Plain
-from crashhunt.base.program_messages import ProgramAnswer, ProgramRequest, RoadMapData
+from crashhunt.base.program_message_types import ProgramAnswer, ProgramRequest, RoadMapData
 from crashhunt.corpus import Bisected, CaseReport
 from crashhunt.crashes import COMPETENT_DRIVERS, CrashSummary, Fault, Group, Judgement, Note, TrustedOrigin
 from crashhunt.hunts import AuditReport, Checked, SignalList, StoppedBecause

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._disk_check import Checked as Checked, check as check, salvage as salvage
+    from ._disk_check import Checked as Checked, check as check
     from ._hunt import Hunt as Hunt
     from ._next_trials import (
         GREATEST_LAG as GREATEST_LAG,
@@ -21,5 +21,6 @@ if TYPE_CHECKING:
     )
     from ._progress import HuntStatus as HuntStatus, PhaseStatus as PhaseStatus, SearchStatus as SearchStatus
     from ._reports import AuditReport as AuditReport, HuntReport as HuntReport, StoppedBecause as StoppedBecause
+    from ._salvage import salvage as salvage
 
 offer_lazily(__name__)

@@ -17,9 +17,9 @@ from crashhunt.crashes import (
 )
 from crashhunt.executors import HasNodes
 from crashhunt.hunts._reports import kind_data
-from crashhunt.reruns import call_in_threads
 from crashhunt.results import CrashTally, Kinds, sums_of_branches, sums_of_probes
 from crashhunt.trial import Outcome
+from crashhunt.trial_reruns import call_in_threads
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence

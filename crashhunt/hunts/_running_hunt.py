@@ -24,7 +24,6 @@ from crashhunt.hunts._progress import PhaseClock, Progress, RemainingTime
 from crashhunt.hunts._reports import HuntReport
 from crashhunt.hunts._verification import Confirmation, TrialReruns, VerificationRuns, is_settled, keep_near_misses
 from crashhunt.plans import core_of, disturber_apart, sampler_of
-from crashhunt.reruns import SharedReruns
 from crashhunt.results import (
     HEARTBEAT_S,
     copies_to_come,
@@ -45,6 +44,7 @@ from crashhunt.statistics import (
 )
 from crashhunt.training import held_out_traffics
 from crashhunt.trial import Outcome
+from crashhunt.trial_reruns import SharedReruns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -18,9 +18,9 @@ from crashhunt.crashes import changing, is_bundle_made_here, is_snapshot_trusted
 from crashhunt.executors import PoolExecutor
 from crashhunt.hunts._hunt_setup import settings_again
 from crashhunt.replays import ReplayOptions, confirm
-from crashhunt.reruns import Reruns, StoppedError
 from crashhunt.results import Judged
 from crashhunt.snapshots import Snapshot
+from crashhunt.trial_reruns import Reruns, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from crashhunt.hunts._hunt_setup import HuntSetup
     from crashhunt.hunts._progress import PhaseClock, PhaseName, Progress
     from crashhunt.ledger import Ledger
-    from crashhunt.reruns import EndedRun, SharedReruns
     from crashhunt.trial import TrialResult, TrialSpec
+    from crashhunt.trial_reruns import EndedRun, SharedReruns
 
 
 class Confirmation:

@@ -15,10 +15,10 @@ from crashhunt.crashes import is_bundle_trusted, refuse_side_effects, refuse_unt
 from crashhunt.episode import WorkerSettings
 from crashhunt.plans import read_settings, with_settings
 from crashhunt.replays._edits import edited_spec
-from crashhunt.reruns import Reruns
 from crashhunt.scenario import argument_values, load_order_change, load_scenario, with_recorded_load_order
 from crashhunt.snapshots import Snapshot, code_differences, environment_changes, processor, program_warnings
 from crashhunt.trial import SENSOR_KINDS
+from crashhunt.trial_reruns import Reruns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import Recording
-    from crashhunt.reruns import Where
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialSpec, Value
+    from crashhunt.trial_reruns import Where
 
 
 Code = Literal["snapshot", "current", "log"]

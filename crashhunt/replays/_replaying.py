@@ -12,10 +12,10 @@ from crashhunt.base.errors import CrashhuntError, UntrustedError, UsageError
 from crashhunt.crashes import with_lights
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, values_around
 from crashhunt.replays._prepare import ReplayOptions, Rerun, prepare
-from crashhunt.reruns import StoppedError, run_alone
 from crashhunt.scenario import load_order_change
 from crashhunt.snapshots import environment_changes
 from crashhunt.trial import Outcome, TrialResult
+from crashhunt.trial_reruns import StoppedError, run_alone
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.recording import AgentChannel, Prologue
     from crashhunt.replays._prepare import Code, Look
-    from crashhunt.reruns import SharedReruns
+    from crashhunt.trial_reruns import SharedReruns
 
 
 # Whether a replay is the same as what was recorded, and where it first is not.

@@ -30,6 +30,13 @@ if TYPE_CHECKING:
         list_requirements as list_requirements,
         list_scenarios as list_scenarios,
     )
+    from ._live_screen import (
+        Watcher as Watcher,
+        describe_phase as describe_phase,
+        describe_types as describe_types,
+        format_pace as format_pace,
+        format_seconds as format_seconds,
+    )
     from ._page import (
         GOLDEN_RATIO as GOLDEN_RATIO,
         UNCHOSEN as UNCHOSEN,
@@ -51,13 +58,6 @@ if TYPE_CHECKING:
         describe_scorecard as describe_scorecard,
         scorecard_page as scorecard_page,
         scorecard_table as scorecard_table,
-    )
-    from ._status_screen import (
-        Watcher as Watcher,
-        describe_phase as describe_phase,
-        describe_types as describe_types,
-        format_pace as format_pace,
-        format_seconds as format_seconds,
     )
     from ._step_table import (
         argument_units as argument_units,

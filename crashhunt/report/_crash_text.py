@@ -23,9 +23,9 @@ from crashhunt.crashes import (
     subject_of,
 )
 from crashhunt.recording import describe_value, is_opaque
-from crashhunt.report._status_screen import draw_signals, format_inputs, input_signals
+from crashhunt.report._headline import verdict_of
+from crashhunt.report._live_screen import draw_signals, format_inputs, input_signals
 from crashhunt.report._step_table import NEAREST, stacked, steps_table
-from crashhunt.report._verdict import verdict_of
 from crashhunt.report._words import (
     COLUMNS,
     MAX_STANDING_SPEED_MPS,

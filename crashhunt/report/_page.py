@@ -24,11 +24,11 @@ from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import is_opaque, read_lanes, read_obstacles
 from crashhunt.report._crash_text import Story
+from crashhunt.report._headline import last_avoidable, verdict_of
+from crashhunt.report._live_screen import format_arguments
 from crashhunt.report._player_layers import packed_floats, player_layers
 from crashhunt.report._rate_text import describe_running
-from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._step_table import argument_units
-from crashhunt.report._verdict import last_avoidable, verdict_of
 from crashhunt.report._words import (
     NOT_DECIDED,
     by_likelihood,

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.text import aligned, command_line, count_of, in_lines, out_of
 from crashhunt.crashes import count_causes, join_causes
+from crashhunt.report._live_screen import describe_types, format_arguments, format_inputs, format_seconds
 from crashhunt.report._rate_text import describe_rates
-from crashhunt.report._status_screen import describe_types, format_arguments, format_inputs, format_seconds
 from crashhunt.report._words import (
     by_likelihood,
     describe_branches,

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gymnasium import spaces
     from numpy.typing import NDArray
 
-    from crashhunt.base.program_messages import SpaceDescription
+    from crashhunt.base.program_message_types import SpaceDescription
     from crashhunt.scenario import AgentSetup
     from crashhunt.simulators._observation_parts import Part
 

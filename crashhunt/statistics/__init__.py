@@ -12,6 +12,7 @@ if TYPE_CHECKING:
         compare as compare,
         held_out_by_seed as held_out_by_seed,
     )
+    from ._gate_verdict import PairVerdict as PairVerdict, PairWatch as PairWatch
     from ._hunt_pairs import GateCase as GateCase, GateReport as GateReport, PairedHunts as PairedHunts
     from ._hunt_rate import (
         counts_suffice as counts_suffice,
@@ -19,12 +20,7 @@ if TYPE_CHECKING:
         rate_of_counts as rate_of_counts,
         rate_of_trials as rate_of_trials,
     )
-    from ._paired_test import (
-        PairTest as PairTest,
-        PairVerdict as PairVerdict,
-        PairWatch as PairWatch,
-        SideCounts as SideCounts,
-    )
+    from ._paired_test import PairTest as PairTest, SideCounts as SideCounts
     from ._rare import (
         BLOCK as BLOCK,
         TRIALS_PER_ROOT as TRIALS_PER_ROOT,
@@ -48,6 +44,11 @@ if TYPE_CHECKING:
         refuse_training_traffic as refuse_training_traffic,
     )
     from ._rate_report import CrashRate as CrashRate, RatePart as RatePart, check_confidence as check_confidence
-    from ._units import PER_WORDS as PER_WORDS, CountingRule as CountingRule, Per as Per, TrialFacts as TrialFacts
+    from ._units_and_exposure import (
+        PER_WORDS as PER_WORDS,
+        CountingRule as CountingRule,
+        Per as Per,
+        TrialFacts as TrialFacts,
+    )
 
 offer_lazily(__name__)

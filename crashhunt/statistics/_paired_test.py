@@ -48,17 +48,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from crashhunt.statistics._anytime_interval import Interval, log_of_sum
-from crashhunt.statistics._units import has_too_many_invalid, why_too_many_invalid
+from crashhunt.statistics._units_and_exposure import has_too_many_invalid, why_too_many_invalid
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
-    from crashhunt.statistics._units import CountingRule, TrialFacts
-
-PairVerdict = Literal["better", "worse", "no_difference", "undecided"]
-"""The verdict of pairs on the second agent, compared with the first."""
+    from crashhunt.statistics._units_and_exposure import CountingRule, TrialFacts
 
 _NODES = 256  # of the shares from 0 to 1; the mixture is exact up to 1,023 discordant pairs
 _BIASED_SHARE = 0.5  # 2 q - 1 for a coin with q = 3/4
@@ -353,45 +350,3 @@ def _reason_of(trial: TrialFacts) -> str:
         return failure.message
     place = f" ({failure.agent or failure.party}, {failure.place})" if failure.place else ""
     return f"{failure.kind}: {failure.message}{place}"
-
-
-class PairWatch:
-    """Watches two agents until one agent certainly fails more often, or both certainly fail about equally often.
-
-    The pairs are evaluated in order, one after another. After a decision, later pairs do not count, so the verdict does
-    not depend on the number of workers. The probability of each wrong verdict is at most `alpha`: *better* or *worse*
-    if both agents fail equally often, and *no difference* if the difference is above the margin.
-
-    Args:
-        margin: the greatest difference in failures per trial that counts as no difference; 0 to disable this verdict.
-        alpha: maximum probability of a wrong verdict.
-        rounds: number of trials in each pair.
-    """
-
-    def __init__(self, margin: float, alpha: float = 0.05, rounds: int = 1) -> None:
-        self.margin, self.alpha = margin, alpha
-        self.test = PairTest(rounds)
-        self.verdict: PairVerdict = "undecided"
-
-    def add(self, pairs: Sequence[Pair] | Iterator[Pair], *, may_end: bool = True) -> None:
-        """Add pairs in their order until a pair decides.
-
-        Args:
-            pairs: the pairs, in the order of their numbers.
-            may_end: whether the verdicts *better* and *no difference* are allowed yet; *worse* is always allowed.
-        """
-        for pair in pairs:
-            if self.verdict != "undecided":
-                return
-            self.test.add(pair)
-            self.decide(may_end=may_end)
-
-    def decide(self, *, may_end: bool = True) -> PairVerdict:
-        """Return the verdict on the pairs that were added; the first verdict is final."""
-        if self.verdict == "undecided":
-            worse = self.test.verdict(self.alpha)
-            if worse == "second" or (worse and may_end):
-                self.verdict = "worse" if worse == "second" else "better"
-            elif not worse and may_end and self.margin and self.test.is_within(self.margin, self.alpha):
-                self.verdict = "no_difference"
-        return self.verdict

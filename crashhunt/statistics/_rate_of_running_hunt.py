@@ -18,7 +18,7 @@ from crashhunt.plans import rate_of, share_of
 from crashhunt.results import CodeVersions
 from crashhunt.statistics._rare import BLOCK, TRIALS_PER_ROOT, RareCounter, is_root, learn_forcing, root_of, with_plain
 from crashhunt.statistics._rate_report import make_rate
-from crashhunt.statistics._units import (
+from crashhunt.statistics._units_and_exposure import (
     MAX_INVALID_SHARE,
     CountingRule,
     RateCounter,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from crashhunt.statistics._anytime_interval import Interval, RateTest
     from crashhunt.statistics._rare import RareEstimate
     from crashhunt.statistics._rate_report import CrashRate
-    from crashhunt.statistics._units import Per, Unit
+    from crashhunt.statistics._units_and_exposure import Per, Unit
     from crashhunt.training import HeldOutTraffics
     from crashhunt.trial import Forced, ForcedCopy, TrialResult
 

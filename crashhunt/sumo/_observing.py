@@ -29,10 +29,8 @@ from crashhunt.sumo._road_readers import (
     RightOfWayReader,
     RouteReader,
     RouteStateReader,
-    SignalsReader,
     SpeedLimitReader,
     StopLineReader,
-    SwitchTimesReader,
 )
 from crashhunt.sumo._scene_readers import (
     ActorIdsReader,
@@ -42,6 +40,7 @@ from crashhunt.sumo._scene_readers import (
     PredictionsReader,
     RangesReader,
 )
+from crashhunt.sumo._signal_readers import SignalsReader, SwitchTimesReader
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from libsumo import _libsumo as sumo
 
 from crashhunt.sumo._bent_vehicles import Bends, height_at, is_articulated
-from crashhunt.world import PERSON, Actor, Contact, Roster, Scene
+from crashhunt.sumo._reported_collisions import ReportedCollisions
+from crashhunt.world import PERSON, Actor, Roster, Scene
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,8 +41,6 @@ _HEIGHT_EVERY_M = 20.0  # distance between the points of a lane at which heights
 _FLAT_M = 0.5  # a map with smaller height differences has no bridges and is treated as flat
 _NO_VALUE = -1073741824.0  # of SUMO's getters, as in `libsumo.INVALID_DOUBLE_VALUE`
 _PARKED_BIT = 2  # of SUMO's stop state: the vehicle is next to the road, and off its lane
-_PERSON_LANE_TYPES = frozenset({"sharedLane", "junctionPedestrian", "crossing", "walkingarea"})
-"""SUMO's collision types with a person as victim; a person may have the same id as a vehicle."""
 
 
 class Sight:
@@ -93,7 +92,7 @@ class Sight:
         self._articulated: set[str] = set()
         self._bends.reset()
         self._speeds.clear()
-        self._touched: set[tuple[str, str]] = set()
+        self._collisions = ReportedCollisions()
         self._unparking: frozenset[str] = frozenset()
         self._see((), ())
         self._all_persons: tuple[str, ...] = ()
@@ -127,7 +126,7 @@ class Sight:
             self.look_around()
         self._update_parked()
         ids, persons = self._ids, self._persons
-        contacts = self._contacts()
+        contacts = self._collisions.read(persons=bool(self._persons_count))
         lanes = ()
         if steps % LOOK_AROUND_INTERVAL_STEPS == 0 or contacts or off_road:
             lanes = tuple(map(sumo.vehicle_getLaneID, ids))
@@ -306,30 +305,6 @@ class Sight:
             size = sumo.person_getLength(person), sumo.person_getWidth(person), height
             found = self._known[name] = Actor(name, kind, *size)
         return found
-
-    def _contacts(self) -> tuple[Contact, ...]:
-        """Return the collisions that began in this step; SUMO reports a collision in every step while it lasts."""
-        found = []
-        for collision in sumo.simulation_getCollisions():
-            victim = collision.victim
-            if collision.type in _PERSON_LANE_TYPES:
-                if not self._persons_count:
-                    continue
-                victim = PERSON + victim
-            pair = (collision.collider, victim)
-            if pair not in self._touched:
-                self._touched.add(pair)
-                found.append(
-                    Contact(
-                        collider=collision.collider,
-                        victim=victim,
-                        kind=collision.type,
-                        lane=collision.lane,
-                        collider_speed=collision.colliderSpeed,
-                        victim_speed=collision.victimSpeed,
-                    )
-                )
-        return tuple(found)
 
     def _is_high(self) -> bool:
         """Return whether heights in the network differ by more than `_FLAT_M`."""

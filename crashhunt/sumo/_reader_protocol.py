@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from crashhunt.sumo._lane_paths import NearLanesOf
     from crashhunt.world import RoadMap, Scene
 
+NEVER_S = 1000.0
+"""The time of what does not happen: an actor that stands does not arrive, and a light does not switch."""
+
 NO_VALUE = -1073741824.0
 """The value of SUMO's getters without a value, as in `libsumo.INVALID_DOUBLE_VALUE`."""
 
@@ -220,3 +223,21 @@ class Reader:
     def write(self, draft: Draft, place: int, moment: Moment) -> None:
         """Write the same values into a draft of the compiled core, which replaces a call of `observe`."""
         draft.put_array(place, self.observe(moment).astype(np.float64, copy=False))
+
+
+class RowsReader(Reader):
+    """Reads a part as rows of numbers; the rows after the last one are 0."""
+
+    def observe(self, moment: Moment) -> NDArray[np.float64]:
+        """Return the columns of the part."""
+        found = np.zeros(self._setup.shape)
+        for number, values in enumerate(self._rows(moment)):
+            found[number] = values
+        return found
+
+    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+        """Write the columns of the part."""
+        draft.put(at, tuple([value for row in self._rows(moment) for value in row]))
+
+    def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
+        raise NotImplementedError

@@ -41,7 +41,7 @@ from crashhunt.sumo._followers import Followers
 from crashhunt.sumo._free_motion import obstacle_outlines
 from crashhunt.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
 from crashhunt.sumo._lane_graph import USUAL_CLASS
-from crashhunt.sumo._lights import LightReader
+from crashhunt.sumo._lights_for_pictures import LightReader
 from crashhunt.sumo._loading import VERSION, Loading, keep_xml_ready
 from crashhunt.sumo._observing import ObservedParts
 from crashhunt.sumo._omitted_demand import OmittedDemand

@@ -10,8 +10,8 @@ from crashhunt.base.foreign_code import supports
 from crashhunt.crashes import partner
 from crashhunt.recording import read_log
 from crashhunt.replays import ReplayOptions, prepare
-from crashhunt.reruns import run_alone
 from crashhunt.simulators import NamesMetaActions
+from crashhunt.trial_reruns import run_alone
 
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle

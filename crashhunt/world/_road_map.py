@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.base.program_messages import RoadMapData
+    from crashhunt.base.program_message_types import RoadMapData
 
     Line = NDArray[np.float64]
 

@@ -356,7 +356,7 @@ def test_a_fork_whose_program_answers_otherwise_ends_without_an_answer(tmp_path)
 
 
 def test_a_process_cannot_be_forked_if_its_program_has_seen_too_much(tmp_path, planner, monkeypatch):
-    monkeypatch.setattr("crashhunt.agents._programs._MAX_REPEATED_BYTES", 2_000)
+    monkeypatch.setattr("crashhunt.agents._program_exchange._MAX_REPEATED_BYTES", 2_000)
     agent = agent_of(f"exec:{planner}", tmp_path, is_forked=True)
     known = replace(forks.held(), threads=forks.threads())
     agent.reset(1)

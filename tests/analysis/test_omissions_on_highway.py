@@ -17,9 +17,9 @@ from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.oracles import OffRoad, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.report._words import about_reference
-from crashhunt.reruns import EndedRun
 from crashhunt.scenario import AgentSetup, ObservationSetup, Scenario
 from crashhunt.trial import Outcome, Overruled, TrialSpec
+from crashhunt.trial_reruns import EndedRun
 from crashhunt.world import Motion
 
 CONFIG = {"simulation_frequency": 15, "policy_frequency": 5, "vehicles_count": 1, "lanes_count": 3, "duration": 999}

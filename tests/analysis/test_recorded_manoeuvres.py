@@ -14,8 +14,8 @@ from crashhunt.analysis import _causes, _omissions
 from crashhunt.analysis._causes import Manoeuvre, find_why, lanes_around_crash, manoeuvres_of, relevant_actors
 from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why
-from crashhunt.reruns import StoppedError
 from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled, Range, TrialSpec
+from crashhunt.trial_reruns import StoppedError
 from crashhunt.world import Actor, Roster, Scene
 
 DT = 0.1

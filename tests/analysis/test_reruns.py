@@ -9,8 +9,8 @@ import pytest
 
 from crashhunt.analysis import SetArguments, WhatIfOptions, _whatif_runs as _engine, what_if
 from crashhunt.base.errors import UsageError, WorkerError
-from crashhunt.reruns import NotUnderstoodError, _require_same_trial
 from crashhunt.trial import Disturbance, Overruled, TrialSpec
+from crashhunt.trial_reruns import NotUnderstoodError, _require_same_trial
 
 SPEC = TrialSpec(1, 2, {"ego": {"speed": 3.0}}, {}, 9)
 

@@ -8,13 +8,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt import reruns
+from crashhunt import trial_reruns
 from crashhunt.analysis import _shrink_runs as _runs
 from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError
 from crashhunt.crashes import Bundle, Signature, signature_of
 from crashhunt.replays import _prepare
-from crashhunt.reruns import EndedRun, OutOfTimeError, StoppedError
 from crashhunt.trial import ALL_AGENTS, Collision, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial_reruns import EndedRun, OutOfTimeError, StoppedError
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Refuses:
 
 
 def test_an_older_crashhunt_that_refuses_to_leave_others_out_has_no_one_excluded(tmp_path, monkeypatch):
-    monkeypatch.setattr(reruns, "PoolExecutor", Refuses)
+    monkeypatch.setattr(trial_reruns, "PoolExecutor", Refuses)
     rerun = SimpleNamespace(worker=Worker(), bundle=SimpleNamespace(result=SimpleNamespace(steps_begun=9)))
     words = {"parallel": 1, "budget": 9, "time_s": None, "stopped": lambda: False, "watch": None}
     runs = _runs.Runs(rerun, None, tmp_path / "memory", **words)
@@ -110,7 +110,7 @@ def candidate(same, steps=5, name=0):
 @pytest.fixture
 def make_runs(tmp_path, monkeypatch):
     """Makes runs of a crash of 20 steps; the memory of what came of candidates is a file."""
-    monkeypatch.setattr(reruns, "PoolExecutor", Instant)
+    monkeypatch.setattr(trial_reruns, "PoolExecutor", Instant)
     monkeypatch.setattr(_prepare, "is_current_code", lambda rerun: True)
     monkeypatch.setattr(Instant, "made", ())
     result = TrialResult(candidate("yes", 20), Outcome.AGENT_ERROR, steps=20, failure=FAILED, digest="f" * 32)
@@ -203,8 +203,8 @@ def test_who_enters_is_what_the_same_trial_has_written(make_runs, tmp_path, monk
     folder = tmp_path / "entered"
     folder.mkdir()
     (folder / "entered.json").write_text('["a", "b", "a"]')
-    monkeypatch.setattr(reruns, "scratch_of", lambda scratch, number: folder)
-    monkeypatch.setattr(reruns.layout, "ENTERED", "entered.json")
+    monkeypatch.setattr(trial_reruns, "scratch_of", lambda scratch, number: folder)
+    monkeypatch.setattr(trial_reruns.layout, "ENTERED", "entered.json")
     result = runs._rerun.bundle.result
     runs._rerun = SimpleNamespace(bundle=SimpleNamespace(result=replace(result, digest=digest)))
     everybody = replace(candidate("yes", 4), only=(ALL_AGENTS,))
@@ -267,7 +267,7 @@ def test_bundle_that_is_made_for_its_signature_is_removed(make_runs, tmp_path, m
         return "bundle"
 
     monkeypatch.setattr(_runs, "write_bundle", write_bundle)
-    monkeypatch.setattr(reruns, "read_map", lambda scratch, folder: None)
+    monkeypatch.setattr(trial_reruns, "read_map", lambda scratch, folder: None)
     monkeypatch.setattr(_runs, "signature_of", lambda bundle: f"of {bundle}")
     assert runs._signature_of(EndedRun(0, result, None, folder)) == (None if fails else "of bundle")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["trial"]

@@ -12,8 +12,8 @@ from crashhunt.analysis import _shrink_stages as _stages, fewest
 from crashhunt.analysis._delta_debugging import plainest
 from crashhunt.analysis._shrink_stages import Minimizer, Part
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.reruns import OutOfTimeError, StoppedError
 from crashhunt.trial import ALL_AGENTS, Disturbance, Escape, TrialSpec
+from crashhunt.trial_reruns import OutOfTimeError, StoppedError
 from crashhunt.world import Actor, Roster, Scene
 
 

@@ -18,8 +18,8 @@ from crashhunt.crashes import Cause, TrustedOrigin
 from crashhunt.errors import BundleError, HuntDirectoryError, UsageError
 from crashhunt.render import FilmOptions
 from crashhunt.replays import ReplayOptions
-from crashhunt.reruns import StoppedError
 from crashhunt.trial import Outcome
+from crashhunt.trial_reruns import StoppedError
 
 
 def run(*words):

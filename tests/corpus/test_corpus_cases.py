@@ -24,8 +24,8 @@ from crashhunt.corpus import (
 )
 from crashhunt.corpus._cases import cases_of_type
 from crashhunt.crashes import Cause, Judgement, Signature, judgement_of, with_judgement
-from crashhunt.reruns import EndedRun, StoppedError
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.trial_reruns import EndedRun, StoppedError
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "case"
 

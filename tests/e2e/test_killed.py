@@ -34,7 +34,7 @@ from crashhunt.hunts import Hunt, check, salvage
 from crashhunt.ledger import Ledger
 from crashhunt.plans import Request, plan
 from crashhunt.results import hunt_state
-from crashhunt.suites import _processes, _rerun
+from crashhunt.suites import _hunt_reruns, _processes
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="owners are known by /proc")
 
@@ -204,10 +204,10 @@ def test_salvage_refuses_a_directory_with_anything_else(damaged):
 def test_rerun_to_that_was_killed_before_it_ran_continues(damaged, monkeypatch):
     hunt, to = damaged.folder / "h", damaged.folder / "to"
     ran: list[Path] = []
-    monkeypatch.setattr(_rerun, "run_all", lambda folders, *_, **__: ran.extend(folders))
+    monkeypatch.setattr(_hunt_reruns, "run_all", lambda folders, *_, **__: ran.extend(folders))
 
     def again(**options):
-        return _rerun.rerun([hunt], to=to, trusted=True, **{"changes": {"seed": "7"}, **options})
+        return _hunt_reruns.rerun([hunt], to=to, trusted=True, **{"changes": {"seed": "7"}, **options})
 
     killed(again, NEVER)
     request = json.loads((to / "request.json").read_text())
@@ -230,11 +230,11 @@ def test_rerun_to_that_was_killed_before_it_ran_continues(damaged, monkeypatch):
             again(**options)
     with monkeypatch.context() as patched:
         for state, says in (("running", "the hunt is running"), ("error", "ended in an error")):
-            patched.setattr(_rerun, "hunt_state", lambda _, state=state: SimpleNamespace(state=state))
+            patched.setattr(_hunt_reruns, "hunt_state", lambda _, state=state: SimpleNamespace(state=state))
             with pytest.raises(HuntDirectoryError, match=says):
                 again()
         for state, resumes in (("finished", False), ("crashed", False), ("killed", True), ("interrupted", True)):
-            patched.setattr(_rerun, "hunt_state", lambda _, state=state: SimpleNamespace(state=state))
+            patched.setattr(_hunt_reruns, "hunt_state", lambda _, state=state: SimpleNamespace(state=state))
             ran.clear()
             again()
             assert bool(ran) == resumes, state
@@ -245,7 +245,7 @@ def test_rerun_to_that_was_killed_before_it_ran_continues(damaged, monkeypatch):
     assert ran == [to]
     (damaged.folder / "file").touch()
     with pytest.raises(HuntDirectoryError, match="exists already"):
-        _rerun.rerun([hunt], to=damaged.folder / "file", trusted=True)
+        _hunt_reruns.rerun([hunt], to=damaged.folder / "file", trusted=True)
 
 
 @pytest.mark.parametrize("exchanges", [True, pytest.param(False, marks=pytest.mark.nightly)])
@@ -254,7 +254,7 @@ def test_a_rerun_that_was_killed_while_it_sets_a_hunt_aside_loses_nothing(damage
     if not exchanges:  # as on some network file systems
         monkeypatch.setattr(_processes, "exchange", lambda *_: False)
         monkeypatch.setattr("crashhunt.base.files.exchange", lambda *_: False)
-    request = _rerun._request(hunt)
+    request = _hunt_reruns._request(hunt)
     before, aside = content(hunt), hunt.with_name("h.replaced-0")
     copy = damaged.folder / "copy"
     shutil.copytree(hunt, copy)

@@ -36,13 +36,13 @@ from crashhunt.hunts._running_hunt import RunningHunt, TrialLoop
 from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReruns, is_settled
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
-from crashhunt.reruns import EndedRun, StoppedError
 from crashhunt.results import _hunt_results as _results, _log_reader
 from crashhunt.results._hunt_directory import HuntDirectory
 from crashhunt.results._log_reader import LogReader
 from crashhunt.statistics import TRIALS_PER_ROOT, RareEstimate, _rate_of_running_hunt, rate_of_bar
 from crashhunt.statistics._rare import Estimated
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.trial_reruns import EndedRun, StoppedError
 
 SETTINGS = HuntSettings(
     scenario="toy", scenario_digest="0", trials=9, max_steps=20, seed=3, run=RunSettings(parallel=2)
@@ -724,7 +724,7 @@ def test_trials_run_again_with_the_code_that_they_ran_with(tmp_path, monkeypatch
     (note,) = again.progress.notes
     assert note.startswith("1 trials for near did not run again: nothing proves that you took the snapshot 99 ")
     written = []
-    monkeypatch.setattr("crashhunt.reruns.read_map", lambda folder, trial: (folder, trial.name))
+    monkeypatch.setattr("crashhunt.trial_reruns.read_map", lambda folder, trial: (folder, trial.name))
     monkeypatch.setattr(_verification, "write_bundle", lambda *given, **more: written.append((given, more)) or "bundle")
     assert found[0].write(result(1), confirmed=True) == "bundle"
     (((where, what, trial), more),) = written

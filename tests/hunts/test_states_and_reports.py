@@ -353,7 +353,7 @@ def test_salvage_refuses_a_directory_that_has_something_and_names_what_cannot_be
     def fail(*_):
         raise shutil.Error([("source", "copy", "[Errno 5] Input/output error")])
 
-    monkeypatch.setattr("crashhunt.hunts._disk_check.shutil.copytree", fail)
+    monkeypatch.setattr("crashhunt.hunts._salvage.shutil.copytree", fail)
     with pytest.raises(HuntDirectoryError, match=r"cannot be written: \[Errno 5\] Input/output error"):
         salvage(checked, tmp_path / "s")
     assert not (tmp_path / "s").exists()

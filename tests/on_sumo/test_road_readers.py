@@ -15,7 +15,7 @@ libsumo = pytest.importorskip("libsumo")
 sumolib = pytest.importorskip("sumolib")
 
 from crashhunt.simulators import parse_parts  # noqa: E402
-from crashhunt.sumo import _road_readers as readers  # noqa: E402
+from crashhunt.sumo import _road_readers as readers, _signal_readers  # noqa: E402
 from crashhunt.sumo._conflicts import Conflicts  # noqa: E402
 from crashhunt.sumo._lane_graph import LaneGraph  # noqa: E402
 from crashhunt.sumo._reader_protocol import Moment, Places, ReaderSetup  # noqa: E402
@@ -41,11 +41,11 @@ READERS = {
     "lanes": readers.LanesReader,
     "route": readers.RouteReader,
     "route_state": readers.RouteStateReader,
-    "signals": readers.SignalsReader,
+    "signals": _signal_readers.SignalsReader,
     "right_of_way": readers.RightOfWayReader,
     "speed_limit": readers.SpeedLimitReader,
     "stop_line": readers.StopLineReader,
-    "time_to_switch": readers.SwitchTimesReader,
+    "time_to_switch": _signal_readers.SwitchTimesReader,
 }
 
 

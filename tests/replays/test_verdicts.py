@@ -10,8 +10,8 @@ import pytest
 from crashhunt.base.errors import CrashhuntError, UntrustedError, UsageError
 from crashhunt.recording import AgentChannel, Divergence, Prologue, Tag
 from crashhunt.replays import Look, ReplayOptions, ReplayReport, _debugger, _replaying as _replay
-from crashhunt.reruns import EndedRun, StoppedError
 from crashhunt.trial import KILLED, Collision, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial_reruns import EndedRun, StoppedError
 
 EGO = AgentChannel("ego", "float32", (8, 7), "float64", (2,))
 PROLOGUE = Prologue((EGO,), 0.1)

@@ -16,7 +16,7 @@ from crashhunt.plans import HuntSettings, RunSettings
 from crashhunt.recording import Phase
 from crashhunt.report import describe_hunt, describe_replay, describe_versions
 from crashhunt.report._listing import describe
-from crashhunt.report._status_screen import _workers
+from crashhunt.report._live_screen import _workers
 from crashhunt.report._words import about_disturbances, about_events, fault_words
 from crashhunt.trial import Collision, Disturbance, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Event

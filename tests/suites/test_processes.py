@@ -18,7 +18,7 @@ from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.plans import Request, plan
 from crashhunt.results import hunt_state
-from crashhunt.suites import RunRequest, Suite, SuiteEntry, _processes, _rerun, rerun
+from crashhunt.suites import RunRequest, Suite, SuiteEntry, _hunt_reruns, _processes, rerun
 from crashhunt.suites._processes import REQUEST, check_machine, run_all, set_aside, write_request
 
 ASKED = RunRequest(
@@ -246,7 +246,7 @@ def test_the_request_of_settings_results_in_the_same_settings():
                     keep_going=True)  # fmt: skip
     scenario, settings = plan(given)
     assert [*scenario.agents] == ["ego"]
-    again = _rerun._request_of(settings)
+    again = _hunt_reruns._request_of(settings)
     assert (again.trials, again.max_steps, again.seed, again.sampler, again.disturb) == (
         7,
         9,
@@ -260,7 +260,7 @@ def test_the_request_of_settings_results_in_the_same_settings():
         (("meta", "trajectory:visible=whole"), ""),
     ):  # fmt: skip
         agents = {name: replace(settings.agents["ego"], action=one) for name, one in zip("ab", actions, strict=True)}
-        assert _rerun._request_of(replace(settings, agents=agents)).action == asked
+        assert _hunt_reruns._request_of(replace(settings, agents=agents)).action == asked
 
 
 @pytest.mark.parametrize(

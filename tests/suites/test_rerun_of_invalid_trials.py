@@ -11,7 +11,7 @@ from crashhunt.base import layout
 from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings, RunSettings, write_settings
 from crashhunt.results import HuntState
-from crashhunt.suites._rerun import _replace_invalid
+from crashhunt.suites._hunt_reruns import _replace_invalid
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
 

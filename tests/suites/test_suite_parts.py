@@ -18,7 +18,7 @@ from crashhunt.base.errors import BusyError, HuntDirectoryError, UntrustedError,
 from crashhunt.plans import AgentSettings, HuntSettings, Request, RunSettings, read_settings, write_settings
 from crashhunt.results import hunt_state
 from crashhunt.scenario import shipped_scenarios
-from crashhunt.suites import RunRequest, Suite, SuiteEntry, _processes, _rerun, _suite_file as _suite, rerun
+from crashhunt.suites import RunRequest, Suite, SuiteEntry, _hunt_reruns, _processes, _suite_file as _suite, rerun
 from crashhunt.suites._processes import REQUEST, refuse_untrusted_hunt, slots_of, trust_hunt, write_request
 
 ASKED = RunRequest(
@@ -186,12 +186,12 @@ def test_trust_in_a_hunt_is_in_all_its_code(hunt, monkeypatch, tmp_path):
 
 
 def test_running_hunt_is_not_run_again(hunt, monkeypatch):
-    monkeypatch.setattr(_rerun, "hunt_state", lambda folder: SimpleNamespace(state="running"))
+    monkeypatch.setattr(_hunt_reruns, "hunt_state", lambda folder: SimpleNamespace(state="running"))
     with pytest.raises(HuntDirectoryError) as caught:
         rerun([hunt], trusted=True)
     assert caught.value.where == str(hunt)
     checked = []
-    monkeypatch.setattr(_rerun, "refuse_untrusted_hunt", checked.append)
+    monkeypatch.setattr(_hunt_reruns, "refuse_untrusted_hunt", checked.append)
     with pytest.raises(HuntDirectoryError):
         rerun([hunt])
     assert checked == [hunt]
@@ -208,16 +208,18 @@ def test_running_hunt_is_not_run_again(hunt, monkeypatch):
 def test_hunts_run_again_by_their_state(hunt, monkeypatch, state, failed, invalid, everything, expected):
     found = SimpleNamespace(state=state, failed=failed)
     ran, aside, seen = [], [], []
-    monkeypatch.setattr(_rerun, "hunt_state", lambda folder: found)
-    monkeypatch.setattr(_rerun, "_replace_invalid", lambda folder, given: invalid)
-    monkeypatch.setattr(_rerun, "set_aside", lambda folder, planned: aside.append(planned(folder / "x")) or "aside")
+    monkeypatch.setattr(_hunt_reruns, "hunt_state", lambda folder: found)
+    monkeypatch.setattr(_hunt_reruns, "_replace_invalid", lambda folder, given: invalid)
+    monkeypatch.setattr(
+        _hunt_reruns, "set_aside", lambda folder, planned: aside.append(planned(folder / "x")) or "aside"
+    )
 
     def run(folders, parallel, *, watch, machine):
         ran.append((folders, parallel, machine))
         if watch:
             watch()
 
-    monkeypatch.setattr(_rerun, "run_all", run)
+    monkeypatch.setattr(_hunt_reruns, "run_all", run)
     written = (hunt / REQUEST).stat().st_ino
     states, replaced = rerun(
         [hunt], everything=everything, trusted=True, parallel=2, watch=seen.append, machine={"executor": "fresh"}
@@ -231,38 +233,38 @@ def test_hunts_run_again_by_their_state(hunt, monkeypatch, state, failed, invali
 
 
 def test_request_of_a_hunt_without_one_is_that_of_its_settings(hunt, monkeypatch, tmp_path):
-    assert _rerun._request(hunt) == ASKED
+    assert _hunt_reruns._request(hunt) == ASKED
     (hunt / REQUEST).unlink()
     write_settings(hunt / layout.HUNT, settings(), ["crashhunt"])
-    found = _rerun._request(hunt)
+    found = _hunt_reruns._request(hunt)
     assert (found.request.scenario, found.folder) == ("loop", str(Path.cwd()))
     (tmp_path / "own").mkdir()
     monkeypatch.chdir(tmp_path)
     write_settings(hunt / layout.HUNT, settings(scenario="own"), ["crashhunt"])
-    monkeypatch.setattr(_rerun, "latest_snapshot", lambda folder: None)
-    assert _rerun._request(hunt).request.scenario == str(tmp_path / "own")
+    monkeypatch.setattr(_hunt_reruns, "latest_snapshot", lambda folder: None)
+    assert _hunt_reruns._request(hunt).request.scenario == str(tmp_path / "own")
     snapshot = SimpleNamespace(path=hunt / "snapshots/0f")
-    monkeypatch.setattr(_rerun, "latest_snapshot", lambda folder: snapshot)
-    found = _rerun._request(hunt)
+    monkeypatch.setattr(_hunt_reruns, "latest_snapshot", lambda folder: snapshot)
+    found = _hunt_reruns._request(hunt)
     assert found.request.scenario == str(hunt / "snapshots/0f/scenario" / layout.SCENARIO)
-    moved = _rerun._with_moved_scenario(found, hunt, tmp_path / "aside")
+    moved = _hunt_reruns._with_moved_scenario(found, hunt, tmp_path / "aside")
     assert moved.request.scenario == str(tmp_path / "aside/snapshots/0f/scenario" / layout.SCENARIO)
-    assert _rerun._with_moved_scenario(ASKED, hunt, tmp_path / "aside") is ASKED
+    assert _hunt_reruns._with_moved_scenario(ASKED, hunt, tmp_path / "aside") is ASKED
 
 
 def test_changes_of_a_request_name_their_owner(hunt):
     asked = replace(ASKED, request=replace(ASKED.request, agents={}, arguments={"speed": "4"}))
-    assert _rerun._changed(asked, {}, hunt) == asked
+    assert _hunt_reruns._changed(asked, {}, hunt) == asked
     changes = {"trials": "11", "max_steps": "12", "seed": "5", "speed": "6", "vehicles": "9"}
-    found = _rerun._changed(asked, changes, hunt).request
+    found = _hunt_reruns._changed(asked, changes, hunt).request
     assert (found.trials, found.max_steps, found.seed) == (11, 12, 5)
     assert found.arguments == {"ego.speed": "6"}
     assert found.scenario_arguments == {"vehicles": "9"}
     assert asked.request.arguments == {"speed": "4"}
     other = replace(asked, request=replace(asked.request, arguments={"ego.speed": "4", "speed": "5"}))
-    assert _rerun._changed(other, {"ego.speed": "7"}, hunt).request.arguments == {"ego.speed": "7"}
+    assert _hunt_reruns._changed(other, {"ego.speed": "7"}, hunt).request.arguments == {"ego.speed": "7"}
     with pytest.raises(UsageError, match="--set trials=many"):
-        _rerun._changed(asked, {"trials": "many"}, hunt)
+        _hunt_reruns._changed(asked, {"trials": "many"}, hunt)
 
 
 @pytest.mark.parametrize(
@@ -276,31 +278,31 @@ def test_copy_of_a_hunt_resumes_until_it_has_ended(hunt, monkeypatch, tmp_path, 
         if watch:
             watch()
 
-    monkeypatch.setattr(_rerun, "hunt_state", lambda folder: SimpleNamespace(state=state, dir=folder))
-    monkeypatch.setattr(_rerun, "run_all", run)
+    monkeypatch.setattr(_hunt_reruns, "hunt_state", lambda folder: SimpleNamespace(state=state, dir=folder))
+    monkeypatch.setattr(_hunt_reruns, "run_all", run)
     for _ in range(2):
-        (found,) = _rerun._run_copies([hunt], tmp_path / "to", {}, 3, seen.append, {"executor": "fresh"})
+        (found,) = _hunt_reruns._run_copies([hunt], tmp_path / "to", {}, 3, seen.append, {"executor": "fresh"})
         assert found.dir == tmp_path / "to"
     assert ran == [([tmp_path / "to"], 3, {"executor": "fresh"})] * (2 * runs)
     assert len(seen) == 2 * runs
     assert RunRequest.read(tmp_path / "to" / REQUEST) == ASKED
     with pytest.raises(HuntDirectoryError):
-        _rerun._run_copies([hunt], tmp_path / "no/to", {}, 3, None, None)
+        _hunt_reruns._run_copies([hunt], tmp_path / "no/to", {}, 3, None, None)
     (tmp_path / "empty").mkdir()
-    _rerun._run_copies([hunt], tmp_path / "empty", {}, 3, None, None)
+    _hunt_reruns._run_copies([hunt], tmp_path / "empty", {}, 3, None, None)
 
 
 @pytest.mark.parametrize(("state", "says"), [("running", "is running"), ("error", "ended in an error")])
 def test_copy_that_runs_or_failed_is_refused(hunt, monkeypatch, state, says):
-    monkeypatch.setattr(_rerun, "hunt_state", lambda folder: SimpleNamespace(state=state))
+    monkeypatch.setattr(_hunt_reruns, "hunt_state", lambda folder: SimpleNamespace(state=state))
     with pytest.raises(HuntDirectoryError, match=says) as caught:
-        _rerun._require_same_request(hunt, ASKED)
+        _hunt_reruns._require_same_request(hunt, ASKED)
     assert caught.value.where == str(hunt)
     with pytest.raises(HuntDirectoryError, match="exists already"):
-        _rerun._require_same_request(hunt, replace(ASKED, folder="/other"))
+        _hunt_reruns._require_same_request(hunt, replace(ASKED, folder="/other"))
     (hunt / REQUEST).unlink()
     with pytest.raises(HuntDirectoryError, match="exists already"):
-        _rerun._require_same_request(hunt, ASKED)
+        _hunt_reruns._require_same_request(hunt, ASKED)
 
 
 # The file of a suite.
@@ -435,4 +437,4 @@ def test_default_suite_has_every_scenario_with_its_agents():
 
 def test_settings_on_disk_are_what_a_request_keeps(hunt):
     write_settings(hunt / layout.HUNT, settings(), ["crashhunt"])
-    assert _rerun._request_of(read_settings(hunt / layout.HUNT)).agents == {"ego": "keep-lane"}
+    assert _hunt_reruns._request_of(read_settings(hunt / layout.HUNT)).agents == {"ego": "keep-lane"}

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from crashhunt.crashes import Bundle
-    from crashhunt.reruns import Reruns
     from crashhunt.trial import TrialResult
+    from crashhunt.trial_reruns import Reruns
 
 _SCENARIOS = (
     "loop", "loop-two-agents", "intersection", "merge", "motorway", "highway", "highway-policy", "roundabout",

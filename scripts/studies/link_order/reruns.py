@@ -22,8 +22,8 @@ from crashhunt.base import layout
 from crashhunt.hunts._hunt_setup import settings_again
 from crashhunt.ledger import Ledger
 from crashhunt.recording import first_divergence
-from crashhunt.reruns import SharedReruns, run_alone
 from crashhunt.snapshots import Snapshot
+from crashhunt.trial_reruns import SharedReruns, run_alone
 
 
 def main() -> bool:

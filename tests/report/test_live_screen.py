@@ -18,7 +18,7 @@ from crashhunt.hunts import HuntStatus, PhaseStatus, SearchStatus
 from crashhunt.hunts._progress import StrategyStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher, describe_running
-from crashhunt.report._status_screen import _line, _nearest_words, describe_kinds, format_inputs
+from crashhunt.report._live_screen import _line, _nearest_words, describe_kinds, format_inputs
 from crashhunt.trial import Disturbance, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -71,7 +71,7 @@ def test_what_the_search_tries_and_when_danger_last_grew_is_shown_where_there_is
 
 def test_plain_lines_of_a_phase_are_printed_on_change_only(monkeypatch):
     now = iter(range(0, 1000, 10))
-    monkeypatch.setattr("crashhunt.report._status_screen.time.monotonic", lambda: next(now))
+    monkeypatch.setattr("crashhunt.report._live_screen.time.monotonic", lambda: next(now))
     out = io.StringIO()
     watch = Watcher(Console(file=out, width=100), TITLE)
     for done in (3, 4, 4, 4, 5):

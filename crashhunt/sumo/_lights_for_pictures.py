@@ -11,7 +11,7 @@ from crashhunt.simulators import Lights
 from crashhunt.sumo._ego_and_actors import lights_of
 from crashhunt.sumo._observing import ObservedParts
 from crashhunt.sumo._reader_protocol import Moment
-from crashhunt.sumo._road_readers import SIGNAL_STATES
+from crashhunt.sumo._signal_readers import SIGNAL_STATES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

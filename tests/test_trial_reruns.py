@@ -10,10 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt import reruns
+from crashhunt import trial_reruns
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.errors import CrashhuntError
-from crashhunt.reruns import (
+from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.trial import CRASHES, Outcome, Overruled, TrialResult, TrialSpec
+from crashhunt.trial_reruns import (
     Budget,
     NotUnderstoodError,
     OutOfTimeError,
@@ -23,8 +25,6 @@ from crashhunt.reruns import (
     call_in_threads,
     run_alone,
 )
-from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.trial import CRASHES, Outcome, Overruled, TrialResult, TrialSpec
 
 
 def spec(number):
@@ -67,7 +67,7 @@ def runs(worker, monkeypatch):
 
     def make(*ends, **more):
         executor = Executor(*ends)
-        monkeypatch.setattr(reruns, "_executor", lambda *given: executor)
+        monkeypatch.setattr(trial_reruns, "_executor", lambda *given: executor)
         return Reruns(worker, "current", **more), executor
 
     return make
@@ -135,7 +135,7 @@ def test_trial_that_ran_without_a_part_of_its_specification_is_refused(runs):
 
 def test_one_trial_that_is_run_alone_ends_with_its_process(worker, monkeypatch):
     made, executor = [], Executor()
-    monkeypatch.setattr(reruns, "FreshProcessExecutor", lambda given, *, parallel: made.append(given) or executor)
+    monkeypatch.setattr(trial_reruns, "FreshProcessExecutor", lambda given, *, parallel: made.append(given) or executor)
     unplaced = replace(worker, scratch=Path())
     for ended in run_alone(unplaced, spec(3)):
         assert (ended.result, ended.folder) == (survived(3), scratch_of(made[0].scratch, 3))
@@ -149,8 +149,8 @@ def test_one_trial_that_is_run_alone_ends_with_its_process(worker, monkeypatch):
 
 def test_only_reruns_that_are_alone_run_without_a_pool(worker, monkeypatch):
     made = []
-    monkeypatch.setattr(reruns, "PoolExecutor", lambda given, **more: made.append(("pool", more)))
-    monkeypatch.setattr(reruns, "FreshProcessExecutor", lambda given, **more: made.append(("fresh", more)))
+    monkeypatch.setattr(trial_reruns, "PoolExecutor", lambda given, **more: made.append(("pool", more)))
+    monkeypatch.setattr(trial_reruns, "FreshProcessExecutor", lambda given, **more: made.append(("fresh", more)))
     for where in ("snapshot", "current", "alone"):
         Reruns(worker, where, parallel=2)
     assert made == [
@@ -182,7 +182,7 @@ class Failing:
 
 
 def test_executor_that_fails_once_fails_every_thread(worker, monkeypatch, tmp_path):
-    monkeypatch.setattr(reruns, "_executor", Failing)
+    monkeypatch.setattr(trial_reruns, "_executor", Failing)
     shared, looks = SharedReruns(tmp_path / "shared", parallel=2), iter(range(200))
     with ThreadPoolExecutor(2) as threads:
         begun = [threads.submit(shared.run, worker, spec(3), lambda: next(looks, None) is None) for _ in range(4)]
@@ -199,7 +199,7 @@ def test_threads_share_the_processes_of_equal_settings(worker, monkeypatch, tmp_
         made.append((given.scratch.name, where, parallel, found := Executor()))
         return found
 
-    monkeypatch.setattr(reruns, "_executor", executor)
+    monkeypatch.setattr(trial_reruns, "_executor", executor)
     shared = SharedReruns(tmp_path / "shared", parallel=2)
     for scratch in ("a", "b"):  # which is not the folder of the runs
         ended = shared.run(replace(worker, scratch=tmp_path / scratch), spec(3))
@@ -215,7 +215,7 @@ def test_threads_share_the_processes_of_equal_settings(worker, monkeypatch, tmp_
 
 def test_budget_names_what_has_ended_it(monkeypatch):
     now, stops = [5.0], []
-    monkeypatch.setattr(reruns.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(trial_reruns.time, "monotonic", lambda: now[0])
     budget = Budget(lambda: bool(stops), 2.0)
     assert (budget.require(), budget.why) == (False, "")
     now[0] = 7.0

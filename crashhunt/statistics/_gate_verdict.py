@@ -1,0 +1,57 @@
+"""The verdict of a gate about two agents: better, worse, no difference above a margin, or undecided."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from crashhunt.statistics._paired_test import PairTest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from crashhunt.statistics._paired_test import Pair
+
+PairVerdict = Literal["better", "worse", "no_difference", "undecided"]
+"""The verdict of pairs on the second agent, compared with the first."""
+
+
+class PairWatch:
+    """Watches two agents until one agent certainly fails more often, or both certainly fail about equally often.
+
+    The pairs are evaluated in order, one after another. After a decision, later pairs do not count, so the verdict does
+    not depend on the number of workers. The probability of each wrong verdict is at most `alpha`: *better* or *worse*
+    if both agents fail equally often, and *no difference* if the difference is above the margin.
+
+    Args:
+        margin: the greatest difference in failures per trial that counts as no difference; 0 to disable this verdict.
+        alpha: maximum probability of a wrong verdict.
+        rounds: number of trials in each pair.
+    """
+
+    def __init__(self, margin: float, alpha: float = 0.05, rounds: int = 1) -> None:
+        self.margin, self.alpha = margin, alpha
+        self.test = PairTest(rounds)
+        self.verdict: PairVerdict = "undecided"
+
+    def add(self, pairs: Sequence[Pair] | Iterator[Pair], *, may_end: bool = True) -> None:
+        """Add pairs in their order until a pair decides.
+
+        Args:
+            pairs: the pairs, in the order of their numbers.
+            may_end: whether the verdicts *better* and *no difference* are allowed yet; *worse* is always allowed.
+        """
+        for pair in pairs:
+            if self.verdict != "undecided":
+                return
+            self.test.add(pair)
+            self.decide(may_end=may_end)
+
+    def decide(self, *, may_end: bool = True) -> PairVerdict:
+        """Return the verdict on the pairs that were added; the first verdict is final."""
+        if self.verdict == "undecided":
+            worse = self.test.verdict(self.alpha)
+            if worse == "second" or (worse and may_end):
+                self.verdict = "worse" if worse == "second" else "better"
+            elif not worse and may_end and self.margin and self.test.is_within(self.margin, self.alpha):
+                self.verdict = "no_difference"
+        return self.verdict
