@@ -103,6 +103,10 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
         for text in given:
             setting, value = _parse_setting(part, text, where)
             settings[setting] = value
+            requires = next(one.requires for one in part.settings if one.name == setting)
+            if value and requires and requires not in known:
+                message = f"{where}: the simulator of this scenario does not have {word!r}"
+                raise UsageError(message, fix=f"leave {setting} out")
         if settings.get("relation"):
             part = replace(part, columns=part.columns + part.relation)
         found[name] = RequestedPart(part, settings)

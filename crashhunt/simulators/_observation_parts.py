@@ -55,6 +55,7 @@ class Setting(NamedTuple):
         unit: Unit of the value; empty for whole numbers.
         meaning: Description of the setting.
         choices: The words that the setting takes instead of numbers; its value is then the index of the word.
+        requires: The part that the simulator must also have for values other than 0; empty if there is none.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Setting(NamedTuple):
     unit: str
     meaning: str
     choices: tuple[str, ...] = ()
+    requires: str = ""
 
     @property
     def is_whole(self) -> bool:
@@ -259,7 +261,7 @@ PARTS: Mapping[str, Part] = {
                 Setting("radius", 100.0, 1.0, REACH_M, "m", "largest distance of the centres"),
                 Setting(
                     "relation", 0, 0, 1, "", "adds columns about the actors' lanes, followed as far as ``radius``",
-                    (OFF, ON),
+                    (OFF, ON), "right_of_way",
                 ),
             ),
             measured=("x", "y", "vx", "vy", "acceleration", "length", "width", "ahead", "lane_offset"),
@@ -413,7 +415,9 @@ PARTS: Mapping[str, Part] = {
                 Setting("steps", 30, 1, 1000, "", "number of times, the first one interval from now"),
                 Setting("radius", 100.0, 1.0, REACH_M, "m", "largest distance of the centres"),
                 Setting("interval", 0.1, 0.01, 10.0, "s", "time between two positions"),
-                Setting("along", 0, 0, 1, "", "what the actor drives along", ("heading", "lanes")),
+                Setting(
+                    "along", 0, 0, 1, "", "what the actor drives along", ("heading", "lanes"), "right_of_way"
+                ),
             ),
             measured=("x", "y", "speed"),
         ),

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crashhunt.base.errors import UsageError
 from crashhunt.simulators._bicycle_model import WHEELBASE_SHARE
 from crashhunt.simulators._kinematics_observation import kind_number
 from crashhunt.simulators._observation_layout import History, layouts_of
-from crashhunt.simulators._observation_parts import ON, REACH_M, SCENE_PARTS
+from crashhunt.simulators._observation_parts import REACH_M, SCENE_PARTS
 from crashhunt.simulators._scene_parts import (
     ActorNumbers,
     RayCaster,
@@ -69,11 +68,6 @@ class SceneObserver:
 
     def __init__(self, setups: Mapping[str, AgentSetup], others: Iterable[str] = ()) -> None:
         self.layouts = layouts_of(setups, (*SCENE_PARTS, *others))
-        for agent, layout in self.layouts.items():
-            for part, setting, value in (("predictions", "along", "lanes"), ("actors", "relation", ON)):
-                if part in layout.parts and layout.parts[part].settings[setting]:
-                    where = f"agents.{agent}.observation: {part}:{setting} is {value!r}"
-                    raise UsageError(f"{where}, which this simulator does not have", fix="leave it out")
         self.hidden: set[tuple[str, str]] = set()
         self._step_length_s = self._start_s = 0.0
         self._seed = 0

@@ -99,10 +99,15 @@ def test_observation_cannot_be_changed_by_the_agent(hunted):
     assert done.json["outcomes"] == {"agent_error": 1}
 
 
-def test_simulator_without_the_part_refuses_in_one_line(shell):
-    refused = shell.crashhunt("run", "x", "1", "1", "5", "--scenario", "highway", "--observe", "signals", expect=2)
-    assert "--observe: the simulator of this scenario has no part 'signals'" in refused.err
+@pytest.mark.parametrize(
+    ("part", "what"),
+    [("signals", "has no part 'signals'"), ("actors:relation=true", "does not have 'actors:relation=true'")],
+)
+def test_simulator_without_the_part_refuses_in_one_line_and_leaves_nothing_behind(shell, part, what):
+    refused = shell.crashhunt("run", "x", "1", "1", "5", "--scenario", "highway", "--observe", part, expect=2)
+    assert f"--observe: the simulator of this scenario {what}" in refused.err
     assert refused.err.count("\n") == 1
+    assert not (shell.folder / "x").exists()
 
 
 def test_parts_are_listed_with_columns_and_units(shell):
