@@ -68,6 +68,7 @@ class FreeMotion:
         self._is_relative = settings.get("frame") == "ego"
         self._is_overruled = False
         self._aim: tuple[float, float] | None = None  # the position of the last target pose
+        self._backwards_m = 0.0  # since the vehicle has last moved ahead by as much
         self._pursues = settings.get("tracker") == "pure_pursuit"
         self._half, self._half_width = sumo.vehicle_getLength(vehicle) / 2, sumo.vehicle_getWidth(vehicle) / 2
         self._ahead = 2 * self._half * REFERENCE_SHARES[str(settings.get("reference_point", "center"))]
@@ -105,6 +106,7 @@ class FreeMotion:
         if self._arrives(state):
             sumo.vehicle_remove(self._vehicle, _ARRIVED)
             return True
+        self._backwards_m = self._backwards_after(state)
         self.state = state
         front = state.x + self._half * math.cos(state.heading), state.y + self._half * math.sin(state.heading)
         try:
@@ -191,15 +193,24 @@ class FreeMotion:
         if not least <= moved <= most:
             message = f"the {self._words} moves the vehicle by {moved:.3f} m in a step of {dt:g} s"
             least, most = math.ceil(max(0.0, least) * 100) / 100, math.floor(most * 100) / 100
-            fix = f"return a pose between {least:.2f} and {most:.2f} m away; positions are those of {self._point}"
-            return ActionError(message, fix=fix)
+            fix = f"return a pose between {least:.2f} and {most:.2f} m away"
+            if self._form == "target_pose":  # which is the end of a curve over several steps
+                fix = f"return a later time, or a pose with a way of {least:.2f} to {most:.2f} m in the step"
+            return ActionError(message, fix=f"{fix}; positions are those of {self._point}")
         turned = math.remainder(after.heading - state.heading, math.tau)
         if abs(turned) > _MAX_YAW_RATE_RADPS * dt + _MAX_TURN_RAD:
             message = f"the {self._words} turns the vehicle by {turned:.2f} rad in a step of {dt:g} s"
             return ActionError(message, fix=f"turn by at most {_MAX_YAW_RATE_RADPS * dt + _MAX_TURN_RAD:.2f} rad")
-        if dx * math.cos(state.heading) + dy * math.sin(state.heading) < -_MAX_SLIDE_M:
-            return ActionError(f"the {self._words} moves the vehicle backwards", fix="return poses ahead of it")
+        if (backwards := self._backwards_after(after)) > _MAX_SLIDE_M:
+            message = f"the {self._words} moves the vehicle backwards by {backwards:.2f} m"
+            return ActionError(message, fix=f"return poses ahead of it, or at most {_MAX_SLIDE_M:g} m behind it in all")
         return None
+
+    def _backwards_after(self, after: MotionState) -> float:
+        """Return how far the vehicle has moved backwards after a step, in m, less how far it has moved ahead since."""
+        state = self.state
+        dx, dy = after.x - state.x, after.y - state.y
+        return max(0.0, self._backwards_m - dx * math.cos(state.heading) - dy * math.sin(state.heading))
 
     def motion_of(self, action: NDArray[np.generic]) -> Motion:
         """Return what an encoded action does: the speed after the step, and whether the vehicle leaves its lane."""

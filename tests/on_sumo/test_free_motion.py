@@ -244,6 +244,37 @@ def test_trajectory_that_cannot_be_followed_is_refused_with_value_and_limit(star
     assert caught.value.fix
 
 
+@pytest.mark.parametrize("form", ["trajectory", "target_pose"])
+def test_vehicle_that_stands_moves_backwards_by_no_more_than_the_tolerance_in_all(start, form):
+    simulator, step = start(form, **EMPTY)
+
+    def pose(ahead):
+        x, y, h = centre()
+        return (x + ahead, y, h, 0.1) if form == "target_pose" else [[0.1, x + ahead, y, h, 0.0]]
+
+    while libsumo.vehicle.getSpeed("ego") > 0.3:
+        step(pose(max(0.0, libsumo.vehicle.getSpeed("ego") - 1.0) / 10))
+    step(pose(0.2))
+    for ahead in (-0.15, 0.1, -0.14):
+        step(pose(ahead))
+    with pytest.raises(ActionError, match=r"moves the vehicle backwards by 0\.28 m") as caught:
+        simulator.actions["ego"].encode(pose(-0.09))
+    assert "0.2 m" in caught.value.fix
+    step(pose(0.25))
+    step(pose(-0.19))
+
+
+def test_target_pose_that_is_due_too_early_is_refused_with_the_way_of_a_step(start):
+    simulator, _ = start("target_pose", **EMPTY)
+    (x, y, h), v = centre(), libsumo.vehicle.getSpeed("ego")
+    with pytest.raises(ActionError, match=r"the target pose moves the vehicle by \d\.\d+ m in a step") as caught:
+        simulator.actions["ego"].encode((x + 1.5 * v, y, h, 0.5))
+    most = math.floor((v + 1.0) * 10 + 20) / 100
+    assert caught.value.fix.startswith("return a later time, or a pose with a way of 0.")
+    assert f" to {most:.2f} m in the step; positions are those of the centre" in caught.value.fix
+    assert simulator.actions["ego"].encode((x + 1.5 * v, y, h, 1.5)) is not None
+
+
 def test_trajectory_is_followed_between_its_points(start):
     simulator, step = start("trajectory", **EMPTY)
     x, y, h = centre()
