@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import json
 import os
@@ -21,6 +20,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.files import exchange, put_in_place, whole_file
 from crashhunt.base.integrity import authentication_code, is_authentic, read_bounded
+from crashhunt.base.processes import die_with
 from crashhunt.base.signals import stop_requests
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.text import command_line
@@ -55,7 +55,6 @@ PURPOSE_OF_REQUEST = "request of a suite"  # of its authentication code
 _LOOK_EVERY_S = 0.1  # at processes that may have ended
 _WATCH_EVERY_S = 1.0  # the table of `suite run --watch`
 _BUSY_S = 15.0  # for the process of an earlier run to leave the directory
-_PR_SET_PDEATHSIG = 1
 _NEW_CODE = "continue_with_new_code"  # the option of a run that is none of `RunSettings`
 
 
@@ -259,10 +258,7 @@ def _start(folder: Path, run: Given, environment: Mapping[str, str] | None) -> s
 
 
 def _main(folder: Path, run: Given, parent: int) -> None:
-    if sys.platform == "linux":  # a suite that is killed takes its hunts along, and they keep what has finished
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != parent:
-            return
+    die_with(parent, signal.SIGTERM)  # a suite that is killed takes its hunts along, and they keep what has finished
     from crashhunt.hunts import Hunt
     from crashhunt.report import describe_hunt
 

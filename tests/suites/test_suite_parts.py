@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tomllib
@@ -68,7 +69,7 @@ def test_process_of_a_hunt_runs_in_the_folder_of_its_request(hunt, monkeypatch, 
 
 
 def test_process_of_a_hunt_waits_for_an_earlier_one(hunt, monkeypatch, capsys):
-    made, slept, busy = [], [], [True, True, False]
+    made, slept, ends_with, busy = [], [], [], [True, True, False]
 
     def make(*given, **more):
         def run():
@@ -79,12 +80,13 @@ def test_process_of_a_hunt_waits_for_an_earlier_one(hunt, monkeypatch, capsys):
         made.append((given, more))
         return SimpleNamespace(run=run)
 
-    monkeypatch.setattr(_processes.sys, "platform", "other")  # this process must not end with its parent
+    monkeypatch.setattr(_processes, "die_with", lambda *given: ends_with.append(given))
     monkeypatch.setattr(_processes, "_planned", lambda folder, request, run: ("scenario", run, request.trials))
     monkeypatch.setattr("crashhunt.hunts.Hunt", make)
     monkeypatch.setattr("crashhunt.report.describe_hunt", lambda report: f"described {report}")
     monkeypatch.setattr(_processes.time, "sleep", slept.append)
-    _processes._main(hunt, {"parallel": 2}, 0)
+    _processes._main(hunt, {"parallel": 2}, 7)
+    assert ends_with == [(7, signal.SIGTERM)]  # a suite that is killed takes its hunts along
     ((given, more),) = made
     assert given == (hunt, "scenario", {"parallel": 2})
     assert (more["command"], more["imported"], more["partner"]) == (["crashhunt", "suite", "run"], 7, None)
