@@ -79,9 +79,29 @@ def test_frenetix_brakes_although_its_costs_prefer_to_drive_through_the_vehicle_
         "predictions": predictions, "prediction_covariance": covariance,
     }  # fmt: skip
     vehicle = SimpleNamespace(length=5.0, width=1.8, rear_axle_offset=1.5, wheelbase=3.0)
-    plan = Frenetix(vehicle, 19.0).act(seen)
+    agent = Frenetix(SimpleNamespace(reference_path=route[:, 1:3]), vehicle, 19.0)
+    plan = agent.act(seen)
     assert plan[5, 4] < 4.0
     assert (np.diff(plan[:10, 4]) < 0).all()
+
+
+@pytest.mark.nightly
+def test_frenetix_brakes_straight_on_where_no_curve_is_feasible():
+    pytest.importorskip("frenetix")
+    from crashhunt.agents.planners.frenetix_agent import Frenetix
+
+    path = np.column_stack([np.arange(-20.0, 100.0, 2.0), np.zeros(60)])
+    route = np.zeros((60, 6))
+    route[:, 0], route[:, 1], route[:, 4] = 1.0, path[:, 0], 13.9
+    seen = {
+        "ego": np.array([0.0, 0.0, 1.5, 8.0, 0.0, 0.0, 0.0]), "actors": np.zeros((9, 15)), "route": route,
+        "predictions": np.zeros((9, 30, 4)), "prediction_covariance": np.zeros((9, 30, 3)),
+    }  # fmt: skip
+    vehicle = SimpleNamespace(length=5.0, width=1.8, rear_axle_offset=1.5, wheelbase=3.0)
+    plan = Frenetix(SimpleNamespace(reference_path=path), vehicle).act(seen)
+    assert (plan[:, 3] == 1.5).all()
+    assert plan[:, 4] == pytest.approx(np.maximum(8.0 - 8.0 * plan[:, 0], 0.0))
+    assert np.hypot(*plan[-1, 1:3]) == pytest.approx(4.0)  # v² / 2a
 
 
 def test_mpc_keeps_its_distance_from_the_side_of_a_truck_that_crosses():

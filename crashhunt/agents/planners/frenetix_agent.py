@@ -1,12 +1,11 @@
 """frenetix as an agent: it samples curves along the route, and drives the cheapest feasible one."""
 
-from itertools import product
-
 import frenetix as fx
 import numpy as np
 from frenetix.trajectory_functions import FillCoordinates, cost_functions as costs, feasability_functions as limits
 
-PARTS = "ego actors:rows=9 predictions:rows=9 prediction_covariance:rows=9:along=0.3:across=0.1 route:behind=20"
+PARTS = "ego actors:rows=9 predictions:rows=9 prediction_covariance:rows=9:along=0.3:across=0.1 route"
+ENDS = np.array(np.meshgrid((1, 1.5, 2, 3), np.linspace(0, 1, 6), (-0.5, 0, 0.5))).reshape(3, -1).T
 
 
 class Frenetix:
@@ -14,7 +13,12 @@ class Frenetix:
 
     observation, action = PARTS.split(), "trajectory"
 
-    def __init__(self, vehicle, desired_speed: float = 14.0, caution: float = 1e4):
+    def __init__(self, map, vehicle, desired_speed: float = 14.0, caution: float = 1e4):
+        path = map.reference_path  # which continues straight on before its start and beyond its end
+        path = np.vstack([path[0] - 20 * (path[1] - path[0]), path, path[-1] + 50 * (path[-1] - path[-2])])
+        along = np.append(0, np.hypot(*np.diff(path, axis=0).T).cumsum())
+        smooth = [np.convolve(np.interp(np.arange(along[-1]), along, v), np.ones(7) / 7, "valid") for v in path.T]
+        self.frame = fx.CoordinateSystemWrapper(np.column_stack(smooth))  # without corners, in steps of 1 m
         self.size, self.wheelbase = (vehicle.length, vehicle.width, vehicle.rear_axle_offset), vehicle.wheelbase
         self.desired_speed, self.caution = desired_speed, caution
 
@@ -22,32 +26,34 @@ class Frenetix:
 
     def act(self, observation):
         x, y, heading, speed, acceleration, _, steering = observation["ego"][:7].tolist()
-        wheelbase, is_slow = self.wheelbase, speed < 4
-        path, limit = (route := observation["route"][observation["route"][:, 0] > 0])[:, 1:3], route[:, 4]
-        wanted = min(self.desired_speed, np.sqrt(limit**2 + 2 * np.hypot(*(path - (x, y)).T)).min())  # at 1 m/s²
-        frame = fx.CoordinateSystemWrapper(np.vstack([path, path[-1] + 50 * (path[-1] - path[-2])]))  # beyond its end
+        ahead, limit = (route := observation["route"][observation["route"][:, 0] > 0])[:, 1:3], route[:, 4]
+        wanted = min(self.desired_speed, np.sqrt(limit**2 + 2 * np.hypot(*(ahead - (x, y)).T)).min())  # at 1 m/s²
         state = fx.CartesianPlannerState(np.array([x, y]), heading, speed, acceleration, steering)
-        start = fx.compute_initial_state(frame, state, wheelbase, is_slow)
-        ends = product((1.0, 1.5, 2.0, 3.0), np.linspace(0, wanted, 6), (-0.5, 0, 0.5))
-        rows = [(0, time, *start.x0_lon, v, 0, *start.x0_lat, offset, 0, 0) for time, v, offset in ends]
+        start = fx.compute_initial_state(self.frame, state, self.wheelbase, is_slow := speed < 4)
+        rows = [(0, t, *start.x0_lon, v, 0, *start.x0_lat, d, 0, 0) for t, v, d in ENDS * (1, wanted, 1)]
         handler = fx.TrajectoryHandler(0.1)
-        handler.add_function(FillCoordinates(is_slow, heading, frame, 3))
+        handler.add_function(FillCoordinates(is_slow, heading, self.frame, 3))
         handler.add_feasability_function(limits.CheckAccelerationConstraint(8.0, 8.0, False))
-        handler.add_feasability_function(limits.CheckCurvatureConstraint(0.6, wheelbase, False))
+        handler.add_feasability_function(limits.CheckCurvatureConstraint(0.6, self.wheelbase, False))
         handler.add_cost_function(costs.CalculateLateralJerkCost("lateral", 0.2))
         handler.add_cost_function(costs.CalculateLongitudinalJerkCost("longitudinal", 0.2))
         handler.add_cost_function(costs.CalculateDistanceToReferencePathCost("path", 5.0))
         handler.add_cost_function(costs.CalculateVelocityOffsetCost("speed", 1.0, wanted, 0.1, 1.5, False, 2))
-        risk = "risk", self.caution, _predicted(observation), *self.size
-        handler.add_cost_function(costs.CalculateCollisionProbabilityFast(*risk))
+        seen = zip(*(observation[one] for one in ("actors", "predictions", "prediction_covariance")), strict=True)
+        others = {n: fx.PredictedObject(n, list(map(_pose, p, c)), *a[7:9]) for n, (a, p, c) in enumerate(seen) if a[0]}
+        handler.add_cost_function(costs.CalculateCollisionProbabilityFast("risk", self.caution, others, *self.size))
         handler.generate_trajectories(np.array(rows), is_slow)
         handler.evaluate_all_current_functions(True)
-        valid = [one for one in handler.get_sorted_trajectories() if one.valid]  # the first is the cheapest
-        feasible = [one.cartesian for one in valid if one.feasible] or [valid[0].cartesian]
+        feasible = [one.cartesian for one in handler.get_sorted_trajectories() if one.valid and one.feasible]
         # To drive through an actor fast has a smaller sum of probabilities than to brake, so exclude it; else brake.
-        free = (one for one in feasible if not self._touches(one, observation))
-        plan = next(free, None) or min(feasible, key=lambda one: one.v[5])
-        return np.column_stack((np.arange(len(plan.x)) * 0.1, plan.x, plan.y, plan.theta, plan.v))
+        free = (one for one in feasible if not self._touches(one, observation))  # the first is the cheapest
+        plan = next(free, None) or min(feasible, key=lambda one: one.v[5], default=None)
+        times = np.arange(31) * 0.1
+        if plan:
+            return np.column_stack((times[: len(plan.x)], plan.x, plan.y, plan.theta, plan.v))
+        s = (t := np.minimum(times, speed / 8)) * (speed - 4 * t)  # no curve is feasible: brake straight on
+        places = np.add((x, y), np.outer(s, (np.cos(heading), np.sin(heading))))
+        return np.column_stack((times, places, 0 * s + heading, speed - 8 * t))
 
     def _touches(self, plan, observation):
         for actor, poses in zip(observation["actors"], observation["predictions"], strict=True):
@@ -60,13 +66,7 @@ class Frenetix:
         return False
 
 
-def _predicted(observation):
-    actors, others = observation["actors"], {}
-    around = observation["predictions"], observation["prediction_covariance"]
-    for number in np.flatnonzero(actors[:, 0]).tolist():
-        poses = []
-        for (x, y, yaw, _), (a, b, c) in zip(*(one[number] for one in around), strict=True):
-            place, turn = np.array([x, y, 0]), np.array([0, 0, np.sin(yaw / 2), np.cos(yaw / 2)])
-            poses.append(fx.PoseWithCovariance(place, turn, np.pad([[a + 0.1, c], [c, b + 0.1]], (0, 4))))
-        others[number] = fx.PredictedObject(number, poses, *actors[number, 7:9])
-    return others
+def _pose(pose, covariance):
+    (x, y, yaw, _), (a, b, c) = pose, covariance
+    place, turn = np.array([x, y, 0]), np.array([0, 0, np.sin(yaw / 2), np.cos(yaw / 2)])
+    return fx.PoseWithCovariance(place, turn, np.pad([[a + 0.1, c], [c, b + 0.1]], (0, 4)))
