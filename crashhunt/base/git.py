@@ -201,6 +201,8 @@ def git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str
 
 _QUIET_S = 3.0  # before a note on what takes so long
 _MAX_LINES, _MAX_CHARACTERS = 3, 300  # of the output in an error
+# A pipe that ends with this process, also if it is killed, lets a shell kill the group of the build.
+_RUN_BUILD = 'exec 3<&0; (read -r _ <&3; kill -KILL 0) & exec /bin/sh -c "$1" 3<&- </dev/null'
 
 
 class BuildError(CrashhuntError):
@@ -216,7 +218,7 @@ def run_build(
     name: str,
     tell: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Run the command that builds a commit; Ctrl-C and the time limit end all its processes.
+    """Run the command that builds a commit; the time limit and the end of this process end all its processes.
 
     Args:
         command: command line for the shell.
@@ -237,8 +239,8 @@ def run_build(
         kept = log
     with kept.open("wb") as output:
         process = subprocess.Popen(
-            command, shell=True, cwd=folder, env=_environment_of_git(), stdin=subprocess.DEVNULL,
-            stdout=output, stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=partial(die_with, os.getpid()),
+            ["/bin/sh", "-c", _RUN_BUILD, "sh", command], cwd=folder, env=_environment_of_git(),
+            stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
         how = ""
         try:
@@ -253,7 +255,7 @@ def run_build(
         finally:
             with suppress(ProcessLookupError):  # of the processes that it has started, too
                 os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+            process.communicate()
             if not how and log is None:
                 kept.unlink(missing_ok=True)
     if how:

@@ -6,6 +6,7 @@ import math
 import os
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -80,6 +81,21 @@ def test_build_that_is_ended_leaves_no_process(tmp_path, temporary, monkeypatch,
         with pytest.raises(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
     assert bool(list(temporary.iterdir())) == (why == "too long")
+
+
+def test_processes_of_a_build_end_with_a_crashhunt_that_is_killed(tmp_path):
+    code = "from crashhunt.base.git import run_build as run; from pathlib import Path; run({!r}, Path(), None, {})"
+    words = code.format("sleep 600 & echo $! > first; mv first second; wait; true", "limit_s=600.0, name='HEAD'")
+    builder = subprocess.Popen([sys.executable, "-c", words], cwd=tmp_path)
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "second").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    builder.kill()
+    builder.wait()
+    pid = (tmp_path / "second").read_text().strip()
+    while Path(f"/proc/{pid}/cmdline").exists() and Path(f"/proc/{pid}/cmdline").read_bytes():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def git(folder, *words):
