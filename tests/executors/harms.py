@@ -4,9 +4,7 @@ import atexit
 import builtins
 import contextlib
 import ctypes
-import faulthandler
 import fcntl
-import gc
 import json
 import os
 import resource
@@ -209,11 +207,6 @@ def aborts():
 
 
 @harm("dies")
-def fails_fatally():
-    ctypes.pythonapi.Py_FatalError(b"harm")
-
-
-@harm("dies")
 def overflows_stack():
     sys.setrecursionlimit(10**9)
 
@@ -237,11 +230,6 @@ def divides_in_c():
 @harm("dies")
 def kills_itself():
     os.kill(os.getpid(), signal.SIGKILL)
-
-
-@harm("dies")
-def terminates_itself():
-    os.kill(os.getpid(), signal.SIGTERM)
 
 
 @harm("dies")
@@ -283,20 +271,6 @@ def sleeps_in_c():
 @harm("hangs")
 def stops_itself():
     os.kill(os.getpid(), signal.SIGSTOP)
-
-
-@harm("hangs")
-def waits_for_lock():
-    lock = threading.Lock()
-    lock.acquire()
-    lock.acquire()
-
-
-@harm("hangs")
-def reads_from_nobody():
-    receive, send = os.pipe()
-    KEPT.append(send)
-    os.read(receive, 1)
 
 
 # ---- descriptors and files -----------------------------------------------------------------------------------------
@@ -428,24 +402,6 @@ def no_environment():
 
 
 @harm("lives")
-def no_collection():
-    gc.disable()
-    faulthandler.disable()
-
-
-@harm("lives")
-def freezes_random():
-    import random
-
-    random.random = lambda: 0.5
-
-
-@harm("lives")
-def halves_recursion_limit():
-    sys.setrecursionlimit(sys.getrecursionlimit() // 2)
-
-
-@harm("lives")
 def imports_fail():
     sys.meta_path[:] = []
     sys.path[:] = []
@@ -488,11 +444,6 @@ def becomes_nobody():
 
 
 @harm("lives")
-def is_nice():
-    os.nice(19)
-
-
-@harm("lives")
 def starts_program():
     KEPT.append(subprocess.Popen(["sleep", "986"]))
 
@@ -511,13 +462,6 @@ def starts_threads():
 @harm("lives")
 def forks():
     os.fork()
-
-
-@harm("lives")
-def forks_a_few():
-    for _ in range(3):
-        if os.fork() == 0:
-            time.sleep(3600)
 
 
 @harm("lives")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import harms
 import pytest
-from conftest import wait_for
+from conftest import mostly_nightly, wait_for
 
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
@@ -170,7 +170,11 @@ def test_harm_of_each_kind_costs_its_own_trial_and_nothing_of_it_stays(run):
 
 
 @pytest.mark.parametrize(
-    "what", ["starts_daemon", "dies_with_program", "hangs_with_program", "closes_everything", "raises_surrogate"]
+    "what",
+    mostly_nightly(
+        ["starts_daemon", "dies_with_program", "hangs_with_program", "closes_everything", "raises_surrogate"],
+        always=["starts_daemon", "hangs_with_program"],
+    ),
 )
 def test_fresh_process_leaves_nothing_either(run, what):
     trials = [(what, "fifth act")]

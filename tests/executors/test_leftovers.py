@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 LEFTOVERS = Path(__file__).parent / "leftovers.py"
 NOT_ON_THE_TOY = {"class_of_highway_env"}
-ROOT_ONLY = {"user", "effective_user", "group"}
+ROOT_ONLY = {"user", "effective_user"}
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def tried(tmp_path_factory):
 def test_each_kind_is_found_where_it_is_left(tried):
     """In one process: a kind that is not found would show nothing of what isolates trials."""
     missing = NOT_ON_THE_TOY | (ROOT_ONLY if os.geteuid() else set())
-    assert len(tried) >= 48
+    assert len(tried) >= 18
     assert {kind: found for kind, found in tried.items() if found != [False, True]}.keys() <= missing
 
 
@@ -108,7 +108,7 @@ def test_no_kind_reaches_another_trial(run, tried, parallel, chosen):
     # Of its own trial, a few kinds change the steps that follow: the rounding of numbers, the simulator's own methods.
     digests = [result.digest for result in results]
     assert digests[0] == digests[-1]
-    assert digests.count(digests[0]) > len(kinds) - 8
+    assert digests.count(digests[0]) > len(kinds) - 4
     if parallel == 1:
         (alone,) = run(toy(), FreshProcessExecutor, [""])
         assert alone.digest == digests[0]
