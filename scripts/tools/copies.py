@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections import Counter, defaultdict
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -187,7 +188,11 @@ class Slot:
         output = os.open(".said", os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
         for number in (1, 2):
             os.dup2(output, number)
-        sys.path.insert(0, str(self.tree))
+        # No test sees this folder and its modules, of which snapshots would copy the code.
+        sys.path[:] = [str(self.tree), *(place for place in sys.path if place != str(Path(__file__).parent))]
+        for name in ("copies", "slips"):
+            sys.modules.pop(name, None)
+        sys.modules["__main__"] = ModuleType("__main__")
         os.environ |= {"PYTHONPATH": str(self.tree), "TMPDIR": self._temporary}  # for what the tests start, too
         tempfile.tempdir = None
         import hypothesis

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import ast
 import io
+import runpy
 import sys
 import tokenize
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
 import crashhunt
 from crashhunt.agents import planners
+from crashhunt.simulators import PARTS
 
 ADAPTERS = sorted(path for path in Path(planners.__file__).parent.glob("*.py") if path.name != "__init__.py")
 MAX_LINES = 60  # what a user can be asked to write
@@ -45,6 +48,19 @@ def test_adapter_has_at_most_60_lines_of_code(path):
     tokens = tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline)
     lines = {line for token in tokens if token.type not in kinds for line in range(token.start[0], token.end[0] + 1)}
     assert len(lines) <= MAX_LINES
+
+
+def test_fiss_predicts_each_actor_by_its_columns(monkeypatch):
+    monkeypatch.setitem(sys.modules, "fiss_planner", planner := MagicMock())
+    kind = runpy.run_path(str(Path(planners.__file__).with_name("fiss_agent.py")))["FissPlanner"]
+    agent = kind(MagicMock(route=[], lanes={}, stop_lines=[]), MagicMock(max_steering=0.5, wheelbase=3.0))
+    plan = agent.planner.step.return_value.trajectory
+    plan.t, plan.x, plan.y, plan.yaw, plan.v = np.zeros((5, 2))
+    value = {one.name: 10.0 + number for number, one in enumerate(PARTS["actors"].columns)} | {"vx": 3.0, "vy": 4.0}
+    row = np.array([[*value.values()]])
+    agent.act({"ego": np.ones(13), "actor_ids": np.array([7]), "actors": row, "signals": np.zeros((0, 4))})
+    place = value["x"], value["y"], value["heading"], 5.0, value["length"], value["width"]
+    assert planner.predict_lane_following.call_args.args == (agent.roads, 7, *place, 6.0, 0.1)
 
 
 @pytest.mark.nightly
