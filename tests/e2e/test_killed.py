@@ -12,9 +12,7 @@ import random
 import shutil
 import signal
 import sqlite3
-import subprocess
 import sys
-import time
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +21,6 @@ from types import SimpleNamespace
 import pytest
 from conftest import keeps_going, mostly_nightly, wait_for
 from repositories import git
-from test_corpus import DRIVER, MENDED
 
 from crashhunt.base.git import run_to_end
 from crashhunt.base.temporary import OwnerProcess, owner_in, remove_leftovers, remove_tree, start_time, this_process
@@ -41,21 +38,6 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="owners are know
 # What a command does to files, and to processes; opening is one where it is for writing.
 STEPS = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.symlink", "os.link", "os.truncate", "subprocess.Popen",
          "shutil.copyfile", "shutil.copytree", "shutil.rmtree", "sqlite3.connect"}  # fmt: skip
-AT_STEP = f"""
-import atexit, os, signal, sys
-STEPS, at, seen = {STEPS!r}, int(os.environ.pop("KILL_AT_STEP", "0")), [0]
-def hook(event, arguments):
-    if event in STEPS or (event == "open" and isinstance(arguments[2], int) and arguments[2] & 3):
-        seen[0] += 1
-        if seen[0] == at:
-            os.kill(os.getpid(), signal.SIGKILL)
-def say(pid=os.getpid(), path=os.environ.pop("STEPS_FILE", "")):
-    if path and os.getpid() == pid:
-        open(path, "w").write(str(seen[0]))
-if at and sys.orig_argv[1:2] and sys.orig_argv[1].endswith("/crashhunt"):
-    sys.addaudithook(hook)
-    atexit.register(say)
-"""
 NEVER = 10**9
 
 
@@ -71,13 +53,19 @@ def killed(function, step: int) -> int:
     hear, tell = os.pipe()
     pid = os.fork()
     if pid == 0:
+        seen = 0
+
+        def hook(event, arguments):
+            nonlocal seen
+            if event in STEPS or (event == "open" and isinstance(arguments[2], int) and arguments[2] & 3):
+                seen += 1
+                if seen == step:
+                    os.kill(os.getpid(), signal.SIGKILL)
+
         with suppress(BaseException):
-            hook: dict = {}
-            exec(AT_STEP.partition("def say")[0], hook)
-            hook["at"] = step
-            sys.addaudithook(hook["hook"])
+            sys.addaudithook(hook)
             function()
-            os.write(tell, str(hook["seen"][0]).encode())
+            os.write(tell, str(seen).encode())
         os._exit(0)
     os.close(tell)
     os.waitpid(pid, 0)
@@ -161,14 +149,6 @@ def rows(hunt: Path) -> list[int]:
     with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{hunt}/ledger.sqlite?mode=ro", uri=True)) as database:
         return [number for (number,) in database.execute("SELECT number FROM trials")]
     return []
-
-
-def rows_by_digest(hunt: Path) -> dict[int, str]:
-    """The committed rows of a hunt: number to trace digest."""
-    with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{hunt}/ledger.sqlite?mode=ro", uri=True)) as database:
-        found = database.execute("SELECT number, result FROM trials")
-        return {number: json.loads(row)["digest"] for number, row in found}
-    return {}
 
 
 def test_salvage_refuses_a_directory_with_anything_else(damaged):
@@ -478,146 +458,3 @@ def test_a_hunt_that_is_stopped_while_it_confirms_is_resumed_by_a_rerun(toy, mon
     (state,) = toy.crashhunt("rerun", "h", "--json").json["hunts"]
     assert state["state"] == "crashed"
     assert [bundle.confirmed for bundle in list_bundles(toy.folder / "h")] == [True]
-
-
-SUITE = """
-[defaults]
-scenario = "toy"
-trials = 6
-max_steps = 60
-seed = 2
-[[hunts]]
-id = "fast"
-[hunts.arguments]
-speed = "9:14"
-[[hunts]]
-id = "slow"
-[hunts.arguments]
-speed = "4:5"
-"""
-AGENT = ("--scenario", "toy", "--agent", "driver:Driver", "--arg", "speed=20:22", "--seed", "1", "--keep-going")
-# Command, and what it makes.
-COMMANDS = {
-    "run": (("run", "new", "2", "12", "60", *AGENT, "--near-misses", "2", "--keep", "2"), "new"),
-    "probes": (("run", "new", "2", "6", "60", "--scenario", "toy", "--seed", "3", "--arg", "speed=9", "--disturb",
-                "brake=0.02", "--probe", "0.5", "--branch", "--keep-going", "--audit", "0.5"), "new"),
-    "sumo": (("run", "new", "2", "4", "60", "--scenario", "loop", "--seed", "3", "--arg", "speed=20", "--disturb",
-              "brake=0.1", "--probe", "2", "--branch", "--keep-going", "--audit", "0.5"), "new"),
-    "suite": (("suite", "run", "suite.toml", "many", "2"), "many"),
-    "shrink": (("shrink", "h", "--crash", "0", "--budget", "60"), "h"),
-    "judge": (("judge", "h", "--crash", "0", "--why", "10"), ""),
-    "corpus run": (("corpus", "run", "kept", "--keep", "today"), "today"),
-    "bisect": (("bisect", "../h", "--good", "HEAD~2"), ""),
-    "salvage": (("check", "h", "--salvage", "saved"), "saved"),
-    "export": (("export", "h", "crash.zip", "--crash", "0"), "crash.zip"),
-    "report": (("report", "h", "--output", "report.html"), "report.html"),
-    "replay": (("replay", "h", "--crash", "0", "--code", "current"), ""),
-    "archive": (("replay", "before.zip", "--trust"), ""),
-    "rerun": (("rerun", "h", "--to", "again", "--set", "trials=5"), "again"),
-    "film": (("replay", "h", "--crash", "0", "--from-log", "--frames", "frames"), "frames"),
-}  # fmt: skip
-
-
-LEAVING = """
-import _posixshmem, os, uuid
-def leave():
-    name = "/crashhunt-test-" + os.environ["TMPDIR"].replace("/", "-") + uuid.uuid4().hex
-    os.close(_posixshmem.shm_open(name, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode=0o600))
-"""
-
-
-def prepared(shell):
-    """A folder with everything that is killed later."""
-    (shell.folder / "driver.py").write_text(LEAVING + DRIVER.replace("pass", "leave()"))
-    (shell.folder / "suite.toml").write_text(SUITE)
-    shell.crashhunt("run", "h", "2", "3", "60", *AGENT)
-    shell.crashhunt("corpus", "add", *map(str, (shell.folder / "h" / "crashes").glob("00000[01]-*")), "--to", "kept")
-    shell.crashhunt("export", "h", "before.zip", "--crash", "0")
-    project = shell.folder / "my project"
-    project.mkdir()
-    git(project, "init", "-q")
-    for number, code in enumerate((MENDED, f"{MENDED}# 1\n", DRIVER)):
-        (project / "driver.py").write_text(LEAVING + code.replace("pass", "leave()"))
-        git(project, "add", "driver.py")
-        git(project, "commit", "-qm", str(number))
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", COMMANDS)
-def test_whatever_is_killed_whenever_nothing_is_lost_and_nothing_left(toy, made_once, temporary_files, name):
-    """Eight kills of each command: at steps on files, and after some time."""
-    kills = int(os.environ.get("CRASHHUNT_TEST_KILLS", "8"))
-    made_once(prepared, toy)
-    base, words = toy.folder, COMMANDS[name][0]
-    (base / "sitecustomize.py").write_text(AT_STEP)
-    environment = {**toy.environment, "TMPDIR": str(temporary_files), "PYTHONPATH": str(base)}
-    whole = base.with_name(f"whole of {base.name}")
-    shutil.copytree(base, whole, symlinks=True)
-    folder = base / "my project" if name == "bisect" else base
-
-    def begin(step: int) -> subprocess.Popen:
-        return subprocess.Popen(
-            [str(Path(sys.executable).parent / "crashhunt"), *words], cwd=folder, stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE, env={**environment, "KILL_AT_STEP": str(step), "STEPS_FILE": str(base / "steps")},
-        )  # fmt: skip
-
-    def ended(process: subprocess.Popen) -> int:
-        try:
-            _, said = process.communicate(timeout=300)
-        finally:
-            process.kill()  # one that takes longer would hunt on in a folder that is removed
-        assert b"Traceback" not in said, said
-        return process.returncode
-
-    def nothing_is_left() -> None:
-        wait_for(lambda: not processes_of(base), timeout_s=10.0)
-        subprocess.run([str(Path(sys.executable).parent / "crashhunt"), "oracles"], env=environment,
-                       cwd=base, check=True, capture_output=True)  # fmt: skip
-        assert left_in(base) == []
-        assert not [*base.glob("my project/.git/worktrees")]
-        assert not [*Path("/dev/shm").glob(f"crashhunt-test-{str(temporary_files).replace('/', '-')}*")]
-
-    began = time.monotonic()
-    code = ended(begin(NEVER))
-    took_s = time.monotonic() - began
-    assert code in (0, 1)
-    steps, right = int((base / "steps").read_text()), facts(base)
-    nothing_is_left()
-    generator = random.Random(name)
-    for number in range(kills):
-        shutil.rmtree(base)
-        shutil.copytree(whole, base, symlinks=True)
-        if number % 2:
-            process = begin(generator.randint(1, steps))
-        else:
-            process = begin(NEVER)
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(generator.uniform(0.15, 1.0) * took_s)
-            process.kill()
-        process.communicate(timeout=300)
-        nothing_is_left()
-        if name == "film" and (base / "frames").exists():  # which takes no folder that has anything in it
-            assert facts(base) == right
-            remove_tree(base / "frames")
-        assert ended(begin(NEVER)) == code, (name, number)
-        assert facts(base) == right, (name, number)
-        nothing_is_left()
-
-
-def facts(base: Path) -> dict[str, object]:
-    """What commands have made, but for what tells when, and by which process."""
-    found: dict[str, object] = {}
-    for path in sorted(base.rglob("*")):
-        name = str(path.relative_to(base))
-        if path.name == "ledger.sqlite":
-            with closing(sqlite3.connect(path)) as database:
-                rows = database.execute("SELECT number, result FROM trials ORDER BY number")
-                found[name] = [(number, json.loads(row)["outcome"], json.loads(row)["digest"]) for number, row in rows]
-        elif path.name == "crash.json":
-            data = json.loads(path.read_text())
-            found[name] = [data.get(key) for key in ("outcome", "digest", "confirmed", "step", "shrunk")]
-        elif path.suffix in (".sqlite-wal", ".sqlite-shm", ".pyc", ".jsonl") or ".git/" in name or "__pyca" in name:
-            continue
-        elif path.is_file() and path.name not in ("steps", "run.log", ".lock"):
-            found[name] = path.name
-    return found

@@ -16,12 +16,13 @@ import random
 import shutil
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import threading
 import time
 import urllib.request
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from http.client import HTTPException
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +31,7 @@ import pytest
 from conftest import FAULTY, Shell, add_toy, wait_for
 from repositories import git
 from test_corpus import DRIVER, MENDED
-from test_killed import AGENT, SUITE, facts, processes_of, rows_by_digest
+from test_killed import processes_of
 
 from crashhunt.base.processes import children_of
 from crashhunt.base.temporary import owner_in, remove_tree
@@ -56,6 +57,22 @@ SIGNALS = [
 INSIDE = ("keeper", "fork server", "template", "supervisor", "zygote", "trial")
 LATEST_S = 300.0  # for a command to end by itself
 
+SUITE = """
+[defaults]
+scenario = "toy"
+trials = 6
+max_steps = 60
+seed = 2
+[[hunts]]
+id = "fast"
+[hunts.arguments]
+speed = "9:14"
+[[hunts]]
+id = "slow"
+[hunts.arguments]
+speed = "4:5"
+"""
+AGENT = ("--scenario", "toy", "--agent", "driver:Driver", "--arg", "speed=20:22", "--seed", "1", "--keep-going")
 LOOP = ("--scenario", "loop", "--seed", "3", "--keep-going")
 HIGHWAY = ("--scenario", "highway", "--seed", "1", "--keep-going")
 ERRING = ("--disturb", "brake=0.02", "--probe", "0.5", "--branch", "--audit", "0.5")
@@ -448,3 +465,30 @@ def test_processes_of_a_command_are_found_by_their_roles(tmp_path):
 def see_that_rows_are_kept(before: dict[str, dict[int, str]], after: dict[str, dict[int, str]]) -> None:
     for ledger, rows in before.items():
         assert {number: after[ledger].get(number) for number in rows} == rows
+
+
+def facts(base: Path) -> dict[str, object]:
+    """What commands have made, but for what tells when, and by which process."""
+    found: dict[str, object] = {}
+    for path in sorted(base.rglob("*")):
+        name = str(path.relative_to(base))
+        if path.name == "ledger.sqlite":
+            with closing(sqlite3.connect(path)) as database:
+                rows = database.execute("SELECT number, result FROM trials ORDER BY number")
+                found[name] = [(number, json.loads(row)["outcome"], json.loads(row)["digest"]) for number, row in rows]
+        elif path.name == "crash.json":
+            data = json.loads(path.read_text())
+            found[name] = [data.get(key) for key in ("outcome", "digest", "confirmed", "step", "shrunk")]
+        elif path.suffix in (".sqlite-wal", ".sqlite-shm", ".pyc", ".jsonl") or ".git/" in name or "__pyca" in name:
+            continue
+        elif path.is_file() and path.name not in ("steps", "run.log", ".lock"):
+            found[name] = path.name
+    return found
+
+
+def rows_by_digest(hunt: Path) -> dict[int, str]:
+    """The committed rows of a hunt: number to trace digest."""
+    with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{hunt}/ledger.sqlite?mode=ro", uri=True)) as database:
+        found = database.execute("SELECT number, result FROM trials")
+        return {number: json.loads(row)["digest"] for number, row in found}
+    return {}
