@@ -359,11 +359,16 @@ def paired(**given):
     return SimpleNamespace(**plain | given)
 
 
-def test_failed_hunt_is_an_error_of_its_version(tmp_path):
+def test_failed_hunt_is_an_error_of_its_version(tmp_path, monkeypatch):
     run = started(gate(tmp_path), tmp_path / "g")
     assert not run._refuse_failed(paired())
     assert run._refuse_failed(paired(is_hopeless=True, why_not="too many invalid"))
     assert run._why == "loop: too many invalid"
+    counted = []
+    monkeypatch.setattr(run, "_count_pairs", lambda one, **_: counted.append(one.name))
+    run._hunts = paired(name="a", is_hopeless=True, why_not="too many invalid"), paired(name="b")
+    run._run_hunts()
+    assert counted == ["a"]  # no more hunts start
     with pytest.raises(NoValidTrialError, match="no trial can be set up: no map") as caught:
         run._refuse_failed(paired(failure=lambda: ("base", "no_valid_trial", "no map")))
     assert caught.value.where == "BASE (mine:Old)"
