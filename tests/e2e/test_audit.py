@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sqlite3
-from contextlib import closing
-
 import pytest
 
 from crashhunt.episode import WorkerSettings, scratch_of
@@ -40,12 +36,6 @@ def test_a_difference_is_reported_with_the_first_step_and_field(toy):
 def test_a_share_that_cannot_be_meant_is_refused(toy, share):
     done = toy.crashhunt(*WORDS, f"--audit={share}", expect=2)
     assert f"--audit is {float(share):g}" in done.json["error"]["message"]
-
-
-def left(toy):
-    with closing(sqlite3.connect(toy.folder / "h" / "ledger.sqlite")) as ledger:
-        rows = dict(ledger.execute("SELECT key, value FROM hunt WHERE key IN ('audits_left', 'state')"))
-    return json.loads(rows.get("audits_left", "[]"))
 
 
 def test_audit_that_is_killed_from_outside_is_no_difference(tmp_path, monkeypatch):

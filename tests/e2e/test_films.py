@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import os
-import resource
-from contextlib import redirect_stdout
 from typing import TYPE_CHECKING
 
 import av
 import pytest
 from conftest import add_toy, one_in
 from PIL import Image
-
-from crashhunt.cli import main
 
 if TYPE_CHECKING:
     import numpy as np
@@ -177,24 +171,3 @@ sys.meta_path.insert(0, Hide())
     done = crash.crashhunt("replay", "h", "--from-log", "--video", "a.mp4", expect=2)
     assert word in done.err
     assert "[video]" in done.err
-
-
-@pytest.mark.nightly  # by day, test_log.py has a full disk
-def test_a_full_disk_leaves_no_half_film(crash):
-    """A limit on the size of a file stands in for a disk that is full."""
-    out, code = crash.folder / "out.json", 99
-    pid = os.fork()
-    if pid == 0:
-        try:
-            os.chdir(crash.folder)
-            with out.open("w", encoding="utf-8") as file, redirect_stdout(file):
-                resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))
-                main(["replay", "h", "--from-log", "--video", "a.mp4", "--json"])
-        except SystemExit as leaving:
-            code = leaving.code
-        finally:
-            os._exit(code)
-    _, status = os.waitpid(pid, 0)
-    assert os.waitstatus_to_exitcode(status) == 2, out.read_text()
-    assert "cannot be written" in json.loads(out.read_text())["error"]["message"]
-    assert not list(crash.folder.glob("*.mp4")) + list(crash.folder.glob(".*.mp4"))

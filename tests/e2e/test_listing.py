@@ -63,7 +63,7 @@ def test_list_without_a_kind_names_the_entries_of_every_kind(shell):
     assert "crashhunt list agents" in more
 
 
-@pytest.mark.parametrize("kind", ["agents", "disturbances", "oracles", "scenarios"])
+@pytest.mark.parametrize("kind", ["agents", "disturbances"])
 def test_commands_of_earlier_versions_are_aliases_of_list(shell, kind):
     assert shell.crashhunt(kind, "--json").json == shell.crashhunt("list", kind, "--json").json
     lines = shell.crashhunt("--help").out.splitlines()

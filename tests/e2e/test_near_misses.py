@@ -38,20 +38,6 @@ def test_they_are_the_most_dangerous_survivors(hunt):
     assert hunt.crashhunt("check", "h", "--json").json["fine"]
 
 
-@pytest.mark.nightly  # by day, a crash is
-def test_one_is_replayed_shown_and_exported_by_its_number(hunt):
-    number = str(survivors(hunt)[0]["number"])
-    replayed = hunt.crashhunt("replay", "h", "--crash", number, "--json").json
-    assert (replayed["verdict"], replayed["outcome_recorded"]) == ("reproduced", "survived")
-    assert "survived after 30 steps" in hunt.crashhunt("show", "h", "--crash", number).out
-    hunt.crashhunt("export", "h", "near.zip", "--crash", number)
-    assert hunt.crashhunt("replay", "near.zip", "--from-log", "--json").json["verdict"] == "reproduced"
-    hunt.crashhunt(
-        "replay", "h", "--crash", number, "--from-log", "--gif", "near.gif", "--size", "128x64", "--fps", "1"
-    )
-    assert (hunt.folder / "near.gif").stat().st_size > 1000
-
-
 def test_it_is_reported_around_the_moment_when_it_was_nearest(hunt):
     number = str(survivors(hunt)[0]["number"])
     words = ("h", "--crash", number)

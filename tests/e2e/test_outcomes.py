@@ -111,20 +111,6 @@ def test_process_that_dies_in_the_constructor_of_an_agent_is_no_crash(toy):
     assert not [*toy.folder.glob("h/crashes/*")]
 
 
-def test_a_traffic_crash_states_who_hit_which(shell):
-    words = ("run", "h", "2", "60", "600", "--arg", "speed=22:25", "--seed", "3", "--json")
-    (found,) = shell.crashhunt(*words).json["crashes"]
-    assert found["outcome"] == "collision"
-    crash = crash_of(shell.folder / "h")
-    assert crash["category"] == "traffic crash"
-    hit = crash["collision"]
-    assert hit["role"] in ("collider", "victim")
-    assert "ego" in (hit["collider"], hit["victim"])
-    assert set(hit["seen_by"]) <= {"overlap", "reported"}
-    assert hit["lane"]
-    assert crash["closest_approach"]["gap_m"] == 0.0 or hit["seen_by"] == ["reported"]
-
-
 def test_crash_on_decides_what_counts(toy):
     words = ("run", "h", "2", "4", "60", "--agent", "faulty:Raises", *TOY, "--json")
     report = toy.crashhunt(*words, "--crash-on", "collision,hang").json

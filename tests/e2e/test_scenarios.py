@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 from conftest import mostly_nightly, one_in
 
-import crashhunt
 from crashhunt.crashes import list_bundles, names_of_actions
 from crashhunt.report import player_data
 from crashhunt.scenario import shipped_scenarios
@@ -155,20 +154,6 @@ def test_a_mistake_in_a_highway_scenario_is_one_line(shell, table, says):
     assert says in done.err
     assert len(done.err.strip().splitlines()) == 1
     assert "snapshots" not in done.err  # the file to mend is the one that was given
-
-
-@pytest.mark.nightly  # by day, replays/test_prepare.py and replays/test_verdicts.py
-def test_a_crash_in_one_simulator_is_tried_in_another(shell):
-    words = ("--scenario", "highway", "--agent", "keep-lane", "--arg", "speed=30", "--seed", "1", "--deterministic")
-    shell.crashhunt("run", "h", "2", "20", "150", *words)
-    done = shell.crashhunt("replay", "h", "--scenario", "motorway", expect=None)
-    assert "the scenario was highway and is motorway" in done.out
-    assert "it crashes there as well" in done.out or "does not show a fix" in done.out
-    told = shell.crashhunt("replay", "h", "--scenario", "motorway", "--json", expect=None).json
-    assert told["verdict"] in ("changed", "not_comparable")
-    assert told["divergence"] is None
-    assert crashhunt.replay(shell.folder / "h", scenario="motorway").verdict == told["verdict"]
-    assert "2 controlled" in shell.crashhunt("replay", "h", "--scenario", "loop-two-agents", expect=2).err
 
 
 STRANGE = [

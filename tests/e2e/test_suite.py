@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import signal
 import tomllib
 
 import pytest
-from conftest import wait_for
 
 SUITE = """
 [defaults]
@@ -42,21 +39,6 @@ agent = "explodes:Agent"
 [[hunts]]
 id = "no-scenario"
 scenario = "nowhere"
-"""
-SLOW = """
-[defaults]
-scenario = "toy"
-trials = 80
-max_steps = 50
-seed = 3
-scenario_arguments = { step_wall_s = 0.001 }
-arguments.speed = 4
-[[hunts]]
-id = "a"
-[[hunts]]
-id = "b"
-[[hunts]]
-id = "c"
 """
 
 
@@ -113,20 +95,6 @@ def test_a_damaged_plan_leaves_the_others_untouched(toy):
     run_all(folders, 2)
     assert states(toy) == {"fast/0": "error", "fast/1": "crashed", "slow/0": "finished"}
     assert "no request.json" in toy.crashhunt("logs", "out", "--errors-only").out
-
-
-@pytest.mark.nightly  # by day, test_gate.py interrupts two hunts
-def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
-    written(toy, SLOW.replace("80", "5000"))  # so that none ends before it is looked at, on no machine
-    process = toy.begin("suite", "run", "suite.toml", "out", "2", "--json")
-    wait_for(lambda: (toy.folder / "out/b/0/ledger.sqlite").exists() and len(numbers(toy, "out/b/0")) > 3)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=300)
-    assert process.returncode == 130, err
-    assert len(json.loads(out)["hunts"]) == 3
-    assert "Run the same command to resume" in err
-    found = states(toy)
-    assert (found["a/0"], found["b/0"], found["c/0"]) == ("interrupted", "interrupted", "queued")
 
 
 def test_snapshots_of_a_suite_take_in_what_is_asked_for(toy):

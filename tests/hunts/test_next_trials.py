@@ -267,18 +267,6 @@ def test_a_trial_that_is_run_again_is_what_was_proposed(tmp_path):
     assert len(after) == TRIALS + 9
 
 
-@pytest.mark.nightly  # by day, the hunts above, and test_optuna.py makes one again, which continues
-def test_a_hunt_with_a_sampler_of_optuna_runs_the_same_trials_however_often_it_is_killed(tmp_path):
-    """What it has drawn and its generations are in no ledger, and follow from what it is told."""
-    pytest.importorskip("optuna")
-    chosen = settings("optuna:cma-es", deterministic=True)
-    hunt(tmp_path / "whole.sqlite", chosen, random.Random(1), lag=4)
-    path, started = killed_again_and_again(tmp_path, chosen, random.Random(2), [9, 13, 11, 8], lag=4)
-    assert len(started) == 5
-    assert specs(path) == specs(tmp_path / "whole.sqlite")
-    assert {spec.origin for spec in specs(path)} == {"random", "optuna"}
-
-
 def test_one_that_does_not_learn_needs_no_row(tmp_path):
     path = tmp_path / "ledger.sqlite"
     hunt(path, settings("random"), random.Random(1))

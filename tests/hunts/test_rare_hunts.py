@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import pytest
 
 import crashhunt
-from crashhunt.cli import _spell_out
 from crashhunt.disturbances import DisturbanceSampler, brake
 from crashhunt.errors import UsageError
 from crashhunt.hunts._reports import RareReport
@@ -80,14 +79,6 @@ def test_rare_mode_refuses_what_it_has_no_law_for(tmp_path, options, says):
 def test_rare_mode_keeps_going_so_it_may_keep_a_few_bundles_of_each_type(tmp_path):
     hunt = crashhunt.prepare(tmp_path / "h", 1, 8, 20, **OPTIONS, disturb=["stop=0.01"], keep=2)
     assert (hunt.settings.run.keep, hunt.settings.run.keep_going) == (2, True)
-
-
-def test_a_box_of_western_longitudes_is_the_value_of_its_option():
-    assert _spell_out(["init", "d", "--bbox", "-122.3,37.8,-122.2,37.9"]) == [
-        "init", "d", "--bbox=-122.3,37.8,-122.2,37.9",
-    ]  # fmt: skip
-    for words in (["init", "d", "--bbox"], ["init", "--bbox", "--json"], ["init", "d", "--bbox", "2,48,3,49"]):
-        assert _spell_out(words) == words
 
 
 class Rows(dict):

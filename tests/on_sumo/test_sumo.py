@@ -74,17 +74,6 @@ def test_a_network_that_no_one_wrote_for_us(town, agent, ego):
     assert sorted(path.name for path in town.folder.iterdir() if path.name != "__pycache__") == sorted([*before, "h"])
 
 
-@pytest.mark.nightly  # by day, test_traffic_survey.py replaces vehicles
-def test_another_vehicle_is_driven_in_each_trial(town):
-    words = ("--scenario", "town.sumocfg", "--arg", "speed=5:9", "--keep-going", "--keep-trials", "--seed", "3")
-    done = town.crashhunt("run", "h", "2", "6", "100", *words, "--json")
-    assert "invalid" not in done.json["outcomes"]
-    assert "each trial replaces one random vehicle (3 candidates, entering at 2" in done.err
-    specs = [json.loads(path.read_text())["spec"] for path in (town.folder / "h" / "trials").glob("*/params.json")]
-    assert {"ego"} == {agent for spec in specs for agent in spec["arguments"]}
-    assert len({spec["scenario_arguments"]["vehicle"] for spec in specs}) > 1
-
-
 def test_who_takes_the_place_of_another_drives_on_from_there(town, tmp_path):
     """The same traffic as with the other, whose way goes on, one step later, where it was."""
     scenes = {}

@@ -93,17 +93,6 @@ def test_hunt_does_not_resume_with_other_code_and_loses_nothing(agent, tmp_path)
     assert sum(run(9).outcomes.values()) == 9
 
 
-@pytest.mark.nightly  # by day, the file of an agent
-def test_scenario_that_changed_is_named_by_its_file(agent, tmp_path):
-    run(2)
-    (tmp_path / "toy.toml").write_text(TOY.replace("30.0", "31.0"))
-    with pytest.raises(HuntDirectoryError, match=r"scenario_arguments\.gap_m was 30.0 and is now 31\.0"):
-        run(2)  # an argument of the scenario is a setting
-    (tmp_path / "toy.toml").write_text(TOY.replace("A toy", "Another toy"))
-    with pytest.raises(HuntDirectoryError, match=f"{REFUSED} 2 trials of this hunt: scenario/scenario.toml;"):
-        run(2)
-
-
 def test_hunt_without_results_may_change_its_code(agent, tmp_path):
     run(2)
     with closing(Ledger(tmp_path / "h" / "ledger.sqlite", writable=True)) as ledger:

@@ -143,16 +143,6 @@ def test_only_the_order_of_danger_counts_for_the_strategies_alone(make, crashes,
     assert hunted(lambda danger: 1.0 - danger) != asked
 
 
-@pytest.mark.nightly  # by day, danger that leads nowhere
-def test_danger_that_states_nothing_gets_probes_only():
-    luck = np.random.default_rng(1)
-    asked, _ = hunt(GuidedSampler(UNIT), lambda _: luck.random() * 0.9, 450)
-    guided = [proposal.origin for proposal in asked[100:]]
-    assert guided.count("halton") > 0.6 * len(guided)
-    asked, _ = hunt(GuidedSampler(UNIT), lambda _: 0.0, 300)
-    assert [proposal.origin for proposal in asked[100:]].count("halton") > 0.6 * 200
-
-
 def test_danger_that_leads_nowhere_has_a_try_and_then_next_to_nothing():
     asked, _ = hunt(GuidedSampler(UNIT), lambda proposal: 0.9 - float(np.linalg.norm(values(proposal) - 0.5)) / 2, 500)
     unguided = [proposal.origin in ("halton", "random") for proposal in asked]

@@ -213,19 +213,6 @@ def test_after_an_interrupt_the_next_request_gets_its_own_answer(remote, monkeyp
         assert (again.tobytes(), info_again) == (observation.tobytes(), info)
 
 
-@pytest.mark.nightly  # by day, one between messages
-def test_an_interrupt_in_the_middle_of_a_message_ends_the_process(remote, monkeypatch):
-    remote.reset(seed=1)
-    with monkeypatch.context() as patch:
-        patch.setattr(type(remote._episodes._pipe), "recv_bytes", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            remote.step(1)
-    for _ in range(2):
-        with pytest.raises(SimulatorError, match="interrupted in the middle of a message; make a new environment"):
-            remote.reset()
-    assert not os.path.exists(f"/proc/{remote._episodes.pid}")  # noqa: PTH110
-
-
 @pytest.mark.parametrize("crash", [pytest.param("", marks=pytest.mark.nightly), None])
 def test_a_killed_process_is_reported_whatever_is_asked_next(remote, crash):
     remote.reset(seed=1)

@@ -64,8 +64,7 @@ CONFIGS = {
 # with continuous actions on a motorway; test_kernel.py has linear drivers, test_accelerator_usual.py has grids. The
 # others, and other traffic (seed 1), by night.
 ALWAYS = [(name, "default", 0) for name in ("intersection-multi-agent-v2", "merge-generic-v1", "roundabout-generic-v1")]
-ALWAYS += [("highway-fast-v0", config, 0) for config in ("default", "seen")] + [("racetrack-oval-v0", "default", 0)]
-ALWAYS += [("parking-parked-v0", "default", 0)]
+ALWAYS += [("highway-fast-v0", config, 0) for config in ("default", "seen")]
 STEPS = {"highway-v0": 4, "lane-keeping-v0": 40}
 
 
