@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from crashhunt.agents._protocol import SPEED_OR_META, meta_actions, wanted_meta_action
+from crashhunt.base.errors import UsageError
 from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
@@ -41,22 +42,21 @@ def check_layout(space: Space[object] | None) -> None:
     """Refuse an observation space that lacks the columns which the agent reads.
 
     Raises:
-        ValueError: the observation space has parts, or not the columns presence, x, y, vx, vy, cos_h and sin_h.
+        UsageError: the observation space has parts, or not the columns presence, x, y, vx, vy, cos_h and sin_h.
     """
     if space is None:
         return
     from gymnasium.spaces import Dict  # takes no time here: the maker of the space has imported it
 
     if isinstance(space, Dict):
-        raise ValueError(
-            f"the agent observes Kinematics, but would receive the parts {', '.join(space)}; name no parts for it, or "
-            "--observe kinematics"
-        )
+        message = f"the agent observes Kinematics, but would receive the parts {', '.join(space)}"
+        raise UsageError(message, fix="name no parts for it, or --observe kinematics")
     columns = (space.shape or (0,))[-1]
     if columns != SIN_H + 1:
-        raise ValueError(
+        raise UsageError(
             "the agent needs the default features (presence, x, y, vx, vy, cos_h, sin_h), but the observation has "
-            f"{columns} columns"
+            f"{columns} columns",
+            fix="omit features in [observation]",
         )
 
 

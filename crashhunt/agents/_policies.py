@@ -407,7 +407,8 @@ class NumpyPolicy:
         action_space: action space of the vehicle.
 
     Raises:
-        ValueError: the file does not contain such weights, or the observation does not have the default columns.
+        UsageError: the observation does not have the default columns.
+        ValueError: the file does not contain such weights.
     """
 
     actions = SPEED_OR_META

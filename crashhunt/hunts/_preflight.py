@@ -49,6 +49,7 @@ _MAX_INVALID_AT_START = 10  # trials; if none of so many could begin, the setup 
 _ENOUGH_TRIALS = 10
 """Trials after which a hunt reports that a name of the scenario has not occurred; later trials may still correct it."""
 _ABSENT_SO_FAR = " names nothing that occurred "
+_OF_ANY_VALUES = ("PluginError", "UsageError")  # classes of errors that the values of arguments do not cause
 _ENOUGH_CANDIDATES = 4
 """Trials; one that fails by chance would do so as often as this only rarely."""
 
@@ -57,7 +58,7 @@ class Preflight:
     """Holds back the first results of a hunt as long as all of them are the same start-up failure of an agent.
 
     This check takes no additional time, because it uses the hunt's own first trials. If an argument of the agent
-    varies, another value may work, so no result is held back.
+    varies, another value may work, so no result is held back, except for errors that do not depend on values.
 
     Args:
         settings: settings of the hunt.
@@ -109,7 +110,7 @@ class Preflight:
             failure.kind,
             failure.message,
         )
-        varied = any(
+        varied = failure.kind not in _OF_ANY_VALUES and any(
             agent == failure.agent and not isinstance(distribution, Constant)
             for (agent, _), distribution in self._settings.space.items()
         )
@@ -120,7 +121,7 @@ class Preflight:
         assert failure is not None
         # The hunt replaces the other paths of the snapshot.
         message, trace = _replaced(failure.message, self._files), _replaced(failure.traceback, self._files)
-        kind = "" if failure.kind in ("ValueError", "invalid") else f"{failure.kind}: "
+        kind = "" if failure.kind in ("ValueError", "invalid", *_OF_ANY_VALUES) else f"{failure.kind}: "
         given = result.spec.arguments.get(failure.agent, {})
         # The user may have given an argument or not, so name no option.
         names = ", ".join(f"{name}={value}" for name, value in given.items() if isinstance(value, str))
@@ -130,6 +131,8 @@ class Preflight:
         message, _, fix = message.partition(" Fix: ")  # which crashhunt's own agents name
         usual = f"correct the agent or its arguments {names}" if names else "correct the agent"
         fix = fix.rstrip(".") or usual
+        if failure.kind in _OF_ANY_VALUES:
+            fix = ""  # which the message contains
         if "pip install" in message:
             fix = "install the package"
         return ArgumentError(

@@ -19,6 +19,7 @@ from crashhunt.agents._car_following import (
     idm_acceleration,
     off_path,
 )
+from crashhunt.base.errors import UsageError
 from crashhunt.simulators import MetaAction
 
 SPEEDS = st.floats(0.0, 24.0)
@@ -161,13 +162,13 @@ def test_an_observation_of_other_columns_is_refused():
     for space in (None, spaces.Box(-1, 1, (8, 7), np.float32)):
         check_layout(space)
     for space in (spaces.Box(-1, 1, (8, 6), np.float32), spaces.Discrete(3)):
-        with pytest.raises(ValueError, match="default features"):
+        with pytest.raises(UsageError, match="default features"):
             check_layout(space)
 
 
 def test_parts_of_observations_are_refused_with_their_names():
     space = spaces.Dict({"ego": spaces.Box(0.0, 1.0, (13,)), "actors": spaces.Box(0.0, 1.0, (2, 15))})
     with pytest.raises(
-        ValueError, match="receive the parts actors, ego; name no parts for it, or --observe kinematics"
+        UsageError, match="receive the parts actors, ego; name no parts for it, or --observe kinematics"
     ):
         check_layout(space)

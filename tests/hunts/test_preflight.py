@@ -111,6 +111,18 @@ def test_where_an_argument_varies_another_value_may_do():
     assert preflight.filter_setup_failures(result(0)) == [result(0)]
 
 
+@pytest.mark.parametrize("kind", ["PluginError", "UsageError"])
+def test_where_no_value_would_do_it_is_refused_with_the_fix_of_the_message(kind):
+    preflight = Preflight(settings_of(speed="5:15"), 3)
+    message = "'fmu:a.fmu': its input x has no source; name the source"
+    held = [result(number, message, kind=kind) for number in range(3)]
+    assert [preflight.filter_setup_failures(one) for one in held[:2]] == [[], []]
+    with pytest.raises(
+        ArgumentError, match=r"^agent ego: .* does not start: 'fmu:a\.fmu': .* no source; name the source$"
+    ):
+        preflight.filter_setup_failures(held[2])
+
+
 class Says:
     """An executor with notices."""
 
