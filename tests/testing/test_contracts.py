@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import subprocess
@@ -253,51 +252,6 @@ class TestRecorded(_Agents):
             agent.act(observations[0])
         with pytest.raises(IndexError, match="60 actions"):
             agent.act(observations[0])
-
-
-ENVIRONMENT = """
-import json, sys, warnings
-warnings.simplefilter("error")
-import gymnasium
-from gymnasium.utils.env_checker import check_env
-where, *forms = sys.argv[1:]
-for form in forms:
-    options = {"action": form, "max_steps": 50, "render_mode": "rgb_array", "process": where == "own"}
-    environment = gymnasium.make("crashhunt:crashhunt/SUMO-v0", **options)
-    check_env(environment.unwrapped)
-    observation, info = environment.reset(seed=4)
-    first = observation.tobytes()
-    steps, done = 0, False
-    while not done:
-        observation, reward, terminated, truncated, info = environment.step((8.0, 0) if form == "continuous" else 1)
-        steps += 1
-        done = terminated or truncated
-    again, _ = environment.reset(seed=4)
-    later, _ = environment.reset()
-    other = gymnasium.make("crashhunt:crashhunt/SUMO-v0", process=False)
-    other.reset(seed=1)
-    try:
-        environment.unwrapped.step(environment.action_space.sample())
-        taken_over = ""
-    except Exception as error:
-        taken_over = str(error)
-    other.close()
-    environment.close()
-    print(json.dumps({"same": again.tobytes() == first, "next": later.tobytes() != first, "steps": steps,
-                      "truncated": bool(truncated), "taken_over": taken_over}))
-"""
-
-
-@pytest.mark.nightly  # by day, test_episodes.py has the checker
-@pytest.mark.parametrize(("where", "forms"), [("here", ["meta"]), ("here", ["continuous"]), ("own", ["meta"])])
-def test_the_gymnasium_environment_passes_gymnasiums_own_checker(where, forms):
-    command = [sys.executable, "-c", ENVIRONMENT, where, *forms]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) == len(forms)
-    for found in map(json.loads, done.stdout.splitlines()):
-        assert ("another simulator" in found.pop("taken_over")) == (where == "here")
-        assert found == {"same": True, "next": True, "steps": 50, "truncated": True}
 
 
 def test_meta_actions_are_in_the_order_of_highway_env():
