@@ -18,21 +18,23 @@ class Frenetix:
         path = np.vstack([path[0] - 20 * (path[1] - path[0]), path, path[-1] + 50 * (path[-1] - path[-2])])
         along = np.append(0, np.hypot(*np.diff(path, axis=0).T).cumsum())
         smooth = [np.convolve(np.interp(np.arange(along[-1]), along, v), np.ones(7) / 7, "valid") for v in path.T]
-        self.frame = fx.CoordinateSystemWrapper(np.column_stack(smooth))  # without corners, in steps of 1 m
+        self.path = np.column_stack(smooth)  # without corners, in steps of 1 m
         self.size, self.wheelbase = (vehicle.length, vehicle.width, vehicle.rear_axle_offset), vehicle.wheelbase
-        self.desired_speed, self.caution = desired_speed, caution
+        self.desired_speed, self.caution, self.at = desired_speed, caution, 0
 
     def reset(self, seed): ...
 
     def act(self, observation):
-        x, y, heading, speed, acceleration, _, steering = observation["ego"][:7].tolist()
+        x, y, yaw, v, acceleration, _, steering = observation["ego"][:7].tolist()
         ahead, limit = (route := observation["route"][observation["route"][:, 0] > 0])[:, 1:3], route[:, 4]
         wanted = min(self.desired_speed, np.sqrt(limit**2 + 2 * np.hypot(*(ahead - (x, y)).T)).min())  # at 1 m/s²
-        state = fx.CartesianPlannerState(np.array([x, y]), heading, speed, acceleration, steering)
-        start = fx.compute_initial_state(self.frame, state, self.wheelbase, is_slow := speed < 4)
-        rows = [(0, t, *start.x0_lon, v, 0, *start.x0_lat, d, 0, 0) for t, v, d in ENDS * (1, wanted, 1)]
+        self.at += np.hypot(*(self.path[self.at : self.at + 500] - (x, y)).T).argmin()
+        frame = fx.CoordinateSystemWrapper(self.path[max(0, self.at - 20) : self.at + 150])
+        state = fx.CartesianPlannerState(np.array([x, y]), yaw, v, acceleration, steering)
+        start = fx.compute_initial_state(frame, state, self.wheelbase, is_slow := v < 4)
+        rows = [(0, t, *start.x0_lon, end, 0, *start.x0_lat, d, 0, 0) for t, end, d in ENDS * (1, wanted, 1)]
         handler = fx.TrajectoryHandler(0.1)
-        handler.add_function(FillCoordinates(is_slow, heading, self.frame, 3))
+        handler.add_function(FillCoordinates(is_slow, yaw, frame, 3))
         handler.add_feasability_function(limits.CheckAccelerationConstraint(8.0, 8.0, False))
         handler.add_feasability_function(limits.CheckCurvatureConstraint(0.6, self.wheelbase, False))
         handler.add_cost_function(costs.CalculateLateralJerkCost("lateral", 0.2))
@@ -48,12 +50,10 @@ class Frenetix:
         # To drive through an actor fast has a smaller sum of probabilities than to brake, so exclude it; else brake.
         free = (one for one in feasible if not self._touches(one, observation))  # the first is the cheapest
         plan = next(free, None) or min(feasible, key=lambda one: one.v[5], default=None)
-        times = np.arange(31) * 0.1
         if plan:
-            return np.column_stack((times[: len(plan.x)], plan.x, plan.y, plan.theta, plan.v))
-        s = (t := np.minimum(times, speed / 8)) * (speed - 4 * t)  # no curve is feasible: brake straight on
-        places = np.add((x, y), np.outer(s, (np.cos(heading), np.sin(heading))))
-        return np.column_stack((times, places, 0 * s + heading, speed - 8 * t))
+            return np.column_stack((np.arange(len(plan.x)) * 0.1, plan.x, plan.y, plan.theta, plan.v))
+        s = (t := np.minimum(at := np.arange(31) * 0.1, v / 8)) * (v - 4 * t)  # else brake straight on
+        return np.column_stack((at, np.add((x, y), np.outer(s, (np.cos(yaw), np.sin(yaw)))), 0 * s + yaw, v - 8 * t))
 
     def _touches(self, plan, observation):
         for actor, poses in zip(observation["actors"], observation["predictions"], strict=True):
