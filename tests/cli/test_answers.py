@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from command_line import run
 
 from crashhunt import cli
 from crashhunt.cli import _corpus, _gate, _judge, _rate, _suite
@@ -21,9 +22,8 @@ from crashhunt.suites import GateProgress
 
 
 def test_what_if_refuses_to_run_no_time():
-    options = cli.make_parser().parse_args(["whatif", "h", "--times", "0"])
     with pytest.raises(UsageError, match="--times is 0; give at least 1"):
-        options.command(options, [])
+        run("whatif", "h", "--times", "0")
 
 
 @pytest.mark.parametrize(
@@ -69,11 +69,6 @@ def test_rate_refuses_two_units():
         run("rate", "a", "--bar", "2/hour", "--per", "trial")
     with pytest.raises(UsageError, match="--bar is 2"):
         run("rate", "a", "--bar", "2")
-
-
-def run(*words):
-    options = cli.make_parser().parse_args(list(words))
-    return options.command(options, list(words))
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from command_line import parser, run
 
-from crashhunt import cli
 from crashhunt.cli import _check, _guide, _judge, _replay, _shrink, _trust, _whatif
 from crashhunt.corpus import KnownType
 from crashhunt.crashes import Cause, TrustedOrigin
@@ -20,11 +20,6 @@ from crashhunt.render import FilmOptions
 from crashhunt.replays import ReplayOptions
 from crashhunt.trial import Outcome
 from crashhunt.trial_reruns import StoppedError
-
-
-def run(*words):
-    options = cli.make_parser().parse_args([str(word) for word in words])
-    return options.command(options, list(words))
 
 
 def named(name, **more):
@@ -265,7 +260,7 @@ def test_panels_are_drawn_from_the_step_before_the_first_that_a_film_shows(monke
     ],
 )
 def test_steps_of_a_replay_to_look_at(words, look):
-    options = cli.make_parser().parse_args(["replay", "h", *words])
+    options = parser().parse_args(["replay", "h", *words])
     if {"--pdb", "--json"} <= {*words}:
         with pytest.raises(UsageError, match="--pdb needs a terminal"):
             _replay._view_of(options, crash())
@@ -275,19 +270,19 @@ def test_steps_of_a_replay_to_look_at(words, look):
 
 
 def test_debugger_stops_in_the_step_in_which_the_agent_failed():
-    options = cli.make_parser().parse_args(["replay", "h", "--pdb"])
+    options = parser().parse_args(["replay", "h", "--pdb"])
     assert _replay._view_of(options, crash(outcome=Outcome.AGENT_ERROR)).stop_at == 51
     assert _replay.look_at_all(crash(outcome=Outcome.HANG)).until == 50
     assert _replay.look_at_all(crash(outcome=Outcome.PROCESS_DIED, steps=0)) is None
     assert _replay.look_at_all(crash(), quiet=True).quiet
     assert not _replay.look_at_all(crash()).quiet
-    gui = cli.make_parser().parse_args(["replay", "h", "--gui"])
+    gui = parser().parse_args(["replay", "h", "--gui"])
     with pytest.raises(UsageError, match="ended before its first step, so there is nothing to show; omit --gui"):
         _replay._view_of(gui, crash(outcome=Outcome.PROCESS_DIED, steps=0))
 
 
 def test_closest_moment_is_that_of_a_near_miss(monkeypatch):
-    options = cli.make_parser().parse_args(["replay", "h", "--before", "3"])
+    options = parser().parse_args(["replay", "h", "--before", "3"])
     near = SimpleNamespace(step=20, agent="ego", other="x")
     monkeypatch.setattr("crashhunt.crashes.most_dangerous", lambda recording: near)
     bundle = crash(is_near_miss=True)
@@ -413,13 +408,13 @@ def test_film_has_the_options_that_are_given(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     words = ["--gif", "a.gif", "--fps", "5", "--size", "320x200", "--last-seconds", "3", "--no-panels"]
     words += ["--last-step-repeats", "7", "--blank-frames", "2"]
-    film = _replay.film_options(cli.make_parser().parse_args(["replay", "h", *words]))
+    film = _replay.film_options(parser().parse_args(["replay", "h", *words]))
     assert (film.fps, film.size, film.last_s, film.panels) == (5.0, (320, 200), 3.0, False)
     assert (film.last_step_repeats, film.blank_frames) == (7, 2)
-    usual = _replay.film_options(cli.make_parser().parse_args(["replay", "h", "--video", "a.mp4"]))
+    usual = _replay.film_options(parser().parse_args(["replay", "h", "--video", "a.mp4"]))
     assert (usual.fps, usual.size, usual.last_s, usual.panels) == (0.0, (960, 540), 0.0, True)
     assert (usual.last_step_repeats, usual.blank_frames) == (10, 10)
-    assert _replay.film_options(cli.make_parser().parse_args(["replay", "h", "--fps", "5"])) is None
+    assert _replay.film_options(parser().parse_args(["replay", "h", "--fps", "5"])) is None
 
 
 def test_films_of_several_crashes_are_written_together(opened, monkeypatch, capsys, tmp_path):

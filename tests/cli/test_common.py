@@ -11,9 +11,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from command_line import parser as whole_parser
 
 from crashhunt.base.signals import stop_requests
-from crashhunt.cli import _common, _trust, make_parser
+from crashhunt.cli import _common, _trust
 from crashhunt.cli._common import Parser
 from crashhunt.errors import HuntDirectoryError, UntrustedError, UsageError
 
@@ -77,12 +78,12 @@ def test_name_that_begins_with_a_hyphen_is_no_missing_argument():
     with pytest.raises(
         UsageError, match=r"^there is no option '-dash'; see .*; if it is a file or folder, write ./-dash$"
     ):
-        make_parser().parse_args(["run", "-dash", "1", "1", "1"])
+        whole_parser().parse_args(["run", "-dash", "1", "1", "1"])
     with pytest.raises(
         UsageError, match=r"^--agent has no value; give one, as --agent=VALUE if it begins with a hyphen"
     ):
-        make_parser().parse_args(["run", "h", "1", "1", "1", "--agent", "-dash"])
-    assert make_parser().parse_args(["rate", "h", "--bar=-1"]).bar == "-1"
+        whole_parser().parse_args(["run", "h", "1", "1", "1", "--agent", "-dash"])
+    assert whole_parser().parse_args(["rate", "h", "--bar=-1"]).bar == "-1"
 
 
 def test_help_that_cannot_be_written_is_an_error(parser):
@@ -293,7 +294,7 @@ def test_options_of_a_hunt_are_read_as_python_has_them():
     ],
 )
 def test_all_values_of_an_option_with_a_list_count(words, counted):
-    given = vars(make_parser().parse_args(words))
+    given = vars(whole_parser().parse_args(words))
     assert {name: given[name] for name in counted} == counted
 
 
@@ -309,7 +310,7 @@ def test_all_values_of_an_option_with_a_list_count(words, counted):
 )
 def test_option_of_which_a_user_expects_both_values_to_count_is_refused_twice(words, message):
     with pytest.raises(UsageError) as caught:
-        make_parser().parse_args(words)
+        whole_parser().parse_args(words)
     assert str(caught.value).startswith(message)
 
 
@@ -319,7 +320,7 @@ def test_option_of_which_a_user_expects_both_values_to_count_is_refused_twice(wo
 )
 def test_empty_id_of_a_crash_is_refused(words, text):
     with pytest.raises(UsageError) as caught:
-        make_parser().parse_args([*words, "--crash", text])
+        whole_parser().parse_args([*words, "--crash", text])
     assert str(caught.value).startswith(f"--crash {text!r} has an empty id; give the id of a crash or the number of")
 
 

@@ -18,6 +18,7 @@ keep_going = true
 """
 
 
+@pytest.mark.nightly  # by day, test_answers_on_crashes.py
 def test_crash_that_is_not_in_the_corpus_ends_the_night_with_1(toy):
     toy.crashhunt(
         "run", "h", "1", "4", "60", "--scenario", "toy", "--arg", "speed=10:20", "--seed", "1", "--keep-going"
