@@ -616,7 +616,7 @@ class _StopsAndGoes:
 def test_parts_of_observations_are_the_same_bit_by_bit(run, scenario, parts):
     agents = _StopsAndGoes(), _StopsAndGoes()
     (ours, simulator), (theirs, _) = (
-        run(scenario, native=native, steps=160, parts=parts, agent=agent)
+        run(scenario, native=native, steps=100, parts=parts, agent=agent)
         for native, agent in zip((None, False), agents, strict=True)
     )
     assert simulator._sight.core is core

@@ -148,7 +148,9 @@ HITS = {("grid-lights", 1), ("stops", 2), ("left-grid", 5)}
 """Town and seed of drives that end at another vehicle in a junction: the driver is an example, and no good one."""
 
 
-@pytest.mark.parametrize(("name", "seed", "share"), [("grid-lights", 1, 0.2), ("allway", 2, 1.0)])
+@pytest.mark.parametrize(
+    ("name", "seed", "share"), [("grid-lights", 1, 0.2), pytest.param("allway", 2, 1.0, marks=pytest.mark.nightly)]
+)
 def test_compiled_core_writes_the_observations_of_the_driver_like_python(name, seed, share, tmp_path, monkeypatch):
     from crashhunt.sumo import SumoSetup, SumoSimulator
 

@@ -10,6 +10,8 @@ import pytest
 
 from crashhunt.trial import TrialSpec
 
+pytestmark = pytest.mark.nightly  # by day, test_guided_known_crashes.py finds several kinds
+
 STUDY = Path(__file__).parents[2] / "scripts" / "studies" / "search"
 
 
