@@ -301,7 +301,7 @@ PARTS: Mapping[str, Part] = {
         ),
         Part(
             name="route",
-            meaning="points along the route ahead, on the best lane",
+            meaning="points along the route ahead, on the best lane; a required lane change is a step to the side",
             axes=("points",),
             columns=(
                 _PRESENT,
