@@ -148,8 +148,6 @@ def libraries_of(locator: str) -> tuple[dict[str, Path], list[str]]:
     Raises:
         PluginError: the program does not exist or cannot be executed.
     """
-    if can_fork(locator):
-        return {}, []
     program = _program(words_of(locator)[0], locator)
     return ({}, []) if _is_of_system(program) else own_libraries(program)
 

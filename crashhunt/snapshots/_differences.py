@@ -159,7 +159,7 @@ def program_warnings(snapshot: Snapshot, locators: Iterable[str]) -> list[str]:
     files, here = snapshot.argument_files, platform.machine()
     found = []
     for locator in locators:
-        if not is_program(locator) or can_fork(locator):  # a library is refused where it is loaded
+        if can_fork(locator):  # a library is refused where it is loaded
             continue
         word = words_of(locator)[0]
         facts = describe_binary(Path(files[word])) if word in files else None

@@ -533,7 +533,7 @@ def _program_files(settings: HuntSettings, found: Sources, takes_code: bool, hun
             places[word] = f"{folder}/{path.name}"
             places |= {str(module): f"{folder}/{name}" for name, module in neighbouring_modules(path).items()}
         found.files[places[word]] = str(path)
-    for locator in locators:
+    for locator in (one for one in locators if not can_fork(one)):
         libraries, fixed = libraries_of(locator)
         folder = f"{layout.FILES}/{libraries_folder(locator)}"
         places |= {str(path): f"{folder}/{name}" for name, path in libraries.items() if name not in fixed}

@@ -215,6 +215,7 @@ _TESTS_ELSEWHERE = {
         "testing/test_broken_contracts.py",
     ),
     "snapshots": ("snapshots/test_*.py", "e2e/test_snapshot.py"),
+    "snapshots/_differences.py": ("snapshots/test_changes.py", "base/test_binaries.py", "e2e/test_snapshot.py"),
     "suites": ("suites/test_*.py", "e2e/test_suite.py", "e2e/test_gate.py"),
     "testing/_backend_contract.py": ("scenario/test_backends.py",),
     "testing/_disturbance_contract.py": ("disturbances/test_rates.py",),

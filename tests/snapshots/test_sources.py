@@ -7,12 +7,13 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from crashhunt.base.git import query
 from crashhunt.base.plugins import ImportedModules
-from crashhunt.snapshots._take import _cannot_make, find_sources
+from crashhunt.snapshots._take import Sources, _cannot_make, _program_files, find_sources
 
 
 def test_crashhunt_comes_along_without_the_pages_of_its_guide():
@@ -114,6 +115,16 @@ def test_zip_file_that_holds_a_module_is_copied_and_imported_from(tmp_path, monk
     assert found.files[place] == str(archive)
     assert found.paths == ["code", place]
     assert not [kept for kept in found.files if "zipped" in kept]
+
+
+def test_files_of_programs_and_fmus_have_places_whatever_their_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("planner.py", "helper.py", "it's.fmu"):
+        Path(name).touch(mode=0o755)
+    agents = {name: SimpleNamespace(agent=name) for name in ("exec:./planner.py", "fmu:./it's.fmu")}
+    places = _program_files(SimpleNamespace(agents=agents), Sources(), False, tmp_path / "h")
+    helper = {str(tmp_path / "helper.py"): "files/program-0/helper.py"}
+    assert places == {"./planner.py": "files/program-0/planner.py", **helper, "./it's.fmu": "files/program-1/it's.fmu"}
 
 
 @pytest.mark.parametrize(
