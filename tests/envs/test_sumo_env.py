@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -15,57 +14,10 @@ import pytest
 from conftest import mostly_nightly
 from gymnasium.utils.env_checker import check_env
 
-import crashhunt
 from crashhunt.envs import SumoEnv
-from crashhunt.errors import ActionError, InvalidEpisodeError, ScenarioError, SimulatorError, UsageError
+from crashhunt.errors import ActionError, SimulatorError, UsageError
 from crashhunt.scenario import ACTIONS
 from crashhunt.sumo._observing import READERS
-
-SEVERAL = """
-import json, warnings
-import gymnasium
-import numpy as np
-warnings.simplefilter("ignore")
-
-def make():
-    return gymnasium.make("crashhunt:crashhunt/SUMO-v0", action="meta", max_steps=40)
-
-if __name__ == "__main__":
-    one, two = make(), make()
-    found = {"kinds": [type(env.unwrapped._episodes).__name__ for env in (one, two)]}
-    first, second = (env.reset(seed=3)[0] for env in (one, two))
-    same = np.array_equal(first, second)
-    for _ in range(20):
-        a, b = one.step(3), two.step(3)
-        same = same and np.array_equal(a[0], b[0]) and a[1:] == b[1:]
-    found["same"] = bool(same)
-    one.close()
-    found["again"] = type(make().unwrapped._episodes).__name__
-    two.close()
-    found["vector"] = []
-    for kind in (gymnasium.vector.SyncVectorEnv, gymnasium.vector.AsyncVectorEnv):
-        vector = kind([make] * 2)
-        vector.reset(seed=[5, 5])
-        rewards = [vector.step(np.array([3, 3]))[1] for _ in range(5)]
-        found["vector"].append(float(np.sum(rewards)))
-        found["equal"] = all(reward[0] == reward[1] for reward in rewards)
-        vector.close()
-    print(json.dumps(found))
-"""
-
-
-@pytest.mark.nightly  # by day, test_episodes.py, and one at a time
-def test_several_in_one_process_and_in_gymnasiums_vectors(tmp_path):
-    (tmp_path / "several.py").write_text(SEVERAL)
-    done = subprocess.run(
-        [sys.executable, "several.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["kinds"] == ["Episodes", "RemoteEpisodes"]
-    assert found["again"] == "Episodes"  # the first has been closed
-    assert found["same"] and found["equal"]  # noqa: PT018 - one fact
-    assert found["vector"][0] == found["vector"][1] > 0
 
 
 def with_every_part(form, scenario="intersection", parts=tuple(READERS)):
@@ -120,80 +72,6 @@ def test_stable_baselines3_trains_with_steering_on_a_dictionary_of_parts():
     vector.close()
 
 
-@pytest.fixture(scope="module")
-def own():
-    env = SumoEnv("intersection", process=True, render_mode="rgb_array")
-    yield env
-    env.close()
-
-
-def test_a_picture_of_the_scene(own):
-    own.reset(seed=1)
-    first = own.render()
-    assert (first.shape, first.dtype) == ((540, 960, 3), np.uint8)
-    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 10
-    for _ in range(10):
-        own.step((8.0, 0))
-    assert not np.array_equal(own.render(), first)
-    assert own.metadata["render_fps"] == 10
-
-
-def test_only_the_last_step_of_an_episode_has_an_outcome(own):
-    _, info = own.reset(seed=1)
-    times, ended = [info["sim_time_s"]], False
-    while not ended and len(times) < 600:
-        _, _, ended, truncated, info = own.step((14.0, 0))
-        times.append(info["sim_time_s"])
-        assert not truncated
-        assert ("outcome" in info) == ended
-    assert np.diff(times) == pytest.approx(0.1)
-    assert info["outcome"] in ("collision", "finished")
-    with pytest.raises(SimulatorError, match="the episode has ended"):
-        own.step((14.0, 0))
-    own.reset(seed=1)
-    assert "outcome" not in own.step((14.0, 0))[4]
-
-
-def test_errors_come_through(own):
-    own.reset(seed=1)
-    with pytest.raises(ActionError, match="is not") as caught:
-        own.step(np.array([[1.0], [0.0]]))
-    assert caught.value.fix
-    own.step((8.0, 0))  # and it goes on
-    with pytest.raises((ScenarioError, InvalidEpisodeError, UsageError)):
-        SumoEnv("no-such-scenario", process=True)
-    with pytest.raises(UsageError, match="render_mode is 'human'"):
-        SumoEnv(render_mode="human")
-
-
-@pytest.mark.nightly  # by day, in the same process: test_episodes.py
-def test_others_err_where_it_is_asked_for():
-    env = SumoEnv("loop", process=True, disturb="brake=2, stop=0.5", max_steps=40)
-    found = []
-    for _ in range(2):
-        observations, said = [env.reset(seed=4)[0]], []
-        for step in range(1, 41):
-            observation, _, terminated, truncated, info = env.step((12.0, 0))
-            observations.append(observation)
-            said += [(step, *info.get("disturbances", ()))] if "disturbances" in info else []
-            if terminated or truncated:
-                break
-        found.append((np.array(observations), said))
-    env.close()
-    (first, said), (second, again) = found
-    assert said == again
-    assert np.array_equal(first, second)
-    assert any("brakes with" in words for _, *told in said for words in told)
-    plain = SumoEnv("loop")  # in this process, where it is the same
-    plain.reset(seed=4)
-    undisturbed = [plain.step((12.0, 0)) for _ in range(len(first) - 1)]
-    plain.close()
-    assert not any("disturbances" in info for *_, info in undisturbed)
-    last = said[0][0]  # until somebody errs, it is the same episode
-    assert all(np.array_equal(first[step], undisturbed[step - 1][0]) for step in range(1, last))
-    assert not np.array_equal(first[-1], undisturbed[-1][0])
-
-
 def test_what_disturbs_the_first_observation_is_reported_with_it():
     env = SumoEnv("loop", disturb="late_observation@1=itself:0.2:1,late_action@2=itself:0.2:1", max_steps=5)
     _, told = env.reset(seed=4)
@@ -225,8 +103,6 @@ def ended(pid):
 
 def test_a_process_that_dies_is_reported():
     env = SumoEnv(process=True)
-    with pytest.raises(UsageError, match="nothing to render"):
-        SumoEnv.render(_with_mode(env))
     env.reset(seed=1)
     os.kill(env._episodes._process.pid, signal.SIGKILL)
     with pytest.raises(SimulatorError, match="ended by signal 9; make a new environment"):
@@ -292,24 +168,6 @@ def test_reseeded_copies_differ_and_can_be_repeated(branching):
     assert (one, other) == (same, again)
 
 
-def test_what_cannot_be_branched_is_refused_in_one_line(own, monkeypatch):
-    here = SumoEnv("loop")
-    with pytest.raises(UsageError, match="process of its own can be branched; make it with process=True"):
-        here.branch(1)
-    here.close()
-    with pytest.raises(UsageError, match="n is 0; give the number of copies"):
-        own.branch(0)
-    env = SumoEnv("loop", process=True)
-    with pytest.raises(SimulatorError, match="no episode is running, so there is nothing to branch; call reset"):
-        env.branch(1)
-    env.close()
-
-
-def _with_mode(env):
-    env.render_mode = "rgb_array"
-    return env
-
-
 ORPHAN = """
 import os, sys, time
 from crashhunt.envs import SumoEnv
@@ -332,11 +190,6 @@ def test_it_ends_with_its_parent_whatever_becomes_of_that():
             assert ended(pid)
         finally:
             os.killpg(process.pid, signal.SIGKILL)  # the copy
-
-
-def test_accelerate_is_offered_in_public():
-    assert "accelerate" in dir(crashhunt)
-    assert callable(crashhunt.accelerate)
 
 
 ORDERS = """

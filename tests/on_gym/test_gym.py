@@ -18,7 +18,6 @@ from crashhunt.episode import Nearness
 from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.gym import GymSimulator
 from crashhunt.gym._descriptor import BACKEND, CrashRule, GymSetup
-from crashhunt.oracles import ReportedCollision
 from crashhunt.plans import Request, plan
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.testing import SimulatorContract
@@ -68,10 +67,6 @@ gymnasium.register("Tray-v0", entry_point=Tray, disable_env_checker=True)
 gymnasium.register("Short-v0", entry_point=Tray, disable_env_checker=True, max_episode_steps=10)
 
 
-def fell_hard(observation, reward, terminated, truncated, info):
-    return f"fell at {observation['step'][0]}" if info["fell"] else ""
-
-
 def scenario_of(name, *, crash=None, arguments=None, **kwargs):
     setup = GymSetup(id=name, kwargs=kwargs, crash=CrashRule(**(crash or {})))
     return Scenario(simulator="gym", tables={"gym": setup}, agents={"ball": AgentSetup()}, arguments=arguments or {})
@@ -110,32 +105,6 @@ def fall(simulator, steps=100):
         if terminations["ball"]:
             return step
     return None
-
-
-@pytest.mark.parametrize(
-    ("crash", "says"),
-    [
-        ({"info": "fell"}, "fell"),
-        ({"reward_below": -2.0}, "reward -2."),
-        ({"function": f"{__name__}:fell_hard"}, "fell at "),
-        ({"termination": True}, "terminated"),
-    ],
-)
-def test_the_crash_rule_states_when_and_why(tmp_path, crash, says):
-    simulator = simulator_of(tmp_path, "Tray-v0", crash=crash)
-    step = fall(simulator)
-    (contact,) = simulator.scene().contacts
-    assert contact.kind.startswith(says)
-    assert step == 40 if says == "terminated" else 8 <= step <= 13
-    (finding,) = ReportedCollision().check(simulator.scene(), ("ball",))
-    assert (finding.collision.role, finding.collision.kind) == ("alone", contact.kind)
-
-
-def test_without_a_rule_the_episode_finishes_when_the_environment_terminates(tmp_path):
-    simulator = simulator_of(tmp_path, "Tray-v0")
-    assert fall(simulator) == 40
-    assert simulator.scene().contacts == ()
-    assert simulator.agents == []
 
 
 def was_cut(observation, reward, terminated, truncated, info):
@@ -271,7 +240,7 @@ def test_environment_has_the_wrappers_with_which_it_is_registered(tmp_path):
 
 
 def test_scenario_without_a_crash_rule_has_a_note():
-    for crash, count in (({}, 1), ({"kind": f"{__name__}:kind_of"}, 1), ({"info": "fell"}, 0)):
+    for crash, count in (({}, 1), ({"kind": f"{__name__}:was_cut"}, 1), ({"info": "fell"}, 0)):
         found = list(BACKEND.notes(scenario_of("Tray-v0", crash=crash)))
         assert (
             found == ["gym.crash has no rule, so only failures of the agent and of the environment are crashes"] * count
@@ -309,16 +278,6 @@ def test_observations_are_recorded_flat_and_shown_as_they_are(tmp_path):
     shown = spaces.unflatten(space, flat)
     assert space.contains(shown)
     assert np.array_equal(shown["ball"], simulator._env.unwrapped.ball)
-
-
-def test_scenario_arguments_are_keywords(tmp_path):
-    arguments = {"wide": ArgumentSetup(default=3.0, option="size")}
-    simulator = simulator_of(tmp_path, "Tray-v0", crash={"info": "fell"}, arguments=arguments)
-    assert simulator._env.unwrapped.size == 3.0
-    simulator.reset(seed=1, options={"arguments": {"wide": 0.5}})
-    assert simulator._env.unwrapped.size == 0.5
-    with pytest.raises(InvalidEpisodeError, match="a tray has a size"):
-        simulator.reset(seed=1, options={"arguments": {"wide": -1.0}})
 
 
 def test_scenario_argument_that_is_a_signal_is_a_function_of_the_time(tmp_path):
@@ -463,17 +422,6 @@ def make_straying():
     return Straying()
 
 
-def test_observations_that_the_environment_does_not_promise_are_reported_once(tmp_path):
-    simulator = simulator_of(tmp_path, f"{__name__}:make_straying")
-    for _ in range(2):
-        simulator.reset(seed=1)
-        for _ in range(4):
-            simulator.step({"me": np.array(1)} if "me" in simulator.agents else {simulator.agents[0]: np.array(1)})
-    nan, outside = simulator.notices
-    assert nan.endswith("shows its agent an observation that contains NaN")
-    assert outside.endswith("shows its agent an observation outside its own observation space")
-
-
 SCENARIO = """
 schema = 1
 title = "Strays"
@@ -506,7 +454,6 @@ class Near(Tray):
             **info,
             "left": left if self.steps != 2 else math.nan,
             "share": 1 - left / self.size,
-            "word": "far",
         }
 
 
@@ -531,52 +478,11 @@ def test_where_no_scene_states_it_the_environment_names_its_danger(tmp_path, dan
         assert nearness.end(TrialResult(spec, Outcome.SURVIVED)).danger == simulator.named_danger
 
 
-def test_a_danger_that_names_nothing_or_is_no_number_is_one_line(tmp_path):
+def test_danger_that_names_nothing_is_one_line():
     scenario = scenario_of("Near-v0")
     for danger in ("distance", "info.", "-reward"):
         with pytest.raises(ScenarioError, match=f"gym.danger = '{danger}' is not of the form"):
             BACKEND.check(scenario.with_table(replace(scenario.table(GymSetup), danger=danger)), "scenario.toml")
-    simulator = GymSimulator(scenario.with_table(replace(scenario.table(GymSetup), danger="info.word")), tmp_path)
-    simulator.reset(seed=1)
-    with pytest.raises(ForeignError) as caught:
-        simulator.step({"ball": simulator.actions["ball"].encode({"tilt": np.zeros(2, np.float32), "kick": 0})})
-    assert str(caught.value.error).startswith("gym.danger = 'info.word' is of type str: 'far' (allowed: a bool, ")
-
-
-class Kinds(Tray):
-    def step(self, action):
-        *rest, info = super().step(action)
-        kind = {1: "left  edge\n", 2: 7, 3: "", 4: "a" * 200}.get(self.size, "right edge")
-        return *rest, {**info, "crash_kind": kind}
-
-
-gymnasium.register("Kinds-v0", entry_point=Kinds, disable_env_checker=True)
-
-
-def kind_of(observation, reward, terminated, truncated, info):
-    return f"beyond {observation['ball'][0]:.0f}" if info["fell"] else 1 / 0
-
-
-@pytest.mark.parametrize(
-    ("size", "rule", "kind"),
-    [
-        (1, {"info": "fell"}, "left edge"),
-        (2, {"info": "fell"}, "fell"),  # a number is no text
-        (3, {"info": "fell"}, "fell"),
-        (4, {"info": "fell"}, "a" * 80),
-        (5, {"info": "fell"}, "right edge"),
-        (5, {"info": "fell", "kind": f"{__name__}:kind_of"}, "beyond 5"),
-    ],
-)
-def test_environment_or_function_names_the_crash_type(tmp_path, size, rule, kind):
-    simulator = simulator_of(tmp_path, "Kinds-v0", crash=rule, size=size)
-    fall(simulator)
-    (contact,) = simulator.scene().contacts
-    assert contact.kind == kind
-    # A cell describes the crash where neither the environment nor a function names its type.
-    assert (simulator.crash_cell == "") == (kind not in ("fell",))
-    simulator.reset(seed=2)
-    assert simulator.crash_cell == ""
 
 
 TWO_KINDS = """
