@@ -63,7 +63,7 @@ _DESCRIPTION = "Hunt for the crashes of a driving agent, and save each crash so 
 _EPILOG = """\
 examples:
   crashhunt run crash 2 300 1500
-      hunt the shipped scenario `loop`: 2 trials at a time, 300 at most, 1500 steps each
+      hunt the included scenario `loop`: 2 trials at a time, 300 at most, 1500 steps each
   crashhunt run out 4 1000 1500 --scenario my/town.sumocfg --agent my_pkg.agents:Planner --arg headway_s=0.3:2
       hunt your own agent on your own network
   crashhunt replay crash

@@ -166,8 +166,13 @@ def add_json(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
     )
 
 
-def add_crash(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that select a crash."""
+def add_crash(parser: argparse.ArgumentParser, *, default: str = "the crash with the fewest steps") -> None:
+    """Add the arguments that select a crash.
+
+    Args:
+        parser: the parser of the command.
+        default: what the command selects without the option.
+    """
     parser.add_argument(
         "directory",
         metavar="DIR",
@@ -179,7 +184,7 @@ def add_crash(parser: argparse.ArgumentParser) -> None:
         metavar="ID",
         action=CrashId,
         default="",
-        help="the id of a crash, or the number of its trial; default: the crash with the fewest steps",
+        help=f"the id of a crash, or the number of its trial; default: {default}",
     )
 
 

@@ -32,8 +32,8 @@ def add_completion(commands: Commands) -> None:
     completion = commands.add_parser(
         "completion",
         help="print a shell script that adds tab completion",
-        description="Print a script for a shell. With the script, the tab key completes commands, options, scenarios, "
-        "agents, samplers, arguments, outcomes, directories and crashes.",
+        description="Print a script for a shell. With the script, the tab key completes commands,\n"
+        "options, scenarios, agents, samplers, arguments, outcomes, directories and\ncrashes.",
         epilog=_INSTRUCTIONS,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -24,6 +24,8 @@ def add_init(commands: Commands) -> None:
     """Add the command ``init`` to the parser."""
     init = commands.add_parser(
         "init",
+        usage="%(prog)s (--osm FILE | --opendrive FILE | --xosc FILE | --net FILE\n"
+        "                       | --grid NxM | --spider NxM) [option]... DIR",
         help="make a scenario from a map",
         description="Make a scenario from a map: the network, traffic that does not jam, a first agent, and a README "
         "with the next commands. The command tries the scenario before it writes DIR. Needs: pip install "
@@ -31,8 +33,10 @@ def add_init(commands: Commands) -> None:
     )
     init.add_argument("directory", metavar="DIR", type=Path, help="folder of the scenario; must be new or empty")
     maps = init.add_argument_group("the map (exactly one)").add_mutually_exclusive_group(required=True)
-    maps.add_argument("--osm", metavar="FILE", type=Path, help="a map of OpenStreetMap: .osm, .osm.gz or .pbf")
-    maps.add_argument("--opendrive", metavar="FILE", type=Path, help="an OpenDRIVE map: .xodr")
+    maps.add_argument(
+        "--osm", metavar="FILE", type=Path, help="a map of OpenStreetMap: .osm, .osm.xml, .gz of these, or .pbf"
+    )
+    maps.add_argument("--opendrive", metavar="FILE", type=Path, help="an OpenDRIVE map: .xodr or .xodr.gz")
     maps.add_argument(
         "--xosc", metavar="FILE", type=Path,
         help="instead of a map: the parameters of an OpenSCENARIO file of a test case of UN R157 (.xosc)",

@@ -239,7 +239,7 @@ def add_replay(commands: Commands) -> None:
         description="Run a saved crash again in a new process, from its bundle alone, and compare every observation, "
         "action and scene with the log. Exits with 1 if the verdict is not the expected one.",
     )
-    add_crash(replay)
+    add_crash(replay, default="the crash with the fewest steps; for a film, several with commas")
     who = replay.add_mutually_exclusive_group()
     who.add_argument(
         "--code", choices=("snapshot", "current"), default="snapshot",

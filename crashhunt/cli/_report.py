@@ -28,7 +28,7 @@ def add_report(commands: Commands) -> None:
         description="Write one HTML file that needs no network and no other file. The file shows the numbers of the "
         "hunt, plots of arguments against outcomes, and an animated replay of each crash. Runs no code of the bundle.",
     )
-    add_crash(report)
+    add_crash(report, default="all crashes")
     report.add_argument(
         "--output", "-o", metavar="FILE", type=Path, help="the HTML file to write; default: DIR/report.html"
     )

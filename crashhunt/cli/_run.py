@@ -107,7 +107,10 @@ def add_run(commands: Commands) -> None:
         "parallel", metavar="PARALLEL", type=integer, help="number of trials that run at a time; 0: one per core"
     )
     run.add_argument(
-        "trials", metavar="TRIALS", type=integer, help="maximum number of trials; 0: no limit, which needs --for"
+        "trials",
+        metavar="TRIALS",
+        type=integer,
+        help="maximum number of trials; 0: no limit, which needs --for or a bar for the rate",
     )
     run.add_argument("max_steps", metavar="MAX_STEPS", type=integer, help="maximum number of steps of a trial")
     groups = {name: run.add_argument_group(title) for name, title in _GROUPS.items()}

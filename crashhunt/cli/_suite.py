@@ -61,8 +61,8 @@ def add_suite(commands: Commands) -> None:
     run.set_defaults(command=_run)
     defaults = verbs.add_parser(
         "defaults",
-        help="print a suite file with a hunt for every shipped scenario",
-        description="Print a suite file with a hunt for every shipped scenario, which you can edit.",
+        help="print a suite file with a hunt for every included scenario",
+        description="Print a suite file with a hunt for every included scenario, which you can edit.",
     )
     defaults.set_defaults(command=_defaults)
 

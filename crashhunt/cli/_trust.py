@@ -27,7 +27,7 @@ def add_trust_command(commands: Commands) -> None:
         "trust",
         help="trust the code of hunts and crashes that you did not make on this machine",
         description="Trust the code of hunts, crashes and corpora that you did not make on this machine, such as "
-        "folders from your other machine or hunts of an earlier version of crashhunt. Commands then run this code "
+        "folders from your other machine. Commands then run this code "
         "without asking. Prints what the trusted code would run: the agent, the version of crashhunt, and the "
         "snapshot. If the code changes, it is no longer trusted. If DIR is the root of a git work tree, trusts the "
         "crashes that git tracks there, now and later. Runs no code. Without DIR, lists everything that you trust.",

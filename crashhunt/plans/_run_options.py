@@ -63,9 +63,9 @@ class Subject(_Options):
 
     scenario: Path | str = option(
         "loop", "name of an included scenario, or a path",
-        help="a shipped one (see crashhunt list scenarios), a folder, a scenario.toml, a .sumocfg or a map (.osm, "
+        help="an included one (see crashhunt list scenarios), a folder, a scenario.toml, a .sumocfg or a map (.osm, "
         ".xodr)",
-        brief="a shipped scenario, a folder, a scenario.toml, a .sumocfg or a map (.osm, .xodr)",
+        brief="an included scenario, a folder, a scenario.toml, a .sumocfg or a map (.osm, .xodr)",
         flag="--scenario", metavar="NAME|PATH", group="what",
     )  # fmt: skip
     ego: str = option(

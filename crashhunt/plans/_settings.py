@@ -419,7 +419,7 @@ class Request(HuntOptions):
             if fix := check(value):
                 raise UsageError(f"{name} is {value}", fix=fix)
         if not self.trials and not self.duration and not self.until_rate:
-            raise UsageError("TRIALS is 0", fix="give at least 1, or 0 (no limit) and a time with --for")
+            raise UsageError("TRIALS is 0", fix="give at least 1, or 0 (no limit) with --for or --until-rate")
         checked = super(Request, replace(self, keep_going=True) if self.rare else self).checked()
         if checked.until_rate and (checked.sampler != "random" or checked.seeds):
             option = "--seeds" if checked.seeds else f"--sampler {checked.sampler}"

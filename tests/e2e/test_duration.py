@@ -55,6 +55,6 @@ def test_times_are_read(text, seconds):
 
 
 def test_no_limit_at_all_is_refused():
-    with pytest.raises(UsageError, match=r"TRIALS is 0; give at least 1, or 0 \(no limit\) and a time with --for"):
+    with pytest.raises(UsageError, match=r"TRIALS is 0; give at least 1, or 0 \(no limit\) with --for or --until-rate"):
         Request(trials=0, max_steps=1).checked()
     assert Request(trials=0, max_steps=1, duration="1s").checked().trials == 0

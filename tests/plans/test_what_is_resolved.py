@@ -389,7 +389,7 @@ def test_unused_statistics_next_to_a_policy_are_a_note(folder, tmp_path):
         ({"max_steps": 0}, "MAX_STEPS is 0; give at least 1"),
         ({"max_steps": 2.5}, "MAX_STEPS is 2.5; give a whole number"),
         ({"parallel": -1}, "PARALLEL is -1; give at least 0 (0: one per core)"),
-        ({"trials": 0}, "TRIALS is 0; give at least 1, or 0 (no limit) and a time with --for"),
+        ({"trials": 0}, "TRIALS is 0; give at least 1, or 0 (no limit) with --for or --until-rate"),
     ],
 )
 def test_numbers_that_cannot_be_meant_are_refused(numbers, says):
