@@ -103,8 +103,10 @@ def _summary_of(found: Shrunk) -> str:
         return in_lines(lines)
     (before, after), (agents, agents_left), result = found.others, found.agents, small.result
     moved = "" if found.scripted is None else _replaced_words(found.scripted)
+    other, other_now = (one.collision.other if one.collision is not None else "" for one in (was, result))
     lines += [
         f"{small.id}: {result.summary}",
+        *([f"  the crash type is the same, with {other_now} instead of {other}"] if other != other_now else []),
         f"  other actors: {before} before, {after} now; steps: {was.steps} before, {result.steps} now",
         *([f"  agents: {agents} before, {agents_left} now"] if agents_left < agents else []),
         *([f"  {moved}"] if moved else []),

@@ -593,6 +593,12 @@ def test_minimized_crash_is_described():
         "confirmed: bit-identical when replayed in a new process",
         "note: n",
     ]
+    (was, now) = (SimpleNamespace(other=name) for name in ("left.3", "left.5"))
+    with_partners = shrunk(bundle=crash(), small=crash(confirmed=True))
+    with_partners.bundle.result.collision, with_partners.small.result.collision = was, was
+    assert "instead" not in _shrink._summary_of(with_partners)
+    with_partners.small.result.collision = now
+    assert "\n  the crash type is the same, with left.5 instead of left.3\n" in _shrink._summary_of(with_partners)
     odd = crash(path=Path("a\nb/crashes/3"), confirmed=True)
     assert "\n  saved in $'a\\x0ab/crashes/3'\n" in _shrink._summary_of(shrunk(small=odd))
     plain = _shrink._summary_of(shrunk(small=small, ended="budget")).splitlines()
