@@ -461,7 +461,7 @@ def test_several_threads_share_the_folder(place):
 
 def test_several_processes_make_and_remove_the_same_parent(place):
     def use():
-        for _ in range(150):
+        for _ in range(50):
             with temporary_folder("replay") as folder:
                 assert folder.is_dir()
             remove_leftovers()

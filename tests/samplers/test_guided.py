@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import math
 
 import numpy as np
@@ -34,6 +36,11 @@ EXAMPLES = (
 
 def portfolio_told(*trials):
     """One that was told origins and scores, each trial somewhere else."""
+    return copy.deepcopy(_portfolio_told(*trials))
+
+
+@functools.cache
+def _portfolio_told(*trials):
     made = Portfolio(Cube(SPACE), SPACE, HuntFacts())
     for number, (origin, score) in enumerate(trials):
         made.tell(ScoredTrial(number, PLACES[number], number, score, origin))
