@@ -174,7 +174,7 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> tuple[Got, 
                 fix="give --from FOLDER, the folder of the repository that contains the module",
             )
         if found.returncode != 0:
-            last = next(iter(found.stderr.strip().splitlines()[-1:]), "")
+            last = found.stderr.strip().rpartition("\n")[2]
             return "cannot_run", f"{module!r} cannot be imported: {last}"
     command = [sys.executable, "-P", "-m", "crashhunt", "corpus", "run", str(case), "--json"]
     done = run_to_end(command, folder, environment)

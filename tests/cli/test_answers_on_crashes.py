@@ -108,7 +108,7 @@ def grouped(monkeypatch):
     monkeypatch.setattr("crashhunt.results.crashes_by_version", lambda hunts, groups: {})
     monkeypatch.setattr("crashhunt.crashes.group_crashes", group_crashes)
     monkeypatch.setattr("crashhunt.report.describe_groups", lambda groups, known: f"types; known: {known}")
-    monkeypatch.setattr("crashhunt.report.describe_causes", lambda groups, causes: "causes")
+    monkeypatch.setattr("crashhunt.report.describe_causes", lambda types, causes: f"{types is groups}: {len(causes)}")
     monkeypatch.setattr("crashhunt.crashes.join_causes", lambda groups, causes: [named("joined")])
     monkeypatch.setattr("crashhunt.crashes.count_causes", lambda joined: (5, 6))
     monkeypatch.setattr("crashhunt.base.signals.stop_requests", requests)
@@ -149,7 +149,7 @@ def test_types_are_divided_by_cause(grouped, capsys, words, most, interrupted):
     data = json.loads(out)
     assert data["groups"] == [{"type": "rear", "causes": ["why"]}, {"type": "side", "causes": ["why"]}]
     assert (data["types_by_cause"], data["by_cause"]) == (5, ["joined"])
-    assert "causes\n" in err
+    assert "True: 2\n" in err
     assert ("Interrupted: some causes are not known yet." in err) == interrupted
     assert [bundle.hunt for bundle, _ in asked["trust"]] == ["h0", "h1"]
     assert {trusted for _, trusted in asked["trust"]} == {None}
@@ -648,6 +648,8 @@ def test_bisect_ends_with_1_where_it_stays_open(opened, monkeypatch, capsys, com
     run("bisect", "h", "--good", "v1", "--json", "--build", "make -j4", "--build-timeout", "2m")
     assert asked[3][2] == {"bad": "HEAD", "folder": None, "build": "make -j4", "build_limit_s": 120.0}
     assert capsys.readouterr().out == json.dumps({"commit": commit}) + "\n"
+    with pytest.raises(UsageError, match="the following arguments are required: --good"):
+        run("bisect", "h")
 
 
 def test_crash_is_exported_as_a_zip_file_or_as_a_scenario(opened, monkeypatch, capsys, tmp_path):

@@ -156,13 +156,14 @@ def judge(monkeypatch, tmp_path):
             is_import = command[2] == "-c"
             place = tmp_path / origin if not origin.startswith("/") else origin
             return SimpleNamespace(
-                returncode=code if is_import else 1, stdout=f"{place}\n" if is_import else printed, stderr="x" * 400
-            )
+                returncode=code if is_import else 1, stdout=f"{place}\n" if is_import else printed,
+                stderr=f"Traceback\n{'x' * 400}\n",
+            )  # fmt: skip
 
         monkeypatch.setattr(_bisect, "run_to_end", run_to_end)
         monkeypatch.setattr(_bisect, "import_environment", lambda folder, tree: {"PATHS": f"{folder} {tree}"})
         got, why = _bisect._run(tmp_path / "case", tmp_path / "agents", tmp_path, {"z", "agents.driver"})
-        assert bool(why) == (got == "cannot_run")
+        assert why == (f"'agents.driver' cannot be imported: {'x' * 400}" if got == "cannot_run" else "")
         return got, ran
 
     return judge_it
