@@ -9,6 +9,7 @@ arrive by itself. crashhunt detects collisions by the outlines, and this module 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from itertools import pairwise
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -109,6 +110,7 @@ class FreeMotion:
         self._backwards_m = self._backwards_after(state)
         self.state = state
         front = state.x + self._half * math.cos(state.heading), state.y + self._half * math.sin(state.heading)
+        self._return_to_route()
         try:
             sumo.vehicle_moveToXY(self._vehicle, "", -1, *front, 90.0 - math.degrees(state.heading), _FREE)
         except libsumo.TraCIException:
@@ -120,6 +122,13 @@ class FreeMotion:
             self.events.append(("off_road", f"drove into the {hit}"))
             return False
         return self._stays_on_road()
+
+    def _return_to_route(self) -> None:
+        """Give the vehicle its own route again after it has left the route, for example to overtake."""
+        vehicle = self._vehicle
+        if sumo.vehicle_getRouteID(vehicle) != self._route and sumo.vehicle_getRoadID(vehicle) in self.edges:
+            with suppress(libsumo.TraCIException):  # SUMO may find no way on this route from here
+                sumo.vehicle_setRouteID(vehicle, self._route)
 
     def _stays_on_road(self) -> bool:
         """Return whether the centre is on the road; add an event if the vehicle begins to drive over a kerb.

@@ -264,6 +264,23 @@ def test_vehicle_that_stands_moves_backwards_by_no_more_than_the_tolerance_in_al
     step(pose(-0.19))
 
 
+def test_vehicle_that_has_overtaken_on_the_oncoming_lane_has_its_route_again(start):
+    _, step = start("trajectory", **EMPTY)
+    route, y0, seen = libsumo.vehicle.getRoute("ego"), centre()[1], []
+    for number in range(110):
+        x, y, h = centre()
+        to = math.atan2(y0 + (6.5 if number < 50 else 0.0) - y, 8.0)
+        h += max(-0.1, min(0.1, max(-0.4, min(0.4, to)) - h))
+        speed = max(8.0, libsumo.vehicle.getSpeed("ego") - 1.0)
+        step([[0.1, x + speed / 10 * math.cos(h), y + speed / 10 * math.sin(h), h, speed]])
+        seen.append((libsumo.vehicle.getRoadID("ego"), libsumo.vehicle.getRoute("ego")))
+    ((away, _),) = {one for one in seen if one[0] != route[0]}
+    first = max(place for place, one in enumerate(seen) if one[0] == away) + 1
+    assert away == "to-west"
+    assert seen[first][1] == route[:1]  # SUMO replaces the route of a vehicle on another road
+    assert {one[1] for one in seen[first + 1 :]} == {route}
+
+
 def test_target_pose_that_is_due_too_early_is_refused_with_the_way_of_a_step(start):
     simulator, _ = start("target_pose", **EMPTY)
     (x, y, h), v = centre(), libsumo.vehicle.getSpeed("ego")
