@@ -9,7 +9,7 @@ import pytest
 
 from crashhunt.errors import UsageError
 from crashhunt.ledger import Ledger
-from crashhunt.plans import Request, RunSettings
+from crashhunt.plans import Request
 
 HUNT = ("--scenario", "toy", "--seed", "4", "--arg", "speed=1", "--set", "step_wall_s=0.001")
 
@@ -38,20 +38,6 @@ def test_trials_that_have_all_ended_are_all_trials(toy):
     ledger = Ledger(toy.folder / "h/ledger.sqlite")
     assert 3500 < ledger.facts()["until"] - time.time() <= 3600
     ledger.close()
-
-
-@pytest.mark.parametrize("text", ["0", "0s", "30x", "m", "-5s", "1m1h", " 5s", "nan", "inf", "1e3s", "1e999s"])
-def test_what_is_no_time_is_refused(text):
-    with pytest.raises(UsageError) as refused:
-        Request(trials=1, max_steps=1, duration=text).checked()
-    assert str(refused.value) == f"--for is {text}; give a time above 0, such as 90s, 30m, 2h or 1h30m"
-
-
-@pytest.mark.parametrize(
-    ("text", "seconds"), [("90", 90), ("1.5m", 90), ("1h30m", 5400), ("2d", 172800), ("1h1s", 3601), ("", float("inf"))]
-)
-def test_times_are_read(text, seconds):
-    assert RunSettings(duration=text).duration_s == seconds
 
 
 def test_no_limit_at_all_is_refused():

@@ -9,7 +9,6 @@ import resource
 import sqlite3
 import threading
 from contextlib import closing, suppress
-from pathlib import Path
 
 import pytest
 
@@ -17,8 +16,6 @@ from crashhunt.base.integrity import digest_of_row
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger, Turn, _schema, _writer
 from crashhunt.trial import KILLED, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
-
-FROZEN = sorted((Path(__file__).parent / "versions").glob("version-*.sqlite"))
 
 
 def result(number, outcome=Outcome.SURVIVED, *, steps=10, origin="", **more):

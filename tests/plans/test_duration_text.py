@@ -22,7 +22,9 @@ def test_each_unit_counts_its_seconds(text, seconds):
     assert check_duration(text) == ""
 
 
-@pytest.mark.parametrize("text", ["0", "0s", "-1", "1x", "h", "30m1h", "1 h", "s", "1e3", "9" * 400])
+@pytest.mark.parametrize(
+    "text", ["0", "0s", "-1", "1x", "h", "30m1h", "1 h", " 5s", "s", "nan", "inf", "1e3", "9" * 400]
+)
 def test_text_that_is_no_time_is_refused(text):
     with pytest.raises(ValueError, match="is not a time"):
         seconds_of(text)

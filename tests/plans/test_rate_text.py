@@ -24,7 +24,11 @@ def test_rates_have_a_number_and_what_it_is_per(text, rate):
     assert check_rate(text) == ""
 
 
-@pytest.mark.parametrize("text", ["2", "-1/hour", "nan/hour", "0/hour", "9e-13/hour", "1.1e12/hour", "1/trial"])
+@pytest.mark.parametrize(
+    "text",
+    ["2", "-1/hour", "nan/hour", "0/hour", "9e-13/hour", "1.1e12/hour", "1/trial", "2/trial", "/hour", "inf/hour",
+     "1e999/hour", "1/mile", "1//hour", "1/hour/hour", "1,5/hour", "1/1001km"],
+)  # fmt: skip
 def test_texts_that_are_no_rates_have_a_fix(text):
     with pytest.raises(ValueError, match=r"rate|range"):
         rate_of(text)

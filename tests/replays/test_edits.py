@@ -60,6 +60,11 @@ def test_edits_of_disturbances_differ_from_edits_of_arguments():
             "disturbances.brake@5", "ahead:1:2", (Disturbance(5, "ahead", "brake", 1.0, 2.0, "ego"), *PLANNED),
             "disturbances.brake@5 was none and is brake@5=ahead:1.0:2.0",
         ),
+        (
+            "disturbances.cut_in@3", "left_ahead:4:2",
+            (Disturbance(3, "left ahead", "cut_in", 4.0, 2.0, "ego"), *PLANNED),
+            "disturbances.cut_in@3 was none and is cut_in@3=left_ahead:4.0:2.0",
+        ),
         ("disturbances.brake@20", "ahead:4:2", PLANNED, ""),
         ("disturbances.40.how_long", "1", PLANNED, ""),
     ],
