@@ -112,6 +112,8 @@ def test_other_words_in_hunt_toml_replace_what_was_given_and_remove_what_has_no_
     assert [(one.step, one.what) for one in found] == [(7, "stop"), (30, "brake")]
     assert changed == ["disturb was stop=0.1,brake@20=ahead:4:2 and is stop=0.1,brake@30=ahead:4:2"]
     assert ignored == []
+    kinds = ("stop=0.1", "late_action=1")  # of two kinds that were drawn, one has a rate no more
+    assert with_other_words((drawn, LATE), kinds, kinds[:1], ("ego",))[0] == (drawn,)
     found, changed, ignored = with_other_words(planned, before, (), ("ego",))
     assert (found, len(changed), ignored) == ((), 1, [])
     found, changed, ignored = with_other_words(planned, before, ("stop=0.2", before[1]), ("ego",))
