@@ -28,7 +28,6 @@ from crashhunt.corpus import _bisection as _bisect
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.hunts import Hunt, check, salvage
-from crashhunt.ledger import Ledger
 from crashhunt.plans import Request, plan
 from crashhunt.results import hunt_state
 from crashhunt.suites import _hunt_reruns, _processes
@@ -149,36 +148,6 @@ def rows(hunt: Path) -> list[int]:
     with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{hunt}/ledger.sqlite?mode=ro", uri=True)) as database:
         return [number for (number,) in database.execute("SELECT number FROM trials")]
     return []
-
-
-def test_salvage_refuses_a_directory_with_anything_else(damaged):
-    (found,) = check(damaged.folder / "h")
-    to = damaged.folder / "saved"
-    to.mkdir()
-    saved = salvage(found, to)  # into one that is empty
-    (to / "crashes" / found.crashes[0]).rename(damaged.folder / "elsewhere")
-    with pytest.raises(HuntDirectoryError, match="the directory exists already"):
-        salvage(found, to)
-    (damaged.folder / "elsewhere").rename(to / "crashes" / found.crashes[0])
-    assert salvage(found, to) == saved
-    resumed = damaged.folder / "resumed"
-    shutil.copytree(to, resumed)
-    with closing(Ledger(resumed / "ledger.sqlite", writable=True)) as ledger:
-        ledger.enter("all_trials")
-    with pytest.raises(HuntDirectoryError, match="the directory exists already"):
-        salvage(found, resumed)
-    with closing(sqlite3.connect(to / "ledger.sqlite")) as database, database:
-        database.execute("DELETE FROM trials WHERE number = (SELECT MAX(number) FROM trials)")
-    for name in ("file", "folder"):
-        other = damaged.folder / name
-        other.touch() if name == "file" else (other / "thesis").mkdir(parents=True)
-        with pytest.raises(HuntDirectoryError, match="the directory exists already"):
-            salvage(found, other)
-    with pytest.raises(HuntDirectoryError, match="the directory exists already"):
-        salvage(found, to)
-    with pytest.raises(HuntDirectoryError, match="cannot be written"):
-        salvage(found, damaged.folder / "no" / "where")
-    assert left_in(damaged.folder) == []
 
 
 def test_rerun_to_that_was_killed_before_it_ran_continues(damaged, monkeypatch):

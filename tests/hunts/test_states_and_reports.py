@@ -349,6 +349,10 @@ def test_salvage_refuses_a_directory_that_has_something_and_names_what_cannot_be
     with pytest.raises(HuntDirectoryError, match="the directory exists already"):
         salvage(checked, taken)
     assert [path.name for path in taken.iterdir()] == ["notes.txt"]
+    (tmp_path / "file").touch()
+    for place, says in ((tmp_path / "file", "exists already"), (tmp_path / "no" / "where", "cannot be written")):
+        with pytest.raises(HuntDirectoryError, match=says):
+            salvage(checked, place)
 
     def fail(*_):
         raise shutil.Error([("source", "copy", "[Errno 5] Input/output error")])

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings, strategies as st
+from hypothesis import given, settings, strategies as st
 from scenes import scene
 
 from crashhunt.oracles import Overlap, ReportedCollision, TooClose, merge_findings
@@ -21,7 +21,6 @@ from crashhunt.world import (
     corners,
     outlines_overlap,
     rectangle_gap,
-    time_to_contact,
 )
 
 rectangles = st.tuples(
@@ -88,26 +87,6 @@ def test_overlap_and_gap_agree_with_points_of_the_outlines(one, two):
         assert distance - gap < 0.2  # between neighbouring points of both outlines
 
 
-@given(rectangles, rectangles, st.floats(-20, 20), st.floats(-20, 20))
-@settings(deadline=None)
-def test_time_to_contact_agrees_with_moving_there(one, two, vx, vy):
-    offset, turn, half_one, half_two = relative(one, two)
-    assume(not outlines_overlap(one, two))
-    c, s = math.cos(one[2]), math.sin(one[2])
-    velocity = np.array([[vx * c + vy * s, vy * c - vx * s]])
-    found = float(time_to_contact(offset, velocity, turn, half_one, half_two)[0])
-
-    def at(time):
-        return (two[0] + vx * time, two[1] + vy * time, *two[2:])
-
-    if math.isfinite(found):
-        assert not outlines_overlap(one, at(max(0.0, found - 1e-3)))
-        touching = rectangle_gap(*relative(one, at(found)))[0]
-        assert touching < 1e-6
-    else:
-        assert not any(outlines_overlap(one, at(time)) for time in np.linspace(0, 5, 60))
-
-
 @given(rectangles, rectangles)
 def test_a_near_miss_is_as_near_as_points_of_the_outlines_say(one, two):
     roster = Roster((Actor("ego", "car", *one[3:]), Actor("other", "car", *two[3:])))
@@ -119,15 +98,6 @@ def test_a_near_miss_is_as_near_as_points_of_the_outlines_say(one, two):
     elif 0.1 < distance < 6.0:
         said = float(found[0].event.what.split()[3])
         assert -0.01 < distance - said < 0.2
-
-
-def test_time_to_contact_of_vehicles_in_line():
-    one, two = (0, 0, 0.0, 5, 2), (25, 0, 0.0, 5, 2)
-    offset, turn, half_one, half_two = relative(one, two)
-    assert time_to_contact(offset, np.array([[-10.0, 0.0]]), turn, half_one, half_two)[0] == pytest.approx(2.0)
-    assert time_to_contact(offset, np.array([[10.0, 0.0]]), turn, half_one, half_two)[0] == math.inf
-    assert time_to_contact(offset, np.array([[0.0, 0.0]]), turn, half_one, half_two)[0] == math.inf
-    assert rectangle_gap(offset, turn, half_one, half_two)[0] == pytest.approx(20.0)
 
 
 def test_the_closest_approach_of_known_scenes():
