@@ -7,13 +7,12 @@ import signal
 import subprocess
 import sys
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from conftest import wait_for
 
-from crashhunt.corpus import add_case, find_cases, read_case, run_cases
+from crashhunt.corpus import add_case, find_cases, run_cases
 from crashhunt.crashes import find_bundle
 from crashhunt.errors import BundleError, HuntDirectoryError
 
@@ -94,28 +93,6 @@ def test_crashes_that_a_corpus_has_are_reported_from_new_ones(kept):
     assert "cannot be written" in kept.crashhunt("crashes", "h", "--summary", "no/s.md", expect=2).err
 
 
-def test_what_is_there_already_gets_another_expectation_only(kept):
-    bundle = find_bundle(kept.folder / "h", "0")
-    corpus = kept.folder / "kept crashes"
-    before = sorted(corpus.iterdir())
-    again = add_case(bundle, corpus, expect="fixed")
-    assert not again.new
-    assert (again.case.expect, again.case.note) == ("fixed", "too fast")
-    assert read_case(again.case.path) == again.case
-    assert sorted(corpus.iterdir()) == before
-
-
-@pytest.mark.parametrize(("corpus", "expected"), [("weights", "w/model.zip"), ("../outside", "{here}/w/model.zip")])
-def test_case_inside_repository_names_its_files_by_relative_paths(kept, corpus, expected):
-    bundle = find_bundle(kept.folder / "h", "0")
-    arguments = {"ego": {**bundle.result.spec.arguments["ego"], "path": str(kept.folder / "w" / "model.zip")}}
-    spec = replace(bundle.result.spec, arguments=arguments)
-    case = add_case(replace(bundle, result=replace(bundle.result, spec=spec)), kept.folder / corpus).case
-    (found,) = case.bundle().result.spec.arguments.values()
-    assert found["path"] == expected.format(here=kept.folder)
-    assert found["speed"] == bundle.result.spec.arguments["ego"]["speed"]
-
-
 def test_todays_code_is_judged(kept):
     found = kept.crashhunt("corpus", "run", "kept crashes", "--keep", "out", "--json").json["cases"]
     assert [(case["got"], case["ok"]) for case in found] == [("still", True)] * 2
@@ -132,14 +109,10 @@ def test_what_is_damaged_or_no_case_is_reported_and_does_not_keep_the_others(kep
     assert (report.got, other.got) == ("cannot_run", "still")
     assert "has changed; restore the case from the repository" in report.now  # there is no --force, as of a replay
     case = second / "crashhunt-case.toml"
-    for text, said in (("expect = 'maybe'", "maybe"), ("expect = [", "not valid TOML"), ("", "expect")):
-        case.write_text(text)
-        (report,) = run_cases([second])
-        assert report.got == "cannot_run"
-        assert said in report.now
-        assert not report.ok
-    case.write_text("expect = 'still'\nlater = 1")  # of a later version
-    assert read_case(second).expect == "still"
+    case.write_text("expect = 'maybe'")
+    (report,) = run_cases([second])
+    assert (report.got, report.ok) == ("cannot_run", False)
+    assert "maybe" in report.now
     with pytest.raises(BundleError, match="no case of a corpus"):
         find_cases([kept.folder / "h"])
     assert "did you mean 'kept crashes'" in kept.crashhunt("corpus", "run", "kept crashs", expect=2).err
