@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,9 +13,7 @@ from crashhunt.base.version import __version__
 from crashhunt.corpus._case_runs import _run_case
 from crashhunt.crashes import find_bundle
 from crashhunt.replays import ReplayOptions, prepare
-from crashhunt.replays._replaying import judged
 from crashhunt.sumo import SumoSetup
-from crashhunt.trial import Outcome
 
 AGENT = '''
 import helper
@@ -204,21 +201,6 @@ def test_a_case_keeps_the_order_of_links_that_it_was_recorded_with(crash_on_sumo
         report = _run_case(path, None, lambda: False)
         assert asked.pop().scenario.table(SumoSetup).fix_link_order is kept
         assert report.warnings == warnings
-
-
-def test_a_fixed_order_of_links_that_is_missing_is_the_first_suspect(crash_on_sumo, monkeypatch):
-    rerun = prepare(find_bundle(crash_on_sumo.folder / "h"), ReplayOptions())
-    environment = {**rerun.snapshot.environment(), "load_order": "fixed"}
-    monkeypatch.setattr(type(rerun.snapshot), "environment", lambda _: environment)
-    result = rerun.bundle.result
-    other = replace(result, outcome=Outcome.SURVIVED)
-    monkeypatch.setattr("crashhunt.native._link_order._load_library", lambda: None)
-    report = judged(rerun, rerun.recorded, rerun.recorded, other)
-    assert (report.verdict, report.reason) == (
-        "not_comparable",
-        "the simulator differs: the order of SUMO's links was fixed and is not fixed: the library is not built",
-    )
-    assert judged(rerun, rerun.recorded, rerun.recorded, result).verdict == "reproduced"
 
 
 def test_a_snapshot_of_a_crashhunt_that_runs_trials_in_another_way_states_so(crash):
