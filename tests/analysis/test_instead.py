@@ -112,16 +112,6 @@ def period(faculty, last, actor="x", first=0):
     return {"faculty": faculty, "last": last, "actor": actor, "first": first}
 
 
-def test_lane_changes_are_tried_first_and_then_the_latest_periods_with_the_partner():
-    periods = [
-        period("longitudinal", 39), period("lateral", 30), period("longitudinal", 36, ""), period("lateral", 19),
-        period("longitudinal", 38, "y"), period("lateral", 24, ""), period("longitudinal", 20),
-    ]  # fmt: skip
-    found = [(one["faculty"], one["last"]) for one in searched()._candidates(tuple(periods))]
-    assert found == [("lateral", 30), ("lateral", 24), ("longitudinal", 39), ("longitudinal", 36)]
-    assert [one["last"] for one in searched()._candidates(tuple(periods[-1:] + periods[3:5]))] == [20]
-
-
 SLOW, SIDE = period("longitudinal", 39, first=9), period("lateral", 30, first=4)
 OWN = [("longitudinal", 9), ("lateral", 4)]
 

@@ -74,28 +74,3 @@ def test_lane_changes_and_then_the_latest_periods_with_the_collision_partner_are
     search = object.__new__(_Search)
     search._end, search._dt, search._other = 60, 0.25, "x"
     assert [one["first"] for one in search._candidates(tuple(periods))] == first
-
-
-@pytest.mark.parametrize(
-    ("was", "outcome", "now", "ending"),
-    [
-        (("ego", "x"), Outcome.SURVIVED, None, "none"),
-        (("ego", "x"), Outcome.FINISHED, None, "none"),
-        (("ego", "x"), Outcome.COLLISION, ("ego", "x"), "same"),
-        (("ego", "x"), Outcome.COLLISION, ("x", "ego"), "same"),
-        (("ego", "x"), Outcome.COLLISION, ("ego", "y"), "other"),
-        (("ego", "x"), Outcome.OFF_ROAD, None, "other"),
-        (None, Outcome.OFF_ROAD, None, "same"),
-        (None, Outcome.COLLISION, ("ego", "x"), "other"),
-        (("ego", "x"), Outcome.HANG, None, "unclear"),
-        (("ego", "x"), Outcome.PROCESS_DIED, None, "unclear"),
-    ],
-)
-def test_ending_of_a_run_with_the_reference_driver_is_that_of_its_crash(was, outcome, now, ending):
-    def result(outcome, hit):
-        collision = hit and SimpleNamespace(collider=hit[0], victim=hit[1])
-        return SimpleNamespace(outcome=outcome, collision=collision)
-
-    search = object.__new__(_Search)
-    search._result = result(Outcome.COLLISION if was else Outcome.OFF_ROAD, was)
-    assert search._ending(result(outcome, now)) == ending
