@@ -187,6 +187,7 @@ def test_learner_that_comes_later_makes_the_trial_invalid(tmp_path):
         (1, {"runner": (1.0,)}, "the reward is of type tuple: (1.0,)"),
         (2, {"runner": {"over": False}}, "terminations['runner'] is of type dict: {'over': False}"),
         (3, {"runner": "False"}, "truncations['runner'] is of type str: 'False'"),
+        (0, 3, "step() returned observations = 3, which is not a dictionary by agent"),
         (2, False, "step() returned terminations = False, which is not a dictionary by agent"),
         (4, [], "step() returned infos = [], which is not a dictionary by agent"),
         (4, {"runner": {"caught": {"hunter_0": False}}}, "info['caught'] is of type dict: {'hunter_0': False}"),

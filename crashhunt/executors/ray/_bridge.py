@@ -70,7 +70,6 @@ def main() -> None:
         control.sendall(json.dumps({**error.to_json(), **kinds}).encode() + b"\n")
     except BaseException:
         traceback.print_exc()
-        sys.stderr.flush()
     finally:
         os._exit(code)  # the keeper and Ray end the remaining processes
 
