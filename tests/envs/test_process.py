@@ -117,15 +117,16 @@ def test_errors_are_raised_here_and_end_nothing(remote):
 def test_answer_to_an_interrupted_request_is_skipped(remote):
     remote.reset(7, {})
 
-    class Interrupted:
-        def poll(self):
-            raise KeyboardInterrupt
+    def interrupt():
+        raise KeyboardInterrupt
 
-    answers, remote._answers = remote._answers, Interrupted()
-    with pytest.raises(KeyboardInterrupt):
-        remote.step(1)
+    answers = remote._answers
+    for waits in ([interrupt], [answers.poll, interrupt]):  # the second time, after the answer to the first
+        remote._answers = SimpleNamespace(poll=lambda waits=waits: waits.pop(0)())
+        with pytest.raises(KeyboardInterrupt):
+            remote.step(1)
     remote._answers = answers
-    assert remote.step(1)[0] == 9
+    assert remote.step(1)[0] == 10
     assert remote.is_closed is False
 
 

@@ -361,6 +361,8 @@ def test_usual_change_of_the_target_speed_needs_no_code_of_highway_env():
             found.append({name: vars(vehicle)[name] for name in before})
             assert applied in (usual, None)
         assert found[0] == (found[1] if usual else before)
+    vars(vehicle).update(before, target_speeds=np.array([[20.0, 30.0]]))
+    assert not _substep_loop.choose(env, 3)
 
 
 def test_step_of_an_onlooker_calls_its_functions_in_order():
