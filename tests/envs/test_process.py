@@ -194,16 +194,6 @@ def test_fork_of_the_owner_only_closes_its_connection():
     there.close()
 
 
-def test_server_ends_with_the_program_of_the_user(monkeypatch):
-    monkeypatch.setattr(_process, "_LOOK_EVERY_S", 0.001)
-    here, there = Pipe()
-    looks = iter([False, False, True])
-    episodes = Episodes(3)
-    assert _process._serve(there, lambda: next(looks), episodes) is episodes
-    assert list(looks) == []
-    here.close()
-
-
 def test_copies_are_closed_where_a_later_one_cannot_be_made(remote, monkeypatch):
     asked = []
 

@@ -23,7 +23,7 @@ from crashhunt.sumo.maps._folder import agent_module, arguments_of, next_command
 from crashhunt.sumo.maps._picture import draw_map, drawable
 from crashhunt.sumo.maps._road_network import Edge, NetworkLane, RoadNetwork
 from crashhunt.sumo.maps._tools import Tools
-from crashhunt.sumo.maps._traffic import Demand, Route, _ego_routes, _entry_capacity, route_file
+from crashhunt.sumo.maps._traffic import Demand, Route, _ego_routes, route_file
 
 
 def lane(allowed=None, disallowed=(), length=100.0, at_m=0.0):
@@ -132,13 +132,6 @@ def test_full_disk_under_a_program_is_reported(tools, tmp_path, monkeypatch):
 def test_rates_add_up_and_follow_weights():
     found = {one.id: rate for one, rate in demand(route("a", "x", weight=3), route("b", "y")).rates()}
     assert found == {"a": pytest.approx(450.0), "b": pytest.approx(150.0)}
-
-
-def test_first_road_of_no_route_gets_more_than_it_takes():
-    routes = (route("a", "x", weight=3), route("b", "y", weight=1))
-    most = _entry_capacity(network(x=[lane()], y=[lane(), lane()]), routes, 4)
-    assert most * 3 / 4 <= 800.0 + 1e-9
-    assert most == pytest.approx(800.0 * 4 / 3)
 
 
 def test_agent_begins_at_different_places_first():
