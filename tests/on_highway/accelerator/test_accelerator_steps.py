@@ -290,6 +290,20 @@ def test_meta_actions_have_the_effect_that_they_have_in_highway_env(change):
     assert slow == fast
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_sub_step_that_leads_beyond_all_numbers_counts_once():
+    def drive():
+        env = made()
+        env.step(1)
+        env.road.vehicles[-1].position[0], env.road.vehicles[-1].speed = 1.797e308, 1e308
+        with pytest.raises(TypeError):
+            env.step(1)
+        return env.steps, [exact(vars(vehicle)) for vehicle in env.road.vehicles]
+
+    slow, fast = slow_and_fast(drive)
+    assert slow == fast
+
+
 def test_meta_action_at_the_end_of_a_lane_is_applied_by_highway_env():
     switch_on()
     env = made()
