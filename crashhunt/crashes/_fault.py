@@ -47,7 +47,7 @@ _STEP_M = 1.0  # m from the side of a car: a nearer person walks in the path of 
 _OFF_M = 2.5  # m from the axis of a car: a nearer person may already be on the road
 _WALKING_SPEED_MPS = 3.0  # m/s: a slower vehicle can stop for any actor
 _CLEARS_S = 3.0  # s before the contact: a vehicle that stood or was inside a junction for so long could be seen
-_INSERTED_S = 1.0  # s after the start: earlier crashes result from the places where vehicles were inserted
+_INSERTED_S = 1.0  # s after an actor has entered: earlier crashes result from the place where it was inserted
 _SOURCES = {"red_light": "Vienna, article 23; StVO § 37", "wrong_way": "Vienna, article 10; StVO § 2"}
 _RED_S = 8.0  # s: a vehicle that ran a red light has left the junction after this time
 
@@ -383,7 +383,7 @@ def _egos(rule: str, words: str, source: str) -> Fault:
 
 def fault_in(case: ContactRecord) -> Fault:
     """Return the fault for a collision according to the rules."""
-    if case.time_s - case.began_s < _INSERTED_S or len(case.before) < 2:
+    if len(case.before) < 2 or case.time_s - max(case.began_s, case.before[0].time_s) < _INSERTED_S:
         return Fault("nobody can tell")
     if case.is_disputed:
         return Fault("nobody can tell")

@@ -157,6 +157,21 @@ def verdict(case):
     return found
 
 
+def test_vehicle_that_enters_the_road_right_before_a_standing_one_is_not_at_fault():
+    def standing(*, entered_s):
+        case = drive(lambda t: (5.0, 0.0, 1.2, 0.0), straight(14))
+        alone = Roster(case.scenes[0].roster.actors[:1])
+        return replace(case, scenes=[
+            one if one.time_s >= -entered_s else Scene(one.time_s, alone, one.points[:1], one.headings[:1],
+                                                       one.speeds[:1])
+            for one in case.scenes
+        ])  # fmt: skip
+
+    assert [one.rule for one in fault_in(standing(entered_s=2.0)).findings] == ["standing"]
+    assert fault_in(standing(entered_s=2.0)).verdict == "the other"
+    assert fault_in(standing(entered_s=0.25)).verdict == "nobody can tell"
+
+
 def test_who_drives_into_the_back_of_who_was_long_ahead():
     assert verdict(drive(straight(20), straight(10, 5))) == "ego"
     assert verdict(drive(straight(10, 5), straight(20))) == "the other"
