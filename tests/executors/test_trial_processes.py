@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base import layout
-from crashhunt.base.errors import CrashhuntError, RecorderError
+from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import _trial_process
 from crashhunt.executors._trial_process import TrialProcess, notices_of_late_imports
@@ -393,6 +393,13 @@ def test_output_of_a_trial_is_in_its_folder(process, monkeypatch, tmp_path):
     assert (folder / layout.RUN_LOG).read_text() == "before"
     assert (folder / layout.STACK).stat().st_mode & 0o777 == 0o644
     assert handled == [found._stack, (signal.SIGUSR1, found._stack)]
+
+
+def test_folder_that_is_gone_is_a_fault_of_the_machine(process, tmp_path):
+    found = process()
+    found._home = tmp_path / "gone"
+    with pytest.raises(HostError, match="in which trials run cannot be entered: No such file or directory; restore it"):
+        found._enter_home()
 
 
 def test_module_that_only_a_trial_imports_from_outside_of_the_snapshot_is_reported(tmp_path, monkeypatch):
