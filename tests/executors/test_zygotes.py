@@ -281,7 +281,9 @@ def test_simulator_that_cannot_be_made_is_reported(zygote):
 
 @pytest.mark.parametrize("reports", [True, False])
 def test_trial_runs_in_a_fork_that_is_waited_for(zygote, monkeypatch, reports):
-    supervisor, opened = zygote.test.supervisor, []
+    supervisor, opened, looks = zygote.test.supervisor, [], []
+    watch = SimpleNamespace(look=lambda: looks.append(True), remove=lambda: None)
+    monkeypatch.setattr(_fork_server, "SharedMemoryWatch", lambda: watch)
     waited = iter([(0, 0), (0, 0), (PID, 3 << 8)])
 
     def pidfd_open(pid):
@@ -303,6 +305,7 @@ def test_trial_runs_in_a_fork_that_is_waited_for(zygote, monkeypatch, reports):
     assert zygote._run(job(0)) == (PID, 3)
     assert zygote.test.killed == [PID]
     assert zygote.test.spared == [frozenset()]
+    assert len(looks) > 1  # at its shared memory, also while it runs: its death would hide this
     assert not stage.exists()
     assert [pid for pid, _ in opened] == [PID] * reports
     for _, write in opened:
