@@ -6,7 +6,6 @@ The first measures the criticality of the episode, and the second records the ep
 from __future__ import annotations
 
 import math
-import struct
 from collections import Counter, deque
 from dataclasses import replace
 from functools import partial
@@ -29,6 +28,7 @@ from crashhunt.recording import (
     encode_events,
     encode_heights,
     encode_notes,
+    encode_roster,
     encode_spines,
 )
 from crashhunt.simulators import (
@@ -280,7 +280,6 @@ class Recorder(Observer):
         self._numbers: dict[Actor, int] = {}
         self._same: dict[int, int] = {}
         self._kept: list[Actor] = []
-        self._roster: Roster | None = None
         # Without detection of events, a count of 0 would be misleading.
         self._events: Counter[str] | None = Counter() if supports(simulator, ReportsEvents) else None
         # Called in every step: without a call in between.
@@ -289,9 +288,13 @@ class Recorder(Observer):
 
     def lend(self, steps: UsualSteps, roster: Roster) -> None:
         """Let the compiled core write the recording of its steps directly, for the given actors."""
-        if roster is not self._roster:
+        if roster is not self._box.roster:
             self._note_roster(roster)
-        self._box.lend(steps, roster)
+        self._box.lend(steps, roster, encode_roster([*map(self.number, roster.actors)]))
+
+    def number(self, actor: Actor) -> int:
+        """Return the number of an actor in the recording; -1 before its first record."""
+        return self._same.get(id(actor), -1)
 
     def begin(self, episode: ObservedEpisode) -> None:
         """Record the actors of the episode."""
@@ -330,7 +333,7 @@ class Recorder(Observer):
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Record a scene, and before it any changes of actors and lanes."""
-        if scene.roster is not self._roster:
+        if scene.roster is not self._box.roster:
             self._note_roster(scene.roster)
         if scene.lanes:
             self._box.append(Tag.LANES, 0, "\n".join(scene.lanes).encode())
@@ -349,20 +352,17 @@ class Recorder(Observer):
     def _note_roster(self, roster: Roster) -> None:
         actors = roster.actors
         # Most are the same objects as before: to look for an equal one takes longer than all else about a roster.
-        numbers = list(map(self._same.get, map(id, actors)))
-        if None in numbers:
-            fresh, known = [], self._numbers
-            for row, number in enumerate(numbers):
-                if number is None:
-                    actor, free = actors[row], len(known)
-                    numbers[row] = self._same[id(actor)] = known.setdefault(actor, free)
-                    self._kept.append(actor)  # so that no other actor gets its id()
-                    if len(known) > free:
-                        fresh.append(actor)
-            if fresh:
-                self._box.append(Tag.ACTORS, 0, encode_actors(fresh))
-        self._box.append(Tag.ROSTER, 0, struct.pack(f"<{len(numbers)}I", *numbers))
-        self._roster = roster
+        fresh, known = [], self._numbers
+        for actor in actors:
+            if id(actor) not in self._same:
+                free = len(known)
+                self._same[id(actor)] = known.setdefault(actor, free)
+                self._kept.append(actor)  # so that no other actor gets its id()
+                if len(known) > free:
+                    fresh.append(actor)
+        if fresh:
+            self._box.append(Tag.ACTORS, 0, encode_actors(fresh))
+        self._box.append(Tag.ROSTER, 0, encode_roster([*map(self.number, actors)]))
 
     def copied(self) -> None:
         """Continue recording in a private copy."""

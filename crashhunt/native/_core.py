@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from functools import cache
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -92,16 +92,21 @@ class UsualSteps(Protocol):
 
     def listen(
         self,
-        enter: Callable[[tuple[str, ...]], tuple[_Vehicles, tuple[str, ...], int, dict[str, object]] | None],
+        meet: Callable[[str], tuple[str, object, float, float, float, bool, int] | None],
+        adopt: Callable[[_Vehicles, tuple[str, ...], Any, int], object],
         record_roster: Callable[[], object],
         /,
     ) -> None:
         """Set the functions that are called when the visible vehicles change.
 
         Args:
-            enter: function that receives their ids, and returns the vehicles in the form for `resume`, or None for an
-                incomplete scene.
-            record_roster: function called when these vehicles are recorded; it provides a recording buffer again.
+            meet: function that receives the id of a vehicle that was not in sight. It returns the id, the actor, its
+                length, width and reach (m), whether it is controlled, and its number in the recording, or -1 before its
+                first record. It returns None if the core cannot continue with this vehicle.
+            adopt: function that receives the vehicles in sight, their ids and actors, and the row of the agent; it
+                returns their roster.
+            record_roster: function that records this roster if an actor has no number yet, or if the buffer is full; it
+                provides a recording buffer again.
         """
 
     def perceive(
@@ -142,7 +147,7 @@ class UsualSteps(Protocol):
 
     def resume(
         self,
-        who: tuple[_Vehicles, tuple[str, ...], int, dict[str, object]],
+        who: tuple[_Vehicles, tuple[str, ...], int, dict[str, object], tuple[object, ...]],
         observation: object,
         columns: Columns,
         time_s: float,
@@ -155,7 +160,7 @@ class UsualSteps(Protocol):
         """Resume after a completed step.
 
         Args:
-            who: The vehicles of the scene, their ids, the row of the agent, and the controlled vehicles.
+            who: The vehicles of the scene, their ids, the row of the agent, the controlled vehicles, and all actors.
             observation: The next observation of the agent.
             columns: The positions, headings and speeds of the scene.
             time_s: The time of the scene, in s.
@@ -166,11 +171,26 @@ class UsualSteps(Protocol):
             step: The number of the step.
         """
 
-    def borrow(self, tape: object, offset: int, reserved: int, tags: tuple[int, int, int, int], /) -> None:
-        """Record into a given buffer, with the tags of observation, action, step and lanes."""
+    def borrow(
+        self, tape: object, offset: int, reserved: int, tags: tuple[int, int, int, int, int], roster: object,
+        numbers: bytes, /,
+    ) -> None:  # fmt: skip
+        """Record into a given buffer.
 
-    def give_back(self) -> tuple[int, int, list[int]]:
-        """Stop recording; return the end of the records, the last complete step, and the offsets of all steps."""
+        Args:
+            tape: The buffer.
+            offset: The offset of the next record.
+            reserved: The number of bytes that may be used.
+            tags: The tags of observation, action, step, lanes and roster.
+            roster: The actors in sight, which have been recorded.
+            numbers: The payload of the record of this roster.
+        """
+
+    def give_back(self) -> tuple[int, int, Any, list[tuple[Any, int, None]]]:
+        """Stop recording; return the end of the records, the last complete step, the last roster, and all steps.
+
+        A step consists of its roster and the offset of its numbers.
+        """
 
     def pause(self) -> None:
         """Run no steps and report nothing until `resume`, while other code runs a step."""

@@ -545,12 +545,11 @@ Surroundings around; // used again: looks are many and alike
 // The row of each actor in the scene before; -1 of who was not in it. Empty where all are the same.
 typedef std::vector<long> Earlier;
 
-// The names of those near, as Python has them; where they are the rows of other names, these objects.
-PyObject *near_names(PyObject *others = nullptr, const Earlier *rows = nullptr) {
+// The names of those near, as Python has them.
+PyObject *near_names() {
     PyObject *ids = PyTuple_New(static_cast<Py_ssize_t>(around.near.size()));
     for (size_t number = 0; ids && number < around.near.size(); number++) {
-        const long row = rows ? (*rows)[number] : -1;
-        PyObject *id = row < 0 ? text_of(around.names[around.near[number]]) : Py_NewRef(PyTuple_GET_ITEM(others, row));
+        PyObject *id = text_of(around.names[around.near[number]]);
         if (!id) {
             Py_CLEAR(ids);
         } else {

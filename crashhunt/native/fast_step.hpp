@@ -47,14 +47,16 @@ struct Steps {
     long standstill = 0;
     int always_ask = 0, overlaps = 0;
     long long last = 0, now_and_then = 0;
-    PyObject *enter = nullptr, *record_roster = nullptr; // called with who is in sight now, and when that is recorded
+    // Called with the name of whom was not in sight, with who is in sight now, and where the core cannot record that.
+    PyObject *meet = nullptr, *adopt = nullptr, *record_roster = nullptr;
     // of the present roster, and of the step that is complete
     bool ready = false, stopped = false, known = false; // whether the vehicles were found in the step before
     long long made = 0; // by SUMO so far when they were, vehicles of this and other runs
     struct Sight {
         Vehicles *vehicles = nullptr;
-        PyObject *ids = nullptr;
+        PyObject *ids = nullptr, *actors = nullptr, *roster = nullptr; // the last as the black box has it
         std::vector<char> controlled;
+        std::vector<uint32_t> numbers; // of the actors, as they are recorded; empty where that is not known
         size_t row = 0;
     } sight, entered;
     Vehicles *before_vehicles = nullptr;
@@ -69,23 +71,23 @@ struct Steps {
     // of the black box
     PyObject *tape = nullptr;
     size_t offset = 0, reserved = 0;
-    long tags[4] = {}; // of an observation, an action, a step, lanes
-    std::vector<size_t> trail;
+    long tags[5] = {}; // of an observation, an action, a step, lanes, a roster
+    PyObject *recorded = nullptr, *trail = nullptr; // the last roster; (roster, where the numbers begin, None) of each step
 
     Steps() = default;
     Steps(const Steps &) = delete;
     ~Steps() {
         for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, perceive, restore, draft, whole_type,
                               part_names, perceived, reinterpret_cast<PyObject *>(eyes),
-                              limits, stood, reinterpret_cast<PyObject *>(sight.vehicles), sight.ids,
-                              reinterpret_cast<PyObject *>(entered.vehicles), entered.ids,
-                              reinterpret_cast<PyObject *>(before_vehicles), enter, record_roster, observation, answer,
-                              tape}) {
+                              limits, stood, reinterpret_cast<PyObject *>(sight.vehicles), sight.ids, sight.actors,
+                              sight.roster, reinterpret_cast<PyObject *>(entered.vehicles), entered.ids, entered.actors,
+                              entered.roster, reinterpret_cast<PyObject *>(before_vehicles), meet, adopt, record_roster,
+                              observation, answer, tape, recorded, trail}) {
             Py_XDECREF(one);
         }
     }
 
-    bool able() const { return ready && !stopped && tape; }
+    bool able() const { return ready && !stopped && tape && sight.roster; }
 
     // Writes a record and where the process is; false where that is Python's to do.
     bool record(int kind, const void *data, size_t length, Phase phase) {
@@ -299,7 +301,8 @@ struct Steps {
     }
 
     // Who is controlled, of those in sight; false with an exception.
-    static bool set_sight(Sight &place, PyObject *vehicles, PyObject *ids, Py_ssize_t row, PyObject *controlled) {
+    static bool set_sight(Sight &place, PyObject *vehicles, PyObject *ids, Py_ssize_t row, PyObject *controlled,
+                          PyObject *actors) {
         place.controlled.clear();
         for (Py_ssize_t actor = 0; actor < PyTuple_GET_SIZE(ids); actor++) {
             const int known = PyDict_Contains(controlled, PyTuple_GET_ITEM(ids, actor));
@@ -311,12 +314,15 @@ struct Steps {
         const Roster &roster = *reinterpret_cast<Vehicles *>(vehicles)->roster;
         const size_t size = roster.ids.size();
         if (roster.lengths.size() != size || place.controlled.size() != size || row < 0 ||
-            static_cast<size_t>(row) >= size) {
+            static_cast<size_t>(row) >= size || static_cast<size_t>(PyTuple_GET_SIZE(actors)) != size) {
             PyErr_SetString(PyExc_ValueError, "these are not the vehicles of the scene");
             return false;
         }
         keep(place.vehicles, vehicles);
         keep(place.ids, ids);
+        keep(place.actors, actors);
+        Py_CLEAR(place.roster);
+        place.numbers.clear();
         place.row = static_cast<size_t>(row);
         return true;
     }
@@ -337,19 +343,86 @@ struct Steps {
             }
             earlier.push_back(row_before);
         }
-        PyObject *names = enter && enter != Py_None ? near_names(sight.ids, &earlier) : nullptr;
-        PyObject *found = names ? PyObject_CallOneArg(enter, names) : nullptr;
-        Py_XDECREF(names);
-        PyObject *vehicles, *ids, *controlled;
-        Py_ssize_t row;
-        const bool known = found && found != Py_None &&
-                           PyArg_ParseTuple(found, "OO!nO!", &vehicles, &PyTuple_Type, &ids, &row, &PyDict_Type,
-                                            &controlled) &&
-                           vehicles_of(vehicles) && set_sight(entered, vehicles, ids, row, controlled) &&
-                           around.same(*entered.vehicles->roster);
+        const bool known = meet && meet_all();
         PyErr_Clear(); // it is said again
-        Py_XDECREF(found);
         return known;
+    }
+
+    // Fills in who is in sight now: as before, who was, and otherwise as Python has met them.
+    bool meet_all() {
+        const size_t count = earlier.size();
+        Py_XSETREF(entered.vehicles, reinterpret_cast<Vehicles *>(vehicles_type->tp_alloc(vehicles_type, 0)));
+        Py_XSETREF(entered.ids, PyTuple_New(static_cast<Py_ssize_t>(count)));
+        Py_XSETREF(entered.actors, PyTuple_New(static_cast<Py_ssize_t>(count)));
+        Py_CLEAR(entered.roster);
+        entered.controlled.clear();
+        entered.numbers.clear();
+        if (!entered.vehicles || !entered.ids || !entered.actors) {
+            return false;
+        }
+        const Roster &were = *sight.vehicles->roster;
+        Roster &roster = *(entered.vehicles->roster = new Roster());
+        bool numbered = true, present = false;
+        for (size_t row = 0; row < count; row++) {
+            const long was = earlier[row];
+            double length, width, reach;
+            PyObject *id, *actor, *met = nullptr;
+            int controlled;
+            long number = -1;
+            if (was >= 0) {
+                length = were.lengths[was], width = were.widths[was], reach = were.reaches[was];
+                id = PyTuple_GET_ITEM(sight.ids, was), actor = PyTuple_GET_ITEM(sight.actors, was);
+                controlled = sight.controlled[was];
+                number = sight.numbers.empty() ? -1 : static_cast<long>(sight.numbers[was]);
+            } else {
+                PyObject *name = text_of(around.names[around.near[row]]);
+                met = name ? PyObject_CallOneArg(meet, name) : nullptr;
+                Py_XDECREF(name);
+                if (!met || !PyTuple_CheckExact(met) ||
+                    !PyArg_ParseTuple(met, "OOdddpl", &id, &actor, &length, &width, &reach, &controlled, &number)) {
+                    Py_XDECREF(met);
+                    return false;
+                }
+            }
+            PyTuple_SET_ITEM(entered.ids, static_cast<Py_ssize_t>(row), Py_NewRef(id));
+            PyTuple_SET_ITEM(entered.actors, static_cast<Py_ssize_t>(row), Py_NewRef(actor));
+            Py_XDECREF(met);
+            roster.ids.push_back(around.names[around.near[row]]);
+            roster.lengths.push_back(length);
+            roster.widths.push_back(width);
+            roster.reaches.push_back(reach);
+            entered.controlled.push_back(controlled != 0);
+            entered.numbers.push_back(static_cast<uint32_t>(number));
+            numbered = numbered && number >= 0;
+            if (was == static_cast<long>(sight.row)) {
+                entered.row = row;
+                present = true;
+            }
+        }
+        if (!numbered) {
+            entered.numbers.clear();
+        }
+        return present;
+    }
+
+    // Tells Python who is in sight now, and records it; REFUSED where it is Python's to say why not, and negative with an
+    // exception, such as of a disk that is full.
+    int note_roster() {
+        PyObject *roster = PyObject_CallFunction(adopt, "OOOn", entered.vehicles, entered.ids, entered.actors,
+                                                 static_cast<Py_ssize_t>(entered.row));
+        if (!roster) {
+            PyErr_Clear();
+            return REFUSED;
+        }
+        Py_XSETREF(entered.roster, roster);
+        const std::vector<uint32_t> &numbers = entered.numbers;
+        if (!numbers.empty() && record(4, numbers.data(), 4 * numbers.size(), SIMULATING)) {
+            keep(recorded, roster);
+            return DONE;
+        }
+        PyObject *done = PyObject_CallNoArgs(record_roster);
+        Py_XDECREF(done);
+        return !done ? -1 : able() ? DONE : REFUSED;
     }
 
     // What has come of a step that has been simulated; negative with an exception. Everything is read before anything
@@ -404,13 +477,9 @@ struct Steps {
                        !reached.empty();
             }
             if (others) {
-                PyObject *done = PyObject_CallNoArgs(record_roster);
-                if (!done) {
-                    return -1; // such as a disk that is full
-                }
-                Py_DECREF(done);
-                if (!able()) {
-                    return SIMULATED;
+                const int noted = note_roster();
+                if (noted != DONE) {
+                    return noted < 0 ? noted : SIMULATED;
                 }
             }
             const size_t records = 8 * (2 + 1 + next.values.size()) + next.lanes.size() + 64;
@@ -461,7 +530,11 @@ struct Steps {
         char *start = static_cast<char *>(buffer.buf);
         char *rewards = put_step(start + offset, tags[2], step, now.time_s, 1, now.values);
         memcpy(rewards, &reward, 8);
-        trail.push_back(offset + 32);
+        PyObject *step_in_trail = Py_BuildValue("(OnO)", sight.roster, static_cast<Py_ssize_t>(offset + 32), Py_None);
+        if (!step_in_trail || PyList_Append(trail, step_in_trail) < 0) {
+            PyErr_Clear();
+        }
+        Py_XDECREF(step_in_trail);
         offset += 32 + 8 * now.values.size();
         say_where(start, offset, step, SIMULATING, 0);
         PyBuffer_Release(&buffer);
@@ -548,14 +621,16 @@ PyObject *usual_heed(PyObject *object, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
-// listen(enter, record_roster): who is called where others than before are in sight
-template <PyObject *Steps::*first, PyObject *Steps::*second> PyObject *usual_keep(PyObject *object, PyObject *arguments) {
-    PyObject *one, *other;
-    if (!PyArg_ParseTuple(arguments, "OO", &one, &other)) {
+// listen(meet, adopt, record_roster): who is called where others than before are in sight
+PyObject *usual_listen(PyObject *object, PyObject *arguments) {
+    Steps &steps = steps_of(object);
+    PyObject *meet, *adopt, *record_roster;
+    if (!PyArg_ParseTuple(arguments, "OOO", &meet, &adopt, &record_roster)) {
         return nullptr;
     }
-    keep(steps_of(object).*first, one);
-    keep(steps_of(object).*second, other);
+    keep(steps.meet, meet);
+    keep(steps.adopt, adopt);
+    keep(steps.record_roster, record_roster);
     Py_RETURN_NONE;
 }
 
@@ -604,19 +679,19 @@ PyObject *usual_judge(PyObject *object, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
-// resume((vehicles, ids, row, controlled), observation, columns, time_s, lanes, (road, lane_index, lane, from_left),
+// resume((vehicles, ids, row, controlled, actors), observation, columns, time_s, lanes, (road, lane_index, lane, from_left),
 //        follower, step)
 PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
-    PyObject *vehicles, *ids, *controlled, *observation, *columns;
+    PyObject *vehicles, *ids, *controlled, *actors, *observation, *columns;
     Py_ssize_t row;
     const char *lanes, *road, *lane, *follower;
     double time_s, from_left;
     int lane_index;
     long long step;
     steps.ready = false;
-    if (!PyArg_ParseTuple(arguments, "(OO!nO!)OOds(sisd)sL", &vehicles, &PyTuple_Type, &ids, &row, &PyDict_Type,
-                          &controlled, &observation, &columns, &time_s, &lanes, &road, &lane_index, &lane, &from_left,
+    if (!PyArg_ParseTuple(arguments, "(OO!nO!O!)OOds(sisd)sL", &vehicles, &PyTuple_Type, &ids, &row, &PyDict_Type,
+                          &controlled, &PyTuple_Type, &actors, &observation, &columns, &time_s, &lanes, &road, &lane_index, &lane, &from_left,
                           &follower, &step) ||
         !vehicles_of(vehicles) || !columns_of(columns)) {
         return nullptr;
@@ -627,7 +702,7 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
         PyErr_SetString(PyExc_ValueError, "these are not the vehicles of the scene");
         return nullptr;
     }
-    if (!Steps::set_sight(steps.sight, vehicles, ids, row, controlled)) {
+    if (!Steps::set_sight(steps.sight, vehicles, ids, row, controlled, actors)) {
         return nullptr;
     }
     keep(steps.before_vehicles, vehicles);
@@ -646,13 +721,15 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
-// borrow(map, offset, reserved, (tags of an observation, an action, a step, lanes))
+// borrow(map, offset, reserved, (tags of an observation, an action, a step, lanes, a roster), roster, numbers): the roster
+// is of those in sight, and has been recorded with these numbers
 PyObject *usual_borrow(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
-    PyObject *tape;
-    Py_ssize_t offset, reserved;
-    if (!PyArg_ParseTuple(arguments, "Onn(llll)", &tape, &offset, &reserved, &steps.tags[0], &steps.tags[1],
-                          &steps.tags[2], &steps.tags[3])) {
+    PyObject *tape, *roster;
+    Py_ssize_t offset, reserved, length;
+    const char *numbers;
+    if (!PyArg_ParseTuple(arguments, "Onn(lllll)Oy#", &tape, &offset, &reserved, &steps.tags[0], &steps.tags[1],
+                          &steps.tags[2], &steps.tags[3], &steps.tags[4], &roster, &numbers, &length)) {
         return nullptr;
     }
     Py_buffer buffer;
@@ -666,30 +743,32 @@ PyObject *usual_borrow(PyObject *object, PyObject *arguments) {
         PyErr_SetString(PyExc_ValueError, "nothing can be written there");
         return nullptr;
     }
+    Py_XSETREF(steps.trail, PyList_New(0));
+    if (!steps.trail) {
+        return nullptr;
+    }
     keep(steps.tape, tape);
     steps.offset = static_cast<size_t>(offset);
-    steps.trail.clear();
+    keep(steps.recorded, roster);
+    Steps::Sight &seen = steps.earlier.empty() ? steps.sight : steps.entered;
+    keep(seen.roster, roster);
+    seen.numbers.clear();
+    if (seen.vehicles && static_cast<size_t>(length) == 4 * seen.vehicles->roster->ids.size()) {
+        seen.numbers.resize(static_cast<size_t>(length) / 4);
+        memcpy(seen.numbers.data(), numbers, static_cast<size_t>(length));
+    }
     Py_RETURN_NONE;
 }
 
-// give_back() -> (offset, step, where the numbers of each step begin)
+// give_back() -> (offset, step, the last roster, [(roster, where the numbers begin, None) of each step])
 PyObject *usual_give_back(PyObject *object, PyObject *) {
     Steps &steps = steps_of(object);
-    PyObject *places = PyList_New(static_cast<Py_ssize_t>(steps.trail.size()));
-    for (size_t number = 0; places && number < steps.trail.size(); number++) {
-        PyObject *place = PyLong_FromSize_t(steps.trail[number]);
-        if (!place) {
-            Py_CLEAR(places);
-        } else {
-            PyList_SET_ITEM(places, static_cast<Py_ssize_t>(number), place);
-        }
-    }
-    if (!places) {
+    if (!steps.trail && !(steps.trail = PyList_New(0))) {
         return nullptr;
     }
     Py_CLEAR(steps.tape);
-    steps.trail.clear();
-    return Py_BuildValue("(nLN)", static_cast<Py_ssize_t>(steps.offset), steps.step, places);
+    return Py_BuildValue("(nLON)", static_cast<Py_ssize_t>(steps.offset), steps.step,
+                         steps.recorded ? steps.recorded : Py_None, std::exchange(steps.trail, nullptr));
 }
 
 // take(agents) -> what has come of it
@@ -851,8 +930,7 @@ PyMethodDef usual_methods[] = {
     {"note", usual_note, METH_O, "Record an action; return whether that could be done."},
     {"go_on", usual_go_on, METH_O, "Simulate, and look where nothing has happened yet; return what has come of it."},
     {"heed", usual_heed, METH_VARARGS, "Take what is counted of braking and of standing."},
-    {"listen", usual_keep<&Steps::enter, &Steps::record_roster>, METH_VARARGS,
-     "Take who is called where others than before are in sight."},
+    {"listen", usual_listen, METH_VARARGS, "Take who is called where others than before are in sight."},
     {"perceive", usual_perceive, METH_VARARGS, "Take what makes and restores observations that consist of parts."},
     {"perceived", usual_perceived, METH_O, "Return what has been made for a step; None if nothing has."},
     {"judge", usual_judge, METH_VARARGS, "Take when somebody has to be asked about a step."},

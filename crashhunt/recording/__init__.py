@@ -51,6 +51,7 @@ if TYPE_CHECKING:
         encode_events as encode_events,
         encode_heights as encode_heights,
         encode_notes as encode_notes,
+        encode_roster as encode_roster,
         encode_spines as encode_spines,
     )
 

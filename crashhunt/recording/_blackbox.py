@@ -24,7 +24,7 @@ import numpy as np
 from crashhunt.base.errors import DISK, RecorderError
 from crashhunt.base.forks import MEMORY
 from crashhunt.recording.records._agent_records import ACTION, OBSERVATION, PROLOGUE
-from crashhunt.recording.records._scene_record import LANES, NOTES, STEP
+from crashhunt.recording.records._scene_record import LANES, NOTES, ROSTER, STEP
 from crashhunt.world import joined_frame
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Phase(IntEnum):
 
 # Attributes of modules, and members of an enum, are looked up at every use; these are used in every step.
 _STEP, _OBSERVATION, _ACTION = STEP.tag, OBSERVATION.tag, ACTION.tag
-_CORE_TAGS = _OBSERVATION, _ACTION, _STEP, LANES.tag  # records of another writer
+_CORE_TAGS = _OBSERVATION, _ACTION, _STEP, LANES.tag, ROSTER.tag  # records of another writer
 _ACT, _SIMULATE = int(Phase.ACT), int(Phase.SIMULATE)
 
 
@@ -179,25 +179,32 @@ class BlackBox:
         """Record the action that an agent returned."""
         self._raw(_ACTION, agent, array, _SIMULATE)
 
-    def lend(self, steps: UsualSteps, roster: Roster) -> None:
+    @property
+    def roster(self) -> Roster | None:
+        """The actors of the last step; None before the first step."""
+        self._stop_core()
+        return self._roster
+
+    def lend(self, steps: UsualSteps, roster: Roster, numbers: bytes) -> None:
         """Let the core record the steps of one agent until another method of this black box is called.
 
         Args:
             steps: steps of the core to record.
-            roster: the actors of these steps, which must have been recorded.
+            roster: the actors of the first of these steps, which must have been recorded.
+            numbers: the payload of the record of this roster.
         """
         self._stop_core()
         self._roster = roster
-        steps.borrow(self._map, self._offset, self._reserved, _CORE_TAGS)
+        steps.borrow(self._map, self._offset, self._reserved, _CORE_TAGS, roster, numbers)
         self._lent = steps
 
     def _stop_core(self) -> None:
         if self._lent is not None:
-            self._offset, step, places = self._lent.give_back()
+            self._offset, step, self._roster, places = self._lent.give_back()
             self._lent = None
             if places:
                 self._step = step
-                self._trail += [(self._roster, place, None) for place in places]
+                self._trail += places
 
     def _raw(self, tag: int, agent: int, array: NDArray[np.generic], phase: int) -> None:
         if self._lent is not None:

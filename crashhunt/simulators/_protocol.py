@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.native import UsualSteps, Vehicles
     from crashhunt.simulators._observation_layout import ObservationLayout
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Lane, Motion, Neighbor, Paths, RoadMap, Roster, Scene, Surroundings, VehicleData
+    from crashhunt.world import Actor, Lane, Motion, Neighbor, Paths, RoadMap, Roster, Scene, Surroundings, VehicleData
 
 
 class Options(TypedDict, total=False):
@@ -573,8 +573,14 @@ class FastStepper(Protocol):
     def roster(self) -> Roster:
         """The actors in sight; while `core` runs a step, they may already be the actors after this step."""
 
-    def enter(self, ids: tuple[str, ...], /) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:
-        """Set the vehicles in sight; return their data for `core`, or None if `core` cannot continue with them."""
+    def meet(self, vehicle: str, /) -> tuple[str, Actor, float, float, float, bool] | None:
+        """Return id, actor, length, width and reach (m) of a vehicle, and whether it is controlled.
+
+        The method returns None if `core` cannot continue with the vehicle.
+        """
+
+    def adopt(self, vehicles: Vehicles, ids: tuple[str, ...], actors: tuple[Actor, ...], row: int, /) -> Roster:
+        """Set the vehicles in sight, with the row of the agent, and return their roster."""
 
     def resume(self) -> Scene | None:
         """Bring `core` to the state of the simulator; return the scene, or None if that is not possible yet."""

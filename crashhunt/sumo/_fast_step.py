@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from crashhunt.simulators import Kinematics, Observations, Simulator, StepResult
     from crashhunt.sumo._range_of_sight import Sight
     from crashhunt.sumo._traffic_events import SumoEvents
-    from crashhunt.world import Roster
+    from crashhunt.world import Actor, Roster
 
 
 _MAX_ROSTERS = 3  # rosters to keep: of the last scene, the scene before it, and the next scene, which may not be needed
@@ -116,7 +116,8 @@ class UsualSteps:
         self._core, self._agent = core, agent
         self._sight, self._events, self._kinematics = sight, events, kinematics
         self._present, self._arrive = present, arrive
-        self.apply, self.finish, self.enter = part(apply), part(finish), part(self._enter)
+        self.apply, self.finish, self.meet = part(apply), part(finish), part(sight.meet)
+        self.adopt = part(self._adopt)
         array = np.ndarray, shape, _FLOAT32 if draft is None else _FLOAT64
         self.core = core.UsualSteps(
             agent, SimpleNamespace(simulationStep=simulate), array, kinematics.shape[0] - 1,
@@ -144,18 +145,15 @@ class UsualSteps:
         """The actors in sight; while the core runs a step, they may already be the actors after this step."""
         return self._sight.roster
 
-    def _enter(self, ids: tuple[str, ...]) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:
-        """Set the vehicles in sight; return None if they have properties that the core does not read."""
-        self._sight.see(ids)
-        seen, row = self._sight.plain, self.roster.index.get(self._agent)
-        if seen is None or row is None:
-            return None
+    def _adopt(self, vehicles: Vehicles, ids: tuple[str, ...], actors: tuple[Actor, ...], row: int) -> Roster:
+        """Set the vehicles in sight, and return their roster."""
+        roster = self._sight.adopt(vehicles, ids, actors)
         while len(self._rosters) > _MAX_ROSTERS:
             del self._rosters[next(iter(self._rosters))]
-        self._rosters[seen[0]] = self.roster
+        self._rosters[vehicles] = roster
         if self._enter_parts is not None:
-            self._enter_parts(seen[0], row, self.roster)
-        return *seen, row, self._controlled
+            self._enter_parts(vehicles, row, roster)
+        return roster
 
     def _make_observation(self, columns: Columns, time_s: float, row: int, lane: str) -> NDArray[np.generic]:
         assert self._perceive is not None
@@ -175,7 +173,7 @@ class UsualSteps:
         row = scene.roster.index[agent]
         self._rosters = {vehicles: scene.roster}
         self.core.resume(
-            (vehicles, ids, row, self._controlled), observations[agent], columns, scene.time_s,
+            (vehicles, ids, row, self._controlled, scene.roster.actors), observations[agent], columns, scene.time_s,
             "\n".join(scene.lanes), where, self._events.followers[agent], steps,
         )  # fmt: skip
         return scene

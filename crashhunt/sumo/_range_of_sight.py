@@ -175,9 +175,15 @@ class Sight:
         """The actors in sight."""
         return self._roster
 
-    def see(self, ids: tuple[str, ...]) -> None:
-        """Set which vehicles are in sight; no person is then in sight."""
-        self._see(ids, ())
+    def meet(self, vehicle: str) -> tuple[str, Actor, float, float, float, bool] | None:
+        """Return id, actor, length, width and reach (m) of a vehicle, and whether it is controlled.
+
+        The method returns None if the core cannot read the vehicle.
+        """
+        actor = self._actor(vehicle)
+        if vehicle in self._articulated:
+            return None
+        return vehicle, actor, actor.length, actor.width, self._reaches[vehicle], vehicle in self._controlled
 
     def reads_right(self) -> bool:
         """Return whether the core's values are bit-identical to the values of libsumo's getters."""
@@ -216,6 +222,12 @@ class Sight:
         if self.core is not None:
             self._vehicles = self.core.Vehicles(ids, roster.lengths, roster.widths, roster.reaches)
         self._plain = None if persons or self._long else self._vehicles
+
+    def adopt(self, vehicles: Vehicles, ids: tuple[str, ...], actors: tuple[Actor, ...]) -> Roster:
+        """Set which vehicles are in sight, all of which the core can read, and return their roster."""
+        self._ids, self._persons, self._long = ids, (), []
+        self._roster, self._vehicles, self._plain = Roster(actors), vehicles, vehicles
+        return self._roster
 
     def _columns(self) -> Lists:
         ids = self._ids

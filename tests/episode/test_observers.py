@@ -24,6 +24,11 @@ class Box:
 
     def __init__(self):
         self.said = []
+        self.roster = None
+
+    def step(self, *given):
+        self.said.append(("step", *given))
+        self.roster = given[1].roster
 
     def __getattr__(self, name):
         return lambda *given: self.said.append((name, *given))

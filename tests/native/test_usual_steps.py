@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 from saying import Says
 
+from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.base.errors import RecorderError
 from crashhunt.crashes import own_frames
-from crashhunt.episode import FastEpisode, Nearness, Observer, Recorder
+from crashhunt.episode import Episode, FastEpisode, Nearness, Observer, Recorder
+from crashhunt.episode._fast_path import FastPath
 from crashhunt.native import ANSWERED, ASK, DONE, REFUSED, SIMULATED
 from crashhunt.oracles import OffRoad, Overlap, RedLight, ReportedCollision, RequirementOracle, TooClose
 from crashhunt.recording import BlackBox, Tag
-from crashhunt.scenario import load_scenario
+from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.simulators import SpeedAndLaneChange
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
 
@@ -440,11 +442,11 @@ def test_a_black_box_that_fails_at_an_action_is_the_agents_doing(street, monkeyp
         def __init__(self, steps):
             self.give_back, self._borrow = steps.give_back, steps.borrow
 
-        def borrow(self, tape, offset, reserved, tags):
-            self._borrow(tape, offset, offset + street.simulator._shown["ego"].nbytes + 16, tags)
+        def borrow(self, tape, offset, reserved, *rest):
+            self._borrow(tape, offset, offset + street.simulator._shown["ego"].nbytes + 16, *rest)
 
-    def scarcely(steps, roster):
-        return lend(Scarce(steps), roster)
+    def scarcely(steps, *rest):
+        return lend(Scarce(steps), *rest)
 
     def closed(number, array):
         told.append(number)
@@ -586,17 +588,44 @@ def test_arguments_of_another_kind_are_refused(street):
         lambda: core.UsualSteps("ego", None, (None, None, None), 1, 0.1, False, True, (sized, 0, 1.0), 0.0),
         lambda: steps.heed([], 0.0, {}, 1),
         lambda: steps.judge(1),
-        lambda: steps.borrow(bytearray(200), 0, 100, (1, 2, 3, 4)),
-        lambda: steps.borrow(bytearray(200), 201, 100, (1, 2, 3, 4)),
-        lambda: steps.borrow(b"", 64, 100, (1, 2, 3, 4)),
-        lambda: steps.resume((sized, (), 0, {}), None, None, 0.0, "", ("", 0, "", 0.0), "", 1),
+        lambda: steps.borrow(bytearray(200), 0, 100, (1, 2, 3, 4, 5), None, b""),
+        lambda: steps.borrow(bytearray(200), 201, 100, (1, 2, 3, 4, 5), None, b""),
+        lambda: steps.borrow(b"", 64, 100, (1, 2, 3, 4, 5), None, b""),
+        lambda: steps.resume((sized, (), 0, {}, ()), None, None, 0.0, "", ("", 0, "", 0.0), "", 1),
         lambda: steps.reads(None),
     ):
         with pytest.raises((TypeError, ValueError, BufferError)):
             call()
     columns = core.columns(sized, [(0.0, 0.0)], [0.0], [0.0])
-    for ids, row in (((), 0), (("a",), 1), (("a",), -1)):
+    for ids, row, actors in (((), 0, (1,)), (("a",), 1, (1,)), (("a",), -1, (1,)), (("a",), 0, ())):
         with pytest.raises(ValueError, match="not the vehicles"):
-            steps.resume((sized, ids, row, {}), None, columns, 0.0, "", ("", 0, "", 0.0), "", 1)
+            steps.resume((sized, ids, row, {}, actors), None, columns, 0.0, "", ("", 0, "", 0.0), "", 1)
     assert steps.take({}) == steps.take(None) == 2
     assert not steps.note(np.zeros(2))
+
+
+def test_vehicles_that_come_into_sight_again_are_recorded_without_python(tmp_path, monkeypatch):
+    from crashhunt.sumo import SumoSimulator
+
+    scenario = load_scenario("loop")
+    simulator, box = SumoSimulator(scenario, tmp_path), BlackBox(tmp_path / "box")
+    spec = TrialSpec(0, 1, {}, argument_values(scenario), 400)
+    calls, recorded, record_roster = [], {}, FastPath._record_roster
+    monkeypatch.setattr(FastPath, "_record_roster", lambda path: (calls.append(1), record_roster(path))[1])
+    for kind in (Episode, FastEpisode):
+        box.begin(pid=0, trial=0, started=0.0)
+        with kind(spec, simulator=simulator, make_agent=lambda *_: KeepLaneWithSpeed(10.0), crash_on=(),
+                  observers=[Recorder(box, simulator)]) as episode:  # fmt: skip
+            result = episode.start()
+            while result is None:
+                result = episode.step()
+        recorded[kind] = bytes(box.committed())
+    assert recorded[Episode] == recorded[FastEpisode]
+    at, rosters, data = 0, 0, recorded[FastEpisode]
+    while at < len(data):
+        rosters += data[at] == Tag.ROSTER
+        at += 8 + (int.from_bytes(data[at + 4 : at + 8], "little") + 7) // 8 * 8
+    assert rosters > 30
+    assert len(calls) < rosters  # those of vehicles seen for the first time, and those after an event
+    box.close()
+    simulator.close()
