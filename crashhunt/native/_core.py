@@ -30,8 +30,10 @@ DONE, ASK, REFUSED, ANSWERED, SIMULATED = range(5)
 """
 
 Points = list[tuple[float, float]]
-Part = tuple[object, int, list[float], list[float], list[int]]
-"""Successive scenes: the columns of a `Frame`, the row of the agent or -1, of each actor length, width and a number."""
+Part = tuple[object, int, "list[float] | Vehicles", list[float] | None, list[int] | None]
+"""Successive scenes: the columns of a `Frame`, the row of the agent or -1, of each actor length, width and a number.
+
+`Vehicles` may replace lengths and widths, and None numbers that are equal to the rows."""
 
 
 class Columns(Protocol):

@@ -910,7 +910,8 @@ PyObject *least_change(PyObject *, PyObject *const *given, Py_ssize_t count) {
 const double SLACK = 1e-6; // m, and relative: what NumPy rounds otherwise is far less
 const double MOST_KNOWN = 1e9; // of numbers beyond, what is rounded otherwise may be more
 
-// Successive scenes of one roster, of a Frame: (columns, row or -1, lengths, widths, numbers of the actors).
+// Successive scenes of one roster, of a Frame: (columns, row or -1, lengths, widths, numbers of the actors). Vehicles may
+// stand for the lengths, and None for the widths then, and for numbers that are the rows.
 struct Part {
     Py_buffer buffer = {};
     bool held = false;
@@ -939,13 +940,21 @@ struct Part {
             return false;
         }
         own = PyLong_AsSsize_t(PyTuple_GET_ITEM(given, 1));
-        PyObject *whose = PyTuple_GET_ITEM(given, 4);
-        if (PyErr_Occurred() || !numbers_of(PyTuple_GET_ITEM(given, 2), lengths) ||
-            !numbers_of(PyTuple_GET_ITEM(given, 3), widths) || !PyList_CheckExact(whose)) {
+        PyObject *sizes = PyTuple_GET_ITEM(given, 2), *whose = PyTuple_GET_ITEM(given, 4);
+        if (Py_TYPE(sizes) == vehicles_type) {
+            lengths = reinterpret_cast<Vehicles *>(sizes)->roster->lengths;
+            widths = reinterpret_cast<Vehicles *>(sizes)->roster->widths;
+        } else if (PyErr_Occurred() || !numbers_of(sizes, lengths) || !numbers_of(PyTuple_GET_ITEM(given, 3), widths)) {
             return false;
         }
         actors = lengths.size();
-        for (Py_ssize_t row = 0; row < PyList_GET_SIZE(whose); row++) {
+        if (whose != Py_None && !PyList_CheckExact(whose)) {
+            return false;
+        }
+        for (size_t row = 0; whose == Py_None && row < actors; row++) {
+            numbers.push_back(static_cast<int64_t>(row));
+        }
+        for (Py_ssize_t row = 0; whose != Py_None && row < PyList_GET_SIZE(whose); row++) {
             numbers.push_back(PyLong_AsLongLong(PyList_GET_ITEM(whose, row)));
         }
         if (PyErr_Occurred() || widths.size() != actors || numbers.size() != actors || own < -1 ||

@@ -221,12 +221,14 @@ class Sight:
         self._vehicles: Vehicles | None = None
         if self.core is not None:
             self._vehicles = self.core.Vehicles(ids, roster.lengths, roster.widths, roster.reaches)
+            roster.vehicles = self._vehicles
         self._plain = None if persons or self._long else self._vehicles
 
     def adopt(self, vehicles: Vehicles, ids: tuple[str, ...], actors: tuple[Actor, ...]) -> Roster:
         """Set which vehicles are in sight, all of which the core can read, and return their roster."""
         self._ids, self._persons, self._long = ids, (), []
         self._roster, self._vehicles, self._plain = Roster(actors), vehicles, vehicles
+        self._roster.vehicles = vehicles
         return self._roster
 
     def _columns(self) -> Lists:

@@ -200,7 +200,7 @@ def _near_block(
     core = core_of(frames)
     if core is None:
         return None
-    parts = [part_of(frame, agent, frame.roster.rows) for frame in frames]
+    parts = [part_of(frame, agent) for frame in frames]
     least = closest.gap_m, closest.time_to_collision_s, closest.required_deceleration
     found = core.may_be_near(parts, _GAP_M, _HORIZON_S, *least, only_best)
     if found is None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.native import Columns, Core, Part
+    from crashhunt.native import Columns, Core, Part, Vehicles
     from crashhunt.world._events import Event
 
 PERSON = "person "
@@ -92,7 +92,12 @@ class Roster:
 
     Args:
         actors: all actors of the scene.
+
+    Attributes:
+        vehicles: the same actors in the compiled core; None if it does not know them.
     """
+
+    vehicles: Vehicles | None = None
 
     def __init__(self, actors: tuple[Actor, ...]) -> None:
         self.actors = actors
@@ -101,11 +106,6 @@ class Roster:
     def index(self) -> dict[str, int]:
         """The row of each actor, by the actor's identifier."""
         return {actor.id: row for row, actor in enumerate(self.actors)}
-
-    @cached_property
-    def rows(self) -> list[int]:
-        """The row of each actor."""
-        return list(range(len(self.actors)))
 
     @cached_property
     def half_sizes(self) -> NDArray[np.float64]:
@@ -194,10 +194,17 @@ def core_of(frames: Sequence[Frame]) -> Core | None:
     return core
 
 
-def part_of(frame: Frame, agent: str, numbers: list[int]) -> Part:
-    """Return a frame around an agent in the form that the compiled core needs, with a number for each actor."""
+def part_of(frame: Frame, agent: str, numbers: list[int] | None = None) -> Part:
+    """Return a frame around an agent in the form that the compiled core needs.
+
+    Args:
+        frame: the frame.
+        agent: identifier of the agent.
+        numbers: number of each actor; None for its row.
+    """
     roster = frame.roster
-    return frame.columns, roster.index.get(agent, -1), roster.lengths, roster.widths, numbers
+    sizes = (roster.lengths, roster.widths) if roster.vehicles is None else (roster.vehicles, None)
+    return frame.columns, roster.index.get(agent, -1), *sizes, numbers
 
 
 def joined_frame(

@@ -184,7 +184,7 @@ def _fronts_from_core(
     every, step = _every(step_length_s), 0
     parts = []
     for frame in frames:
-        whose = frame.roster.rows
+        whose = None
         after = step + len(frame.columns)
         # Only where the agent has a sample; actor numbers are undefined where a reach is given.
         if reach is None and agent in frame.roster.index and -(-step // every) * every < after:

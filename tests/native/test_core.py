@@ -192,6 +192,13 @@ def test_scenes_without_the_agent_count_and_others_keep_their_numbers():
         (_, steps), (_, others) = core.tracks([absent, part, absent], 1, 20.0, 0.0, 0.0, 0.0)
         assert np.frombuffer(steps, np.int64).tolist() == [2, 3]
         assert np.frombuffer(others, np.int64).reshape(2, -1).tolist() == [[0, 1], [7, 7]]
+        sizes = core.Vehicles(("a", "b"), [5.0] * 2, [2.0] * 2, [5.1] * 2)
+        assert core.tracks([(frame, 1, sizes, None, [7, 4])], 1, 20.0, 0.0, 0.0, 0.0) == core.tracks(
+            [part], 1, 20.0, 0.0, 0.0, 0.0
+        )
+        assert core.may_be_near([(frame, 1, sizes, None, None)], 50.0, 10.0, math.inf, math.inf, 0.0, False) == (
+            core.may_be_near([part], 50.0, 10.0, math.inf, math.inf, 0.0, False)
+        )
 
 
 def test_a_part_that_is_not_whole_is_left_to_python():
@@ -281,7 +288,7 @@ def test_the_closest_of_many_scenes_is_the_same_bit_by_bit():
             theirs.measure([frame])
             assert ours.closest == theirs.closest
         found.append(ours.closest)
-        parts = [(frame.columns, 0, frame.roster.lengths, frame.roster.widths, frame.roster.rows) for frame in frames]
+        parts = [(frame.columns, 0, frame.roster.lengths, frame.roster.widths, None) for frame in frames]
         numbers, _ = core.may_be_near(parts, 50.0, 10.0, math.inf, math.inf, 0.0, True)
         kept += len(numbers) // 48
     assert any(one.gap_m == 0 for one in found)
