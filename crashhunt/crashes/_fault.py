@@ -366,9 +366,10 @@ def fault_of(bundle: Bundle, recording: Recording | None = None, record: Contact
             "off the road", "it left the road without contact with an actor", "Vienna, article 13 (1); StVO § 3 (1)"
         )
     event = result.event
-    driven_s = result.steps * (result.step_length_s or 0.0)  # results of early versions have no length of a step
-    if event is not None and event.kind in _SOURCES and driven_s >= _INSERTED_S:
-        return _egos(event.kind.replace("_", " "), event.what, _SOURCES[event.kind])
+    if event is not None and event.kind in _SOURCES:  # crash.json has no length of a step
+        dt = result.step_length_s or (recording or bundle.recording()).prologue.step_length_s
+        if result.steps * dt >= _INSERTED_S:
+            return _egos(event.kind.replace("_", " "), event.what, _SOURCES[event.kind])
     if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
         return Fault("nobody can tell")
     contact = record or contact_record(bundle, recording)

@@ -9,6 +9,7 @@ from collections import Counter
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -312,8 +313,9 @@ def test_an_event_that_breaks_a_rule_is_the_agents_own(tmp_path, kind, steps, ex
         TrialSpec(1, 1, {"ego": {}}, {}, max_steps=99), Outcome(kind), steps, event=event, step_length_s=0.1
     )
     assert fault_of(Bundle(tmp_path, result, 1, "abc")).verdict == expected
-    unknown = replace(result, step_length_s=None)  # as in results of early versions
-    assert fault_of(Bundle(tmp_path, unknown, 1, "abc")).verdict == "nobody can tell"
+    saved = Bundle(tmp_path, replace(result, step_length_s=None), 1, "abc")  # as it is read from crash.json
+    recording = SimpleNamespace(prologue=SimpleNamespace(step_length_s=0.1))
+    assert fault_of(saved, recording).verdict == expected
 
 
 def crossing(speed):
