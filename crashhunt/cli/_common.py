@@ -370,7 +370,7 @@ def build_limit_s(options: argparse.Namespace) -> float:
 
 
 def make_console(*, stderr: bool = False, width: int | None = None) -> Console:
-    """Return a console that highlights nothing, and that raises `BrokenPipeError` if its reader has gone.
+    """Return a console that prints text as it is, and that raises `BrokenPipeError` if its reader has gone.
 
     Rich would end this process with exit code 1, which is an answer of several commands.
 
@@ -384,7 +384,7 @@ def make_console(*, stderr: bool = False, width: int | None = None) -> Console:
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
 
-    return Raising(stderr=stderr, highlight=False, width=width)
+    return Raising(stderr=stderr, highlight=False, markup=False, emoji=False, width=width)
 
 
 def unwritable_output(error: OSError, descriptor: int) -> CrashhuntError:

@@ -155,7 +155,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
             raise BrokenPipeError from error
         watcher.tell_notes()  # where there was nothing to run
     described = describe_hunt(report, has_dashboard=console.is_terminal and has_dashboard())
-    console.print(described, markup=False, soft_wrap=True)
+    console.print(described, soft_wrap=True)
     if options.json:
         print(json.dumps(report.to_json()))
     if report.stopped_because == "no_valid_trial":

@@ -249,7 +249,7 @@ def show_states(states: list[HuntState], console: Console) -> None:
     for state in states:
         if state.detail:
             why = one_line(state.detail.splitlines()[0])
-            console.print(f"{one_line(state.dir)}: {why}", markup=False, soft_wrap=True)
+            console.print(f"{one_line(state.dir)}: {why}", soft_wrap=True)
 
 
 def _exit_code(states: list[HuntState]) -> int:

@@ -204,7 +204,7 @@ def states_watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None],
     def tell(states: list[HuntState]) -> None:
         for state in states:
             if known.get(state.dir, "queued") != state.state:
-                console.print(f"{state.dir}: {state_words(state)}", markup=False, soft_wrap=True)
+                console.print(f"{state.dir}: {state_words(state)}", soft_wrap=True)
             known[state.dir] = state.state
 
     return tell, lambda: None
@@ -221,5 +221,5 @@ def _print_states(states: list[HuntState], directory: Path, *, as_json: bool, mo
         some = f"{len(errors)} hunt{'s' if len(errors) > 1 else ''} could not run"
         logs = command_line("crashhunt", "logs", directory, "--errors-only")
         fix = f"see {logs}, then {command_line('crashhunt', 'rerun', directory)}"
-        console.print(f"{some}; {fix}", markup=False, soft_wrap=True)
+        console.print(f"{some}; {fix}", soft_wrap=True)
     return THE_ANSWER_IS_NO if errors else DONE

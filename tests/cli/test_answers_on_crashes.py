@@ -906,9 +906,9 @@ def test_run_ends_with_the_code_of_its_report(monkeypatch, capsys, words, report
     hunt = SimpleNamespace(settings=setup, scenario=SimpleNamespace(name="toy", notes=()), run=lambda watcher: found)
     monkeypatch.setattr("signal.signal", lambda *_: None)
     monkeypatch.setattr("crashhunt.api.prepare", lambda *words, **options: hunt)
-    monkeypatch.setattr("crashhunt.report.describe_hunt", lambda report, **_: "found")
+    monkeypatch.setattr("crashhunt.report.describe_hunt", lambda report, **_: "found in [b]:car:h")
     assert run("run", "h", "1", "5", "60", *words, "--json") == code
-    assert capsys.readouterr() == ('"the report"\n', "found\n")
+    assert capsys.readouterr() == ('"the report"\n', "found in [b]:car:h\n")
 
 
 def test_ctrl_c_after_a_hunt_does_not_say_that_the_hunt_has_not_begun(monkeypatch, capfd):
