@@ -220,7 +220,7 @@ def child_step(scenario: str, observation: str = "") -> dict[str, float]:
         for owner, name, label in (
             (libsumo, "simulationStep", "simulate"),
             (KeepLaneWithSpeed, "act", "agent"),
-            (Sight, "see", "others in sight"),
+            (Sight, "_see", "others in sight"),
             (Recorder, "lend", "others recorded"),
             (FastEpisode, "_complete", "steps in Python"),
             (FastEpisode, "_show_step", "oracles asked"),
