@@ -213,7 +213,7 @@ def test_a_reported_collision_of_a_free_vehicle_counts_only_if_the_outlines_touc
     simulator, step = start("acceleration_steering", "loop")
     ahead = libsumo.vehicle.getLeader("ego", 1000.0)[0]
     reported = (Contact("ego", ahead, "junction", "south_0", 5.0, 15.0),)
-    monkeypatch.setattr(simulator._sight, "_contacts", lambda: reported)
+    monkeypatch.setattr(simulator._sight._collisions, "read", lambda persons: reported)
     assert step((0.0, 0.0)) == {"ego": False}
     assert simulator.scene().contacts == ()
     x, y, _ = centre()

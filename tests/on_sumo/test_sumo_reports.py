@@ -210,7 +210,7 @@ def test_vehicle_that_is_taken_off_is_hidden_at_once(world):
     roster = made.roster
     made.lose("nobody")
     assert made.roster is roster
-    made.see(("near",))
+    made._see(("near",), ())
     assert [actor.id for actor in made.roster.actors] == ["near"]
     assert made.plain is None  # without the core
     assert made.reads_right()

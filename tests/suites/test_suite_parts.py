@@ -341,7 +341,7 @@ def suite(tmp_path, text):
      ("[defaults]\ntimeout_s = -1.0\n[[hunts]]\nid = 'a'", "hunts.a: timeout_s is -1; give seconds above 0"),
      ("[[hunts]]\nid = 'a'\nkeep = 2", "hunts.a: keep 2 requires .*; give keep_going = true or distinct as well"),
      ("[[hunts]]\nid = 'a'\nsnapshot_limit_mb = 0", "snapshot_limit_mb is 0; .* above 0, or snapshot_code = false"),
-     ("[[hunts]]\nid = 'a'\ntrials = 0", "trials is 0; give .* a time with duration")],
+     ("[[hunts]]\nid = 'a'\ntrials = 0", "trials is 0; give .* duration or until_rate")],
 )  # fmt: skip
 def test_mistake_in_a_suite_names_its_file(tmp_path, text, says):
     with pytest.raises(UsageError, match=says) as caught:
