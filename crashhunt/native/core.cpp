@@ -1466,7 +1466,7 @@ char *put_step(char *place, long tag, long long step, double time_s, size_t agen
     put(&length, 4);
     put(&number, 8);
     put(&time_s, 8);
-    memcpy(place + 8 * agents, values.data(), 8 * values.size());
+    std::copy_n(reinterpret_cast<const char *>(values.data()), 8 * values.size(), place + 8 * agents);
     return place;
 }
 
