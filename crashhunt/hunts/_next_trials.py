@@ -70,7 +70,7 @@ def _propose_trial(
     disturber: DisturbanceSampler | None = None,
     forcing: Forcing | None = None,
     *,
-    digest_of_changes: bool = False,
+    digest_of_changes: bool,
 ) -> TrialSpec | None:
     """Return the trial as `spec_of`; None if the sampler proposes none before it receives further results."""
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
@@ -175,8 +175,8 @@ class Trials:
         disturber: object that draws the disturbances of trials; None if trials have no disturbances.
         forcings: object that returns the forcing of each root in rare mode; None in any other hunt.
         apart: the finished trials of other versions of the code, whose results a learning sampler does not receive.
-        digest_of_changes: whether the digests of the trials cover only the changes of observations.
         begun_with: version of the proposals that the hunt already contains; None if it contains none.
+        digest_of_changes: whether the digests of the trials cover only the changes of observations.
 
     Raises:
         CrashhuntError: the sampler failed, or the ledger is damaged.
@@ -252,12 +252,12 @@ class Trials:
                     break
                 self._refuse_other_version()
                 self._told += self._report_to_sampler(self._next - self._lag_of(self._next))
-                spec = self._propose()
+                spec = self._propose(self._next)
                 if spec is None and self._open:
                     break
                 if spec is None:
                     self._told += self._report_to_sampler(self._next)
-                    spec = self._propose()
+                    spec = self._propose(self._next)
                 if spec is None:
                     self._next = None
                     break
@@ -300,10 +300,10 @@ class Trials:
             self._results[number] = result
             heappush(self._untold, number)
 
-    def _propose(self) -> TrialSpec | None:
-        """Return the next trial of a sampler that learns; None if it needs further results."""
+    def _propose(self, number: int) -> TrialSpec | None:
+        """Return a trial of a sampler that learns; None if it needs further results."""
         drawn = self._settings, self._sampler, self._disturber
-        return _propose_trial(self._next or 0, *drawn, digest_of_changes=self._digest_of_changes)
+        return _propose_trial(number, *drawn, digest_of_changes=self._digest_of_changes)
 
     def _refuse_other_version(self) -> None:
         """Refuse to mix proposals of two versions, because the hunt's seed could then no longer repeat the hunt."""

@@ -47,7 +47,7 @@ struct Steps {
     long standstill = 0;
     int always_ask = 0, overlaps = 0;
     long long last = 0, now_and_then = 0;
-    // Called with the name of whom was not in sight, with who is in sight now, and where the core cannot record that.
+    // Called with a vehicle that comes into sight, with all that are then in sight, and to record them for the core.
     PyObject *meet = nullptr, *adopt = nullptr, *record_roster = nullptr;
     // of the present roster, and of the step that is complete
     bool ready = false, stopped = false, known = false; // whether the vehicles were found in the step before
@@ -691,8 +691,8 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     long long step;
     steps.ready = false;
     if (!PyArg_ParseTuple(arguments, "(OO!nO!O!)OOds(sisd)sL", &vehicles, &PyTuple_Type, &ids, &row, &PyDict_Type,
-                          &controlled, &PyTuple_Type, &actors, &observation, &columns, &time_s, &lanes, &road, &lane_index, &lane, &from_left,
-                          &follower, &step) ||
+                          &controlled, &PyTuple_Type, &actors, &observation, &columns, &time_s, &lanes, &road,
+                          &lane_index, &lane, &from_left, &follower, &step) ||
         !vehicles_of(vehicles) || !columns_of(columns)) {
         return nullptr;
     }
