@@ -219,19 +219,9 @@ def judge(
     The agent is overruled after some step: it brakes as hard as its vehicle can, or changes lanes and brakes. The other
     vehicles react freely. The search begins at a calculated step and bisects. The search then runs the steps after the
     last step that avoided the crash, as far as the number of runs allows. The reason is that a later step may avoid the
-    crash even if an earlier step does not. Causes are found by removing one candidate at a time.
-
-    Args:
-        bundle: The bundle of a crash. Without a collision partner, only the runs for causes are possible.
-        options: options of the replays; only the code that drives and its trust are used.
-        runs: maximum number of trials for avoiding the crash.
-        why: maximum number of trials for the causes; 0 for none.
-        reference: maximum number of trials with a reference driver, which show what the agent omitted; 0 for none.
-        drivers: whether models of a competent driver are asked whether they would have prevented a collision.
-        parallel: number of runs at a time.
-        watch: function called with the number of finished runs and the maximum number.
-        stopped: function that returns whether to stop; called repeatedly. After a stop, the results of the finished
-            runs are returned.
+    crash even if an earlier step does not. Causes are found by removing one candidate at a time. The arguments are
+    those of `judge_bundle`. Without a collision partner, only the runs for causes are possible. After a stop, the
+    results of the finished runs are returned.
 
     Raises:
         UsageError: the crash is a near miss or a hang, no run is possible, or ``runs`` is below 1.
@@ -307,19 +297,8 @@ def judge_bundle(
     """Judge a crash, write the judgement to its ``crash.json``, and return the bundle with the judgement.
 
     Parts that this call does not compute keep the answers of earlier calls. If the call is stopped, its answers do not
-    replace earlier ones. Another process may judge the same crash at the same time.
-
-    Args:
-        bundle: the bundle of a crash.
-        options: options of the replays, as for `judge`.
-        runs: maximum number of trials for avoiding the crash.
-        why: maximum number of trials for the causes; 0 for none.
-        reference: maximum number of trials with a reference driver; 0 for none.
-        drivers: whether models of a competent driver are asked whether they would have prevented a collision.
-        parallel: number of runs at a time; 0 for one per core.
-        write: whether to write the judgement.
-        watch: function called with the number of finished runs and the maximum number.
-        stopped: function that returns whether to stop; called repeatedly.
+    replace earlier ones. Another process may judge the same crash at the same time. The maximum numbers of trials are
+    those of `crashhunt.judge`. Of the options, only the code that drives and its trust are used.
 
     Raises:
         UsageError: a number is out of its range, or no run is possible.

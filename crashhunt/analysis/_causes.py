@@ -66,11 +66,7 @@ class Manoeuvre:
 def relevant_actors(recording: Recording, agent: str, other: str, most: int) -> list[str]:
     """Return the actors to examine for a crash: the collision partner, and the actors that came closest before.
 
-    Args:
-        recording: recording of the collision.
-        agent: identifier of the controlled vehicle.
-        other: The collision partner; empty if there was none.
-        most: maximum number of actors.
+    Without a collision partner, ``other`` is empty.
     """
     scenes = recording.scenes()
     since = scenes[-1].time_s - _NEAR_S if scenes else 0.0
@@ -93,11 +89,7 @@ def relevant_actors(recording: Recording, agent: str, other: str, most: int) -> 
 def manoeuvres_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> list[Manoeuvre]:
     """Return an actor's manoeuvres in the last seconds before a step: the last manoeuvre of each type.
 
-    Args:
-        recording: recording of the collision.
-        actor: identifier of the actor.
-        lanes: lanes around the place of the crash.
-        end: The step of the collision, which is excluded, because a collision changes speeds.
+    The step of the collision is excluded, because a collision changes speeds.
     """
     dt = recording.prologue.step_length_s
     first = max(0, end - round(_BEFORE_S / dt))
@@ -183,11 +175,7 @@ class _Candidate:
 def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[], None]) -> Why:
     """Return the causes of a crash.
 
-    Args:
-        rerun: the crash to analyse.
-        runs: object that runs trials of the crash.
-        most: maximum number of trials to run, not counting the unchanged trial.
-        tell: function called after each finished run.
+    At most ``most`` trials run, not counting the unchanged trial. ``tell`` is called after each run.
 
     Raises:
         CrashhuntError: no trial can be run.

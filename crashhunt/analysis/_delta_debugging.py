@@ -30,9 +30,7 @@ _ROUNDING_DIGITS = (1, 2, 3, 4)
 def fewest(items: Sequence[T], tried: Tried[tuple[T, ...]]) -> tuple[T, ...]:
     """Return a minimal part of some items that still passes a test: without any single remaining item, the test fails.
 
-    Args:
-        items: all items, with which the test is known to pass.
-        tried: function that runs the test with some of the items.
+    The test is known to pass with all items.
     """
     found = tuple(items)
     if not found or tried([()]) is not None:
@@ -59,12 +57,7 @@ def _chunks(items: tuple[T, ...], count: int) -> list[tuple[T, ...]]:
 
 
 def plainest(value: Value, default: Value | None) -> list[Value]:
-    """Return simpler values to try instead of a value, the simplest first: its default, then rounder numbers.
-
-    Args:
-        value: The value of an argument.
-        default: The default of the argument; None if it is unknown.
-    """
+    """Return simpler values to try instead of a value, the simplest first: its default, then rounder numbers."""
     found = list(_plainer(value, default))
     return list(dict.fromkeys(found[: found.index(value)] if value in found else found))
 

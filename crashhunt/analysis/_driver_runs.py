@@ -65,11 +65,7 @@ def find_preventability(
 ) -> Preventability:
     """Return which models of a competent driver would have prevented a collision of two actors.
 
-    Args:
-        rerun: the collision to analyse.
-        parallel: number of runs at a time.
-        stopped: function that returns whether to stop.
-        tell: function called after each finished run.
+    ``tell`` is called after each finished run.
     """
     result, recording = rerun.bundle.result, rerun.recorded
     hit = result.collision
@@ -104,9 +100,7 @@ def find_preventability(
 def judge_preventability(bundle: Bundle, *, parallel: int = 1) -> bool | None:
     """Return whether any model of a competent driver would have prevented a crash, by running its trial again.
 
-    Args:
-        bundle: the crash. The code of its snapshot runs, and must be trusted.
-        parallel: number of runs at a time.
+    The code of its snapshot runs, and must be trusted.
 
     Returns:
         None if no model applies, or the runs do not decide it.

@@ -146,9 +146,7 @@ class LeaveOut:
     def taking_part(self, entered: tuple[str, ...], agents: Collection[str]) -> tuple[str, ...]:
         """Return the actors that remain.
 
-        Args:
-            entered: all actors that entered in the recorded trial.
-            agents: the agents, which always take part.
+        Agents always take part.
 
         Raises:
             UsageError: an actor to exclude is not among the actors that entered, or is an agent.
@@ -234,10 +232,6 @@ class Reseed:
 def step_before(bundle: Bundle, seconds: float) -> int:
     """Return the last step that is at least the given time before the end of a crash.
 
-    Args:
-        bundle: the crash.
-        seconds: simulation time, in s.
-
     Raises:
         UsageError: the time lies before the start, or not before the crash.
     """
@@ -283,18 +277,7 @@ def interventions_of(
 ) -> list[Intervention]:
     """Return the interventions that the options of ``crashhunt whatif`` request.
 
-    Args:
-        bundle: the crash that runs again.
-        changes: new values from ``--set``; with a step, they apply only to the agent from this step on.
-        from_step: the last step that stays as recorded.
-        before_s: time before the crash at which the change begins, in s, instead of ``from_step``.
-        agent: the agent that takes control, as ``module:Name`` or ``ID=module:Name``.
-        arguments: arguments of the agent that takes control.
-        futures: whether each run has other random numbers from the given step on.
-        overrule: name of a manoeuvre that replaces the agent's actions from the given step on, or ``ID=NAME``.
-        leave_out: ids of actors that are excluded.
-        code: the code that drives, if the user selects it.
-        more: further interventions, which no option can express.
+    The arguments are those of `crashhunt.what_if`. ``more`` has further interventions, which no option can express.
 
     Raises:
         UsageError: the options contradict each other, or nothing would change at the step.

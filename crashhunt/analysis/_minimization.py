@@ -120,18 +120,8 @@ def shrink(
     The search removes other actors and disturbances, and simplifies arguments: towards their defaults, or rounder. If
     the crash needs more than a few other actors, these follow their recorded paths. In that form, any path and the
     beginning can be removed. The result depends only on the crash and the budget, unless the time runs out. An
-    interrupted search keeps the best result, and the same call resumes the search.
-
-    Args:
-        bundle: the crash to minimize.
-        budget: maximum number of trials.
-        time_s: wall-time limit, in s; the two runs that confirm the result take additional time.
-        form: how the other actors move: by themselves (``traffic``), along recorded paths (``scripted``), or depending
-            on the number of remaining actors (``either``).
-        parallel: number of runs at a time; 0 for one per core.
-        watch: function called with the number of finished runs and the maximum number.
-        stopped: function that returns whether to stop; called repeatedly.
-        trusted: whether the code of the crash may run; None to determine it.
+    interrupted search keeps the best result, and the same call resumes the search. The arguments are those of
+    `crashhunt.shrink`. The two runs that confirm the result take additional time.
 
     Raises:
         BundleError: the crash is damaged.

@@ -68,14 +68,7 @@ def find_omission(
     """Return what the agent omitted, according to runs with a reference driver.
 
     The runs use the current crashhunt, even if the snapshot has an older one. The first run must therefore be
-    bit-identical.
-
-    Args:
-        rerun: the crash to analyse.
-        most: maximum number of runs.
-        parallel: number of runs at a time.
-        stopped: function that returns whether to stop.
-        tell: function called after each finished run.
+    bit-identical. There are at most ``most`` runs. ``tell`` is called after each finished run.
 
     Raises:
         CrashhuntError: no trial can be run.

@@ -86,11 +86,8 @@ class Runs:
     def first(self, candidates: Sequence[TrialSpec], *, again: bool = False) -> int | None:
         """Return the index of the first candidate that crashes in the same manner; None if no candidate does.
 
-        The result does not depend on the number of trials that run at a time.
-
-        Args:
-            candidates: specifications of the trials to try.
-            again: whether to run candidates again that are known not to crash.
+        The result does not depend on the number of trials that run at a time. With ``again``, candidates run again that
+        are known not to crash.
 
         Raises:
             StoppedError: The search stopped before the answer was known.

@@ -53,11 +53,7 @@ class Part:
 
 
 class Scripting:
-    """Creates trials with parts of a recorded crash.
-
-    Args:
-        rerun: the crash to minimize.
-    """
+    """Creates trials with parts of a recorded crash."""
 
     def __init__(self, rerun: Rerun) -> None:
         recorded = rerun.recorded

@@ -45,12 +45,6 @@ def find_cause(
     The runs with a reference driver are made first. Only if they find no omission, one factor at a time is removed, as
     `judge` does.
 
-    Args:
-        bundle: the crash to judge.
-        options: options of the replays.
-        parallel: number of runs at a time.
-        stopped: function that returns whether to stop.
-
     Raises:
         CrashhuntError: no trial can be run.
     """
@@ -81,14 +75,8 @@ def divide_by_cause(
 ) -> tuple[CauseGroup, ...]:
     """Return the crashes of one type divided by cause, the most frequent cause first.
 
-    Args:
-        group: the crashes of one crash type.
-        options: options of the replays.
-        most: maximum number of crashes to judge.
-        parallel: number of runs at a time.
-        write: whether to write the results of the runs into the bundles, so that the next call needs no run.
-        stopped: function that returns whether to stop; all further crashes then get the cause of the nearest judged
-            crash.
+    At most ``most`` crashes are judged. With ``write``, the results are written into the bundles, so that the next call
+    needs no run. After a stop, all further crashes get the cause of the nearest judged crash.
     """
     bundles, division = group.bundles, Division(most)
     for number, bundle in enumerate(bundles):

@@ -83,10 +83,7 @@ class WhatIfOptions:
 def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: WhatIfOptions | None = None) -> Counts:
     """Run the trial of a crash again with changes, and count how the runs end.
 
-    Args:
-        bundle: the crash whose trial runs again.
-        interventions: the changes; without any change, the trial runs unchanged.
-        options: options of the runs.
+    Without any change, the trial runs unchanged.
 
     Returns:
         The counts. If the runs were stopped, only the runs before the first unfinished run are counted.
@@ -142,12 +139,7 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
 
 
 def future_seed(seed: int, number: int) -> int:
-    """Return the seed of a future, which is the same in every call for the same trial.
-
-    Args:
-        seed: seed of the trial.
-        number: number of the future, counted from 0.
-    """
+    """Return the seed of a future, which is the same in every call for the same trial."""
     return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
 
 

@@ -167,12 +167,7 @@ def add_json(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
 
 
 def add_crash(parser: argparse.ArgumentParser, *, default: str = "the crash with the fewest steps") -> None:
-    """Add the arguments that select a crash.
-
-    Args:
-        parser: the parser of the command.
-        default: what the command selects without the option.
-    """
+    """Add the arguments that select a crash."""
     parser.add_argument(
         "directory",
         metavar="DIR",
@@ -302,12 +297,7 @@ def number(text: str) -> float:
 
 
 def add_parallel(parser: argparse._ActionsContainer, what: str = "trials that run at a time") -> None:
-    """Add the option ``--parallel``.
-
-    Args:
-        parser: parser of the command.
-        what: description of what is counted.
-    """
+    """Add the option ``--parallel``."""
     parser.add_argument(
         "--parallel", metavar="N", type=integer, default=0, help=f"number of {what}; default: one per core"
     )
@@ -373,10 +363,6 @@ def make_console(*, stderr: bool = False, width: int | None = None) -> Console:
     """Return a console that prints text as it is, and that raises `BrokenPipeError` if its reader has gone.
 
     Rich would end this process with exit code 1, which is an answer of several commands.
-
-    Args:
-        stderr: whether to print to stderr.
-        width: number of columns; None for that of the terminal.
     """
     from rich.console import Console
 
@@ -388,12 +374,7 @@ def make_console(*, stderr: bool = False, width: int | None = None) -> Console:
 
 
 def unwritable_output(error: OSError, descriptor: int) -> CrashhuntError:
-    """Return the error for output that cannot be written, which names the stream and its file.
-
-    Args:
-        error: the error of the system.
-        descriptor: 1 for standard output, 2 for standard error.
-    """
+    """Return the error for output that cannot be written, which names the stream and its file."""
     stream = {1: "standard output", 2: "standard error"}[descriptor]
     try:  # Linux knows the file; Python has only the name "<stdout>"
         file = command_line(Path(f"/proc/self/fd/{descriptor}").readlink())
@@ -409,9 +390,7 @@ def unwritable_output(error: OSError, descriptor: int) -> CrashhuntError:
 def shown_progress(what: str, *, as_json: bool) -> Iterator[Watch | None]:
     """Yield a function that shows progress in one line; the line is removed at the end, also after Ctrl-C.
 
-    Args:
-        what: description of the work, such as ``writing crash.mp4``.
-        as_json: whether the output is JSON; in this case, no progress is shown.
+    With ``as_json``, no progress is shown.
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -469,9 +448,7 @@ def tell(options: argparse.Namespace, summary: str, annotations: Sequence[str]) 
 def add_options(groups: Mapping[str, argparse._ArgumentGroup], names: Collection[str] = ()) -> None:
     """Add each option of the command line to its group in the help.
 
-    Args:
-        groups: groups of the help by name.
-        names: names of the options to add; by default all options.
+    Without ``names``, all options are added.
     """
     for option in _options(names):
         _add(groups[option.about.group], option)

@@ -190,11 +190,6 @@ class _Comparison:
 def compare_with_corpus(directory: Path, cases: list[Case], *, as_json: bool) -> tuple[JsonObject, bool]:
     """Print the crash types of all hunts below a directory, compared with a corpus.
 
-    Args:
-        directory: directory of a suite.
-        cases: the cases of the corpus.
-        as_json: whether the standard output is for JSON.
-
     Returns:
         The types in the form that ``crashes --json`` prints, and whether a type is new or cannot be compared.
     """

@@ -175,12 +175,7 @@ class _OutputClosedError(BaseException):
 
 
 def _of_output(watch: Callable[[HuntStatus], None], descriptor: int) -> Callable[[HuntStatus], None]:
-    """Return a function that shows a status, and whose errors name the output instead of the directory of the hunt.
-
-    Args:
-        watch: shows a status.
-        descriptor: the file descriptor that it writes to.
-    """
+    """Return a function that shows a status, and whose errors name the output instead of the directory of the hunt."""
 
     def show(status: HuntStatus) -> None:
         try:

@@ -87,11 +87,7 @@ def states_table(states: list[HuntState]) -> Group:
 
 
 class _FittingTable:
-    """A table of hunts that omits columns for which the terminal is too narrow, because a cut number is a wrong one.
-
-    Args:
-        states: states of the hunts.
-    """
+    """A table of hunts that omits columns for which the terminal is too narrow, because a cut number is a wrong one."""
 
     def __init__(self, states: Sequence[HuntState]) -> None:
         self._states = states

@@ -57,10 +57,7 @@ class Archive:
 def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) -> int:
     """Write a crash, the settings of its hunt and its snapshot into one zip file. The file is never incomplete.
 
-    Args:
-        bundle: the crash to export.
-        target: path of the zip file; an existing file is replaced.
-        watch: function called after each file, with the number of finished files and the number of all files.
+    An existing file is replaced.
 
     Returns:
         The size of the zip file in bytes.

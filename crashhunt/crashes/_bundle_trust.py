@@ -69,10 +69,7 @@ class TrustedOrigin(Serializable):
 def add_trusted(fingerprint: str, *, path: str, runs: str) -> TrustedOrigin:
     """Mark code as trusted from now on, and return the new entry.
 
-    Args:
-        fingerprint: fingerprint of the code.
-        path: present path of the code.
-        runs: a description of what would run, in words.
+    ``runs`` describes in words what would run.
 
     Raises:
         HuntDirectoryError: the entry cannot be stored in any folder.
@@ -156,12 +153,7 @@ def _folders() -> list[Path]:
 
 
 def is_bundle_trusted(bundle: Bundle, *, faults: Sequence[str] | None = None) -> bool:
-    """Return whether the code of a crash may run without a confirmation by the user.
-
-    Args:
-        bundle: the crash whose code would run.
-        faults: the faults of the crash's snapshot, if they are already known.
-    """
+    """Return whether the code of a crash may run without a confirmation by the user."""
     try:
         snapshot = snapshot_of(bundle)
         settings = read_settings(bundle.hunt / layout.HUNT)
@@ -192,12 +184,7 @@ def is_snapshot_trusted(snapshot: Snapshot) -> bool:
 
 
 def is_hunt_trusted(hunt: Path, snapshot: Snapshot) -> bool:
-    """Return whether the code that a hunt's settings name may run without a confirmation by the user.
-
-    Args:
-        hunt: directory of the hunt.
-        snapshot: latest snapshot of the hunt.
-    """
+    """Return whether the code that a hunt's settings name may run without a confirmation by the user."""
     try:
         settings = read_settings(hunt / layout.HUNT)
         same_scenario = settings.scenario == snapshot.settings().scenario
@@ -210,10 +197,6 @@ def is_hunt_trusted(hunt: Path, snapshot: Snapshot) -> bool:
 
 def trust_snapshot(snapshot: Snapshot, path: Path) -> TrustedOrigin:
     """Mark the code of a snapshot as trusted from now on, and return the new entry.
-
-    Args:
-        snapshot: snapshot of a hunt or a corpus.
-        path: path that the user gave.
 
     Raises:
         BundleError: the snapshot is damaged.
@@ -240,10 +223,8 @@ def describe_code(snapshot: Snapshot, settings: HuntSettings) -> str:
 def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> UntrustedError:
     """Return the error that refuses to run the code of a crash.
 
-    Args:
-        bundle: the crash whose code is not trusted.
-        where: the path that the user gave; empty for the folder of the crash.
-        made_by: name of the tool that made the file, according to the file itself.
+    ``where`` is the path that the user gave; by default the folder of the crash. ``made_by`` names the tool that made
+    the file, according to the file itself.
     """
     place = where or str(bundle.path)
     fix = f"if you trust that code, run {command_line('crashhunt', 'trust', place)} once, or add --trust"
@@ -362,8 +343,7 @@ def _repository_of(files: Iterable[Path]) -> Path | None:
 def trust_repository(top: Path) -> TrustedOrigin:
     """Trust the files that git tracks in a work tree, in their present and later states, and return the new entry.
 
-    Args:
-        top: root of the work tree, with symbolic links resolved.
+    Symbolic links in ``top`` must have been resolved.
 
     Raises:
         HuntDirectoryError: the entry cannot be stored in any folder.
@@ -409,11 +389,6 @@ def signature(index: ArchiveIndex) -> str:
 
 def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapping[str, Value]) -> None:
     """Refuse a scenario that has side effects, or whose side effects are unknown.
-
-    Args:
-        scenario: scenario of the crash.
-        settings: settings of its hunt.
-        values: values of the scenario's arguments in the crashed trial.
 
     Raises:
         UsageError: the scenario has side effects; the message names the side effects.

@@ -144,10 +144,6 @@ def join_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGroup]])
 
     Crashes of different types with the same defect are one entry. If the cause names no defect, each crash type is an
     entry.
-
-    Args:
-        groups: the groups of crashes, one for each crash type.
-        causes: the crashes of each type, divided by cause.
     """
     lengths = without_chance_lengths({part.cause for parts in causes for part in parts})
     found: dict[object, list[tuple[Group, CauseGroup]]] = {}
@@ -170,9 +166,6 @@ def count_causes(joined: Sequence[CauseType]) -> tuple[int, int]:
 
     Crashes of an unknown cause may have a cause of the same crash type that already counts. An unknown cause therefore
     counts only if the crash type has no other cause.
-
-    Args:
-        joined: the crashes by cause, as `join_causes` returns them.
     """
     caused = {group.signature for one in joined if one.cause.kind != "unknown" for group, _ in one.variants}
     rest = [one for one in joined if one.cause.kind == "unknown" and one.variants[0][0].signature in caused]
@@ -190,12 +183,7 @@ def without_chance_lengths(causes: Collection[Cause]) -> dict[Cause, Cause]:
 
 
 def cause_of(bundle: Bundle, judgement: Judgement | None) -> Cause:
-    """Return the cause of a crash from the results of its runs; ``unknown`` if they do not show a cause.
-
-    Args:
-        bundle: the crash whose cause is determined.
-        judgement: results of the crash's runs; None if its causes were not analysed.
-    """
+    """Return the cause of a crash from the results of its runs; ``unknown`` if they do not show a cause."""
     if bundle.result.outcome.is_software_fault:
         return Cause("software fault")
     if judgement is None:
@@ -250,10 +238,6 @@ def features_of(bundle: Bundle, recording: Recording | None = None) -> tuple[flo
     The numbers are the length of the collision partner, and, 0.2 s, 1 s and 2 s before the crash, the speeds, the gap
     and the partner's lateral position. Without this position, changes to the left and to the right are alike.
 
-    Args:
-        bundle: the crash to describe.
-        recording: recording of the crash, if it has already been read.
-
     Raises:
         BundleError: the log of the crash is missing or damaged.
     """
@@ -295,10 +279,8 @@ class Division:
 
     The crashes chosen for judgement differ as much as possible. The shortest crash is chosen first, then always the
     crash furthest from all chosen crashes (farthest-first traversal: Gonzalez, Clustering to minimize the maximum
-    intercluster distance, Theoretical Computer Science 38, 1985). Crashes may be added between two choices.
-
-    Args:
-        most: maximum number of crashes to judge.
+    intercluster distance, Theoretical Computer Science 38, 1985). Crashes may be added between two choices. At most
+    ``most`` crashes are judged.
     """
 
     def __init__(self, most: int) -> None:
@@ -312,10 +294,7 @@ class Division:
     def add(self, number: int, steps: int, features: tuple[float, ...]) -> None:
         """Add a crash to the division.
 
-        Args:
-            number: number that identifies the crash.
-            steps: number of steps of the crash's trial.
-            features: features of the crash, as `features_of` returns them.
+        The features are those of `features_of`.
         """
         self._steps[number], self._features[number] = steps, features
 
@@ -335,10 +314,7 @@ class Division:
     def settle(self, number: int, cause: Cause | None) -> None:
         """Store the cause of a crash.
 
-        Args:
-            number: number of the crash.
-            cause: cause that the runs of the crash found; None if the crash cannot be run again. A crash without its
-                own cause gets the cause of the nearest judged crash.
+        A crash that cannot be run again has no cause of its own, and gets the cause of the nearest judged crash.
         """
         self._open.discard(number)
         if number not in self._chosen:
@@ -356,9 +332,7 @@ class Division:
     def restore(self, number: int, answer: JsonObject) -> Cause | None:
         """Add a judged crash whose bundle was deleted; return its cause.
 
-        Args:
-            number: number of the crash.
-            answer: the crash as `answer` returned it.
+        ``answer`` is what `answer` returned for the crash.
         """
         self._features[number] = tuple(answer["features"])
         self.settle(number, None if answer["cause"] is None else Cause.from_json(answer["cause"]))

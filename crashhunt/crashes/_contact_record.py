@@ -496,9 +496,7 @@ class ContactRecord:
     def is_against_its_lane(self, actor: str, back: int | None = None) -> bool | None:
         """Return whether an actor moved against the direction of all lanes at its centre; None if that is not known.
 
-        Args:
-            actor: identifier of the actor.
-            back: index of a time before the contact; None for the time of the contact.
+        ``back`` is the index of a time before the contact; None for the time of the contact.
         """
         way = self.way(actor)
         x, y, heading = (
@@ -677,10 +675,6 @@ def record_in(scenes: Sequence[Scene], hit: Collision) -> ContactRecord | None:
 
 def contact_record(bundle: Bundle, recording: Recording | None = None) -> ContactRecord | None:
     """Return the record of a collision of two actors; no code of the bundle runs.
-
-    Args:
-        bundle: the crash to read.
-        recording: recording of the crash, if it has already been read.
 
     Returns:
         None if there was no contact, or if one of the two actors is missing in the last scene.

@@ -136,11 +136,6 @@ class Signature(Serializable):
 def signature_of(bundle: Bundle, recording: Recording | None = None, record: ContactRecord | None = None) -> Signature:
     """Return the signature of a crash; no code of the bundle runs.
 
-    Args:
-        bundle: the crash to describe.
-        recording: recording of the crash, if it has already been read.
-        record: record of the contact, if it has already been made.
-
     Raises:
         BundleError: the log of the crash is missing or damaged.
     """
@@ -294,10 +289,8 @@ def group_crashes(
 ) -> Groups:
     """Group crashes by their signatures, and return the groups.
 
-    Args:
-        bundles: bundles of one hunt or several; the log of each is read.
-        dropped: number of crashes without a bundle, by the description of their crash type.
-        faults: whether to find the vehicle at fault for each crash.
+    ``dropped`` has the number of crashes without a bundle, by the description of their crash type. With ``faults``, the
+    vehicle at fault is determined for each crash.
     """
     signed, unsigned = [], []
     verdicts: dict[Path, Verdict] = {}
@@ -337,9 +330,7 @@ def groups_of(
 ) -> tuple[Group, ...]:
     """Return the groups of crashes whose signatures are known, the largest first.
 
-    Args:
-        signed: the crashes, each with its signature.
-        dropped: number of crashes without a bundle, by the description of their crash type.
+    ``dropped`` is as for `group_crashes`.
     """
     found: dict[Signature, list[Bundle]] = {}
     for signature, bundle in signed:

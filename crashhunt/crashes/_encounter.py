@@ -94,13 +94,7 @@ class Position:
 
 
 class Encounter:
-    """The steps of a recording in which both of two actors were present.
-
-    Args:
-        recording: recording of the episode.
-        agent: identifier of the first actor.
-        other: identifier of the second actor.
-    """
+    """The steps of a recording in which both of two actors were present."""
 
     def __init__(self, recording: Recording, agent: str, other: str) -> None:
         self.agent = agent
@@ -208,13 +202,7 @@ def last_escape(recording: Recording, agent: str, other: str, *, braking: float)
 
     The agent follows its recorded path and brakes from that step on. The collision partner repeats its recorded motion,
     and keeps its last velocity after the end of the recording. In reality other actors react, so the result is only an
-    estimate. `find_escape` determines the step by runs.
-
-    Args:
-        recording: recording of the crash.
-        agent: Identifier of the agent that brakes.
-        other: Identifier of the collision partner.
-        braking: deceleration of the braking agent, in m/s².
+    estimate. `find_escape` determines the step by runs. ``braking`` is the deceleration, in m/s².
 
     Returns:
         None if there is no such step, or if no collision is calculated even without braking.
@@ -406,9 +394,6 @@ class _LaneChanges:
     After a lane change, the agent's path does not lead through the vehicles behind it, so `dangers` does not count
     them. In this case, the post-encroachment time is the time from the lane change until the vehicle behind reaches the
     agent's position.
-
-    Args:
-        agent: identifier of the agent.
     """
 
     def __init__(self, agent: str) -> None:
@@ -510,10 +495,6 @@ def _nearest(scenes: Sequence[Scene], frames: Sequence[Frame], agent: str) -> tu
 
 def closest_actors(recording: Recording, agent: str) -> list[tuple[str, str]]:
     """Return for each scene the actor with the least time to collision and the actor with the least gap to an agent.
-
-    Args:
-        recording: recording of the episode.
-        agent: the controlled vehicle.
 
     Returns:
         Two identifiers for each scene. An identifier is empty if `approaches` finds no such actor, or if several are

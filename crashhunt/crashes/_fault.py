@@ -349,11 +349,6 @@ class Fault(Serializable):
 def fault_of(bundle: Bundle, recording: Recording | None = None, record: ContactRecord | None = None) -> Fault:
     """Return the vehicle at fault for a crash; no code of the bundle runs.
 
-    Args:
-        bundle: the crash to examine.
-        recording: recording of the crash, if it has already been read.
-        record: record of the contact, if it has already been made.
-
     Raises:
         BundleError: the log of the crash is missing or damaged.
     """

@@ -24,11 +24,6 @@ def visible_from(recording: Recording, agent: str, other: str) -> int | None:
     The step is known if the observation is a table with one row per actor and positions as in `Kinematics`: x ahead and
     y to the right, in m. The step is also known if the observation has the part ``actors``, with positions on the map.
     If a row matches no actor, for example because of noise or delays, the step is unknown.
-
-    Args:
-        recording: recording of the episode.
-        agent: Identifier of the agent whose observations are examined.
-        other: Identifier of the actor to look for.
     """
     channel = next((one for one in recording.prologue.agents if one.id == agent), None)
     if channel is None:

@@ -278,9 +278,7 @@ def wilson(found: int, of: int) -> tuple[float, float]:
     >>> f"{low:.3f} to {high:.3f}"
     '0.052 to 0.360'
 
-    Args:
-        found: number of runs with the outcome.
-        of: number of all runs; at least 1.
+    There is at least 1 run.
     """
     share, spread = found / of, _Z * _Z / of
     center, half = share + spread / 2, math.sqrt(spread * share * (1 - share) + spread * spread / 4)

@@ -119,9 +119,7 @@ class LaneMap:
     def is_against(self, point: tuple[float, float], course: float) -> bool | None:
         """Return whether a point lies only in lanes of the opposite direction; None if other lanes lead elsewhere.
 
-        Args:
-            point: x and y, in m.
-            course: direction of motion, in rad.
+        The point is in m, and the course in rad.
         """
         spot = np.array(point)
         angles = [
@@ -210,9 +208,7 @@ class LaneMap:
     def is_over_side(self, pose: tuple[NDArray[np.float64], float], half_width: float) -> bool:
         """Return whether an actor reaches over the side of the lane on which it drives.
 
-        Args:
-            pose: its centre, in m, and its heading, in rad.
-            half_width: half of its width, in m.
+        The pose is the centre, in m, and the heading, in rad. The half width is in m.
         """
         lane = self._driven(pose)
         return lane is not None and abs(lane.place(pose[0]).aside_m) + half_width - lane.half_width >= _OVER_M

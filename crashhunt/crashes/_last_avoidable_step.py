@@ -63,11 +63,7 @@ class StepBisection:
         self._parallel, self._is_near, self._stride = parallel, is_near, 1
 
     def next_steps(self, endings: Mapping[int, Ending]) -> set[int]:
-        """Return the steps to run next; empty if the last step that avoids the crash is known, or if there is none.
-
-        Args:
-            endings: what happened to the crash in the runs so far, by step.
-        """
+        """Return the steps to run next; empty if the last step that avoids the crash is known, or if there is none."""
         if not endings:
             return {self._start, self._end - 1} if self._parallel > 1 else {self._start}
         helps = last_avoiding(endings)
@@ -240,12 +236,7 @@ def overruled_trial(
 ) -> TrialSpec:
     """Return the trial of a collision with its agent overruled after a step, with enough steps to see the result.
 
-    Args:
-        result: result of the crashed trial.
-        recording: recording of the crashed trial.
-        after: the step after which the agent is overruled.
-        deceleration: The deceleration with which the vehicle stops, in m/s²; None if it is unknown.
-        manoeuvre: manoeuvre of the agent, as in `Overruled`.
+    The vehicle stops with ``deceleration``, in m/s²; None if it is unknown. The manoeuvre is as in `Overruled`.
     """
     assert result.collision is not None
     agent, scene = result.collision.agent, recording.scene(after)
@@ -266,13 +257,7 @@ def ending_of(
 ) -> Ending:
     """Return what happened to a collision in a run with its agent overruled after a step.
 
-    Args:
-        result: result of the crashed trial.
-        recording: recording of the crashed trial.
-        after: the step after which the agent is overruled.
-        rerun: result of the run with the overruled agent.
-        rerun_recording: recording of the run with the overruled agent.
-        deceleration: deceleration with which the vehicle can brake, in m/s²; None if it is unknown.
+    The vehicle can brake with ``deceleration``, in m/s²; None if it is unknown.
     """
     hit = result.collision
     assert hit is not None
@@ -304,12 +289,7 @@ def _is_over(recording: Recording, agent: str, other: str) -> bool:
 def changes_of(recorded: Recording, rerun: Recording, agent: str, lanes: LaneMap, step: int) -> tuple[str, ...]:
     """Return further differences of an agent in a run: lane changes that are missing or new after a step.
 
-    Args:
-        recorded: recording of the crash.
-        rerun: recording of the run.
-        agent: identifier of the agent.
-        lanes: lanes around the place of the crash.
-        step: the last step that both recordings have in common.
+    ``step`` is the last step that both recordings have in common.
     """
     if not lanes:
         return ()

@@ -68,9 +68,7 @@ def subject_of(bundle: Bundle) -> str:
 def read_notes(hunt: Path, crash: str | None = None) -> tuple[Note, ...]:
     """Return the notes of a hunt in the order of their numbers; lines that cannot be read are skipped.
 
-    Args:
-        hunt: directory of the hunt.
-        crash: return only the notes on this crash, see `subject_of`; None for all notes of the hunt.
+    ``crash`` selects the notes on one crash, see `subject_of`.
     """
     notes = _read_lines(hunt)[0]
     return tuple(note for note in notes.values() if crash in (None, note.crash))
@@ -84,11 +82,7 @@ def unreadable_notes(hunt: Path) -> list[int]:
 def add_note(hunt: Path, crash: str, text: str, tags: Sequence[str] = ()) -> Note:
     """Add a note to a hunt or a crash.
 
-    Args:
-        hunt: directory of the hunt.
-        crash: the crash, see `subject_of`; empty for the hunt.
-        text: text of the note; empty if there are tags.
-        tags: tags of the note.
+    ``crash`` is as for `subject_of`, and empty for the hunt. The text may be empty if there are tags.
 
     Raises:
         UsageError: the text or a tag is empty or too long.

@@ -49,12 +49,7 @@ def list_near_misses(directory: Path) -> list[Bundle]:
 
 
 def crash_folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
-    """Return the folders of crashes, also without ``crash.json``, but not the folders of minimized crashes.
-
-    Args:
-        directory: directory of the hunt.
-        place: subfolder of the hunt's directory that contains the crashes.
-    """
+    """Return the folders of crashes, also without ``crash.json``, but not the folders of minimized crashes."""
     folders = (directory / place).glob(layout.SHOWN)
     found = (path for path in folders if path.is_dir() and not path.name.endswith(layout.SMALL))
     return sorted(path for path in found if re.match(r"\d+-", path.name) or (path / layout.CRASH).exists())

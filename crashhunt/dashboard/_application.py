@@ -64,11 +64,7 @@ class Application(NamedTuple):
 def make_application(catalog: Catalog, *, host: str, token: str = "", allow_control: bool = False) -> Application:
     """Return the application, protected against requests that do not come from the user.
 
-    Args:
-        catalog: catalog of the hunts that the application shows.
-        host: host on which the server listens.
-        token: token that requests need; empty if they need none.
-        allow_control: whether requests may stop hunts and start commands.
+    The arguments are those of `serve`.
     """
     shown = _Shown(catalog)
     jobs = Jobs()
@@ -239,11 +235,7 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
 
 
 class _Shown:
-    """The views of all hunts, which are kept between requests.
-
-    Args:
-        catalog: catalog of the hunts.
-    """
+    """The views of all hunts, which are kept between requests."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
@@ -281,8 +273,7 @@ class _Shown:
     def rows(self, since: str) -> JsonObject:
         """Return the rows of hunts that have changed since a revision, and the identifiers of all hunts.
 
-        Args:
-            since: revision that an earlier call returned; for any other text, all rows are returned.
+        For a revision that no earlier call returned, all rows are returned.
         """
         found = self._catalog.hunts()
         rows = {name: self._view(hunt).row() for name, hunt in found.items()}

@@ -143,12 +143,7 @@ def unreadable(folder: Path, root: Path, names: Iterable[str] = _OWN_FILES) -> s
     """Return the reason why a file of a folder must not be opened; empty if all files may be opened.
 
     A folder of another user may contain links that lead out of it, pipes at which a reader waits for ever, and files
-    that fill the memory.
-
-    Args:
-        folder: folder whose files are checked.
-        root: folder inside which the files must lie.
-        names: names of the files and folders to check; by default the names of a hunt's files.
+    that fill the memory. The files must lie inside ``root``. By default, the files of a hunt are checked.
     """
     for name in names:
         path = folder / name
@@ -170,9 +165,7 @@ def unreadable(folder: Path, root: Path, names: Iterable[str] = _OWN_FILES) -> s
 def unreadable_below(folder: Path, root: Path) -> str:
     """Return the reason why a file in a folder or its subfolders must not be opened; empty if all may be opened.
 
-    Args:
-        folder: folder whose files are checked; it may be missing.
-        root: folder inside which the files must lie.
+    The files must lie inside ``root``. The folder may be missing.
     """
     folders = [str(folder)]  # texts: a snapshot has 50 folders, and making a path takes longer than listing its folder
     while folders:

@@ -91,11 +91,7 @@ class Jobs:
     def add(self, hunt: str, path: Path, crash: str, name: str) -> JsonObject:
         """Add a job to the queue.
 
-        Args:
-            hunt: identifier of the hunt.
-            path: path of the hunt's folder.
-            crash: identifier of a crash that exists in the hunt.
-            name: name of the command; one of `COMMANDS`.
+        The crash must exist, and ``name`` is one of `COMMANDS`.
 
         Raises:
             UsageError: the command does not exist, or too many jobs are waiting.

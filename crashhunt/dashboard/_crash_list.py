@@ -39,11 +39,7 @@ class _Entry(NamedTuple):
 
 
 class CrashList:
-    """The bundles of a hunt; each bundle is read once.
-
-    Args:
-        found: the hunt that contains the bundles.
-    """
+    """The bundles of a hunt; each bundle is read once."""
 
     def __init__(self, found: FoundHunt) -> None:
         self._found = found

@@ -140,9 +140,7 @@ def _workers(view: HuntView) -> list[JsonObject]:
 def importance_of_points(points: Sequence[Point], first: int = 0) -> list[JsonObject]:
     """Return the share of the variation in criticality that each argument explains, as in the report.
 
-    Args:
-        points: the trials.
-        first: number of the first trial that counts; trials of lower numbers may have run with other code.
+    Trials with a lower number than ``first`` may have run with other code, and do not count.
     """
     trials: list[tuple[Mapping[str, Value], float]] = []
     for point in points:
@@ -171,11 +169,7 @@ class HuntComparer:
         self._due = 0.0
 
     def compare(self, views: Sequence[HuntView]) -> JsonObject:
-        """Return ``hunts``, each a row with its curve and ``figures``, and ``pairs``, each hunt against the first hunt.
-
-        Args:
-            views: views of the hunts to compare.
-        """
+        """Return ``hunts``, each a row with its curve and ``figures``, and ``pairs``, each hunt against the first."""
         with self._lock:
             rows = []
             for view in views:

@@ -51,11 +51,7 @@ _Key = tuple[object, ...]
 
 
 class HuntView:
-    """The known state of a hunt, kept between requests.
-
-    Args:
-        found: the hunt whose state is read.
-    """
+    """The known state of a hunt, kept between requests."""
 
     def __init__(self, found: FoundHunt) -> None:
         self.found = found
@@ -91,8 +87,7 @@ class HuntView:
     def refresh(self, *, points: bool = False) -> HuntState:
         """Read new data of the hunt, and return its state.
 
-        Args:
-            points: whether to read the sample for plots as well.
+        With ``points``, the sample for plots is read as well.
         """
         with self._lock:
             try:
@@ -321,10 +316,7 @@ def _sign(path: Path) -> tuple[int, int, int]:
 def read_tail(path: Path, root: Path, most: int = _LOG_TAIL_BYTES) -> str:
     """Return the last lines of a text file; empty if the file is missing or outside of a folder.
 
-    Args:
-        path: path of the file.
-        root: folder inside which the file must lie after links are resolved.
-        most: maximum number of bytes to read.
+    The file must lie inside ``root`` after links are resolved.
     """
     resolved = path.resolve()
     if root not in resolved.parents:

@@ -74,11 +74,7 @@ def is_loopback(host: str) -> bool:
 
 
 def names_of(host: str) -> frozenset[str]:
-    """Return the names by which a request may address this machine, in addition to IP addresses.
-
-    Args:
-        host: host on which the server listens.
-    """
+    """Return the names by which a request may address this machine, in addition to IP addresses."""
     names = {"localhost", host.lower()}
     if not is_loopback(host):
         names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
@@ -88,11 +84,7 @@ def names_of(host: str) -> frozenset[str]:
 class Guard:
     """Forwards the requests of the user, and refuses all other requests.
 
-    Args:
-        app: application that answers the forwarded requests.
-        host: host on which the server listens.
-        token: token that every request needs; empty if requests need none.
-        control: whether requests may do more than read.
+    With an empty token, requests need none. Without ``control``, requests may only read.
     """
 
     def __init__(self, app: ASGIApp, *, host: str, token: str = "", control: bool = False) -> None:

@@ -29,13 +29,7 @@ _MAX_TRIED_PORTS = 100
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """The address at which a browser reaches the dashboard.
-
-    Args:
-        host: host on which the server listens.
-        port: port on which the server listens.
-        token: token that requests need; empty if they need none.
-    """
+    """The address at which a browser reaches the dashboard."""
 
     host: str
     port: int

@@ -74,9 +74,7 @@ class _Server(uvicorn.Server):
 def make_server(application: ASGIApp, begun: Callable[[], None]) -> uvicorn.Server:
     """Return the server of the dashboard.
 
-    Args:
-        application: application that answers the requests.
-        begun: function called once, as soon as requests are answered.
+    ``begun`` is called once, as soon as requests are answered.
     """
     config = uvicorn.Config(
         application, log_level="critical", access_log=False, server_header=False, date_header=False,
@@ -89,11 +87,6 @@ def make_server(application: ASGIApp, begun: Callable[[], None]) -> uvicorn.Serv
 
 def run_server(application: ASGIApp, listening: socket.socket, begun: Callable[[], None]) -> None:
     """Run the server until Ctrl-C.
-
-    Args:
-        application: application that answers the requests.
-        listening: the listening socket.
-        begun: function called once, as soon as requests are answered.
 
     Raises:
         KeyboardInterrupt: the user pressed Ctrl-C; all connections have been closed.

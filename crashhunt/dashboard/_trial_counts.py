@@ -71,11 +71,7 @@ class _Part:
 
 
 class TrialCounts:
-    """Counts the trials of a hunt, with a sample for plots.
-
-    Args:
-        crash_on: the outcomes that the hunt counts as a crash.
-    """
+    """Counts the trials of a hunt, with a sample for plots."""
 
     def __init__(self, crash_on: Collection[str]) -> None:
         self.crash_on = frozenset(map(str, crash_on))
@@ -229,8 +225,7 @@ class TrialCounts:
     def curve(self, most: int = PARTS) -> list[list[int]]:
         """Return cumulative trials, steps and crashes after each part of the hunt; all are 0 in the first entry.
 
-        Args:
-            most: maximum number of points; at least 2.
+        ``most`` is the maximum number of points, at least 2.
         """
         found, trials, steps, crashes = [[0, 0, 0]], 0, 0, 0
         for number in sorted(self._parts):
@@ -257,11 +252,7 @@ class TrialCounts:
 
 
 class Sample:
-    """Trials for plots: all crashes, and an evenly spaced share of the other trials.
-
-    Args:
-        crash_on: the outcomes that the hunt counts as a crash.
-    """
+    """Trials for plots: all crashes, and an evenly spaced share of the other trials."""
 
     def __init__(self, crash_on: Collection[str]) -> None:
         self._crash_on = frozenset(map(str, crash_on))
@@ -273,13 +264,7 @@ class Sample:
         self._crashes = 0
 
     def begin(self, ledger: Ledger, last: int, crashes: int) -> None:
-        """Read the sample from the existing trials of a hunt.
-
-        Args:
-            ledger: ledger of the hunt.
-            last: the greatest trial number.
-            crashes: number of crashes.
-        """
+        """Read the sample from the existing trials of a hunt."""
         while (last + 1) * self.share > MAX_POINTS:
             self.share /= 2
         while crashes * self.crash_share > MAX_CRASHES:
@@ -293,9 +278,7 @@ class Sample:
     def add(self, ledger: Ledger, trials: Iterable[tuple[int, str]]) -> None:
         """Read those of the new trials that belong to the sample.
 
-        Args:
-            ledger: ledger of the hunt.
-            trials: number and outcome of each new trial.
+        Each trial has its number and its outcome.
         """
         self._take(
             ledger,
@@ -341,8 +324,7 @@ class Sample:
     def since(self, cursor: str) -> tuple[list[Point], str, bool]:
         """Return the points added after a cursor, the next cursor, and whether they replace all earlier points.
 
-        Args:
-            cursor: cursor that an earlier call returned; for any other text, all points are returned.
+        For a cursor that no earlier call returned, all points are returned.
         """
         now = f"{self.generation}.{len(self.points)}"
         generation, _, count = cursor.partition(".")

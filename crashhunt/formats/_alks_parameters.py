@@ -128,9 +128,7 @@ class _Parameters:
 def scenario_from_openscenario(file: Path, directory: Path) -> ReadParameters:
     """Make a scenario from the parameters of an OpenSCENARIO file of a test case of UN R157.
 
-    Args:
-        file: a scenario with ParameterDeclarations, or a ParameterValueDistribution.
-        directory: folder of the new scenario; an existing folder must be empty.
+    The file has ParameterDeclarations, or is a ParameterValueDistribution. An existing folder must be empty.
 
     Raises:
         ScenarioError: the file cannot be read, or is of no known test case.

@@ -35,12 +35,8 @@ def write_commonroad(bundle: Bundle, target: Path, *, with_agents: bool = False)
     follows from the shapes. Every other actor is a dynamic obstacle from the step in which it was first seen. Each
     agent is a planning problem, which consists of its start and the goal of still driving at the end of the recording.
     A planner that avoids the crash solves the planning problem. The yaw rate is that of the first step. The slip angle
-    is unknown and written as 0.
-
-    Args:
-        bundle: the crash to write.
-        target: path of the file; an existing file is replaced.
-        with_agents: whether the recorded paths of the agents are written as obstacles as well.
+    is unknown and written as 0. An existing file is replaced. With ``with_agents``, the recorded paths of the agents
+    are obstacles as well.
 
     Returns:
         The number of each actor in the file, including planning problems.

@@ -80,11 +80,7 @@ class Page:
     file: Path
 
     def text(self, parser: argparse.ArgumentParser) -> str:
-        """Return the whole page as Markdown.
-
-        Args:
-            parser: parser of the command line, which one of the pages describes.
-        """
+        """Return the whole page as Markdown."""
         return completed(self.file.read_text(encoding="utf-8"), parser)
 
 

@@ -311,11 +311,7 @@ def _keys(module: str, name: str) -> str:
 
 
 def describe_commands(parser: argparse.ArgumentParser) -> str:
-    """Return every command with its arguments and options, as Markdown.
-
-    Args:
-        parser: parser of the command line.
-    """
+    """Return every command with its arguments and options, as Markdown."""
     return "\n".join(line for command, _ in _commands(parser) for line in _command(command))
 
 

@@ -257,13 +257,7 @@ class Turn:
 
 
 class LedgerReader:
-    """Reads the trials and facts of a ledger.
-
-    Args:
-        database: open connection to the database.
-        path: path of the ledger file.
-        shape: columns of the ledger's tables.
-    """
+    """Reads the trials and facts of a ledger."""
 
     def __init__(self, database: PatientConnection, path: Path, shape: Shape) -> None:
         self._database = database
@@ -347,11 +341,7 @@ class LedgerReader:
         return {number for (number,) in rows}
 
     def count_longer(self, wall_s: float) -> int:
-        """Return the number of trials that took longer than a time and did not hang.
-
-        Args:
-            wall_s: the time, in s of wall time.
-        """
+        """Return the number of trials that took longer than a time and did not hang."""
         return self._count(f"trials WHERE wall_s > {float(wall_s)!r} AND outcome <> '{Outcome.HANG}'")
 
     def traffic_events(self) -> dict[str, tuple[int, int]]:
@@ -380,9 +370,7 @@ class LedgerReader:
     ) -> tuple[int, tuple[int, str, float] | None]:
         """Return the number of disturbed crashes, and number, outcome and log-likelihood of the likeliest crash.
 
-        Args:
-            outcomes: the outcomes that count as a crash.
-            snapshots: digests of the snapshots whose trials count; empty for all trials.
+        Without ``snapshots``, all trials count.
         """
         where = _among("outcome", outcomes) + (f" AND {_among('snapshot', snapshots)}" if snapshots else "")
         (row,) = self._select(
@@ -400,8 +388,7 @@ class LedgerReader:
     def tried_by_origin(self, outcomes: tuple[str, ...]) -> list[tuple[str, int, int, float, int]]:
         """Return for each trial origin: name, trials, trials with criticality, sum of the criticality, and crashes.
 
-        Args:
-            outcomes: the outcomes that count as a crash; a trial with such an outcome has criticality 1.
+        A trial with one of the outcomes has criticality 1.
         """
         marks = ",".join("?" * len(outcomes))
         rows = self._select(
@@ -540,11 +527,7 @@ class LedgerReader:
         """Return the numbers of the trials with the greatest criticality but no crash, the greatest criticality first.
 
         Of trials with equal criticality, the trial with the lowest number comes first. Trials without a criticality are
-        skipped.
-
-        Args:
-            count: maximum number of trials.
-            snapshots: digests of the snapshots whose trials count; empty for all trials.
+        skipped. Without ``snapshots``, all trials count.
         """
         which = f"AND {_among('snapshot', snapshots)} " if snapshots else ""
         found = [
@@ -604,9 +587,7 @@ class LedgerReader:
     def parts_of(self, width: int, outcome: str) -> Iterator[tuple[int, int, int]]:
         """Count the trials with an outcome in each part of the hunt; yield the part, their number and their steps.
 
-        Args:
-            width: number of trials in a part; part i begins with trial i * width.
-            outcome: the outcome; only trials with this outcome are counted.
+        Part i begins with trial i * width.
         """
         yield from self._select(
             "SELECT number / ?, count(*), sum(steps) FROM trials WHERE outcome = ? GROUP BY number / ?",

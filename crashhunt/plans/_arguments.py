@@ -88,10 +88,6 @@ class Owners:
     ``AGENT.NAME`` is an argument of that agent, and ``scenario.NAME`` is an argument of the scenario. A bare ``NAME``
     belongs to the agent or the scenario that declares it, or else to the agent that accepts any argument. If there are
     several such owners, a bare ``NAME`` belongs to none.
-
-    Args:
-        agents: accepted arguments of each agent.
-        scenario: names of the scenario's arguments.
     """
 
     agents: Mapping[str, Takes]
@@ -99,10 +95,6 @@ class Owners:
 
     def of(self, word: str, *, option: str) -> tuple[str, str] | None:
         """Return the owner of an argument (an agent, or empty for the scenario) and its name; None if no owner has it.
-
-        Args:
-            word: name of the argument as the user wrote it.
-            option: option that contains the name, for error messages.
 
         Raises:
             ArgumentError: several owners have an argument with this name.
@@ -127,12 +119,8 @@ class Owners:
         """Return the owner and the name of an argument of a recorded crash; None if no owner has it.
 
         The record lacks arguments whose default is not a number, a string or a Boolean; for these, `ask` is called.
-
-        Args:
-            word: name of the argument as the user wrote it.
-            ask: function that returns the arguments of an agent from its code; called only if the record does not
-                contain the name. The function returns None if the code may not run.
-            option: option that contains the name, for error messages.
+        ``ask`` returns the arguments of an agent from its code, or None if the code may not run; it is called only if
+        the record does not contain the name.
 
         Raises:
             ArgumentError: several owners have an argument with this name.
@@ -176,10 +164,8 @@ def agent_of(word: str, agents: Collection[str]) -> str:
 def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None) -> Takes:
     """Read the arguments of an agent from its code in another process, because the code may belong to a snapshot.
 
-    Args:
-        locator: locator of the agent, ``module:attribute`` or a registered name.
-        code: folders whose modules take precedence over installed modules.
-        folder: folder from which other modules are imported; by default the current folder.
+    Modules in the folders of ``code`` take precedence over installed modules. Other modules are imported from
+    ``folder``, by default the current folder.
 
     Returns:
         The accepted arguments. If they cannot be determined, every argument is accepted, because the first run reports
@@ -226,13 +212,7 @@ def settings_of_agents(
 ) -> dict[str, AgentSettings]:
     """Return the settings of each agent, with a specification of each argument that has a value.
 
-    Args:
-        request: what the user asks for.
-        scenario: scenario with the agents that drive.
-        signatures: signature of each agent.
-        actions: form of actions of each agent, if one is chosen.
-        observations: observed parts of each agent, if they are chosen.
-        hunted: whether declared ranges apply, and not only values that the user gives.
+    Unless ``hunted``, only values that the user gives apply, and no declared ranges.
 
     Raises:
         ArgumentError: an argument is unknown, missing or invalid.
@@ -325,11 +305,7 @@ def specs_of_scenario(
 ) -> dict[str, ArgumentSpec]:
     """Return the specification of each argument of the scenario, and of the signals of disturbances.
 
-    Args:
-        request: what the user asks for.
-        scenario: the scenario.
-        disturb: the disturbances as words.
-        hunted: whether declared ranges apply, and not only values that the user gives.
+    Unless ``hunted``, only values that the user gives apply, and no declared ranges.
 
     Raises:
         ArgumentError: an argument is unknown or invalid.

@@ -54,12 +54,7 @@ def chosen_actions(
 
     The command line takes precedence over the scenario, and the scenario over the class of its own agent. A class that
     ``--agent`` names takes precedence over the scenario, because the scenario's form is that of the scenario's agent.
-
-    Args:
-        asked: value of ``--action``; may be empty.
-        scenario: scenario with its agents.
-        signatures: signature of each agent.
-        brought: the vehicles for which ``--agent`` names the agent.
+    ``asked`` is the value of ``--action``, and ``brought`` has the vehicles for which ``--agent`` names the agent.
 
     Raises:
         UsageError: an agent cannot return actions of the chosen form, or names a form that does not exist.
@@ -84,10 +79,6 @@ def chosen_actions(
 
 def refuse_misplaced_plans(scenario: Scenario, kinds: Iterable[str]) -> None:
     """Refuse disturbances that would make the plans of an agent begin where the vehicle is not.
-
-    Args:
-        scenario: scenario with its agents.
-        kinds: kinds of the disturbances.
 
     Raises:
         UsageError: an agent returns plans, and a disturbance does not fit them.
@@ -125,13 +116,9 @@ def chosen_observations(
     """Return the parts of each agent for which the command line, the scenario or the agent's class names parts.
 
     The command line takes precedence over the scenario, and the scenario over the class of its own agent. A class that
-    ``--agent`` names takes precedence over the scenario.
-
-    Args:
-        asked: value of ``--observe``; may be empty.
-        scenario: scenario with its agents.
-        signatures: signature of each agent; without one, only the command line and the scenario count.
-        brought: the vehicles for which ``--agent`` names the agent.
+    ``--agent`` names takes precedence over the scenario. ``asked`` is the value of ``--observe``, and ``brought`` has
+    the vehicles for which ``--agent`` names the agent. Without the signature of an agent, only the command line and the
+    scenario count.
 
     Raises:
         UsageError: a part does not exist, or the simulator does not have it.
@@ -181,9 +168,7 @@ def chosen_requirements(request: Request, scenario: Scenario) -> list[str]:
 def without_refuted_notes(scenario: Scenario, requirements: list[str]) -> Scenario:
     """Return the scenario without the notes that do not apply if there is a requirement.
 
-    Args:
-        scenario: the scenario; if it has requirements itself, no such note was made.
-        requirements: the requirements of the hunt.
+    For a scenario that has requirements itself, no such note was made.
     """
     if not requirements or scenario.requirement:
         return scenario
@@ -199,9 +184,7 @@ def parse_crash_on(
 ) -> tuple[tuple[Outcome, ...], dict[str, float]]:
     """Return the outcomes that ``--crash-on`` names, and the limits that it gives.
 
-    Args:
-        words: the values of ``--crash-on``.
-        brought: the outcomes of the chosen oracles, which ``--crash-on`` may name as well.
+    ``brought`` has the outcomes of the chosen oracles, which ``--crash-on`` may name as well.
 
     Raises:
         UsageError: an outcome does not exist, or a limit is invalid.

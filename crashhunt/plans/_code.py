@@ -63,13 +63,7 @@ def describe_code(
 ) -> CodeFacts:
     """Return the declarations of a scenario's agents, and of the other code that options name.
 
-    Args:
-        scenario: the scenario with its agents.
-        oracles: values of ``--oracle``.
-        disturb: value of ``--disturb``.
-        sampler: value of ``--sampler``.
-        executor: value of ``--executor``.
-        timeout_s: time limit of a trial in s; imports may take 60 s longer.
+    Imports may take 60 s longer than a trial.
 
     Raises:
         CrashhuntError: user code cannot be imported, or has ended or stopped its process.

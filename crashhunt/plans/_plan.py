@@ -62,10 +62,7 @@ def plan(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario,
 def plan_with_code(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario, HuntSettings, CodeFacts]:
     """Resolve a user's request; also return the declarations of the code that the request names.
 
-    Args:
-        request: what the user asks for: scenario, agents, arguments and options.
-        survey: function that returns the scenario with the vehicles that an agent can replace. The function is called
-            last because it may take long, and invalid requests are refused before.
+    ``survey`` is called last because it may take long, and invalid requests are refused before.
 
     Raises:
         CrashhuntError: the request is invalid.

@@ -202,11 +202,7 @@ def _flat(data: object, prefix: str = "") -> dict[str, str]:
 def write_settings(path: Path, settings: HuntSettings, command: list[str], *, like: Path | None = None) -> None:
     """Write ``hunt.toml``, with the command line as a comment on top. The file is never incomplete.
 
-    Args:
-        path: path of the file. Keys that a later version has added to an existing file are kept.
-        settings: the settings of the hunt.
-        command: the command line of the hunt.
-        like: path of another file whose additional keys are kept instead.
+    Keys that a later version has added to an existing file, or to the file ``like``, are kept.
     """
     import tomli_w
 
@@ -302,8 +298,7 @@ class ChoosesParallelism(Protocol):
 def executor_of(word: str) -> Callable[..., Any]:
     """Return the factory of the named executor, with the executor's argument if there is one.
 
-    Args:
-        word: a registered name or ``module:attribute``, optionally followed by ``:ARG``, which may contain colons.
+    The word may end with ``:ARG``, which may contain colons.
 
     Raises:
         PluginError: the executor does not exist.

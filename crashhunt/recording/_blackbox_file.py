@@ -79,9 +79,7 @@ def _with_changes_only(
 def changes_of(earlier: memoryview, now: memoryview) -> bytes:
     """Return where two arrays of 64-bit words differ, as one bit per word, and then the changed words.
 
-    Args:
-        earlier: bytes of the first array, as many as of the second.
-        now: bytes of the second array.
+    Both arrays have as many bytes.
     """
     words = np.frombuffer(now, "<u8")
     is_changed = words != np.frombuffer(earlier, "<u8")
@@ -243,9 +241,6 @@ class BlackBoxFile:
 
     The file is never mapped into memory, because reading a mapped page would kill this process if the trial truncates
     the file.
-
-    Args:
-        path: path of the file to create.
 
     Raises:
         RecorderError: the disk is full.

@@ -64,11 +64,6 @@ def values_around(recorded: Recording, replayed: Recording, divergence: Divergen
 
     The result is empty if the divergence does not concern a single value. A value is None if a recording lacks the
     step.
-
-    Args:
-        recorded: recording of the trial.
-        replayed: recording of its replay.
-        divergence: the first difference of the two recordings.
     """
     if divergence.place is None:
         return []
@@ -95,12 +90,8 @@ def has_same_scenes(recorded: Recording, rerun: Recording, step: int) -> bool:
     """Return whether the scenes of a run are bit-identical to the recorded scenes up to and including a step.
 
     If a change begins after this step, only such a run gives information about the recorded trial. Observations and
-    actions are not compared, because other versions may record them in another form.
-
-    Args:
-        recorded: the recording of the trial; it must contain the step.
-        rerun: the recording of the run.
-        step: the last step to compare.
+    actions are not compared, because other versions may record them in another form. The recorded trial must contain
+    the step.
     """
     rerun = rerun.like(recorded)
     return rerun.steps >= step and all(

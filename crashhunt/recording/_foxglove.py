@@ -62,11 +62,7 @@ _COLORS = {
 def write_views(log: LogWriter, recording: Recording, lanes: Sequence[Lane], crash: TrialResult | None) -> None:
     """Write all view channels.
 
-    Args:
-        log: the log to which channels are added.
-        recording: recording of the episode.
-        lanes: lanes of the map; those far from every controlled vehicle are skipped.
-        crash: description of the crash, for the marker.
+    Lanes far from every controlled vehicle are skipped.
     """
     scenes = recording.scenes()
     if not scenes or not recording.agents:
@@ -365,13 +361,7 @@ def messages_of(
     """Yield schema, channel, sequence number and contents of the messages of an MCAP file, in the order of the file.
 
     A crash has thousands of messages. mcap's own reader takes five times as long, because it creates several objects
-    for each message.
-
-    Args:
-        file: the file, open for reading.
-        reader: mcap's reader of the file.
-        topic: the only topic to yield; empty for all.
-        validate_crcs: whether to verify the checksums.
+    for each message. Without a topic, the messages of all topics are yielded.
 
     Raises:
         McapError: a record is longer than its chunk.
@@ -414,11 +404,7 @@ def _unpacked_size(chunk: Chunk) -> int:
 
 
 class LogWriter:
-    """Writes protobuf messages to an MCAP file, at simulation time.
-
-    Args:
-        writer: mcap's writer of the file.
-    """
+    """Writes protobuf messages to an MCAP file, at simulation time."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
@@ -436,13 +422,8 @@ class LogWriter:
     ) -> None:
         """Write a serialised message.
 
-        Args:
-            topic: topic of the channel, which is created for its first message.
-            kind: protobuf class of the message.
-            data: the serialised message.
-            time_ns: simulation time, in ns.
-            sequence: number of the message within the evidence channels.
-            metadata: metadata of the channel.
+        A channel is created for its first message, with ``metadata``. ``sequence`` is the number of the message within
+        the evidence channels.
         """
         channel = self._channels.get(topic)
         if channel is None:

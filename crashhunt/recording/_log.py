@@ -55,13 +55,8 @@ def write_log(
 ) -> None:
     """Write a log completely or not at all.
 
-    Args:
-        path: path of the file.
-        recording: recording of the episode.
-        lanes: lanes of the map, for viewers.
-        metadata: further metadata of the log.
-        crash: description of the crash, for the marker and the log line.
-        views: whether to write view channels for other tools; without them, the file is half as large.
+    The lanes are for viewers. Without ``views``, the channels for other tools are omitted, and the file is half as
+    large.
 
     Raises:
         HuntDirectoryError: the disk is full, or the folder is not writable.

@@ -74,10 +74,6 @@ class DecodedSteps(Sequence[StepRecord]):
 
     Two uses of a step may return two equal objects. Therefore a caller must not change them.
 
-    Args:
-        records: all records, beginning with the prologue.
-        prologue: the agents of the recording.
-
     Raises:
         ValueError, IndexError, KeyError, TypeError, struct.error: the records contradict each other.
     """
@@ -154,12 +150,7 @@ class DecodedSteps(Sequence[StepRecord]):
 
 
 class DecodedScenes(Sequence["Scene"]):
-    """Scenes of a recording, which are decoded together with their steps.
-
-    Args:
-        steps: the steps of the recording.
-        numbers: numbers of the steps.
-    """
+    """Scenes of a recording, which are decoded together with their steps."""
 
     def __init__(self, steps: DecodedSteps, numbers: range) -> None:
         self._steps = steps
@@ -379,13 +370,7 @@ class Near:
 
 
 def compact_records(records: Iterable[Record], choose: ActorSelector, *, observations: bool) -> Iterator[Record]:
-    """Yield the records of a recording, reduced to some of the actors.
-
-    Args:
-        records: records of the complete recording.
-        choose: function that selects the actors of each step.
-        observations: whether to keep the observations of the agents.
-    """
+    """Yield the records of a recording, reduced to some of the actors."""
     actors: list[list[object]] = []  # as their definitions say
     numbers: dict[int, int] = {}  # of the actors that are kept: number there to number here
     roster: list[int] = []

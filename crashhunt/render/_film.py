@@ -299,10 +299,7 @@ def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions, *, w
 def shown_steps(recording: Recording, last_s: float, nearest: int) -> tuple[int, int]:
     """Return the first and the last step of a film.
 
-    Args:
-        recording: recording of the trial.
-        last_s: duration to show, as in `FilmOptions`.
-        nearest: step of a near miss, as in `Shot`.
+    ``last_s`` is as in `FilmOptions`, and ``nearest`` as in `Shot`.
     """
     dt, end = recording.prologue.step_length_s, recording.steps
     if nearest < 0:
@@ -334,12 +331,7 @@ _PANELS_WITHOUT_SCENE = ("reward", "action")
 
 
 def _builtin_labels(recording: Recording, other: str) -> tuple[str, ...]:
-    """Return the labels of the panels that every film of a recording has.
-
-    Args:
-        recording: recording of the trial.
-        other: identifier of the collision partner; empty if there is none.
-    """
+    """Return the labels of the panels that every film of a recording has."""
     if not recording.actors:
         return _PANELS_WITHOUT_SCENE
     labels = _WITH_OTHER if other else _WITH_NEAREST
@@ -351,13 +343,7 @@ class BuiltinPanels:
     """The panels that every film has: time to collision, gap, speeds, accelerations, criticality, and the action.
 
     A recording without a scene has a curve of the reward instead of the other curves. A dotted line is a value that is
-    cut at the axis.
-
-    Args:
-        recording: recording of the trial.
-        agent: identifier of the vehicle that the curves describe.
-        other: identifier of the collision partner; empty if there is none. The curves then describe the nearest actor.
-        meanings: names of the agent's discrete actions, if they are known.
+    cut at the axis. Without a collision partner, the curves describe the nearest actor.
     """
 
     def __init__(self, recording: Recording, *, agent: str, other: str, meanings: Sequence[str] = ()) -> None:

@@ -56,9 +56,7 @@ class CrashFinding:
 def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> list[CrashFinding]:
     """Return the crash types in the order of their groups; no code of the bundles runs.
 
-    Args:
-        groups: groups of the crashes, one for each crash type.
-        known: name of the corpus case for each crash type that the corpus contains.
+    ``known`` has the name of the case in the corpus for each known crash type.
     """
     found = []
     for group in groups:
@@ -142,12 +140,7 @@ _ICONS = {"still": "💥", "changed": "🔀", "fixed": "✅", "cannot_run": "�
 
 
 def crashes_summary(findings: Sequence[CrashFinding], *, compared: bool = False) -> str:
-    """Return the crash types as a Markdown table, with one row for each crash type.
-
-    Args:
-        findings: one finding for each crash type.
-        compared: whether the crash types were compared with a corpus.
-    """
+    """Return the crash types as a Markdown table, with one row for each crash type."""
     if not findings:
         return "### crashhunt: no crash was saved\n"
     crashes, new = sum(finding.group.count for finding in findings), sum(not finding.known for finding in findings)

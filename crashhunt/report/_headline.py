@@ -59,11 +59,7 @@ class CrashFacts(Protocol):
 
 
 def verdict_of(story: CrashFacts) -> str:
-    """Return one sentence on a crash or near miss: what happened, and which run avoided the crash.
-
-    Args:
-        story: story of the crash or near miss.
-    """
+    """Return one sentence on a crash or near miss: what happened, and which run avoided the crash."""
     if story.nearest is not None:
         return _of_a_near_miss(story)
     omission = _omission(story)
@@ -92,9 +88,7 @@ def _of_a_near_miss(story: CrashFacts) -> str:
 def describe_contact(contact: ContactRecord, omission: Omission | None = None) -> str:
     """Return a description of a contact, without a final period.
 
-    Args:
-        contact: contact of the agent with the collision partner.
-        omission: the lane change that caused the contact according to runs; None if there is no such lane change.
+    ``omission`` is the lane change that caused the contact according to runs.
     """
     changers = contact.lane_changers(_CHANGE_S) if contact.same_way else ()
     what = _what_touched(contact)

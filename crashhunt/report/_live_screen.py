@@ -322,11 +322,6 @@ def describe_types(count: int, by_cause: int | None, noun: str = "type") -> str:
 
     >>> describe_types(4, 6)
     '4 types, 6 by cause'
-
-    Args:
-        count: number of crash types.
-        by_cause: number of crash types by cause; None if the hunt counts types.
-        noun: word for a crash type in the text.
     """
     words = count_of(count, noun)
     return words if by_cause is None else f"{words}, {by_cause} by cause"

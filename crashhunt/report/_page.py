@@ -168,12 +168,7 @@ def _explained(ranks: NDArray[np.intp], parts: NDArray[np.intp]) -> float:
 
 
 def lineage_of(number: int, trial: Callable[[int], JsonObject | None]) -> list[list[object]]:
-    """Return the ancestors of a trial, the parent first, each with its number, origin and criticality.
-
-    Args:
-        number: number of the trial.
-        trial: function that returns the JSON data of a trial by its number; None if the trial is missing.
-    """
+    """Return the ancestors of a trial, the parent first, each with its number, origin and criticality."""
     found: list[list[object]] = []
     row = TrialRow(data) if (data := trial(number)) is not None else None
     while row is not None and row.parent is not None and row.parent < row.number and len(found) < _MAX_GENERATIONS:
@@ -262,10 +257,6 @@ def _read(name: str) -> str:
 
 def player_data(bundle: Bundle, story: Story | None = None) -> dict[str, object]:
     """Return the data and the texts of a crash or near miss for the player.
-
-    Args:
-        bundle: the crash or near miss; its log is read.
-        story: the story of the crash, if it has already been created.
 
     Raises:
         BundleError: the crash is damaged.

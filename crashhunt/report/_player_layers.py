@@ -61,12 +61,7 @@ def player_layers(
 ) -> dict[str, object]:
     """Return the layers of a crash for the player; a layer whose data are missing is missing as well.
 
-    Args:
-        bundle: the crash or near miss.
-        recording: its recording.
-        agent: the agent in the centre of the picture.
-        contact: record of the contact; None if there is none.
-        origin: position that becomes (0, 0), in m.
+    ``origin`` is the position that becomes (0, 0), in m.
     """
     lights = _checked(read_lights(bundle))
     found: dict[str, object] = {

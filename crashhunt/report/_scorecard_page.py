@@ -21,12 +21,7 @@ _COLUMNS = ("group", "cases", "run", "crashes", *(DRIVER_NAMES[model] for model 
 
 
 def describe_scorecard(card: JsonObject, directory: str) -> str:
-    """Return the scorecard as text: the answer first, then the groups, then the files.
-
-    Args:
-        card: the scorecard as JSON-compatible data.
-        directory: directory with the files of the scorecard.
-    """
+    """Return the scorecard as text: the answer first, then the groups, then the files."""
     lines = [_answer(card)]
     if not card["complete"]:
         lines.append("The scorecard is not complete. Run the same command to resume.")

@@ -39,9 +39,7 @@ if TYPE_CHECKING:
 def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> str:
     """Return one line for each crash type, with its shortest crash.
 
-    Args:
-        groups: the groups of crashes, one for each crash type.
-        known: name of the corpus case for each known crash type; None if no corpus was given.
+    With a corpus, ``known`` has the name of its case for each known crash type.
     """
     if not groups:
         return "No crash was saved."
@@ -73,12 +71,7 @@ def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | No
 
 
 def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGroup]]) -> str:
-    """Return the crashes by cause, each cause with a line for each crash type in which it appears.
-
-    Args:
-        groups: the groups of crashes, one for each crash type.
-        causes: the crashes of each type, divided by cause.
-    """
+    """Return the crashes by cause, each cause with a line for each crash type in which it appears."""
     joined = join_causes(groups, causes)
     rows = [["crashes", "cause and types", "judged", "shortest", "steps"]]
     for one in joined:

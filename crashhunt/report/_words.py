@@ -146,14 +146,7 @@ def danger_cells(course: DangerCourse, step: int) -> list[str]:
 
 
 def danger_to_json(course: DangerCourse | None, bundle: Bundle, first: int, last: int) -> dict[str, object] | None:
-    """Return the object under ``danger`` of ``show --json``; None if the recording has no criticality.
-
-    Args:
-        course: criticality of the recording over time.
-        bundle: bundle of the trial.
-        first: first step of the table.
-        last: last step of the table.
-    """
+    """Return the object under ``danger`` of ``show --json``; None if the recording has no criticality."""
     if course is None:
         return None
     return {
@@ -193,13 +186,7 @@ def _summary(moment: DangerousMoment, total: float) -> dict[str, object]:
 
 
 def about_disturbances(recording: Recording, result: TrialResult, first_step: int) -> list[str]:
-    """Return the disturbances in a trial's last steps, one sentence each, and the number of earlier disturbances.
-
-    Args:
-        recording: recording of the episode.
-        result: result of the episode's trial.
-        first_step: first step to describe.
-    """
+    """Return the disturbances in a trial's last steps, one sentence each, and the number of earlier disturbances."""
     step_length_s = recording.prologue.step_length_s
     recent = [one for one in result.disturbances if one.step + one.how_long / step_length_s >= first_step]
     earlier = len(result.disturbances) - len(recent)
@@ -240,9 +227,7 @@ def describe_disturbances(report: HuntReport) -> list[str]:
 def traffic_of(bundle: Bundle, likeliest: str) -> str:
     """Return a text on whether the traffic of a crash was disturbed; empty if its hunt has no disturbances.
 
-    Args:
-        bundle: the crash.
-        likeliest: identifier of the likeliest of the hunt's crashes with disturbances.
+    ``likeliest`` is the id of the likeliest of the hunt's disturbed crashes.
     """
     if not may_be_disturbed(bundle.result):
         return ""
@@ -279,10 +264,7 @@ _MAX_LISTED_EVENTS = 5  # a jam has many
 def about_events(recording: Recording, first_step: int, *, besides: Event | None) -> list[str]:
     """Return a sentence for each traffic event of the last steps, except for the event that ended the trial.
 
-    Args:
-        recording: recording of the episode.
-        first_step: first step to describe.
-        besides: the event that ended the trial; it is excluded because another text describes it.
+    Another text describes this event.
     """
     found = [
         (step.step, event)
@@ -306,11 +288,7 @@ _ESCAPE_WORDS = {
 def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str, other: str) -> list[str]:
     """Return the results of the counterfactual analysis, one sentence each.
 
-    Args:
-        judgement: judgement of the crash.
-        ago: function that returns the time of a step as text, such as ``0.4 s before, after step 68``.
-        agent: identifier of the controlled vehicle.
-        other: identifier of the collision partner.
+    ``ago`` returns the time of a step as text, such as ``0.4 s before, after step 68``.
     """
     best, runs = judgement.best, count_of(judgement.runs, "run")
     sentences = []
@@ -348,14 +326,7 @@ _ANSWER_WORDS = {True: "yes", False: "no", None: "no answer"}
 
 
 def about_drivers(drivers: Preventability, ago: Callable[[int], str], agent: str, other: str) -> list[str]:
-    """Return whether models of a competent driver would have prevented the crash, and when the risk was perceived.
-
-    Args:
-        drivers: the answers of the models.
-        ago: function that returns the time of a step as text, as in `about_judgement`.
-        agent: identifier of the controlled vehicle.
-        other: identifier of the collision partner.
-    """
+    """Return whether models of a competent driver would have prevented the crash, and when the risk was perceived."""
     if not drivers.runs:
         return [f"Whether a competent driver would have prevented it is not known: {drivers.why_not}."]
     answers = "; ".join(_driver_answer(run) for run in drivers.runs)
@@ -376,11 +347,7 @@ def about_drivers(drivers: Preventability, ago: Callable[[int], str], agent: str
 
 
 def list_preventing(answers: Mapping[str, bool | None] | None) -> str:
-    """Return the answers of the models that have one, as text; empty if there are none.
-
-    Args:
-        answers: the answer of each model; None if the models were not asked.
-    """
+    """Return the answers of the models that have one, as text; empty if there are none."""
     known = ((name, answer) for name, answer in (answers or {}).items() if answer is not None)
     return ", ".join(f"{DRIVER_NAMES[name]}: {_ANSWER_WORDS[answer]}" for name, answer in known)
 
@@ -407,11 +374,7 @@ def about_reference(
 ) -> list[str]:
     """Return sentences on what the agent failed to do; empty if no run with a reference driver shows an omission.
 
-    Args:
-        reference: results of the runs with a reference driver.
-        ago: function that returns the time of a step as text, as in `about_judgement`.
-        agent: identifier of the controlled vehicle.
-        had_to_yield: whether a rule blames the agent; otherwise, no sentence says that it did not yield.
+    Unless a rule blames the agent (``had_to_yield``), no sentence says that it did not yield.
     """
     if reference.omission is None:
         return []
@@ -506,11 +469,8 @@ _MANOEUVRE_NOUNS = {"braked": "braking", "sped up": "speeding up", "changed lane
 def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
     """Return the causes of a crash, one sentence each, the strongest first, then the factors without influence.
 
-    A cause is the stronger, the fewer of the runs without it end in the same crash.
-
-    Args:
-        why: the results of the runs.
-        when: function that returns the time of a step as text, such as ``61.3 s``.
+    A cause is the stronger, the fewer of the runs without it end in the same crash. ``when`` returns the time of a step
+    as text, such as ``61.3 s``.
     """
     defaults = {factor.name: factor for factor in why.factors if (factor.kind, factor.what) == ("argument", "default")}
     drawn = {
@@ -606,8 +566,7 @@ def _number(value: Value | None) -> str:
 def describe_versions(versions: Iterable[Mapping[str, Any]]) -> str:
     """Return the trials of each version of the code as text, the newest version first.
 
-    Args:
-        versions: the versions, each with the fields of `VersionCounts`.
+    Each version has the fields of `VersionCounts`.
     """
     ordered = sorted(versions, key=lambda one: not one["is_newest"])
     newest = ordered[0]

@@ -47,10 +47,6 @@ class Monitor:
     Parts of the formula without temporal operators are computed for each sample. Temporal operators are evaluated only
     after a sample in which such a part is unfavourable: any other sample changes nothing.
 
-    Args:
-        requirement: the requirement.
-        step_length_s: time between two samples, in s.
-
     Raises:
         FormulaError: a window does not fit the step length.
     """
@@ -85,8 +81,7 @@ class Monitor:
     def add(self, row: Sequence[float]) -> bool:
         """Add a sample, and return whether the formula is certainly violated.
 
-        Args:
-            row: values of the signals, in the order of `signals`; booleans for boolean signals.
+        The values are in the order of `signals`.
 
         Raises:
             FormulaError: a term has no value, such as after a division by zero.
@@ -141,14 +136,7 @@ class _Part:
 
 
 class _Check:
-    """Decides one conjunct of the formula.
-
-    Args:
-        formula: the conjunct.
-        parts: its parts without temporal operators.
-        step_length_s: time between two samples, in s.
-        text: text of the whole formula, for errors.
-    """
+    """Decides one conjunct of the formula."""
 
     def __init__(self, formula: Formula, parts: list[_Part], step_length_s: float, text: str) -> None:
         self._parts = {id(part.formula): part for part in parts}

@@ -105,13 +105,8 @@ def proposition_values(
 ) -> NDArray[np.float64]:  # fmt: skip
     """Return the value of a proposition at each sample.
 
-    Args:
-        formula: the proposition.
-        signals: values of the signals, at each sample.
-        flags: names of the boolean signals; as a formula, such a signal is infinitely true or false.
-        count: number of samples.
-        text: text of the whole formula, for errors.
-        truth: whether to return truth values in place of robustness.
+    As a formula, a boolean signal is infinitely true or false. With ``truth``, truth values are returned in place of
+    robustness.
     """
     match formula:
         case Truth(value=value):
@@ -171,9 +166,7 @@ class Evaluation:
     def values(self, formula: Formula, *, positive: bool = True) -> NDArray[np.float64]:
         """Return the value of a formula at each sample.
 
-        Args:
-            formula: the formula.
-            positive: whether the formula is below an even number of negations.
+        ``positive`` is whether the formula is below an even number of negations.
         """
         if self.is_leaf(formula):
             return self.leaf(formula)
@@ -212,12 +205,8 @@ def _future(
 ) -> NDArray[np.float64]:
     """Return the minimum or maximum in a window ahead of each sample.
 
-    Args:
-        values: value of each sample.
-        begin: first sample of the window, relative to each sample.
-        end: last sample of the window; None for the end of the trace and everything after it.
-        least: whether to return the minimum.
-        after: value of the samples after the end.
+    The bounds of the window are relative to each sample. Without an end, it reaches to the end of the trace and
+    everything after it, where each sample is ``after``.
     """
     if not least:
         return -_future(-values, begin, end, least=True, after=-after)

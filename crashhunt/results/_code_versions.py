@@ -130,13 +130,7 @@ def resumed_versions(
 ) -> tuple[CodeVersions, tuple[str, ...]]:
     """Return the versions of the code of a hunt that resumes, and the new files that do not count as a change.
 
-    Args:
-        directory: directory of the hunt.
-        ledger: ledger of the hunt.
-        taken: snapshot from which the next trials run.
-        settings: settings of the hunt.
-        before: settings of the hunt before it was resumed.
-        new_code: whether the hunt may continue with other code; None if the command has no option to allow it.
+    ``new_code`` is None if the command has no option to allow other code.
 
     Raises:
         HuntDirectoryError: the code has changed since the hunt's trials, and the hunt must not or cannot continue.

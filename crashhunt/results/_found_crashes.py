@@ -78,11 +78,7 @@ def tally_crashes(
 ) -> CrashTally:
     """Return the counts of the crashes in a ledger.
 
-    Args:
-        ledger: ledger of the hunt.
-        crash_on: the outcomes that count as a crash.
-        disturbed: whether the hunt has disturbances, so that crashes with disturbances are counted.
-        snapshots: digests of the snapshots whose trials count; empty for all trials.
+    With ``disturbed``, crashes with disturbances are counted. Without ``snapshots``, all trials count.
     """
     outcomes = Counter(ledger.outcomes())
     if snapshots:
@@ -134,9 +130,7 @@ class FoundCrashes:
 def find_crashes(directory: Path, limit: int) -> FoundCrashes:
     """Return the crashes of a hunt. If the ledger has the types of all crashes, at most `limit` bundles are read.
 
-    Args:
-        directory: directory of the hunt; its ledger may be missing, as in an exported crash.
-        limit: maximum number of crashes to show.
+    The ledger may be missing, as in an exported crash.
 
     Raises:
         BundleError: a crash that is to be shown is damaged.
@@ -210,9 +204,7 @@ def _types_of(
 def first_trials(first: Mapping[str, str], dropped: Mapping[str, Sequence[int]]) -> dict[str, int]:
     """Return the number of the trial in which each crash type occurred for the first time.
 
-    Args:
-        first: identifier of the first saved crash of each type.
-        dropped: numbers of the trials of each type whose bundles were deleted; the first crash may be one of them.
+    ``dropped`` has the trials of each type whose bundles were deleted; the first crash may be one of them.
     """
     saved = {words: [number] for words, crash in first.items() if (number := _number(crash)) >= 0}
     numbers = {words: [*dropped.get(words, ()), *saved.get(words, ())] for words in {**first, **dropped}}
@@ -323,21 +315,15 @@ class Kinds:
                 self._count(int(word), signature, division.restore(int(word), answer))
 
     def add(self, bundle: Bundle, ended: int) -> None:
-        """Add a saved crash.
-
-        Args:
-            bundle: bundle of the crash.
-            ended: number of finished trials.
-        """
+        """Add a saved crash."""
         if self._add_signature(bundle):
             self.newest, self.newest_trial = time.time(), ended
 
     def groups(self, *, running: bool = False) -> tuple[Group, ...]:
         """Return the crash types, the most frequent first, each with its crashes in the order of their trials.
 
-        Args:
-            running: whether groups some moments old are sufficient, as for a screen that is refreshed ten times a
-                second. With 10,000 crashes, new groups would take too long.
+        While a hunt is ``running``, groups some moments old are sufficient, as for a screen that is refreshed ten times
+        a second. With 10,000 crashes, new groups would take too long.
         """
         began = time.monotonic()
         if running and self._groups is None and began < self._due:
@@ -353,11 +339,7 @@ class Kinds:
         """Remove and return the crashes beyond the `keep` shortest of each crash type, or of each cause.
 
         The removed crashes still count, but are no longer members of a group. A type whose crashes are still being
-        judged keeps all crashes.
-
-        Args:
-            keep: number of bundles to keep of each crash type.
-            final: whether no more crashes will be judged.
+        judged keeps all crashes. ``final`` is whether no more crashes will be judged.
         """
         found = []
         for group in groups_of(self._signed.values()):
@@ -530,13 +512,8 @@ def prune_bundles(
 ) -> list[Bundle]:
     """Delete bundles beyond the `keep` shortest of each crash type; return the remaining crashes.
 
-    Args:
-        ledger: ledger of the hunt.
-        kinds: The crash types of the hunt, from which removed crashes are deleted; None if the hunt ends at its first
-            crash.
-        crashes: The crashes with a bundle.
-        keep: Number of bundles to keep of each crash type; 0 for all.
-        final: whether no more crashes will be judged.
+    Without ``kinds``, the hunt ends at its first crash; otherwise removed crashes are deleted from it. A ``keep`` of 0
+    keeps all bundles. ``final`` is whether no more crashes will be judged.
 
     Raises:
         HuntDirectoryError: the ledger cannot be written.
@@ -551,12 +528,7 @@ def prune_bundles(
 
 
 def crashes_by_version(hunts: Iterable[Path], groups: Iterable[Group]) -> dict[str, dict[str, dict[int, int]]]:
-    """Return the number of crashes of each type (as text) with each version of the code, of hunts with several.
-
-    Args:
-        hunts: directories of hunts.
-        groups: the groups of their crashes, one for each crash type.
-    """
+    """Return the number of crashes of each type (as text) with each version of the code, of hunts with several."""
     found: dict[str, dict[str, dict[int, int]]] = {}
     every = list(groups)
     for hunt in hunts:

@@ -46,8 +46,7 @@ _PERMITTED_FILES = (".lock", layout.SCRATCH, ".hunt.")  # what may be there befo
 class HuntDirectory:
     """The directory of a hunt, with its lock and scratch folder.
 
-    Args:
-        path: path of the directory; the directory itself is created if it does not exist.
+    The directory is created if it does not exist.
 
     Attributes:
         has_begun: whether the hunt has begun. Before that, an error deletes a directory that was created for the hunt,
@@ -132,13 +131,8 @@ class HuntDirectory:
     def claim(self, settings: HuntSettings, command: list[str], *, overwrite: bool, seed_given: bool) -> HuntSettings:
         """Claim the directory for this hunt, or check that it already has this hunt; return the valid settings.
 
-        A hunt without the result of a trial is replaced.
-
-        Args:
-            settings: settings of the hunt.
-            command: the command line, which is written to ``hunt.toml`` as a comment.
-            overwrite: whether a new hunt replaces an existing one.
-            seed_given: whether the user chose the seed; if not, a resumed hunt keeps its own seed.
+        A hunt without the result of a trial is replaced. The command line is written to ``hunt.toml`` as a comment.
+        Unless the user chose the seed, a resumed hunt keeps its own.
 
         Raises:
             HuntDirectoryError: the existing hunt has other trials, or the directory cannot be written.

@@ -321,11 +321,8 @@ _MAX_INSPECTED_ROWS = 1000  # rows, to infer the type of an argument without a d
 def write_text(hunt: HuntResults, out: IO[str], form: str, *, outcomes: Sequence[str] = ()) -> int:
     """Write the trials of a hunt as text; return the number of trials.
 
-    Args:
-        hunt: the hunt.
-        out: the text file to write to.
-        form: the format: ``csv``, ``json`` (one array) or ``jsonl`` (one object per line).
-        outcomes: outcomes of the trials to write; empty for all trials.
+    The form is ``csv``, ``json`` (one array) or ``jsonl`` (one object per line). Without ``outcomes``, all trials are
+    written.
     """
     names = hunt.columns
     count = 0

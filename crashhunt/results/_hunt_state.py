@@ -326,11 +326,7 @@ def _hunt_state(directory: Path) -> HuntState:
 def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last: float | None) -> HuntState:
     """Return the state of a hunt from the facts in its ledger, without its crashes and the results of forks.
 
-    Args:
-        directory: directory of the hunt.
-        facts: facts from the hunt's ledger.
-        outcomes: number of trials with each outcome.
-        last: time at which the last trial ended, in s since the epoch; None if no trial has ended.
+    ``last`` is the time at which the last trial ended, in s since the epoch; None if no trial has ended.
     """
     said = facts.get("state", "queued")
     owner = facts.get("owner")
@@ -368,11 +364,8 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
 def _duration_s(facts: Facts, until: float | None) -> float:
     """Return how long the last run of a hunt lasted up to a time, in s; 0 if that is unknown.
 
-    If the system's clock was set or the machine was suspended, the hunt's own measurement counts.
-
-    Args:
-        facts: facts from the hunt's ledger.
-        until: the time, in s since the epoch; None if no trial has ended.
+    If the system's clock was set or the machine was suspended, the hunt's own measurement counts. The time is in s
+    since the epoch; None if no trial has ended.
     """
     began, measured = facts.get("began"), facts.get("elapsed_s")
     if began is None or until is None:  # such as in a copy that `check --salvage` has made
@@ -419,10 +412,7 @@ def _with_crashes(state: HuntState, ledger: Ledger, facts: Facts) -> HuntState:
 def with_crash_counts(state: HuntState, facts: Facts, counted: int) -> HuntState:
     """Return a state with the numbers of crashes and of their bundles.
 
-    Args:
-        state: state of the hunt.
-        facts: facts from the hunt's ledger.
-        counted: number of trials in the ledger that crashed.
+    ``counted`` is the number of crashed trials in the ledger.
     """
     saved = len(crash_folders(Path(state.dir)))
     dropped = sum(len(numbers) for numbers in (facts.get("dropped") or {}).values())
@@ -439,12 +429,8 @@ def with_crash_counts(state: HuntState, facts: Facts, counted: int) -> HuntState
 def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
     """Return whether every trial of a hunt was drawn independently of the others, as recorded by the hunt.
 
-    Trials in the same traffic are not independent.
-
-    Args:
-        facts: facts from the hunt's ledger.
-        settings: settings of the hunt. In early ledgers without this fact, only the sampler `random` counts as
-            independent.
+    Trials in the same traffic are not independent. In early ledgers without this fact, only the sampler `random` counts
+    as independent.
     """
     return bool(facts.get("independent", settings.sampler == "random")) and not settings.seeds
 

@@ -29,10 +29,7 @@ _MAX_LOG_BYTES = 1_000_000  # bytes of one file, from its end
 class LogReader:
     """Reads the new lines of the logs of a hunt and its trials.
 
-    Args:
-        hunt: directory of the hunt.
-        kinds: the kinds of logs to read: ``run``, ``error`` and ``state``.
-        trial: number of the only trial whose logs are read; None for all.
+    Without ``trial``, the logs of all trials are read.
     """
 
     def __init__(self, hunt: Path, kinds: tuple[LogKind, ...], *, trial: int | None = None) -> None:

@@ -51,9 +51,6 @@ class TrialRow:
 
     Values that an earlier version did not write are missing. The row is based on the JSON data of a ledger, because a
     table may have a million trials, and creating a `TrialResult` takes three times as long.
-
-    Args:
-        data: JSON data of the trial.
     """
 
     data: JsonObject

@@ -118,11 +118,8 @@ def code_differences(snapshot: Snapshot, locators: Iterable[str]) -> list[str] |
     """Return the files of today's code that differ from their copies in a snapshot; None if none can be compared.
 
     Files are compared by content, not by time. A file that the snapshot lacks is reported only if it is a Python file
-    of a work tree.
-
-    Args:
-        snapshot: the snapshot of the crash, which the caller has verified.
-        locators: locators of the agents, whose modules are found as an import from the current folder finds them.
+    of a work tree. The caller has verified the snapshot. Modules of agents are found as an import from the current
+    folder finds them.
     """
     if not snapshot.has_code:
         return None
@@ -152,9 +149,7 @@ def code_differences(snapshot: Snapshot, locators: Iterable[str]) -> list[str] |
 def program_warnings(snapshot: Snapshot, locators: Iterable[str]) -> list[str]:
     """Return the reasons why this machine cannot run the programs of a snapshot, each as a line of text.
 
-    Args:
-        snapshot: the snapshot, which the caller has verified.
-        locators: locators of the agents.
+    The caller has verified the snapshot.
     """
     files, here = snapshot.argument_files, platform.machine()
     found = []

@@ -52,10 +52,7 @@ def environment(imported: ImportedModules | None = None) -> Environment:
     """Return the contents of ``environment.json``.
 
     ``loaded`` lists the distributions with an imported module, and those of simulators, because results may depend on
-    them.
-
-    Args:
-        imported: The imported modules; by default those of this process.
+    them. By default, the imported modules are those of this process.
     """
     imported = imported or ImportedModules.here()
     modules, variables = imported.places.keys(), imported.variables

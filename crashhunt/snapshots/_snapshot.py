@@ -236,9 +236,7 @@ class Snapshot:
     def verify(self, *, to_run: bool = True) -> None:
         """Check that the snapshot is unchanged.
 
-        Args:
-            to_run: whether the snapshot's code is to run; then added modules are faults, and compiled files are
-                deleted.
+        If the code is to run, added modules are faults, and compiled files are deleted.
 
         Raises:
             BundleError: The snapshot has changed; the message names the first fault.
@@ -333,9 +331,7 @@ def latest_snapshot(hunt: Path) -> Snapshot | None:
 def without_code(snapshot: Snapshot, snapshots: Path) -> Snapshot:
     """Copy a snapshot without its code: the scenario with its files, the settings and the environment.
 
-    Args:
-        snapshot: The snapshot of a hunt; the caller need not verify it.
-        snapshots: The folder in which to make the copy.
+    The caller need not verify the snapshot.
 
     Raises:
         BundleError: A file of the snapshot is missing or has changed.

@@ -86,11 +86,6 @@ def find_sources(imported: ImportedModules, *, roots: Sequence[Path] = (), witho
     state and its untracked files that git does not ignore. A module outside of work trees is included with its package,
     or alone. Links that lead out of a work tree are not followed. The directories of hunts are excluded.
 
-    Args:
-        imported: The imported modules.
-        roots: Further files and folders to include.
-        without: A folder to exclude.
-
     Raises:
         SnapshotError: A root does not exist.
     """
@@ -364,15 +359,7 @@ def take_snapshot(
 ) -> Snapshot:
     """Store the scenario, the agents' own projects, the files that their arguments name, and crashhunt itself.
 
-    Equal contents are stored only once.
-
-    Args:
-        snapshots: The folder of all snapshots of a hunt.
-        scenario: The scenario with its agents.
-        settings: The settings of the hunt.
-        options: The options of the snapshot.
-        imported: The modules that are imported for a trial, as returned by `plan_with_code`. By default, a separate
-            process imports the modules now.
+    Equal contents are stored only once. By default, a separate process imports the modules of a trial now.
 
     Raises:
         SnapshotError: The snapshot is too large, or a file cannot be read or written.
@@ -542,12 +529,7 @@ def _program_files(settings: HuntSettings, found: Sources, takes_code: bool, hun
 
 
 def _described_programs(settings: HuntSettings, revisions: Mapping[str, str]) -> dict[str, BinaryFacts]:
-    """Return what identifies the programs of agents, by the words that name them.
-
-    Args:
-        settings: the settings of the hunt.
-        revisions: version of a program's sources by locator.
-    """
+    """Return what identifies the programs of agents, by the words that name them."""
     locators = {agent.agent for agent in settings.agents.values() if is_program(agent.agent)}
     files = {word: path for locator in sorted(locators) for word, path in files_of(locator).items()}
     described = {word: found for word, path in files.items() if (found := describe_binary(path)) is not None}

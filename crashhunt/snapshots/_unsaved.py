@@ -38,10 +38,7 @@ _MAX_FILES = 3  # named one by one
 def describe_unsaved(paths: Iterable[str], snapshot: Snapshot, *, since: float) -> list[str]:
     """Return a sentence for each file of the user that was opened, loaded or started, and that the snapshot lacks.
 
-    Args:
-        paths: absolute paths of files, also of those that do not exist.
-        snapshot: the snapshot from which the code ran.
-        since: time in s; files that were written later are results, and not inputs.
+    Files that were written after ``since`` are results, and not inputs.
     """
     found: dict[str, str] = {}
     kept = f"{snapshot.path.resolve()}{os.sep}"

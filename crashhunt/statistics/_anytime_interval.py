@@ -144,11 +144,7 @@ class Bets:
 
 
 class RateTest:
-    """Counts units, and returns at any time the rates that are compatible with them.
-
-    Args:
-        bets: the bets, fixed before the first unit.
-    """
+    """Counts units, and returns at any time the rates that are compatible with them."""
 
     def __init__(self, bets: Bets | None = None) -> None:
         self.bets = bets or Bets()
@@ -160,10 +156,7 @@ class RateTest:
     def add(self, events: float, exposure: float = 1.0, times: int = 1) -> None:
         """Add a number of equal units.
 
-        Args:
-            events: number of events in each unit, from 0 to the maximum of the bets.
-            exposure: exposure of each unit, from 0 to the maximum of the bets.
-            times: number of units to add.
+        Events and exposure are those of each unit, from 0 to the maximum of the bets.
 
         Raises:
             ValueError: a unit exceeds the bounds on which the bets rely.

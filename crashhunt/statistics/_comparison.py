@@ -298,13 +298,7 @@ def held_out_by_seed(compared: Sequence[HuntResults]) -> dict[int, HeldOutTraffi
 
 
 class _Side:
-    """A hunt in a comparison, whose trials are read once for each confidence.
-
-    Args:
-        hunt: the hunt.
-        held_out: rule that selects the trials that count.
-        per: the unit of its rate.
-    """
+    """A hunt in a comparison, whose trials are read once for each confidence."""
 
     def __init__(self, hunt: HuntResults, held_out: HeldOutTraffics, per: Per) -> None:
         self.hunt, self.held_out, self.per = hunt, held_out, per

@@ -36,9 +36,7 @@ class PairWatch:
     def add(self, pairs: Sequence[Pair] | Iterator[Pair], *, may_end: bool = True) -> None:
         """Add pairs in their order until a pair decides.
 
-        Args:
-            pairs: the pairs, in the order of their numbers.
-            may_end: whether the verdicts *better* and *no difference* are allowed yet; *worse* is always allowed.
+        Unless it ``may_end``, the verdicts *better* and *no difference* are not allowed yet; *worse* is always allowed.
         """
         for pair in pairs:
             if self.verdict != "undecided":

@@ -259,11 +259,8 @@ class PairedHunts:
     def take(self, watch: PairWatch, *, may_end: bool = True, has_ended: bool = False) -> None:
         """Pass the pairs that are complete to a watch, until a pair decides.
 
-        Args:
-            watch: watch of all pairs of the gate.
-            may_end: whether the verdicts *better* and *no difference* are allowed yet; *worse* is always allowed.
-            has_ended: whether the hunts have ended. Before, trials that were killed in an earlier run of the gate do
-                not count, because the hunts run them again.
+        Unless it ``may_end``, only the verdict *worse* is allowed yet. Before the hunts have ended, trials that were
+        killed in an earlier run of the gate do not count, because the hunts run them again.
 
         Raises:
             HuntDirectoryError: the two hunts do not have the same traffic, or a ledger is damaged.

@@ -126,16 +126,8 @@ def rate_of_counts(
 ) -> CrashRate:
     """Return the same rate per trial as `measure_rates`, from counts; only allowed if `counts_suffice`.
 
-    Args:
-        directory: directory of the hunt.
-        settings: settings of the hunt.
-        facts: facts from the hunt's ledger.
-        valid: number of valid trials before the first unfinished trial.
-        invalid: number of invalid trials before the first unfinished trial.
-        crashes: number of crashes among the valid trials.
-        steps: number of simulated steps of the valid trials.
-        excluded: number of trials that ended after the first unfinished trial.
-        confidence: confidence, in percent, of the certain interval, which is valid after any number of trials.
+    ``excluded`` is the number of trials that ended after the first unfinished trial. All other counts are of trials
+    before it; crashes and steps are of the valid trials.
     """
     rule = counting_rule(settings, facts)
     sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")
@@ -158,12 +150,7 @@ def rate_of_trials(
 ) -> CrashRate:
     """Return the same rate per trial as `measure_rates`, without parts, from trials that the caller reads.
 
-    Args:
-        directory: directory of the hunt.
-        settings: settings of the hunt.
-        facts: facts from the hunt's ledger.
-        trials: JSON data of all trials, in the order of their numbers.
-        held_out: rule for the traffic that counts.
+    The trials are in the order of their numbers.
     """
     rule = counting_rule(settings, facts, held_out)
     sequence, counter = UnitSequence(rule), RateCounter(rule, "trial")

@@ -72,12 +72,8 @@ class PairSequence:
 
     A trial that is invalid for both agents is excluded, and so is a trial that was not drawn at random. A trial that is
     invalid for one agent only counts: it has failed if the agent's own code prevents its start. Otherwise, and if its
-    process was killed from outside, its result is unknown.
-
-    Args:
-        rules: counting rules for the trials of the first agent and of the second agent.
-        is_same: function that returns whether two trials of the same number have the same seed and traffic; by default,
-            all have.
+    process was killed from outside, its result is unknown. ``is_same`` returns whether two trials of the same number
+    have the same seed and traffic; by default, all have.
 
     Attributes:
         rounds: number of trials in each pair.
@@ -99,9 +95,7 @@ class PairSequence:
     def add(self, side: int, trial: TrialFacts) -> Iterator[Pair]:
         """Add a trial, and yield the newly complete pairs, including pairs without a trial that counts.
 
-        Args:
-            side: 0 for a trial of the first agent, 1 for a trial of the second agent.
-            trial: trial of any number; a trial that was added before is ignored.
+        ``side`` is 0 for the first agent and 1 for the second. A trial that was added before is ignored.
         """
         if self._has(trial.number) or not self._is_wanted(trial.number):
             return
@@ -243,13 +237,7 @@ class PairTest:
         self.both += first == second > 0
 
     def add_counts(self, only_first: int, only_second: int, alike: int) -> None:
-        """Add the counts of pairs that have one trial per agent.
-
-        Args:
-            only_first: number of pairs in which only the first agent fails.
-            only_second: number of pairs in which only the second agent fails.
-            alike: number of pairs in which no agent fails, or both do.
-        """
+        """Add the counts of pairs that have one trial per agent."""
         self.pairs += only_first + only_second + alike
         self.trials += only_first + only_second + alike
         self.only_first += only_first

@@ -255,10 +255,7 @@ def is_root(number: int) -> bool:
 def with_plain(root: Root, trials: Iterable[TrialResult], crash_on: Sequence[Outcome]) -> Root:
     """Return a root, combined with the plain trials that follow it.
 
-    Args:
-        root: the root without its plain trials.
-        trials: the plain trials after the root; invalid trials do not count.
-        crash_on: the outcomes that count as a crash.
+    Invalid trials do not count.
     """
     trials = list(trials)
     valid = [trial for trial in trials if trial.outcome is not Outcome.INVALID]
@@ -279,10 +276,7 @@ def with_plain(root: Root, trials: Iterable[TrialResult], crash_on: Sequence[Out
 def root_of(result: TrialResult, crash_on: Sequence[Outcome], hazard: float) -> Root | None:
     """Return the estimates from a root; None if the root has no complete result.
 
-    Args:
-        result: result of the root's trial.
-        crash_on: the outcomes that count as a crash.
-        hazard: sum of the start probabilities of disturbances per step, over all models and agents.
+    ``hazard`` is the sum of the start probabilities of disturbances per step, over all models and agents.
     """
     forced = result.forced
     if forced is None or forced.unanswered or result.outcome is Outcome.INVALID or result.spec.forcing is None:
@@ -331,9 +325,7 @@ def _bound(forcing: Forcing, hazard: float) -> float:
 def learn_forcing(earlier: Iterable[Forced], start: Forcing) -> Forcing:
     """Return the forcing of disturbances that minimizes the variance according to earlier roots.
 
-    Args:
-        earlier: results of the copies of earlier roots.
-        start: the forcing of the first roots, used as long as earlier roots have no crashes.
+    ``start`` is the forcing of the first roots. It stays as long as earlier roots have no crashes.
     """
     learned = _Learned()
     roots = 0

@@ -58,11 +58,7 @@ T = TypeVar("T")
 
 
 class Paced(Generic[T]):
-    """Caches a value that is expensive to compute, and computes it again only in a small share of the time.
-
-    Args:
-        make: function that computes the value.
-    """
+    """Caches a value that is expensive to compute, and computes it again only in a small share of the time."""
 
     def __init__(self, make: Callable[[], T]) -> None:
         self._make = make
@@ -72,9 +68,8 @@ class Paced(Generic[T]):
     def __call__(self, version: object, *, now: bool = False) -> T:
         """Return the value, which may be out of date.
 
-        Args:
-            version: version of the data from which the value is computed.
-            now: whether an outdated value is not sufficient.
+        ``version`` is that of the data from which the value is computed. With ``now``, an outdated value is not
+        sufficient.
         """
         began = time.monotonic()
         if self._made is not None and (self._made[0] == version or (began < self._due and not now)):
@@ -89,11 +84,7 @@ class Paced(Generic[T]):
 class RateWatch:
     """Counts the trials of a running hunt, and returns the certain interval at any time.
 
-    Args:
-        rule: rule by which trials count.
-        per: the unit of exposure to which the rate refers.
-        crash_on: the outcomes that count as a crash.
-        alpha: maximum probability that the interval ever excludes the rate.
+    ``alpha`` is the maximum probability that the interval ever excludes the rate.
     """
 
     def __init__(self, rule: CountingRule, per: Per, crash_on: Sequence[str], alpha: float = 0.05) -> None:
@@ -119,9 +110,7 @@ class RateWatch:
     def running(self, *, now: bool = False) -> RunningRate:
         """Return the current rate of the hunt.
 
-        Args:
-            now: whether the rate must be up to date; otherwise a rate some moments old is returned if computing a new
-                rate takes too long.
+        Unless ``now``, a rate some moments old is returned if computing a new rate takes too long.
         """
         sequence = self.sequence
         # A trial that waits for one of a lower number changes no count, but the reason why there is no rate.
@@ -164,14 +153,7 @@ class BarWatch(RateWatch):
 
     The watch ends undecided if the rate is certainly within 20 % of the threshold, because a rate equal to the
     threshold would never be decided. The watch also ends undecided if too many trials are invalid, or if trials have no
-    exposure.
-
-    Args:
-        rule: rule by which trials count.
-        bar: threshold with which the rate is compared.
-        per: the unit of exposure to which the threshold refers.
-        crash_on: the outcomes that count as a crash.
-        alpha: maximum probability of a wrong decision.
+    exposure. ``alpha`` is the maximum probability of a wrong decision.
     """
 
     def __init__(self, rule: CountingRule, bar: float, per: Per, crash_on: Sequence[str], alpha: float = 0.05) -> None:
@@ -254,10 +236,7 @@ class BarWatch(RateWatch):
 def counting_rule(settings: HuntSettings, facts: Facts, held_out: HeldOutTraffics | None = None) -> CountingRule:
     """Return the rule by which the trials of a hunt count.
 
-    Args:
-        settings: settings of the hunt.
-        facts: facts from the hunt's ledger.
-        held_out: rule for the traffic on which agents were trained; None if the caller excludes these trials itself.
+    ``held_out`` is None if the caller excludes the traffic on which agents were trained.
     """
     independent = bool(facts.get("independent", settings.sampler == "random"))
     origin = "" if independent or settings.seeds else facts.get("plain_origin") or ""
@@ -359,13 +338,7 @@ _MAX_VERIFIED_ROOTS = 5  # roots; a crash of a copy is a crash only where it com
 
 
 class Forcings:
-    """Chooses the forcing of each root, from the results of the blocks of roots before the previous block.
-
-    Args:
-        settings: settings of the hunt.
-        ledger: ledger of the hunt.
-        sampler: sampler of the hunt's disturbances.
-    """
+    """Chooses the forcing of each root, from the results of the blocks of roots before the previous block."""
 
     def __init__(self, settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler) -> None:
         self._ledger = ledger
@@ -401,11 +374,6 @@ class RareWatch:
 
     A root counts after its plain trials have ended as well.
 
-    Args:
-        settings: settings of the hunt.
-        ledger: ledger of the hunt.
-        sampler: sampler of the hunt's disturbances.
-
     Attributes:
         weightiest: the greatest weights of roots with a crashed copy, in descending order.
         is_met: whether the interval is narrow enough; no further trial is then read.
@@ -432,8 +400,7 @@ class RareWatch:
     def read(self, finished: int | None = None) -> None:
         """Read the finished trials, up to the first trial that has not finished.
 
-        Args:
-            finished: number of first trials that have finished; None to read it from the ledger.
+        By default, the number of finished trials is read from the ledger.
         """
         while not self.is_met and (finished is None or self._read < finished):
             result = self._ledger.result(self._read)
@@ -476,8 +443,7 @@ class RareWatch:
     def running(self, *, now: bool = False) -> RunningRate:
         """Return the current crash rate.
 
-        Args:
-            now: whether the rate must be up to date; otherwise it may be some moments old.
+        Unless ``now``, the rate may be some moments old.
         """
         return self._paced(self._read // TRIALS_PER_ROOT, now=now)
 

@@ -143,17 +143,7 @@ def make_rate(
 ) -> CrashRate:
     """Return the crash rate from counted units.
 
-    Args:
-        directory: directory of the hunt.
-        per: the unit of exposure to which the rate refers.
-        counter: counter of all units.
-        sequence: sequence that yielded the units.
-        confidence: confidence of the interval, in percent.
-        why_no_interval: reason why no interval is possible, such as a learning sampler; empty if an interval is
-            possible.
-        why_no_estimate: reason why no estimate is possible; empty if an estimate is possible.
-        parts: parts of the rate.
-        bar: threshold with which the rate is compared.
+    The reasons are empty if an interval or an estimate is possible.
     """
     why_not = why_no_interval or counter.why_not
     if not why_not and not counter.units:

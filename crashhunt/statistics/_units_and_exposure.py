@@ -155,11 +155,7 @@ class CountingRule:
 
 
 class UnitSequence:
-    """Combines trials that end in any order to units in the order of their numbers.
-
-    Args:
-        rule: rule by which trials count.
-    """
+    """Combines trials that end in any order to units in the order of their numbers."""
 
     def __init__(self, rule: CountingRule) -> None:
         self._rule = rule
@@ -187,12 +183,7 @@ class UnitSequence:
                 yield unit
 
     def add_counted(self, *, valid: int, invalid: int) -> None:
-        """Add the first trials of a hunt as counts, if each trial is a unit with its own traffic.
-
-        Args:
-            valid: number of trials that ended and count.
-            invalid: number of trials that ended and do not count.
-        """
+        """Add the first trials of a hunt as counts, if each trial is a unit with its own traffic."""
         self._next += valid + invalid
         self.valid += valid
         self.invalid += invalid
@@ -288,11 +279,7 @@ def exposure_of(trial: TrialFacts, per: Per) -> float | None:
 class RateCounter:
     """Counts units for one measure of exposure, either of all trials or of a part of the trials.
 
-    Args:
-        rule: rule by which trials count.
-        per: the unit of exposure to which the rate refers.
-        within: function that returns whether a trial belongs to the part; None for all trials.
-        matches: function that returns whether a crash belongs to the part; None for all crashes.
+    ``within`` returns whether a trial belongs to the part, and ``matches`` whether a crash does; None for all.
     """
 
     def __init__(
@@ -336,13 +323,7 @@ class RateCounter:
         return len(crashed), exposure
 
     def add_counted(self, *, trials: int, crashes: int, steps: int) -> None:
-        """Add the numbers of trials and of crashes, which determine the rate per trial if each trial is a unit.
-
-        Args:
-            trials: number of valid trials.
-            crashes: number of these trials that crashed.
-            steps: number of simulated steps of these trials.
-        """
+        """Add the numbers of trials and of crashes, which determine the rate per trial if each trial is a unit."""
         self.units += trials
         self.trials += trials
         self.crashes += crashes

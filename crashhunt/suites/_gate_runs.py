@@ -191,11 +191,8 @@ class Gate:
     ) -> GateReport:
         """Compare the two versions until the verdict is certain, the pairs or the time are used up, or an interrupt.
 
-        Args:
-            directory: folder of the hunts; finished trials in this folder are not run again. If the folder is None, a
-                temporary folder is used.
-            watch: function called about once a second with the progress.
-            tell: function called with each note, such as the beginning of a build.
+        Finished trials in the directory are not run again; without one, a temporary folder is used. ``watch`` is called
+        about once a second with the progress, and ``tell`` with each note, such as the beginning of a build.
 
         Raises:
             UsageError: an agent was trained on all traffic seeds, or an option is out of range.

@@ -25,10 +25,6 @@ class PreventableCrashes:
 
     A collision with another actor counts only if at least one model of a competent driver would have prevented it. If
     no model applies, or the runs do not decide it, the collision does not count. All other crashes count.
-
-    Args:
-        place: folder of the gate.
-        parallel: number of runs at a time.
     """
 
     def __init__(self, place: Path, parallel: int) -> None:
@@ -46,10 +42,6 @@ class PreventableCrashes:
 
     def counts(self, hunt: Path, number: int) -> bool:
         """Return whether a crash counts.
-
-        Args:
-            hunt: directory of its hunt.
-            number: number of its trial.
 
         Raises:
             CrashhuntError: its trial cannot be run again.

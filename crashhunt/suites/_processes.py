@@ -200,11 +200,8 @@ def run_all(
 def set_aside(folder: Path, planned: Callable[[Path], RunRequest]) -> Path:
     """Move the results of a run to a folder next to it, so that the run can start again; return the new folder.
 
-    If the process is killed during the move, the folder is either unchanged or contains the new request.
-
-    Args:
-        folder: folder of the run.
-        planned: function called with the new path of the folder's contents; it returns the new request of the run.
+    If the process is killed during the move, the folder is either unchanged or contains the new request. ``planned``
+    returns the new request of the run from the new path of the folder's contents.
 
     Raises:
         OSError: a folder cannot be created or renamed.
@@ -369,10 +366,6 @@ def refuse_untrusted_hunt(hunt: Path) -> None:
 
 def trust_hunt(hunt: Path, path: Path) -> list[TrustedOrigin]:
     """Trust all code of a hunt from now on, and return the new entries.
-
-    Args:
-        hunt: directory of the hunt.
-        path: path as the user named it.
 
     Raises:
         BundleError: a snapshot is damaged.

@@ -143,12 +143,8 @@ def entries_of(
 ) -> Iterator[tuple[Group, SuiteEntry]]:
     """Yield the hunts that run the cases of some groups.
 
-    Args:
-        groups: the groups.
-        agent: the agent that drives.
-        speeds: speeds of the agent at the beginning, in km/h.
-        grid: whether every case runs; otherwise the boundary between crashes and survived cases is searched.
-        options: further options of the hunts.
+    Speeds are those at the beginning, in km/h. Without ``grid``, the boundary between crashes and survived cases is
+    searched.
 
     Raises:
         UsageError: a speed is out of range.
@@ -423,17 +419,8 @@ def run_scorecard(
 ) -> Scorecard:
     """Run the cases of a suite that have not run, and return the scorecard.
 
-    Args:
-        suite: name of the suite.
-        agent: the agent.
-        directory: directory for the hunts.
-        speeds: speeds of the agent at the beginning, in km/h.
-        groups: ids of the groups to run; by default all groups.
-        grid: whether to run every case; otherwise the boundary between crashes and survived cases is searched.
-        options: further options of the hunts.
-        parallel: number of trials at a time; 0 for one per core.
-        watch: function called about once a second with the states of the hunts.
-        trusted: whether existing hunts may run without a question.
+    The arguments are those of ``crashhunt scorecard``. ``watch`` is called about once a second with the states of the
+    hunts.
 
     Raises:
         UsageError: an option is invalid.

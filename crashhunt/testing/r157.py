@@ -132,11 +132,6 @@ def _opened(path: Path) -> TextIO:
 class _Table:
     """A CSV file of cases.
 
-    Args:
-        path: path of the file, for messages.
-        file: the open file.
-        kind: the kind of its cases.
-
     Raises:
         UsageError: the file is empty, or a column is missing.
     """

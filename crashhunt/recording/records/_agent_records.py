@@ -82,14 +82,7 @@ def array_difference(
 ) -> Divergence | None:
     """Return the first difference between two arrays of an agent; either array may be missing.
 
-    Args:
-        step: number of the step.
-        agent: identifier of the agent.
-        kind: either ``observation`` or ``action``.
-        columns: names of the columns, if they are known.
-        was: the recorded array.
-        now: the replayed array.
-        opaque: whether the arrays contain values as text.
+    ``kind`` is ``observation`` or ``action``. With ``opaque``, the arrays contain values as text.
     """
     if was is None and now is None:
         return None
@@ -114,9 +107,7 @@ def array_difference(
 def _array_record(tag: int, what: str) -> RecordType:
     """Return the record type for one array per agent and step, as raw bytes; ``aux`` is the agent's number.
 
-    Args:
-        tag: tag of the record.
-        what: either ``observation`` or ``action``, as in the fields of `AgentChannel` and `StepRecord`.
+    ``what`` is ``observation`` or ``action``, as in the fields of `AgentChannel` and `StepRecord`.
     """
 
     def read(reading: Reading, aux: int, payload: bytes) -> None:

@@ -325,11 +325,7 @@ def points_of(payload: bytes, agents: int) -> NDArray[np.float64]:
 def select_actors(tag: int, payload: bytes, mask: NDArray[np.bool_], agents: int) -> bytes:
     """Return the payload of a record, reduced to some actors of its roster; other types are unchanged.
 
-    Args:
-        tag: tag of the record.
-        payload: payload of the record, which covers all actors of the roster.
-        mask: whether to keep each actor of the roster, shape (actors,).
-        agents: number of controlled vehicles.
+    The payload covers all actors of the roster, and so does the mask.
     """
     if tag == STEP.tag:
         values = np.frombuffer(payload, "<f8", offset=_STEP_HEAD.size)
