@@ -332,12 +332,7 @@ crosses to that version would mean something else."""
 
 
 def known_values(kind: type, data: Plain) -> dict[str, Any]:
-    """Return the values for which a dataclass has fields, without values that a later version has added.
-
-    Args:
-        kind: the dataclass.
-        data: keys and values from a file.
-    """
+    """Return the values for which a dataclass has fields, without values that a later version has added."""
     known = {item.name for item in fields(kind)}
     return {name: value for name, value in data.items() if name in known}
 

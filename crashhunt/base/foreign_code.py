@@ -166,11 +166,6 @@ class _Array(Protocol):
 def number_of(value: object, what: str, fix: str) -> float:
     """Return a number of a user's code: a bool, a number, or the only element of an array; NaN is returned as it is.
 
-    Args:
-        value: The value.
-        what: The name of the value for the message.
-        fix: The fix for the message.
-
     Raises:
         UnusableValueError: The value is anything else.
     """
@@ -186,11 +181,6 @@ def number_of(value: object, what: str, fix: str) -> float:
 
 def truth_of(value: object, what: str, fix: str) -> bool:
     """Return whether a bool or number of a user's code is true.
-
-    Args:
-        value: The value.
-        what: The name of the value for the message.
-        fix: The fix for the message.
 
     Raises:
         UnusableValueError: The value is neither a bool nor a number, as for `number_of`, or it is NaN.

@@ -137,10 +137,6 @@ class ImportedModules:
     def here(cls, locators: Iterable[str] = (), modules: Iterable[str] = ()) -> ImportedModules:
         """Import agents and modules in this process, and return all modules that the process has then imported.
 
-        Args:
-            locators: locators of the agents.
-            modules: names of further modules.
-
         Raises:
             PluginError: an agent or a module cannot be imported.
         """

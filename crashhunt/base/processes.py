@@ -33,10 +33,6 @@ def die_with(parent: int, number: int = signal.SIGKILL) -> None:
     """Make the kernel end this process when its parent ends; exit at once if the parent has already ended.
 
     The kernel watches the *thread* that started this process, so this thread must stay alive.
-
-    Args:
-        parent: process id of the parent process.
-        number: signal that the kernel sends.
     """
     _prctl(_PR_SET_PDEATHSIG, number)
     if os.getppid() != parent:  # it died before the prctl call

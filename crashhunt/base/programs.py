@@ -289,10 +289,6 @@ def _files_of_library(locator: str) -> dict[str, Path]:
 def describe_library(locator: str, path: Path) -> Library:
     """Return the contents of a library; another process loads it for this.
 
-    Args:
-        locator: locator of the agent, for errors.
-        path: path of the library.
-
     Raises:
         PluginError: the library cannot be used.
     """

@@ -47,10 +47,6 @@ def confine(folder: Path, readable: Iterable[Path | str] = ()) -> bool:
     The process can still read installed packages, this folder and the named files. If the kernel's version of Landlock
     supports it, the process can open no port and send no signal to other processes.
 
-    Args:
-        folder: folder below which the process may write.
-        readable: further files and folders that the process may read.
-
     Returns:
         Whether the kernel restricts the process; False if the kernel does not support it.
     """

@@ -254,11 +254,7 @@ class Episodes:
 
 
 class _Trail(Observer):
-    """Stores the last scenes for the picture, and the disturbances of the episode.
-
-    Args:
-        length: Number of scenes to store.
-    """
+    """Stores the last scenes for the picture, and the disturbances of the episode."""
 
     def __init__(self, length: int) -> None:
         self.scenes: deque[Scene] = deque(maxlen=length)

@@ -197,11 +197,7 @@ class RemoteEpisodes:
 
 
 class _Fork:
-    """A fork that another process has made, with the methods of `subprocess.Popen` that are used here.
-
-    Args:
-        pid: process id of the fork, which is running.
-    """
+    """A fork that another process has made, with the methods of `subprocess.Popen` that are used here."""
 
     returncode: int | None = None  # only its parent learns that
 

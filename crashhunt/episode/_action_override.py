@@ -44,11 +44,6 @@ _SPEED_ACTIONS = ("FASTER", "SLOWER")
 def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -> Agent:
     """Return an agent that drives like the given agent up to a step, and is overruled after it.
 
-    Args:
-        driver: the given agent.
-        simulator: the simulator, after its reset.
-        overruled: the kind of override, and the step after which it begins.
-
     Raises:
         InvalidEpisodeError: the simulator does not support this override.
     """
@@ -167,10 +162,6 @@ class HandedOver(_Overruling):
     The agent is created before the first step, as in every trial. The agent is reset after the last recorded action,
     with the seed of the trial. The agent's first observation is the observation after this step, so the agent does not
     receive observations of earlier steps.
-
-    Args:
-        driver: the agent that takes control.
-        handover: id of the vehicle, path of its recording, and number of recorded actions to repeat.
     """
 
     def __init__(self, driver: Agent, handover: Handover) -> None:
@@ -262,11 +253,6 @@ class _Response:
 
 class ReferenceDriver(_Overruling):
     """Lets an agent drive, and after a step corrects its unsafe speeds, lane changes, or both.
-
-    Args:
-        driver: the agent that drives.
-        simulator: the simulator, which reports the surroundings of the vehicle.
-        overruled: the vehicle, the step, and what is corrected: speed, lane changes, or both.
 
     Raises:
         InvalidEpisodeError: the simulator does not know the surroundings, or the actions have no known speeds.

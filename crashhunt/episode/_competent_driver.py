@@ -39,11 +39,6 @@ _MAX_LATERAL_MPS = 5.0  # a vehicle that jumps to another lane has no greater la
 class CompetentDriver:
     """Lets an agent drive, and after a step replaces it by a model when the model perceives a risk.
 
-    Args:
-        driver: the agent that drives.
-        simulator: the simulator, which reports the surroundings of the vehicle.
-        overruled: the vehicle, the step, the model, and the other actor.
-
     Raises:
         InvalidEpisodeError: the model cannot drive the vehicle.
     """

@@ -272,12 +272,6 @@ def attribute_error(
       a module that only the agent uses. A module that environment, oracles or observers use as well does not count.
     - a function on the traceback has been replaced since `record_originals`.
     - memory, file handles or recursion depth ran out, and their limit was lowered since then.
-
-    Args:
-        error: the exception, with its traceback.
-        agents: agents by identifier, as far as they have been created.
-        simulator: the simulator of the episode.
-        observing: oracles and observers of the episode.
     """
     for _ in range(_MAX_ATTRIBUTION_ATTEMPTS):
         try:

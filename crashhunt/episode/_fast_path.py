@@ -46,12 +46,6 @@ _EVENT_ORACLES = (ReportedCollision, OffRoad, TrafficEvents, RedLight, WrongWay,
 class FastPath:
     """Completes in Python the steps that the compiled core could not complete, so that the core can run the next steps.
 
-    Args:
-        at_once: the simulator's object that runs uneventful steps.
-        recorder: recorder of the episode.
-        agent: the only agent of the episode.
-        encode: function that encodes the agent's actions.
-
     Attributes:
         cannot_record: whether a failure occurred in the recording.
         is_resuming: whether a failure occurred while the core read the simulator's state.

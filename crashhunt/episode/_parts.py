@@ -63,11 +63,7 @@ _FOREIGN = ProgramFactory | LibraryFactory | FmuFactory  # they create agents th
 
 
 class Parts:
-    """Creates the parts of trials (oracles, simulator, agents) in this process, from the code that the settings name.
-
-    Args:
-        settings: settings of the hunt.
-    """
+    """Creates the parts of trials (oracles, simulator, agents) in this process, from the code of the settings."""
 
     def __init__(self, settings: WorkerSettings) -> None:
         self._settings = settings

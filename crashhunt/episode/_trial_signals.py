@@ -286,12 +286,7 @@ def _is_number(value: object) -> bool:
 
 
 class _SceneReader:
-    """Reads the signals of one agent from scenes.
-
-    Args:
-        episode: the episode.
-        agent: the agent, which is in the scene.
-    """
+    """Reads the signals of one agent from scenes."""
 
     def __init__(self, episode: SignalledEpisode, agent: str) -> None:
         self._episode, self._agent = episode, agent

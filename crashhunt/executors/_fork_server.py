@@ -101,15 +101,7 @@ def main() -> None:
 
 
 class _Server:
-    """Starts supervisors, and reports how they ended.
-
-    Args:
-        control: connection to the pool.
-        orders: connection to the template.
-        template: process of the template.
-        settings: settings of the hunt.
-        conditions: the conditions under which trials can run, as they were before the first trial.
-    """
+    """Starts supervisors, and reports how they ended."""
 
     def __init__(
         self,
@@ -294,13 +286,7 @@ def _send(control: socket.socket, message: FromForkServer | ErrorData) -> None:
 
 
 def be_zygote(control: socket.socket, settings: WorkerSettings, imported: Imported) -> NoReturn:
-    """Fork a process for each trial that the supervisor requests; this function does not return.
-
-    Args:
-        control: connection to the supervisor.
-        settings: settings of the hunt.
-        imported: the completed preparation.
-    """
+    """Fork a process for each trial that the supervisor requests; this function does not return."""
     try:
         _Zygote(control, settings, imported).serve()
     finally:

@@ -42,11 +42,7 @@ class _Folder(NamedTuple):
 
 
 class HostConditions:
-    """The conditions under which the trials of a hunt run, as they are when this object is created.
-
-    Args:
-        settings: settings of the trials.
-    """
+    """The conditions under which the trials of a hunt run, as they are when this object is created."""
 
     def __init__(self, settings: WorkerSettings) -> None:
         hunt = next((path.parent for path in settings.scratch.parents if path.name.startswith(layout.SCRATCH)), None)

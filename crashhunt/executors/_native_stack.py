@@ -34,9 +34,6 @@ def record_native_stack(file: int) -> None:
 
     Does nothing if the compiled library is not installed. Call this function after `faulthandler.enable`, whose output
     then follows.
-
-    Args:
-        file: the descriptor of the file.
     """
     library = _load_library()
     if library is not None:
@@ -54,11 +51,7 @@ def _load_library() -> ctypes.CDLL | None:
 
 
 def split_native_calls(stack: str) -> tuple[str, str]:
-    """Return the native calls of a dead process in the form that Python's calls have, and the rest of its stack.
-
-    Args:
-        stack: the text that the dying process has written.
-    """
+    """Return the native calls of a dead process in the form that Python's calls have, and the rest of its stack."""
     found = _BLOCK.search(stack)
     if found is None:
         return "", stack

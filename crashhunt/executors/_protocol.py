@@ -243,12 +243,7 @@ class FaultReport(TypedDict):
 
 
 def encode_report(report: Report | FaultReport, *, dumps: Callable[[object], str] = json.dumps) -> bytes:
-    """Return a report as bytes, after its checksum.
-
-    Args:
-        report: the report to encode.
-        dumps: function that converts data to JSON text.
-    """
+    """Return a report as bytes, after its checksum."""
     text = dumps(report).encode()
     return checksum_of(text) + text
 
@@ -262,11 +257,7 @@ def checksum_of(text: bytes) -> bytes:
 
 
 class Notes:
-    """The notices of an executor for the user, including notices that its workers leave in the scratch folder.
-
-    Args:
-        scratch: the scratch folder.
-    """
+    """The notices of an executor for the user, including notices that its workers leave in the scratch folder."""
 
     def __init__(self, scratch: Path) -> None:
         self._file = scratch / layout.NOTICES

@@ -355,13 +355,7 @@ _FIRST_EXTRA_NUMBER = 1 << 40  # beyond the numbers of a hunt's trials: each tri
 
 
 def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: EndedTrial) -> TrialResult:
-    """Return the result of a trial, with the last step at which braking avoids the crash if the settings request it.
-
-    Args:
-        supervisor: the supervisor of the trial.
-        settings: settings of the hunt.
-        ended: the ended trial.
-    """
+    """Return the result of a trial, with the last step at which braking avoids the crash if the settings request it."""
     result = ended.result
     if not settings.find_escapes or result.collision is None or supervisor.retires:
         return result

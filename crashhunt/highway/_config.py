@@ -28,11 +28,6 @@ _pristine: dict[type, dict[str, int | float | str]] = {}
 def configured(default: Config, scenario: Scenario, arguments: Mapping[str, Value]) -> Config:
     """Return the configuration of an environment for one trial.
 
-    Args:
-        default: The environment's default configuration.
-        scenario: Scenario that contains the changed entries and the number of controlled vehicles.
-        arguments: The scenario arguments of the trial.
-
     Raises:
         ScenarioError: An entry does not exist, or two values contradict each other.
     """

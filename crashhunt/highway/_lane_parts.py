@@ -65,11 +65,7 @@ class _Line(NamedTuple):
 
 
 class LaneParts:
-    """Reads lanes and routes in one episode. Reads positions only, and draws no random number.
-
-    Args:
-        network: The roads of the episode.
-    """
+    """Reads lanes and routes in one episode. Reads positions only, and draws no random number."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self._network = network

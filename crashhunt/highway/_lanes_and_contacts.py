@@ -40,13 +40,7 @@ _MAX_ROADS = 3  # roads between two vehicles that count as being on one lane
 
 
 def lane_place(network: RoadNetwork, vehicle: RoadObject, other: RoadObject) -> LanePlace:
-    """Return the place of an object on the lanes, relative to the lane of a vehicle.
-
-    Args:
-        network: The roads.
-        vehicle: The vehicle of an agent.
-        other: An object, which may be the vehicle itself.
-    """
+    """Return the place of an object on the lanes, relative to the lane of a vehicle."""
     start, end, number = other.lane_index
     front = other.position + other.LENGTH / 2 * np.array([math.cos(other.heading), math.sin(other.heading)])
     _, right = other.lane.local_coordinates(front)
@@ -76,15 +70,7 @@ def contact_of(
     actor_of: Callable[[RoadObject], Actor],
     lane: str,
 ) -> Contact:
-    """Return the contact between a controlled vehicle that has just crashed and the nearest crashed object.
-
-    Args:
-        agent: The agent's identifier.
-        vehicle: The agent's vehicle.
-        things: All vehicles and obstacles.
-        actor_of: Function that returns the actor of an object.
-        lane: The lane of the vehicle.
-    """
+    """Return the contact between a controlled vehicle that has just crashed and the nearest crashed object."""
     # highway-env does not mark a hit obstacle as crashed, so every obstacle is a candidate.
     others = [other for other in things if other is not vehicle and (other.crashed or isinstance(other, Obstacle))]
     hit = min(others, key=lambda other: gap(vehicle, other), default=None)

@@ -31,9 +31,6 @@ _MAX_VERIFIED_BRANCHES = 10  # trials; each takes two processes of its own
 def verify_branches(copies: VerificationRuns) -> BranchReport | None:
     """Sum up the branches of all trials, and run the likeliest crashed branches from the start in new processes.
 
-    Args:
-        copies: object that runs crashes of forks from the start.
-
     Returns:
         The report; None for a hunt without branches.
     """
@@ -91,9 +88,6 @@ _MAX_VERIFIED_PROBES = 3  # trials; each takes two processes of its own
 
 def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
     """Sum up the probes of all trials, and run the mildest crashed probes from the start in new processes.
-
-    Args:
-        copies: object that runs crashes of forks from the start.
 
     Returns:
         The report; None for a hunt without probes.
@@ -163,10 +157,6 @@ class ForkCrashes:
     strongest plausible disturbance nearly every trial crashes. A crash of a probe measures the robustness of the trial,
     but the hunt does not search for crashes of probes. If the hunt counts crash types or crashes at fault, only trials
     end the hunt.
-
-    Args:
-        copies: object that runs crashes of forks from the start.
-        trials: trials of the hunt that are still to run.
     """
 
     def __init__(self, copies: VerificationRuns, trials: Trials) -> None:
@@ -238,11 +228,7 @@ class ForkCrashes:
 
 
 def verify_fork_results(copies: VerificationRuns) -> tuple[ProbeReport | None, BranchReport | None]:
-    """Run crashes of forks from the start, and record how many are confirmed.
-
-    Args:
-        copies: object that runs crashes of forks from the start.
-    """
+    """Run crashes of forks from the start, and record how many are confirmed."""
     probes, branches = verify_probes(copies), verify_branches(copies)
     found = {PROBES: probes, BRANCHES: branches}
     confirmed = {

@@ -142,13 +142,7 @@ def trials_under_way(parallel: int) -> int:
 
 
 def result_lag(before: Facts, run: RunSettings, parallel: int) -> int:
-    """Return the maximum number of trials by which results reach the sampler late.
-
-    Args:
-        before: facts from the hunt's ledger.
-        run: options that determine how the hunt runs.
-        parallel: number of trials that run at a time.
-    """
+    """Return the maximum number of trials by which results reach the sampler late."""
     under_way = trials_under_way(parallel)
     if not run.deterministic:
         return under_way
@@ -358,9 +352,6 @@ class Pace:
     Without this limit, the faster of two hunts runs trials that are not needed if the comparison ends early. Only the
     hunt that is ahead waits, so the pairs come as fast as without the limit. If the other hunt is not running, there is
     no limit, because it may have ended or failed.
-
-    Args:
-        other: directory of the other hunt.
     """
 
     def __init__(self, other: Path) -> None:
@@ -404,11 +395,7 @@ def find_unanswered(ledger: Ledger) -> list[TrialResult]:
 
 
 class Unanswered:
-    """The trials of a hunt that run again. The rows of these trials stay in the ledger until new results replace them.
-
-    Args:
-        ledger: ledger of the hunt.
-    """
+    """The trials of a hunt that run again. Their rows stay in the ledger until new results replace them."""
 
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger

@@ -149,12 +149,7 @@ def _replaced(text: str, names: Mapping[str, str]) -> str:
 
 
 class WorkerNotices:
-    """Notices of workers. Notices are read before the first result is recorded, because a notice may refuse the hunt.
-
-    Args:
-        settings: settings of the hunt.
-        outcomes: number of finished trials with each outcome.
-    """
+    """Notices of workers, which are read before the first result is recorded, because one may refuse the hunt."""
 
     def __init__(self, settings: HuntSettings, outcomes: Mapping[str, int]) -> None:
         self._settings = settings
@@ -243,12 +238,7 @@ def unusable_value(result: TrialResult) -> ScenarioError | None:
 
 
 def is_hopeless(settings: HuntSettings, outcomes: Mapping[str, int]) -> bool:
-    """Return whether the hunt should end because many trials failed in their setup and no trial succeeded.
-
-    Args:
-        settings: settings of the hunt.
-        outcomes: number of trials with each outcome.
-    """
+    """Return whether the hunt should end because many trials failed in their setup and no trial succeeded."""
     enough = min(settings.most_trials, max(_MAX_INVALID_AT_START, 2 * settings.run.parallel))
     invalid = outcomes.get(str(Outcome.INVALID), 0)
     return invalid >= enough and invalid == sum(outcomes.values())
@@ -298,11 +288,6 @@ class TrafficSurveyor:
 
     def __call__(self, scenario: Scenario, request: Request, settings: HuntSettings) -> Scenario:
         """Return the scenario with the vehicles that enter in a simulation as candidates; unchanged without a survey.
-
-        Args:
-            scenario: the loaded scenario.
-            request: the user's request.
-            settings: the settings without a survey.
 
         Raises:
             ScenarioError: no trial of the scenario can be valid.
@@ -463,10 +448,6 @@ class SignalList(TypedDict):
 def list_signals(scenario: Scenario, settings: HuntSettings) -> SignalList:
     """Return the signals of the first agent of a scenario, after the first step of a trial.
 
-    Args:
-        scenario: the scenario.
-        settings: the settings of a hunt in the scenario.
-
     Raises:
         ScenarioError: the trial cannot be set up.
     """
@@ -491,10 +472,6 @@ def require_known_signals(scenario: Scenario, settings: HuntSettings) -> None:
 
     Without traffic events, only the environment's code knows the signals, and the first trial checks them. A step runs
     only if a name is not one that scenes have.
-
-    Args:
-        scenario: the scenario.
-        settings: the settings of a hunt in the scenario.
 
     Raises:
         FormulaError: a signal is unknown; the error names the most similar one.

@@ -251,14 +251,7 @@ class Progress:
     def resume(
         self, crashes: list[Bundle], run: RunSettings, before: Facts, apart: Collection[int] = frozenset()
     ) -> None:
-        """Add the crashes that earlier runs have saved.
-
-        Args:
-            crashes: the saved crashes of the present version of the code.
-            run: options that determine how the hunt runs.
-            before: facts from the hunt's ledger.
-            apart: the numbers of the trials of other versions.
-        """
+        """Add the crashes that earlier runs have saved."""
         self.crashes = crashes
         self.under_way = before.get("under_way", 0)
         self.failed_steps = before.get("failed_steps", 0)
@@ -278,13 +271,7 @@ class Progress:
             )
 
     def resume_counts(self, ledger: Ledger, before: Facts, crash_on: tuple[Outcome, ...]) -> None:
-        """Add the trials of earlier runs of the hunt to the counts on the screen.
-
-        Args:
-            ledger: ledger of the hunt.
-            before: facts from the hunt's ledger.
-            crash_on: the outcomes that count as a crash.
-        """
+        """Add the trials of earlier runs of the hunt to the counts on the screen."""
         self.outcomes.update(ledger.outcomes())
         self.nearest = ledger.nearest_miss()
         if before.get("origins"):
@@ -596,13 +583,7 @@ class PhaseClock:
         self._shown = -math.inf
 
     def begin(self, name: PhaseName, total: int, done: int = 0) -> None:
-        """Begin a phase.
-
-        Args:
-            name: name of the phase.
-            total: number of runs.
-            done: number of runs that earlier runs of the hunt have finished.
-        """
+        """Begin a phase."""
         self._name, self._total, self._done = name, total, done
         self._left = RemainingTime(time.monotonic())
         self.tick(force=True)

@@ -190,11 +190,7 @@ class RunningHunt:
             self.finished.add(spec.number)
 
     def _resume_progress(self, apart: set[int]) -> None:
-        """Add the trials and crashes of earlier runs of the hunt.
-
-        Args:
-            apart: the numbers of the trials of other versions of the code.
-        """
+        """Add the trials and crashes of earlier runs of the hunt."""
         settings, code, ledger, progress = self.setup.settings, self.setup.code, self.ledger, self.progress
         bundles = list_bundles(self.setup.place.path)
         progress.earlier = [bundle for bundle in bundles if bundle.snapshot in code.earlier]
@@ -345,9 +341,6 @@ class RunningHunt:
 
 class TrialLoop:
     """Submits the trials of a hunt to the executor, and records their results, until no further trial is needed.
-
-    Args:
-        hunt: the hunt.
 
     Raises:
         CrashhuntError: the executor cannot be created.

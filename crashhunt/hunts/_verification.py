@@ -42,10 +42,6 @@ class Confirmation:
     With ``--by-cause``, the same thread also judges crashes, before it confirms others. Only one thread does both, so
     that the two results of a bundle cannot overwrite each other. Crashes that are not confirmed or judged at the end of
     the hunt are confirmed and judged then.
-
-    Args:
-        again: object that runs crashes again.
-        executor: executor of the hunt.
     """
 
     def __init__(self, again: TrialReruns, executor: Executor) -> None:
@@ -322,13 +318,7 @@ class Again:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A crash of a fork of a trial.
-
-    Args:
-        spec: specification that should repeat the crash from the start.
-        outcome: outcome of the fork.
-        step: step at which the fork ended.
-    """
+    """A crash of a fork of a trial."""
 
     spec: TrialSpec
     outcome: str
@@ -383,10 +373,6 @@ class VerificationRuns:
 
         The first run must crash at the same step as the fork, and the second run must be bit-identical to the first.
         The bundle is kept.
-
-        Args:
-            found: the crash of a fork.
-            folder: subfolder of the hunt's directory for the bundle.
         """
         if self.is_stopped:
             return None

@@ -568,12 +568,7 @@ def why_not(libsumo: str) -> str:
 
 
 def core_for(libsumo: str, library: str) -> Core | None:
-    """Return the core, ready for use; None if it cannot be used.
-
-    Args:
-        libsumo: The installed version of libsumo.
-        library: The path of libsumo's loaded library.
-    """
+    """Return the core, ready for use; None if it cannot be used."""
     core = _load_module()
     if core is None or why_not(libsumo):
         return None

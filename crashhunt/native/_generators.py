@@ -32,12 +32,7 @@ _READ_SYMBOL = "_ZN10RandHelper7getSeedEP7SumoRNG"  # RandHelper::getSeed(SumoRN
 
 @cache
 def why_no_reseeding(libsumo: str, library: str) -> str:
-    """Return why the generators cannot be re-seeded with a version of libsumo; empty if they can.
-
-    Args:
-        libsumo: The installed version of libsumo.
-        library: The path of libsumo's loaded library.
-    """
+    """Return why the generators cannot be re-seeded with a version of libsumo; empty if they can."""
     if libsumo not in _CHECKED_VERSIONS:
         return f"libsumo {libsumo} was not checked for re-seeding (checked: {', '.join(_CHECKED_VERSIONS)})"
     try:

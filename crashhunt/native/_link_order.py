@@ -73,12 +73,7 @@ def why_no_link_order(libsumo: str) -> str:
 
 @cache
 def link_order(libsumo: str, library: str) -> LinkOrder:
-    """Load the library that fixes the link order, connect it with libsumo, and return it.
-
-    Args:
-        libsumo: The installed version of libsumo.
-        library: The path of libsumo's loaded library.
-    """
+    """Load the library that fixes the link order, connect it with libsumo, and return it."""
     if reason := why_no_link_order(libsumo):
         return LinkOrder(None, reason)
     loaded = ctypes.CDLL(str(_load_library()))

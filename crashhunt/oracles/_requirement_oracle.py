@@ -34,10 +34,6 @@ class RequirementOracle:
     """Detects that a requirement is violated, at the step at which this is certain, or at the end of the trial.
 
     Each controlled vehicle has to satisfy the requirement, unless all of its signals name a vehicle.
-
-    Args:
-        title: name of the requirement.
-        formula: formula of the requirement.
     """
 
     name = REQUIREMENT

@@ -168,10 +168,6 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
 
     Breakpoints in the agent's code work in the new process, and its output appears immediately.
 
-    Args:
-        rerun: the crash to run.
-        look: what the user wants to examine.
-
     Raises:
         UsageError: there is no display for a window.
         CrashhuntError: the crash could not be run.
@@ -282,15 +278,7 @@ class _Stop(Observer):
 
 
 class _Stopped:
-    """An agent whose next call of ``act`` stops in the debugger.
-
-    Args:
-        agent: the agent that drives.
-        name: name of the vehicle.
-        step: number of the step in which the debugger stops.
-        scene: scene before this step.
-        backwards: observer that goes back to earlier steps.
-    """
+    """An agent whose next call of ``act`` stops in the debugger."""
 
     def __init__(self, agent: Agent, name: str, step: int, scene: Scene, backwards: Backwards | None) -> None:
         self._backwards = backwards
@@ -319,13 +307,7 @@ _MOST_COMPARISONS = 6  # of requirements that a film shows
 
 
 class _Panels(Observer):
-    """Draws the panels of the agents after every action, and the signals of requirements at the end.
-
-    Args:
-        first: the first step whose panels are drawn.
-        folder: folder for the pictures of the panels.
-        requirements: the requirements of the episode.
-    """
+    """Draws the panels of the agents after every action, and the signals of requirements at the end."""
 
     def __init__(self, first: int, folder: Path, requirements: Sequence[RequirementOracle] = ()) -> None:
         self._first = first
@@ -396,12 +378,7 @@ class _Job(TypedDict):
 
 
 class _Window(Observer):
-    """Slows down a simulator with its own window, and lets the window follow the crashing vehicle.
-
-    Args:
-        simulator: the simulator with the window.
-        job: the job, which contains the agent to follow, the time of a step, and the step before which to pause.
-    """
+    """Slows down a simulator with its own window, and lets the window follow the crashing vehicle."""
 
     def __init__(self, simulator: HasWindow, job: _Job) -> None:
         self._simulator = simulator

@@ -95,15 +95,7 @@ class ReplayReport(Serializable):
 def judged(
     rerun: Rerun, recorded: Recording, replayed: Recording, result: TrialResult, *, whole: bool = True
 ) -> ReplayReport:
-    """Compare two recordings of a crash, and return the report.
-
-    Args:
-        rerun: description of the replayed run.
-        recorded: the recording of the crash, or its beginning.
-        replayed: the recording of the replay.
-        result: the result of the replay.
-        whole: whether the replay was expected to end where the crash did.
-    """
+    """Compare two recordings of a crash, and return the report."""
     divergence = None
     if rerun.elsewhere:
         verdict: Verdict = "changed" if result.outcome in rerun.worker.crash_on else "not_comparable"

@@ -40,9 +40,6 @@ class ObservationForm:
     flattened, if flattening loses no information. Any other observation is recorded as the text of its value
     (`encode_value`).
 
-    Args:
-        space: The observation space of the environment.
-
     Attributes:
         original: The environment's observation space.
         space: The space of the arrays.
@@ -82,12 +79,7 @@ class ObservationForm:
         return spaces.unflatten(self.original, array) if self.flattened else array
 
     def contains(self, observation: object, array: NDArray[np.generic]) -> bool:
-        """Return whether an observation lies inside the environment's observation space.
-
-        Args:
-            observation: The observation.
-            array: The observation as an array.
-        """
+        """Return whether an observation lies inside the environment's observation space."""
         if self.structured:
             with _SPACE_BOUNDARY, _quiet():
                 return bool(self.original.contains(observation))
@@ -115,11 +107,7 @@ def _is_nan(array: NDArray[Any]) -> bool:
 
 
 class OpaqueSpace(Space[Any]):
-    """The space of recorded values: arrays of bytes of any length, each the text of a value of another space.
-
-    Args:
-        original: The space of the values.
-    """
+    """The space of recorded values: arrays of bytes of any length, each the text of a value of another space."""
 
     def __init__(self, original: Space[Any]) -> None:
         super().__init__(OPAQUE_SHAPE, np.uint8)
@@ -231,11 +219,7 @@ def _equal(one: Any, other: Any) -> bool:
 
 
 class FlatAction:
-    """A Dict or Tuple action, which is recorded as a flat array.
-
-    Args:
-        space: The environment's action space.
-    """
+    """A Dict or Tuple action, which is recorded as a flat array."""
 
     names: tuple[str, ...] = ()
 
@@ -267,11 +251,7 @@ class FlatAction:
 
 
 class OpaqueAction:
-    """An action of a space without a fixed size, such as Text, Sequence or Graph, recorded as the text of its value.
-
-    Args:
-        space: The environment's action space.
-    """
+    """An action of a space without a fixed size, such as Text, Sequence or Graph, recorded as the text of its value."""
 
     names: tuple[str, ...] = ()
     encoded_shape = OPAQUE_SHAPE

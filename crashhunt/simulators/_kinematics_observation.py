@@ -190,13 +190,7 @@ class HidesActors(Protocol):
 
 
 class Unseen:
-    """Hides one vehicle from one agent, from the next observation on.
-
-    Args:
-        kinematics: The object that makes the observations.
-        agent: The agent that does not see the vehicle.
-        vehicle: The identifier of the vehicle.
-    """
+    """Hides one vehicle from one agent, from the next observation on."""
 
     how_strong = 1.0
 

@@ -34,12 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RequestedPart:
-    """A part with the values of its settings.
-
-    Args:
-        part: The part.
-        settings: The value of every setting, by name.
-    """
+    """A part with the values of its settings."""
 
     part: Part
     settings: Mapping[str, float]
@@ -319,11 +314,7 @@ def _stacked(box: spaces.Box, history: int) -> spaces.Box:
 
 
 class History:
-    """The last observations of an agent in an episode, if its layout stacks them.
-
-    Args:
-        layout: The layout of the observation.
-    """
+    """The last observations of an agent in an episode, if its layout stacks them."""
 
     def __init__(self, layout: ObservationLayout) -> None:
         self._last: dict[str, deque[NDArray[Any]]] = {name: deque(maxlen=layout.history) for name in layout.parts}
@@ -343,10 +334,6 @@ class History:
 
 def layouts_of(setups: Mapping[str, AgentSetup], available: Iterable[str]) -> dict[str, ObservationLayout]:
     """Return the layout of the observation of each agent that observes parts.
-
-    Args:
-        setups: The setups of all agents of a scenario, by agent.
-        available: Names of the parts that the simulator has.
 
     Raises:
         UsageError: A part or a setting does not exist, or a value is out of range.

@@ -57,10 +57,6 @@ class LanePlace:
 class SceneObserver:
     """Builds the observations of all agents that observe parts.
 
-    Args:
-        setups: The setups of all agents of the scenario, by agent.
-        others: Names of the parts that the simulator reads itself.
-
     Attributes:
         layouts: The layout of each such agent's observation.
         hidden: Pairs of identifiers: an agent, and an actor that this agent does not see.

@@ -198,13 +198,7 @@ def with_reference_point(
 
 
 def occluded(scene: Scene, row: int, caster: RayCaster) -> frozenset[str]:
-    """Return the identifiers of the actors that other actors and obstacles hide from a vehicle.
-
-    Args:
-        scene: The scene after the last step.
-        row: Row of the vehicle in the scene.
-        caster: Casts the rays that decide which actors are seen.
-    """
+    """Return the identifiers of the actors that other actors and obstacles hide from a vehicle."""
     reach = caster.reach_m + max(scene.roster.lengths)
     near = [one.row for one in nearest_actors(scene, row, hidden=frozenset(), radius=reach)]
     seen = caster.seen(scene, row, near)
@@ -269,13 +263,7 @@ class RayCaster:
         self._cos, self._sin = np.array([*map(cos, angles)]), np.array([*map(sin, angles)])
 
     def cast(self, scene: Scene, row: int, others: Sequence[int]) -> NDArray[np.float64]:
-        """Return the distance along each ray to the nearest outline, in m; the largest distance if there is none.
-
-        Args:
-            scene: The scene after the last step.
-            row: Row of the vehicle in the scene.
-            others: Rows of the actors whose outlines the rays hit.
-        """
+        """Return the distance along each ray to the nearest outline, in m; the largest distance if there is none."""
         found = self._clear(scene, row)
         _, ray, enters = self._hits(scene, row, others)
         np.minimum.at(found, ray, enters)
@@ -407,13 +395,7 @@ class Raster:
         self.reach_m = math.hypot(rows, columns) / 2 * resolution_m
 
     def occupied(self, scene: Scene, row: int, others: Sequence[int]) -> Mask:
-        """Return whether the centre of each cell is inside the outline of an actor.
-
-        Args:
-            scene: The scene after the last step.
-            row: Row of the vehicle in the scene.
-            others: Rows of the actors.
-        """
+        """Return whether the centre of each cell is inside the outline of an actor."""
         found = np.zeros(self._shape, bool)
         for other in others:
             for x, y, heading, length, width in outlines(scene, other):
@@ -430,13 +412,7 @@ class Raster:
         return found
 
     def obstructed(self, scene: Scene, row: int, obstacles: ObstacleOutlines) -> Mask:
-        """Return whether the centre of each cell is inside the outline of an obstacle.
-
-        Args:
-            scene: The scene after the last step.
-            row: Row of the vehicle in the scene.
-            obstacles: The obstacles.
-        """
+        """Return whether the centre of each cell is inside the outline of an obstacle."""
         edges = obstacles.edges_near(*center_of(scene, row), self.reach_m)
         # As numbers of rows and columns, which are whole at the centre of a cell.
         (first_row, first_column), (last_row, last_column) = (

@@ -88,12 +88,6 @@ def can_step_out(actor: str, agent: str, reach_m: float, junctions: JunctionLane
     SUMO scores each lane nearby by distance, angle and route (``Helper::moveToXYMap``). This function compares the same
     score for the person's lane and for junction lanes, at points along the person's path. If the result is uncertain,
     it returns false.
-
-    Args:
-        actor: Identifier of a walking person.
-        agent: Identifier of the agent whose path the person steps into.
-        reach_m: The distance that the person can walk away from its lane.
-        junctions: The junction lanes of the network.
     """
     person = actor.removeprefix(PERSON)
     if str(sumo.person_getRoadID(person)).startswith(":"):

@@ -312,11 +312,7 @@ def hold_vehicle(vehicle: str, what: str) -> ActiveDisturbance | None:
 
 
 class VehicleCommand:
-    """A command to a vehicle until its end. The vehicle may leave the simulation before.
-
-    Args:
-        vehicle: Identifier of the vehicle.
-    """
+    """A command to a vehicle until its end. The vehicle may leave the simulation before."""
 
     how_strong = 1.0
     speeds: ClassVar[dict[str, float | None]] = {}

@@ -35,14 +35,7 @@ _OFF_ROAD_CLASSES = RAIL | {"ship", "aircraft"}
 
 @dataclass(frozen=True, slots=True)
 class Ego:
-    """The controlled vehicle of a scenario.
-
-    Args:
-        agent: id of the agent.
-        setup: setup of the agent: how the vehicle enters.
-        note: note for the user about the choice.
-        arguments: the scenario arguments that the controlled vehicle needs.
-    """
+    """The controlled vehicle of a scenario."""
 
     agent: str
     setup: AgentSetup

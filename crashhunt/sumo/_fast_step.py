@@ -38,13 +38,7 @@ class WrapsPartOfStep(Protocol):
 
 
 class PresentVehicles(NamedTuple):
-    """The state of a simulator between two steps.
-
-    Args:
-        scene: The scene after the last step.
-        observations: The observations that the agents receive next.
-        steps: Number of completed steps.
-    """
+    """The state of a simulator between two steps."""
 
     scene: Scene
     observations: Observations

@@ -396,11 +396,6 @@ class RouteGuide:
 
     The best lanes of a road are those on which the route can be followed furthest without a lane change. Of these, the
     lanes with the fewest lane changes behind them are the best.
-
-    Args:
-        graph: the graph.
-        edges: ids of the edges of the route.
-        vehicle_class: class of the vehicle.
     """
 
     def __init__(self, graph: LaneGraph, edges: tuple[str, ...], vehicle_class: str) -> None:

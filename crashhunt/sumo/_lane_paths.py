@@ -137,13 +137,7 @@ class LanePaths:
 
 
 class NearLanes:
-    """The lanes near each square of a network for one class of vehicles, and the paths straight through them.
-
-    Args:
-        graph: the lanes of the network.
-        sampling: how points are sampled.
-        vehicle_class: the class of vehicles.
-    """
+    """The lanes near each square of a network for one class of vehicles, and the paths straight through them."""
 
     def __init__(self, graph: LaneGraph, sampling: Sampling, vehicle_class: str) -> None:
         self._graph, self._class = graph, vehicle_class

@@ -44,12 +44,7 @@ class LightReader:
         ]
 
     def read(self, scene: Scene, lanes: Mapping[str, str]) -> Lights:
-        """Return the lights and routes of a scene.
-
-        Args:
-            scene: the scene.
-            lanes: the lane of each agent in the scene.
-        """
+        """Return the lights and routes of a scene."""
         states = {
             light: sumo.trafficlight_getRedYellowGreenState(light) for light in {one for _, one, _ in self._signals}
         }

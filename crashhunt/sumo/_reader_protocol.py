@@ -132,12 +132,7 @@ class Place(NamedTuple):
 
 
 class Places:
-    """Finds a vehicle on the network, once per step for all readers of an agent.
-
-    Args:
-        graph: the lanes of the network.
-        agent: identifier of the vehicle.
-    """
+    """Finds a vehicle on the network, once per step for all readers of an agent."""
 
     def __init__(self, graph: LaneGraph, agent: str) -> None:
         self._graph, self._agent = graph, agent
@@ -198,11 +193,7 @@ def _position_on(graph: LaneGraph, lane: GraphLane, x: float, y: float) -> float
 
 
 class Reader:
-    """Reads one part of an agent's observation. A reader may keep state from step to step of one episode.
-
-    Args:
-        setup: The part, the vehicle and the network.
-    """
+    """Reads one part of an agent's observation. A reader may keep state from step to step of one episode."""
 
     def __init__(self, setup: ReaderSetup) -> None:
         self._setup = setup

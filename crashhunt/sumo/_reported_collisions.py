@@ -17,11 +17,7 @@ class ReportedCollisions:
         self._known: set[tuple[str, str]] = set()
 
     def read(self, *, persons: bool) -> tuple[Contact, ...]:
-        """Return the collisions that began in this step.
-
-        Args:
-            persons: whether collisions with persons count.
-        """
+        """Return the collisions that began in this step."""
         found = []
         for collision in sumo.simulation_getCollisions():
             victim = collision.victim

@@ -430,12 +430,6 @@ class RightOfWayReader(RowsReader):
         """Return the conflicting paths that an actor takes, and the position of its front on its lane, in m.
 
         Each path has the distance from its stop line to the start of the lane, in m.
-
-        Args:
-            name: identifier of the actor.
-            scene: the scene.
-            row: row of the actor.
-            approaches: the lanes from which actors come into conflict with the path of the vehicle.
         """
         try:
             if is_person(name):
@@ -487,13 +481,7 @@ class RightOfWayReader(RowsReader):
 
 
 def _paths_of(vehicle: str, approaches: Sequence[Approach], number: int) -> list[tuple[Conflict, float]]:
-    """Return the conflicting paths that a vehicle takes, each with the distance from its stop line to the lane, in m.
-
-    Args:
-        vehicle: identifier of the vehicle.
-        approaches: the conflicting paths on its lane.
-        number: index of its edge on its route.
-    """
+    """Return the conflicting paths that a vehicle takes, each with the distance in m from its stop line to the lane."""
     edges = tuple(sumo.vehicle_getRoute(vehicle))
     return [
         (one.conflict, one.offset_m)

@@ -90,12 +90,7 @@ _current: weakref.ref[SumoSimulator] | None = None  # the simulator that owns th
 
 
 class SumoSimulator:
-    """Runs the episodes of a scenario on SUMO, one after another in one process.
-
-    Args:
-        scenario: The scenario to run.
-        stage: An existing folder for the files of this process.
-    """
+    """Runs the episodes of a scenario on SUMO, one after another in one process."""
 
     def __init__(self, scenario: Scenario, stage: Path) -> None:
         self.step_length_s = scenario.step_length_s

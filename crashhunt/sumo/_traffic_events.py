@@ -45,12 +45,7 @@ class HardBraking:
         self._limit = limit
 
     def begin(self, agents: Sequence[str], controlled: Mapping[str, object]) -> None:
-        """Reset the state of the last episode.
-
-        Args:
-            agents: Identifiers of the agents that act.
-            controlled: All controlled vehicles, by identifier.
-        """
+        """Reset the state of the last episode."""
         self._controlled = controlled
         self._limits: dict[str, float] = {}
         self._followers = {agent: sumo.vehicle_getFollower(agent)[0] for agent in agents}
@@ -232,12 +227,7 @@ class SumoEvents:
         self._braking.resume(followers)
 
     def look(self, scene: Scene, agents: Sequence[str]) -> tuple[Event, ...]:
-        """Return the events of the step that led to this scene.
-
-        Args:
-            scene: The scene, with the lanes of the controlled vehicles that are on the road.
-            agents: Identifiers of the agents that acted in the step.
-        """
+        """Return the events of the step that led to this scene."""
         self._steps += 1
         last, found = self._last, list[Event]()
         for agent in agents:

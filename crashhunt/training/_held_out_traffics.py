@@ -58,10 +58,6 @@ def is_test_traffic(seed: int, test: float) -> bool:
 def check_test_share(test: float, shown: str) -> float:
     """Return the share of the test part after checking it.
 
-    Args:
-        test: the share.
-        shown: name of the share in error messages.
-
     Raises:
         UsageError: the share is not from 0 to below 1.
     """
@@ -247,12 +243,7 @@ def read_trained_on(path: Path) -> TrainedOn:
 
 @dataclass(frozen=True, slots=True)
 class HeldOutTraffics:
-    """The traffic seeds of a hunt on which no agent of a comparison was trained.
-
-    Args:
-        hunt_seed: seed of the hunt.
-        records: the training records of the agents.
-    """
+    """The traffic seeds of a hunt on which no agent of a comparison was trained."""
 
     hunt_seed: int
     records: tuple[TrainedOn, ...] = ()

@@ -91,9 +91,6 @@ class CrashEpisodes:
     def reset_to_crash(self, index: int) -> tuple[object, dict[str, object], str]:
         """Begin an episode shortly before a crash.
 
-        Args:
-            index: Index of the crash in the list of crashes.
-
         Returns:
             The observation, the info, and a description of where the repeated steps differ from the recording. The
             description is empty if the repeated steps are bit-identical; otherwise the episode must not be used.

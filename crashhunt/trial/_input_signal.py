@@ -128,10 +128,6 @@ def with_fewer_points(arguments: Mapping[str, Value], name: str) -> list[dict[st
     """Return arguments in which a signal has fewer points, the fewest first; empty if the argument is no signal.
 
     The points of the smaller signals are values of the signal, at equal distances in time.
-
-    Args:
-        arguments: the arguments, with the stored signal and its points.
-        name: name of the signal.
     """
     signal = fold_signals(arguments)[name] if name in arguments and f"{name}[0]" in arguments else None
     if not isinstance(signal, InputSignal):

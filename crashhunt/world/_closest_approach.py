@@ -58,9 +58,6 @@ class ApproachMeter:
     Time to collision: Hayward, Near-miss determination through use of a scale of danger (1972); here for outlines at
     constant velocity. Required deceleration (DRAC): Cooper and Ferguson, Traffic studies at T-junctions (1976): v² / (2
     gap) = v / (2 TTC), v being the closing speed.
-
-    Args:
-        agents: identifiers of the controlled vehicles.
     """
 
     def __init__(self, agents: Sequence[str]) -> None:

@@ -351,11 +351,6 @@ def lane_jump(previous: Scene, present: Scene, actor: str) -> float:
     """Return how far an actor jumped sideways between two scenes, in m to its left; 0 if it did not jump.
 
     SUMO changes lanes in an instant. A movement that a bend explains is not a jump, and neither is a teleport.
-
-    Args:
-        previous: the scene one step before.
-        present: the present scene.
-        actor: identifier of the actor.
     """
     was, row = previous.roster.index.get(actor), present.roster.index.get(actor)
     if was is None or row is None or is_person(actor) or _rows_before(previous, present, (row, row)) is None:

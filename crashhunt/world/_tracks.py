@@ -483,12 +483,7 @@ class Paths(Serializable):
 
 
 def paths_of(scenes: Sequence[Scene], agents: Collection[str]) -> Paths:
-    """Return the paths of all actors in consecutive scenes; the path of another actor is interrupted where it parks.
-
-    Args:
-        scenes: the scenes before the first step and after each step.
-        agents: the ids of the controlled vehicles.
-    """
+    """Return the paths of all actors in consecutive scenes; the path of another actor is interrupted where it parks."""
     found: list[_Open] = []
     current: dict[str, _Open] = {}
     for step, scene in enumerate(scenes):

@@ -228,14 +228,7 @@ class TokenError(UnreachableError):
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A node of a Ray cluster.
-
-    Args:
-        id: Ray's identifier of the node.
-        name: name of the node for users.
-        cpus: number of CPUs that can be used.
-        free: number of CPUs that are not in use.
-    """
+    """A node of a Ray cluster."""
 
     id: str
     name: str

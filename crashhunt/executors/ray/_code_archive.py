@@ -305,11 +305,7 @@ class Store:
 
 
 class Place:
-    """The folder of one hunt on a node, which belongs to this process as long as the process lives.
-
-    Args:
-        path: path of the folder.
-    """
+    """The folder of one hunt on a node, which belongs to this process as long as the process lives."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -38,11 +38,7 @@ _TEXT_FILES = (layout.RUN_LOG, layout.ERROR_LOG, layout.STACK)
 
 
 class Work:
-    """The trials of one hunt on this node.
-
-    Args:
-        job: settings of the trials, digest and folders of the archive, and number of trials at a time.
-    """
+    """The trials of one hunt on this node."""
 
     def __init__(self, job: NodeJob) -> None:
         self._job = job

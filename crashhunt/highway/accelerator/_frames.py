@@ -25,10 +25,6 @@ if TYPE_CHECKING:
 class TrafficFrame:
     """The positions of all objects at one time, with coordinates on the lanes that are computed when needed.
 
-    Args:
-        network: The lanes of the road.
-        road: The road with its vehicles and objects.
-
     Attributes:
         plain: Whether all positions have the usual data type; otherwise the frame must not be used.
         things: The vehicles, then the objects.

@@ -48,10 +48,6 @@ assert all(_PARAMETERS[: len(names)] == names for names in NUMBERS_OF.values())
 class KernelObjects:
     """The vehicles and objects of a road in the kernel, and their properties that must stay unchanged meanwhile.
 
-    Args:
-        road: The road.
-        network: The lanes of the road.
-
     Attributes:
         traffic: The vehicles in the kernel; None if the kernel does not know them.
         decides: Whether the kernel knows how all vehicles make decisions.

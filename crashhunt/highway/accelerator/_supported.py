@@ -310,9 +310,6 @@ class Own:
 class VehicleClass:
     """The behaviour that a class of vehicles or objects inherits unchanged from its base class in highway-env.
 
-    Args:
-        kind: The class.
-
     Attributes:
         plain: Whether all attributes that the accelerator reads are plain values.
         collides: Whether the collision check is inherited.

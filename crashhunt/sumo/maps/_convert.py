@@ -63,12 +63,7 @@ class ConvertOptions:
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """A converted network.
-
-    Args:
-        network: contents of the network.
-        notes: notes for the user about the conversion.
-    """
+    """A converted network."""
 
     network: RoadNetwork
     notes: tuple[str, ...]

@@ -32,13 +32,7 @@ class MapArgument:
 
 
 def arguments_of(demand: Demand, scales: tuple[float, float], *, bicycles: bool) -> list[MapArgument]:
-    """Return the arguments of a scenario that is made from a map.
-
-    Args:
-        demand: traffic of the scenario.
-        scales: the smallest and the largest traffic factor.
-        bicycles: whether cyclists take part.
-    """
+    """Return the arguments of a scenario that is made from a map."""
     low, high = scales
     found = [
         MapArgument(

@@ -92,13 +92,6 @@ def find_demand(network: RoadNetwork, tools: Tools, folder: Path, *, net: str, p
     SUMO's randomTrips.py draws the trips, most of them between ends of the network. duarouter computes their routes, so
     every route is drivable.
 
-    Args:
-        network: contents of the network file.
-        tools: the programs of eclipse-sumo.
-        folder: folder in which the programs run.
-        net: name of the network file in the folder.
-        people: whether pedestrians take part.
-
     Raises:
         ScenarioError: no route for cars exists in the network.
     """
