@@ -38,9 +38,9 @@ def found(runs, end=40, start=30, most=10**6, parallel=1):
     return judgement
 
 
-@pytest.mark.parametrize("parallel", [1, 2, 3])
-@pytest.mark.parametrize("last", [-1, 0, 1, 17, 30, 38, 39])
-@pytest.mark.parametrize("start", [0, 17, 39])
+@pytest.mark.parametrize("parallel", [1, 3])
+@pytest.mark.parametrize("last", [-1, 0, 17, 38, 39])
+@pytest.mark.parametrize("start", [0, 39])
 def test_it_is_the_last_step_and_everything_after_it_was_run(parallel, last, start):
     judgement = found(Runs({"brake": range(last + 1)}), start=start, parallel=parallel)
     (brake,) = judgement.attempts

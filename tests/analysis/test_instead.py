@@ -108,7 +108,7 @@ def test_period_is_the_cause_if_the_run_from_its_beginning_ends_well_and_no_run_
     assert len(search.runs) == 3
 
 
-def period(faculty, last, actor="x", first=0):
+def period(faculty="longitudinal", last=40, actor="x", first=0):
     return {"faculty": faculty, "last": last, "actor": actor, "first": first}
 
 
@@ -151,3 +151,17 @@ def test_reference_driver_has_both_parts_where_one_brings_another_crash_about(
     found = search.find("differs")
     assert asked == tried
     assert found == "cause" if helps else found.why_not == why_not
+
+
+@pytest.mark.parametrize(
+    ("periods", "first"),
+    [
+        ([period(first=1), period("lateral", first=2), period(first=3, last=45)], [2, 3, 1]),
+        ([period(first=1, actor="y"), period(first=2, actor=""), period(first=3)], [2, 3]),
+        ([period(first=number, last=number + 30) for number in range(9)], [8, 7, 6, 5]),
+        ([period(first=1, last=19), period(first=2, last=20)], [2]),  # it ended more than 10 s before the crash
+    ],
+)
+def test_lane_changes_and_then_the_latest_periods_with_the_collision_partner_are_examined(periods, first):
+    search = searched(_end=60, _dt=0.25)
+    assert [one["first"] for one in search._candidates(tuple(periods))] == first

@@ -30,9 +30,9 @@ def first(good, seen):
     return tried
 
 
-@given(st.integers(1, 60), st.data())
+@given(st.integers(0, 60), st.data())
 def test_exactly_what_it_takes_is_left(count, data):
-    needed = data.draw(st.sets(st.integers(0, count - 1)))
+    needed = {number for number in range(count) if data.draw(st.booleans())}
     seen = []
     found = fewest(range(count), first(lambda some: needed <= set(some), seen))
     assert set(found) == needed
@@ -50,12 +50,6 @@ def test_parts_are_halves_again_after_one_that_suffices_and_as_small_after_one_t
 
     assert fewest(range(16), tried) == (3, 12)
     assert sizes[:5] == [[0], [8, 8], [4] * 4 + [12] * 4, [4] * 3 + [8] * 3, [4, 4]]
-
-
-def test_where_each_is_needed_none_is_excluded_and_nothing_of_nothing():
-    assert fewest("abcd", first(lambda some: len(some) == 4, [])) == ("a", "b", "c", "d")
-    assert fewest((), first(lambda some: True, [])) == ()
-    assert fewest("abcd", first(lambda some: True, [])) == ()
 
 
 @pytest.mark.parametrize(
@@ -154,69 +148,6 @@ def test_time_that_runs_out_while_others_are_moved_takes_nothing_away(monkeypatc
     assert search.run(lambda: False)[0] in ("time", "done")
     assert search.best == replace(RERUN.spec, only=("a", "b", "c"))
     assert search.smaller[-1] == search.best
-
-
-class FromLaterOn(Scripting):
-    """From step 60 on it takes two others, and of all that are there; from the start on, four."""
-
-    def begins(self, agents):
-        return [90, 60]
-
-    def spec(self, part):
-        return replace(super().spec(part), max_steps=part.begin or 1)
-
-
-class LaterRuns(Runs):
-    """In traffic nobody can be left out.
-
-    Args:
-        pair: who is enough from step 60 on.
-    """
-
-    def __init__(self, pair):
-        super().__init__(10**6)
-        self.pair = pair
-
-    def first(self, specs, *, again=False):
-        for place, spec in enumerate(specs):
-            script = spec.script
-            if script is None:
-                good = spec.only is None
-            else:
-                good = {*(self.pair if spec.max_steps == 60 else "abcd")} <= {*script.names} and spec.max_steps != 90
-            if good:
-                return place
-        return None
-
-
-@pytest.mark.parametrize("pair", ["ah", "gh"])
-def test_fewer_are_enough_where_it_begins_later(monkeypatch, pair):
-    monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS))
-    monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
-    search = _stages.Minimizer(RERUN, LaterRuns(pair), "either")
-    search._scripting = FromLaterOn()
-    assert search.run(lambda: False)[0] == "done"
-    assert (set(search.best.script.names), search.best.max_steps) == ({*pair}, 60)
-
-
-class FewRuns(LaterRuns):
-    """From the start on it takes two others, and from step 60 on one of them."""
-
-    def first(self, specs, *, again=False):
-        for place, spec in enumerate(specs):
-            needed = {*(self.pair[:1] if spec.max_steps == 60 else self.pair)}
-            if spec.only is None if spec.script is None else needed <= {*spec.script.names} and spec.max_steps != 90:
-                return place
-        return None
-
-
-def test_which_it_takes_no_more_where_it_begins_later_is_excluded_of_a_few_as_well(monkeypatch):
-    monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS))
-    monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
-    search = _stages.Minimizer(RERUN, FewRuns("gh"), "either")
-    search._scripting = FromLaterOn()
-    assert search.run(lambda: False)[0] == "done"
-    assert (search.best.script.names, search.best.max_steps) == (("g",), 60)
 
 
 @pytest.mark.parametrize(
@@ -443,6 +374,15 @@ def test_with_another_form_at_hand_only_a_few_are_tried_in_traffic(monkeypatch):
     assert [steps for steps, _ in runs.tried] == [100] * len(groups) + [250] * len(groups)
 
 
+@pytest.mark.parametrize(
+    ("agents", "form"), [(("ego", "a"), "either"), (("ego",), "scripted")], ids=["two agents", "only scripts asked for"]
+)
+def test_script_is_tried_however_few_the_traffic_takes(agents, form):
+    search = Minimizer(crash(agents=agents), Takes(), form)
+    search.best = replace(search.best, only=("c",))
+    assert search._wants_script()
+
+
 @pytest.mark.parametrize("kept", [None, ("c",), ("c", "d", "e")])
 def test_traffic_is_scripted_where_it_takes_many(kept, monkeypatch):
     monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
@@ -453,12 +393,6 @@ def test_traffic_is_scripted_where_it_takes_many(kept, monkeypatch):
     assert not search._wants_script()  # three are few
     search.best = replace(search.best, only=())
     assert search._wants_script()  # alone, its beginning can be cut off
-
-
-def test_two_agents_are_always_scripted_as_well():
-    search = Minimizer(crash(agents=("ego", "a")), Takes(), "either")
-    search.best = replace(search.best, only=("c",))
-    assert search._wants_script()
 
 
 def test_where_no_one_can_be_excluded_that_is_reported():
@@ -525,14 +459,6 @@ def test_a_script_is_smaller_with_fewer_actors_or_agents_or_steps(names, agents,
     assert search._is_smaller(than)
 
 
-def test_one_look_at_the_others_leaves_out_all_that_it_does_not_take():
-    runs = Takes(lambda spec: spec.only is None or {*"bf"} <= {*spec.only})
-    search = Minimizer(crash(), runs, "traffic")
-    search._fewer_others()
-    assert search.best.only == ("b", "f")  # of the six that are nearest
-    assert runs.most_steps == 100
-
-
 class TwoDrive(Scripting):
     """Two agents drive, and three others are there."""
 
@@ -550,6 +476,34 @@ def test_an_agent_that_need_not_drive_is_moved():
     assert Minimizer(rerun, Takes(crashes), "traffic")._fewest_moved(TwoDrive()) == Part(("ego", "a"), ("c",))
     never = Minimizer(rerun, Takes(lambda spec: spec.script is None), "traffic")
     assert never._fewest_moved(TwoDrive()) is None
+
+
+class FromLaterOn(Scripting):
+    """A trial that can also begin at one of two later steps."""
+
+    def begins(self, agents):
+        return [90, 60]
+
+    def spec(self, part):
+        return replace(super().spec(part), max_steps=part.begin or 1)
+
+
+@pytest.mark.parametrize(
+    ("others", "others_from_step_60"), [("abcd", "ah"), ("abcd", "gh"), ("gh", "g")], ids=["near", "far", "one"]
+)
+def test_fewer_are_enough_where_it_begins_later(others, others_from_step_60):
+    """In traffic, no actor can be left out."""
+
+    def crashes(spec):
+        if spec.script is None:
+            return spec.only is None
+        needed = others_from_step_60 if spec.max_steps == 60 else others
+        return {*needed} <= {*spec.script.names} and spec.max_steps != 90
+
+    search = Minimizer(crash(arguments={"ego": {}}, scenario_arguments={}), Takes(crashes), "either")
+    search._scripting = FromLaterOn()
+    assert search.run(lambda: False)[0] == "done"
+    assert (set(search.best.script.names), search.best.max_steps) == ({*others_from_step_60}, 60)
 
 
 def test_where_it_begins_later_pairs_with_which_it_crashed_are_tried_first():
@@ -641,22 +595,6 @@ def test_a_script_may_take_a_second_longer_than_what_was_recorded():
     assert scripting.spec(Part(("ego",), (), begin=40)).disturbances == ()
     rerun.recorded.prologue = SimpleNamespace(step_length_s=2.5)
     assert _stages.Scripting(rerun).spec(Part(("ego",), ())).max_steps == 50  # a step at least
-
-
-def test_after_a_part_was_excluded_the_parts_stay_as_small():
-    """Zeller and Hildebrandt: of n parts, n - 1 are left; to begin with halves again would try each of them twice."""
-    seen = []
-    needed = {0, 2, 4, 6, 8, 10, 12, 14}
-    assert set(fewest(range(16), first(lambda some: needed <= set(some), seen))) == needed
-    sizes = [len(some) for some in seen if needed <= set(some)]
-    assert sizes == list(range(15, 7, -1))
-    assert len(seen) == 187  # with halves again, 274
-
-
-def test_scripts_are_tried_where_only_scripts_are_asked_for():
-    search = Minimizer(crash(), Takes(), "scripted")
-    search.best = replace(search.best, only=("c",))
-    assert search._wants_script()
 
 
 class Lasting(Takes):
