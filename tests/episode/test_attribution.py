@@ -125,15 +125,6 @@ def toy_mended(monkeypatch):
 
 
 @pytest.mark.usefixtures("toy_mended")
-def test_function_of_an_agent_that_raises_inside_the_simulator_is_the_agents(write, tmp_path):
-    result = run(tmp_path, toy(tmp_path), write("mine", agent_module(RAISES_IN_SIMULATOR)).Agent)
-    assert told(result) == ("agent_error", 2, "ego")
-    assert result.failure.kind == "ZeroDivisionError"
-    assert result.failure.message == "division by zero"
-    assert 'mine.py", line' in result.failure.traceback
-
-
-@pytest.mark.usefixtures("toy_mended")
 def test_agent_in_a_module_of_its_own_is_reported_from_another_agent(write, tmp_path):
     second = write("second", agent_module("pass", name="Calm")).Calm
     first = write("mine", agent_module(RAISES_IN_SIMULATOR)).Agent
