@@ -394,24 +394,6 @@ def test_odd_observations_and_failing_ends_are_noticed_once(make, caplog, monkey
     assert [record.getMessage().rpartition(" ")[2] for record in caplog.records] == ["1", "2", "4"]
 
 
-@pytest.mark.parametrize(
-    ("limit", "given"),
-    [("registered", {"a": 1}), ("none", {"max_episode_steps": -1, "a": 1})],
-)
-def test_registered_environment_is_made_as_gymnasium_makes_it(monkeypatch, limit, given):
-    made = []
-    monkeypatch.setattr(gym.gymnasium, "make", lambda *names, **named: made.append((names, named)) or Environment())
-    scenario = Scenario(
-        simulator="gym",
-        agents={"ego": AgentSetup()},
-        tables={
-            "gym": GymSetup(id="mine/Env-v0", kwargs={"a": 1}, crash=CrashRule(termination=True), time_limit=limit)
-        },
-    )
-    GymSimulator(scenario, None)
-    assert made == [(("mine/Env-v0",), given)]
-
-
 WRONG = [(False, False), [True], {"a": True}, "False", "", b"1", None, 1j, np.array([True, False]), np.array([]),
          np.array(["1"]), np.array([None]), np.ma.array([1.0], mask=[True]), object()]  # fmt: skip
 

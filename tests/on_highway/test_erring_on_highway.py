@@ -101,39 +101,6 @@ def test_the_one_that_is_ahead_brakes_and_drives_on_by_itself(begin):
     assert told.vehicle.startswith("vehicle.")
 
 
-def test_no_one_brakes_harder_than_the_model_or_drives_backwards(begin):
-    episode, idle = begin(planned(1, "stop", strong=20.0, long=5.0))
-    other = place(episode, 1, 99.0, speed=10.0)
-    speeds = follow(episode, other, 18)
-    assert idle.told[0].how_strong == other.ACC_MAX == 6.0
-    assert min(np.diff(speeds)) / 0.2 == pytest.approx(-6.0)
-    assert speeds[-5:] == [0.0] * 5
-
-
-def test_a_dawdler_and_a_speeder(begin):
-    episode, _ = begin(planned(1, "dawdle", strong=0.25, long=8.0))
-    other = place(episode, 1, 60.0)
-    assert follow(episode, other, 35)[-1] == pytest.approx(15.0, abs=0.2)
-    episode, _ = begin(planned(1, "speed", "behind", 0.5, 2.0))
-    other = place(episode, 1, -60.0)
-    follow(episode, other, 5)
-    assert other.target_speed == 30.0
-    follow(episode, other, 7)
-    assert other.target_speed == 20.0
-
-
-@pytest.mark.parametrize(
-    ("lane", "ahead", "who"),
-    [(0, 20, "left ahead"), (0, 2, "left"), (0, -20, "left behind"), (2, 20, "right ahead"), (1, -9, "behind")],
-)
-def test_places_are_along_the_lanes(begin, lane, ahead, who):
-    episode, _ = begin()
-    place(episode, lane, float(ahead))
-    found = {cell for cell in ("left ahead", "left", "left behind", "ahead", "behind", "right ahead", "right")
-             if episode.simulator.resolve_target(planned(1, "brake", cell))}  # fmt: skip
-    assert found == {who}
-
-
 def test_an_actor_cuts_in_and_no_one_into_a_side(begin):
     episode, idle = begin(planned(2, "cut_in", "left ahead", 2.0, 3.0))
     other = place(episode, 0, 15.0)
@@ -200,17 +167,6 @@ def test_an_actor_ignores_that_others_have_priority(begin):
         assert not (what == "ignore_priority" and getattr(other, "is_yielding", False))
     assert least["late_action"] < 7.0
     assert least["ignore_priority"] > 8.5
-
-
-@pytest.mark.parametrize(
-    ("road", "who", "found"),
-    [(("o1", "ir1"), "left ahead", True), (("o3", "ir3"), "right ahead", True), (("o2", "ir2"), "ahead", False)],
-)
-def test_who_crosses_the_agents_way(begin, road, who, found):
-    episode, _ = begin(**JUNCTION)
-    crossing(episode, road, 70.0)
-    places = {cell for cell in CELLS if episode.simulator.resolve_target(planned(1, "ignore_priority", cell, 1.0))}
-    assert places == ({who} if found else set())
 
 
 def test_who_is_steered_has_no_route_and_its_way_is_crossed_where_its_lane_leads(begin):

@@ -14,7 +14,6 @@ from onlookers import Steady, Watch
 from crashhunt.disturbances import disturber_of
 from crashhunt.episode import Episode
 from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
-from crashhunt.simulators import SupportsDisturbances
 from crashhunt.sumo import SumoSetup, SumoSimulator
 from crashhunt.trial import Disturbance, TrialSpec
 
@@ -110,40 +109,6 @@ def test_the_one_that_is_ahead_brakes_and_drives_on_by_itself(drive):
     assert watch.speeds("lead")[-1] > speeds[-1]
 
 
-def test_no_one_brakes_harder_than_its_type_can(drive):
-    episode, watch = drive(planned(6, "brake", strong=9.0))
-    advance(episode, 15)
-    assert watch.told[0].how_strong == 4.5
-    assert min(np.diff(watch.speeds("lead")) / 0.1) == pytest.approx(-4.5)
-
-
-def test_who_is_driven_by_an_agent_is_never_meant(drive):
-    episode, watch = drive(planned(3, "brake"), driven=("lead",))
-    advance(episode, 5)
-    assert watch.told == [planned(3, "brake")]
-
-
-def test_a_sudden_stop_lasts_and_ends(drive):
-    episode, watch = drive(planned(3, "stop", strong=4.0, long=6.0), agent=Steady(0.0))
-    advance(episode, 62)
-    speeds = watch.speeds("lead")
-    assert speeds[30:62] == [0.0] * 32
-    advance(episode, 20)
-    assert watch.speeds("lead")[-1] > 1.0
-    assert drives_by_itself("lead")
-
-
-def test_a_dawdler_slows_down_gently(drive):
-    episode, watch = drive(planned(3, "dawdle", strong=0.5, long=8.0), agent=Steady(0.0))
-    advance(episode, 3)
-    before = watch.speeds("lead")[2]
-    advance(episode, 70)
-    assert watch.speeds("lead")[-1] == pytest.approx(before / 2)
-    assert min(np.diff(watch.speeds("lead"))[2:]) / 0.1 >= -1.5 - 1e-9
-    advance(episode, 12)
-    assert drives_by_itself("lead")
-
-
 def test_a_dawdler_that_had_to_wait_continues_as_slowly_as_before_and_no_slower(drive):
     front = AHEAD.replace('"lead"', '"front"').replace('"60"', '"75"')
     episode, watch = drive(planned(3, "dawdle", strong=0.5, long=18.0), traffic=front + AHEAD, agent=Steady(0.0))
@@ -156,15 +121,6 @@ def test_a_dawdler_that_had_to_wait_continues_as_slowly_as_before_and_no_slower(
     libsumo.vehicle.setSpeed("front", -1.0)
     advance(episode, 60)
     assert watch.speeds("lead")[-1] == pytest.approx(wanted)
-
-
-def test_a_follower_wants_to_drive_faster(drive):
-    episode, watch = drive(planned(3, "speed", "behind", 0.5, 2.0), agent=Steady(14.0))
-    advance(episode, 10)
-    assert watch.told[0].vehicle == "follow"
-    assert libsumo.vehicle.getSpeedFactor("follow") == pytest.approx(1.5)
-    advance(episode, 15)
-    assert drives_by_itself("follow")
 
 
 @pytest.mark.parametrize(("at", "who"), [(45, "left ahead"), (27, "left"), (10, "left behind")])
@@ -195,33 +151,12 @@ def test_no_one_cuts_in_into_the_side_of_an_actor(drive):
     assert libsumo.vehicle.getLaneID("left") == "west_1"
 
 
-def test_where_there_is_no_lane_no_one_cuts_in(drive):
-    episode, watch = drive(planned(2, "cut_in", "right ahead", 0.0, 1.0))
-    advance(episode, 4)
-    assert watch.told == [planned(2, "cut_in", "right ahead", 0.0, 1.0)]
-
-
-@pytest.mark.parametrize("who", ["ahead", "behind"])
-def test_who_is_in_the_lane_of_the_agent_does_not_cut_in(drive, who):
-    episode, watch = drive(planned(2, "cut_in", who, 0.0, 1.0))
-    advance(episode, 6)
-    assert watch.told == [planned(2, "cut_in", who, 0.0, 1.0)]
-    assert {libsumo.vehicle.getLaneID(name) for name in ("lead", "follow")} == {"west_0"}
-
-
 def test_who_leaves_while_it_deviates_is_let_go(drive):
     short = AHEAD.replace('departPos="60"', 'departPos="120"') + '<vehicle id="last" type="car" route="up" depart="9"/>'
     episode, watch = drive(planned(2, "dawdle", strong=0.2, long=60.0), traffic=short, agent=Steady(6.0))
     advance(episode, 400)
     assert watch.told[0].vehicle == "lead"
     assert episode.result.failure is None
-
-
-def test_an_agent_that_has_left_has_no_one_around_it(drive):
-    episode, watch = drive(planned(390, "brake"), agent=Steady(30.0), traffic="")
-    advance(episode, 400)
-    assert watch.told == []
-    assert episode.simulator.resolve_target(planned(1, "brake")) == ""
 
 
 def test_who_is_not_seen_is_excluded_of_the_observation_and_nothing_else_changes(drive):
@@ -339,8 +274,3 @@ def test_who_is_taken_off_the_road_is_gone_from_that_step_on(drive):
     assert all(len(scene.points) == len(scene.roster.actors) for scene in watch.scenes)
     assert [one.vehicle for one in watch.told] == ["lead", ""]
     assert "follow" in watch.scenes[-1].roster.index
-
-
-def test_sumo_offers_it():
-    assert all(hasattr(SumoSimulator, name) for name in ("disturbing_kinds", "resolve_target", "disturb"))
-    assert SupportsDisturbances is not None

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from crossing_lines import crossing
 
 libsumo = pytest.importorskip("libsumo")
 sumolib = pytest.importorskip("sumolib")
@@ -326,23 +327,6 @@ def test_stop_line_is_that_of_the_next_link_and_the_rules_of_its_junction(town):
             seen["lights"] += signal > 0
             seen["none"] += not (must_yield or stop_sign or signal)
     assert sum(seen.values()) > 50
-
-
-def crossing(mine, theirs):
-    """The distances along two lines to their first common point; None without one."""
-    before = 0.0
-    for a, b in pairwise(mine):
-        behind = 0.0
-        for c, d in pairwise(theirs):
-            turn = (b[0] - a[0]) * (d[1] - c[1]) - (b[1] - a[1]) * (d[0] - c[0])
-            if abs(turn) > 1e-9:
-                t = ((c[0] - a[0]) * (d[1] - c[1]) - (c[1] - a[1]) * (d[0] - c[0])) / turn
-                u = ((c[0] - a[0]) * (b[1] - a[1]) - (c[1] - a[1]) * (b[0] - a[0])) / turn
-                if -1e-6 <= t <= 1 + 1e-6 and -1e-6 <= u <= 1 + 1e-6:
-                    return before + t * math.dist(a, b), behind + u * math.dist(c, d)
-            behind += math.dist(c, d)
-        before += math.dist(a, b)
-    return None
 
 
 def path_of(town, connection):

@@ -17,7 +17,7 @@ from onlookers import Steady, Watch
 from crashhunt.episode import Episode
 from crashhunt.oracles import Overlap
 from crashhunt.scenario import load_scenario
-from crashhunt.sumo import SumoSimulator, _disturbances, _simulator
+from crashhunt.sumo import SumoSimulator, _simulator
 from crashhunt.sumo._disturbances import JunctionLanes, SteppingOut, _between, _nearest, can_step_out
 from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
@@ -27,7 +27,6 @@ STEADY = '<vType id="steady" vClass="pedestrian" maxSpeed="1.4" speedFactor="1" 
 WALKER = (
     f'{STEADY}<person id="walker" type="steady" depart="0" departPos="60"><walk edges="e" arrivalPos="250"/></person>'
 )
-WAITING = '<person id="waiting" depart="0" departPos="60"><stop lane="e_0" duration="100"/></person>'
 EGO = '<vehicle id="ego" depart="0" departPos="10" departSpeed="10"><route edges="e"/></vehicle>'
 
 
@@ -112,24 +111,6 @@ def test_scene_has_the_headings_and_speeds_of_persons_and_vehicles(drive):
         assert scene.core is core  # which is no longer used after it has read something wrong
 
 
-def test_no_one_steps_out_faster_than_its_type_can_nor_further_than_it_is_back_in_time(drive):
-    slow = WALKER.replace('"1.4"', '"0.5"')
-    _, watch = drive(EGO + slow, stepping(20, strong=3.0, long=2.0))
-    assert watch.told[0].how_strong == 0.5
-    points = np.array(watch.of("person walker", "points"))
-    assert points[:, 1].max() - points[19, 1] == pytest.approx(0.5)  # a second out, a second back
-    assert points[39, 1] == pytest.approx(points[19, 1])
-
-
-@pytest.mark.parametrize(
-    ("traffic", "who"), [(WALKER, "left ahead"), (WAITING, "right ahead"), ("", "right ahead"), (WALKER, "right")]
-)
-def test_who_is_elsewhere_or_does_not_walk_is_not_meant(drive, traffic, who):
-    result, watch = drive(EGO + traffic, stepping(20, who=who), steps=30)
-    assert [one.vehicle for one in watch.told] == [""]
-    assert not result.disturbances
-
-
 def test_who_steps_out_can_be_hit(drive):
     result, watch = drive(EGO + WALKER, stepping(10, long=10.0), speed=12.0, steps=60)
     oracle = Overlap()
@@ -157,12 +138,6 @@ def test_a_vehicle_merges_only_at_the_end_of_its_lane(drive, strong):
         assert points[-1][0] > 300
     assert left[0] > 100  # by itself it merges soon
     assert strong - 2 < left[1] <= strong
-
-
-def test_whose_lane_continues_merges_nowhere(drive):
-    ego, other = MERGING.format("ego", 10, 0), MERGING.format("other", 25, 1)
-    _, watch = drive(ego + other, Disturbance(2, "left ahead", "late_merge", 10.0, 60.0, "ego"), net="taper", steps=5)
-    assert [one.vehicle for one in watch.told] == [""]
 
 
 def traffic_at_two_junctions():
@@ -258,27 +233,6 @@ def test_near_junctions_persons_step_out_only_where_sumo_keeps_them_on_their_sid
     assert outcomes[0] > 10
     assert refused[True] > 10
     assert refused[False] > 10
-
-
-def test_the_next_person_steps_out_where_the_nearest_cannot(drive, monkeypatch):
-    further = WALKER.removeprefix(STEADY).replace("walker", "further").replace('departPos="60"', 'departPos="70"')
-    _, watch = drive(EGO + WALKER + further, stepping(20), steps=30)
-    assert [one.vehicle for one in watch.told] == ["person walker"]
-    able = _disturbances.can_step_out
-    monkeypatch.setattr(
-        _disturbances, "can_step_out", lambda actor, *more: actor != "person walker" and able(actor, *more)
-    )
-    _, watch = drive(EGO + WALKER + further, stepping(20), steps=30)
-    assert [one.vehicle for one in watch.told] == ["person further"]
-
-
-def test_who_cannot_step_out_is_not_commanded(drive, monkeypatch):
-    """Not even where somebody else has chosen the person, as in a crash that is made smaller."""
-    monkeypatch.setattr(_disturbances, "can_step_out", lambda *_: False)
-    result, watch = drive(EGO + WALKER, stepping(20), steps=40)
-    assert not result.disturbances
-    points = np.array(watch.of("person walker", "points"))
-    assert np.ptp(points[:, 1]) < 0.5
 
 
 @pytest.mark.parametrize(

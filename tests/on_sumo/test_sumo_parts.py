@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.base.errors import NoValidTrialError, ScenarioError
+from crashhunt.base.errors import ScenarioError
 from crashhunt.scenario import AgentSetup, ObservationSetup, Scenario, shipped_folder
 from crashhunt.sumo import SumoSetup, _ego, _scenario_check, _sumocfg
 from crashhunt.sumo._ego import Departure, choose_ego, draw_among, number, seconds
@@ -176,39 +176,6 @@ def test_traffic_has_warnings_with_their_times():
     assert "from 50 s on: 7 of 9 vehicles stand still, in 2 of 3 runs" in stuck
     (over,) = warned(surveyed(("a", 1), out_of_time=True), surveyed(("a", 1), end_s=80.0))
     assert "ended at 80 s" in over
-
-
-def test_traffic_that_never_enters_has_its_longest_run():
-    error = _ego._no_entry_error(bare(), [surveyed(steps=5), surveyed(begin_s=10.0, end_s=60.0, steps=900)])
-    assert isinstance(error, NoValidTrialError)
-    assert "50 s" in error.message
-    assert "900 steps from 10 s" in error.message
-
-
-def test_vehicles_that_enter_in_every_run_have_their_latest_time():
-    both = _ego._entering_in_all_runs([surveyed(("b", 9), ("a", 3), ("c", 1)), surveyed(("a", 5), ("b", 4))])
-    assert [(one.vehicle, one.depart_s) for one in both] == [("a", 5.0), ("b", 9.0)]
-    none = _ego._entering_in_all_runs([surveyed(("c", 1)), surveyed(("a", 5), ("b", 4))])
-    assert [(one.vehicle, one.depart_s) for one in none] == [("b", 4.0), ("a", 5.0)]  # those of the run with most
-
-
-def test_survey_keeps_the_rest_of_the_scenario():
-    scenario = bare(arguments={"scale": 1}, notes=("first", "second"))
-    found = _ego.refine(scenario, [surveyed(*((f"t{at}", at) for at in range(200, 400, 50)))])
-    assert list(found.arguments) == ["scale", "vehicle"]
-    assert found.notes[1:] == ("second",)
-    assert list(found.agents) == ["ego"]
-    short = _ego.refine(scenario, [surveyed(cut_short=True, steps=9), surveyed(steps=30)])
-    assert (short.notes[0], short.notes[2]) == ("first", "second")
-    assert "step 30" in short.notes[1]
-    added = replace(scenario, agents={"ego": AgentSetup(route="way")})
-    assert _ego.refine(added, [surveyed()]) is added
-    existing = replace(scenario, agents={"a": AgentSetup(existing=True)})
-    waits = _ego.refine(existing, [surveyed(("a", 400))])
-    assert waits.agents == existing.agents
-    assert (waits.notes[0], len(waits.notes)) == ("first", 3)
-    with pytest.raises(NoValidTrialError):
-        _ego.refine(scenario, [surveyed()])
 
 
 def test_resumed_hunt_keeps_its_candidates():

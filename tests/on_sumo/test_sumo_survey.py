@@ -63,21 +63,6 @@ def test_parked_vehicles_are_no_candidates(town):
     assert "parked" not in candidates(refine(town(), [parked]))
 
 
-def test_with_few_vehicles_in_the_window_all_that_enter_are_candidates(town):
-    sparse = [("a", 0.0), ("b", 10.0), ("c", 320.0), ("d", 600.0)]
-    assert candidates(refine(town(), [run(sparse)])) == ["a", "b", "c", "d"]
-    assert candidates(refine(town(), [run([*sparse, ("e", 330.0), ("f", 340.0)])])) == ["c", "e", "f"]
-
-
-def test_one_candidate_is_the_default_and_does_not_vary(town):
-    scenario = refine(town(), [run([("t50", 51.0)])])
-    assert (scenario.arguments["vehicle"].range, scenario.arguments["vehicle"].default) == ("", "t50")
-    assert list(scenario.agents) == ["ego"]
-    # An id with the separator of a choice cannot be listed, but named.
-    assert refine(town(), [run([("a|b", 51.0)])]).agents["a|b"].existing
-    assert candidates(refine(town(), [run([("a|b", 51.0), ("c d", 52.0), ("é&<", 53.0)])])) == ["c d", "é&<"]
-
-
 @pytest.mark.parametrize(
     ("classes", "says"),
     [

@@ -23,15 +23,21 @@ def merge(tmp_path):
     simulator.close()
 
 
+def apart(scene, one, other):
+    """How far an actor is ahead of another one and to its left, as the latter is headed."""
+    (x, y), (to_x, to_y) = (scene.points[scene.roster.index[name]] for name in (one, other))
+    heading = scene.headings[scene.roster.index[one]]
+    c, s = math.cos(heading), math.sin(heading)
+    return (to_x - x) * c + (to_y - y) * s, (to_y - y) * c - (to_x - x) * s
+
+
 def gap_between(scene, rear, front):
     """The gap on a straight road, from poses and lengths."""
-    behind, ahead = scene.roster.index[rear], scene.roster.index[front]
-    c, s = math.cos(scene.headings[behind]), math.sin(scene.headings[behind])
-    (x, y), (to_x, to_y) = scene.points[behind], scene.points[ahead]
-    return (to_x - x) * c + (to_y - y) * s - scene.roster.actors[ahead].length
+    ahead_m, _ = apart(scene, rear, front)
+    return ahead_m - scene.roster.actors[scene.roster.index[front]].length
 
 
-def test_gaps_and_speeds_are_those_of_the_scene(merge):
+def test_gaps_sides_and_speeds_are_those_of_the_scene(merge):
     seen = {"ahead": 0, 1: 0, -1: 0}
     for step in range(160):
         merge.step({"ego": merge.actions["ego"].encode((22.0, 1 if step == 60 else 0))})
@@ -41,8 +47,6 @@ def test_gaps_and_speeds_are_those_of_the_scene(merge):
         for kind in ("vehicle", "red light"):
             of_kind = [one for one in around.ahead if one.kind == kind]
             assert merge.nearest_ahead("ego", kind) == min(of_kind, key=lambda one: one.gap_m, default=None)
-        if any(math.hypot(c, s) < 0.999 for c, s in [(1, 0)]) or around.speed_mps == 0:
-            continue
         assert around.speed_mps == pytest.approx(scene.speeds[scene.roster.index["ego"]])
         for one in around.ahead:
             if one.actor in scene.roster.index:
@@ -53,27 +57,10 @@ def test_gaps_and_speeds_are_those_of_the_scene(merge):
             for one, rear, front in ((side.ahead, "ego", None), (side.behind, None, "ego")):
                 if one is not None and one.actor in scene.roster.index:
                     seen[change] += 1
+                    assert apart(scene, "ego", one.actor)[1] * change > 1.0
                     wanted = gap_between(scene, rear or one.actor, front or one.actor)
                     assert one.gap_m == pytest.approx(wanted, abs=0.6)
     assert min(seen.values()) > 5
-
-
-def test_the_lane_to_the_left_has_vehicles_to_the_left(merge):
-    sides = {1: 0, -1: 0}
-    for step in range(160):
-        merge.step({"ego": merge.actions["ego"].encode((22.0, 1 if step == 60 else 0))})
-        around, scene = merge.surroundings("ego"), merge.scene()
-        row = scene.roster.index["ego"]
-        for change, side in around.sides.items():
-            for one in (side.ahead, side.behind):
-                if one is not None and one.actor in scene.roster.index:
-                    x, y = scene.points[row]
-                    to_x, to_y = scene.points[scene.roster.index[one.actor]]
-                    heading = scene.headings[row]
-                    left = -(to_x - x) * math.sin(heading) + (to_y - y) * math.cos(heading)
-                    assert left * change > 1.0
-                    sides[change] += 1
-    assert min(sides.values()) > 5
 
 
 def test_looking_changes_nothing_in_the_simulation(merge):
@@ -88,11 +75,6 @@ def test_looking_changes_nothing_in_the_simulation(merge):
         scene = merge.scene()
         traces.append((scene.points, scene.speeds, scene.roster.actors))
     assert traces[0] == traces[1]
-
-
-def test_a_missing_lane_is_known(merge):
-    around = merge.surroundings("ego")
-    assert not around.sides[-1].exists
 
 
 _UNREGULATED_DRIVE = """

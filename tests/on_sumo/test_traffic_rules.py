@@ -12,6 +12,7 @@ import libsumo
 import numpy as np
 import pytest
 from conftest import mostly_nightly
+from crossing_lines import crossing
 
 from crashhunt.agents import CarFollowing
 from crashhunt.episode import SIGNALS as KNOWN_SIGNALS, Episode, TrialSignals
@@ -177,23 +178,6 @@ class Junction:
         second = self.after.get(first[:-2])
         points = self.shapes[first] + (self.shapes[second][1:] if second else [])
         return int(first[:-2].rpartition("_")[2]) + int(first.rpartition("_")[2]), points, driven
-
-
-def crossing(one, other):
-    """The distances along two lines of points at which they first cross; None if they do not."""
-    along = 0.0
-    for (ax, ay), (bx, by) in pairwise(one):
-        whole = 0.0
-        for (cx, cy), (dx, dy) in pairwise(other):
-            turn = (bx - ax) * (dy - cy) - (by - ay) * (dx - cx)
-            if turn:
-                s = ((cx - ax) * (dy - cy) - (cy - ay) * (dx - cx)) / turn
-                u = ((cx - ax) * (by - ay) - (cy - ay) * (bx - ax)) / turn
-                if 0 <= s <= 1 and 0 <= u <= 1:
-                    return along + s * math.dist((ax, ay), (bx, by)), whole + u * math.dist((cx, cy), (dx, dy))
-            whole += math.dist((cx, cy), (dx, dy))
-        along += math.dist((ax, ay), (bx, by))
-    return None
 
 
 @pytest.mark.nightly
