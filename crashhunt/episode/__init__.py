@@ -14,7 +14,13 @@ if TYPE_CHECKING:
     from ._blame import has_users_code as has_users_code, internal_error as internal_error
     from ._branches import Brancher as Brancher
     from ._competent_driver import CompetentDriver as CompetentDriver
-    from ._episode import Episode as Episode, FastEpisode as FastEpisode, Reset as Reset
+    from ._episode import (
+        Episode as Episode,
+        FastEpisode as FastEpisode,
+        Reset as Reset,
+        run_episode as run_episode,
+        seed_everything as seed_everything,
+    )
     from ._failures import are_functions_replaced as are_functions_replaced
     from ._forced_onsets import OnsetForcer as OnsetForcer
     from ._forks import FirstCopy as FirstCopy, ForkRunner as ForkRunner
@@ -30,7 +36,6 @@ if TYPE_CHECKING:
     )
     from ._parts import Parts as Parts, require_origin as require_origin, seal as seal, stage_of as stage_of
     from ._probes import BUDGET as BUDGET, BUDGET_BESIDE as BUDGET_BESIDE, Prober as Prober
-    from ._run_episode import run_episode as run_episode, seed_everything as seed_everything
     from ._trial_signals import INFO_KEY as INFO_KEY, SIGNALS as SIGNALS, TrialSignals as TrialSignals
     from ._worker_settings import WorkerSettings as WorkerSettings, answer_file as answer_file, scratch_of as scratch_of
 

@@ -133,7 +133,7 @@ class Brancher(Observer):
 
     def is_due(self, episode: Episode) -> bool:
         """Return whether to leave a suspended fork after the last step."""
-        return episode.steps % self._second == 0
+        return episode.steps > 0 and episode.steps % self._second == 0
 
     def ask(self, episode: Episode) -> None:
         """Leave a suspended fork if an actor is near, and run the due branches of this fork and of earlier forks."""

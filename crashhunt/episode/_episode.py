@@ -1,9 +1,12 @@
-"""One episode: the only place where agent, simulator and oracle interact.
+"""One episode: the only place where agent, simulator and oracle interact; and a trial, which is one episode.
 
 `Episode` runs each part of each step in Python. `FastEpisode` is an `Episode` with the same results, bit by bit, whose
 uneventful steps on SUMO run in the compiled core, each in one call. `FastEpisode` is the only class that knows the
 core. After a step of the core, the simulator and the attributes of the episode hold an older state. Reading a public
 attribute first updates them to the state of the core.
+
+`run_episode` runs a trial from its specification: an episode that is recorded and measured, with seeded random
+generators.
 
 Reason: on the scenario ``loop``, trials of 600 steps take 1.20 times the CPU time if the core runs no steps (median of
 7 alternating pairs). A subclass takes 1.02 times the CPU time of ``if`` statements in `Episode`, a difference within
@@ -13,11 +16,16 @@ the noise.
 from __future__ import annotations
 
 import inspect
+import random
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
+import numpy as np
+
+from crashhunt.agents import Closes
 from crashhunt.base.errors import InternalError, InvalidEpisodeError
 from crashhunt.base.foreign_code import Boundary, ForeignError, Party, is_at_boundary, is_ours, supports
 from crashhunt.base.forks import held, shared_memory
@@ -26,7 +34,15 @@ from crashhunt.episode._disturbance_injection import DisturbanceInjector
 from crashhunt.episode._failures import Ending, close_agent
 from crashhunt.episode._fast_path import FastPath, make_fast_path
 from crashhunt.episode._forks import Forkable
-from crashhunt.episode._observers import agent_seed, callbacks_for, observation_restorers, options_of
+from crashhunt.episode._observers import (
+    Nearness,
+    Observer,
+    Recorder,
+    agent_seed,
+    callbacks_for,
+    observation_restorers,
+    options_of,
+)
 from crashhunt.episode._trial_signals import TrialSignals
 from crashhunt.native import ANSWERED, ASK, DONE, SIMULATED
 from crashhunt.oracles import (
@@ -46,15 +62,13 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from types import TracebackType
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
-    from crashhunt.episode._observers import Observer
+    from crashhunt.recording import BlackBox
     from crashhunt.simulators import Info, Observations, Simulator, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Scene
-
 
 MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 """Called with agent id, simulator and arguments; returns the agent at the wheel."""
@@ -636,3 +650,94 @@ class FastEpisode(Episode):
     def _detach_observers(self) -> None:
         self._take = None
         super()._detach_observers()
+
+
+class AsksForks(Protocol):
+    """Makes forks of a running episode, and adds what it has found to the result of the trial."""
+
+    def is_due(self, episode: Episode) -> bool:
+        """Return whether to make forks now: before the first step, or after a step."""
+
+    def ask(self, episode: Episode) -> None:
+        """Make forks of the episode."""
+
+    def result(self, result: TrialResult) -> TrialResult:
+        """Return the result of the trial, with that of its forks."""
+
+
+def run_episode(
+    spec: TrialSpec,
+    *,
+    simulator: Simulator,
+    make_agent: MakeAgent,
+    box: BlackBox,
+    oracles: Sequence[Oracle],
+    crash_on: Sequence[Outcome] = CRASHES,
+    observers: Sequence[Observer] = (),
+    reset: Reset | None = None,
+    asking: Sequence[AsksForks] = (),
+) -> TrialResult:
+    """Seed the process's random generators, run one trial from its specification, and record and measure the trial.
+
+    Args:
+        spec: specification of the trial.
+        simulator: the simulator in which the trial runs.
+        make_agent: function called with agent id, simulator and arguments; it returns the agent that drives.
+        box: the black box that records the trial; `BlackBox.begin` has been called.
+        oracles: the oracles, which decide whether a step is a crash.
+        crash_on: The outcomes that end the episode. Other traffic crashes and events are only recorded.
+        observers: Further observers, called after the recorder.
+        reset: function that resets the simulator; None for the simulator's own `reset`.
+        asking: what makes forks of the episode after its steps. Those that are observers observe the episode as well.
+
+    Returns:
+        The result of the trial, including exceptions of agent and simulator.
+
+    Raises:
+        RecorderError: the disk is full.
+    """
+    began = time.monotonic()
+    seed_everything(spec.seed)
+    watching = [one for one in asking if isinstance(one, Observer)]
+    try:
+        with FastEpisode(
+            spec,
+            simulator=simulator,
+            make_agent=make_agent,
+            oracles=oracles,
+            crash_on=crash_on,
+            observers=(Recorder(box, simulator), Nearness(box.take_frames), *observers, *watching),
+            forks=bool(asking),
+            reset=reset,
+        ) as episode:
+            result = episode.start()
+            try:
+                while result is None:
+                    for one in asking:  # before the first step, too: what begins in step 2 is noticed before step 1
+                        if one.is_due(episode):
+                            one.ask(episode)
+                    seed = spec.reseeding.seed_after(episode.steps) if spec.reseeding is not None else None
+                    if seed is not None and (result := episode.reseed(seed)) is not None:
+                        break
+                    result = episode.step()
+            except BaseException as error:
+                result = episode.end_by_agent(error)
+                if result is None:
+                    raise
+    finally:
+        for one in asking:
+            if supports(one, Closes):
+                one.close()
+    for one in asking:
+        result = one.result(result)
+    wall_s = time.monotonic() - began
+    return replace(result, setup_s=episode.setup_s, setup_steps=episode.setup_steps, wall_s=wall_s)
+
+
+def seed_everything(seed: int) -> None:
+    """Seed the random generators of the process: `random`, `numpy.random`, and torch if it has been imported."""
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - agents may use the global generator
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        torch.manual_seed(seed)

@@ -17,8 +17,8 @@ from crashhunt.base.plugins import add_current_folder, import_module, locate
 from crashhunt.base.sandbox import confine
 from crashhunt.base.temporary import record_shared_memory
 from crashhunt.episode._blame import internal_error
+from crashhunt.episode._episode import seed_everything
 from crashhunt.episode._failures import record_originals
-from crashhunt.episode._run_episode import seed_everything
 from crashhunt.oracles import parse_oracle
 from crashhunt.scenario import check_action
 from crashhunt.simulators import FlattensObservations, MasksActions, ObservesParts, ProvidesRoadMaps, ReportsNotices

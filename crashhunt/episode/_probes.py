@@ -152,7 +152,7 @@ class Prober:
 
     def is_due(self, episode: Episode) -> bool:
         """Return whether probes run after the completed step."""
-        return episode.steps % steps_of(self._every_s, episode.simulator.step_length_s) == 0
+        return episode.steps > 0 and episode.steps % steps_of(self._every_s, episode.simulator.step_length_s) == 0
 
     def ask(self, episode: Episode) -> None:
         """For each kind, search for a disturbance that soon crashes the episode and is milder than any found before."""

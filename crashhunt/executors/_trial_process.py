@@ -192,7 +192,8 @@ class TrialProcess:
             # Writes down where every thread is, without needing the interpreter; then the supervisor ends the process.
             watchdog.arm(settings.timeout_s, self._stack)
             made = time.monotonic()
-            prober, brancher, forcer = self._copies()
+            copies = self._copies()
+            first = [FirstCopy(self._cannot_copy)] if job["tries_copy"] and self._fork_runners else []
             if settings.find_escapes and spec.overruled is None:
                 self._lights = LightRecorder()
             result = run_episode(
@@ -204,10 +205,7 @@ class TrialProcess:
                 crash_on=settings.crash_on,
                 observers=[self._lights] if self._lights is not None else [],
                 reset=reset,
-                prober=prober,
-                brancher=brancher,
-                first_copy=FirstCopy(self._cannot_copy) if job["tries_copy"] and self._fork_runners else None,
-                forcer=forcer,
+                asking=[*first, *copies],
             )
         except RecorderError:
             box.announce_no_room()
@@ -299,21 +297,20 @@ class TrialProcess:
             report["lights"] = lights
         return report
 
-    def _copies(self) -> tuple[Prober | None, Brancher | None, OnsetForcer | None]:
-        settings, prober, brancher = self._settings, None, None
-        forcer: OnsetForcer | None = None
+    def _copies(self) -> list[Prober | Brancher | OnsetForcer]:
+        settings = self._settings
+        found: list[Prober | Brancher | OnsetForcer] = []
+        tell = self._notices.append
         if settings.probe_s:
             budget = BUDGET_BESIDE if settings.branch else BUDGET
             refused = {name: setup.refused_disturbances for name, setup in settings.scenario.agents.items()}
-            prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget, self._notices.append, refused)
+            found.append(Prober(settings.probe_s, settings.crash_on, self._delay, budget, tell, refused))
         if settings.branch:
-            brancher = Brancher(settings.branch, settings.crash_on, self._delay, self._notices.append)
+            found.append(Brancher(settings.branch, settings.crash_on, self._delay, tell))
         if settings.force:
-            forcer = OnsetForcer(
-                settings.force, settings.crash_on, settings.timeout_s, self._delay, self._notices.append
-            )
-        self._fork_runners = tuple(each.fork_runner for each in (prober, brancher, forcer) if each is not None)
-        return prober, brancher, forcer
+            found.append(OnsetForcer(settings.force, settings.crash_on, settings.timeout_s, self._delay, tell))
+        self._fork_runners = tuple(each.fork_runner for each in found)
+        return found
 
     def _cannot_copy(self, why_not: str) -> None:
         for runner in self._fork_runners:

@@ -37,7 +37,7 @@ class Place:
         spec = TrialSpec(0, self.seed, {}, self.given, steps or self.steps, **more)
         return run_episode(
             spec, simulator=self.simulator, make_agent=lambda *_: agent or KeepLaneWithSpeed(self.speed), box=self.box,
-            oracles=[ReportedCollision(), Overlap()], brancher=brancher,
+            oracles=[ReportedCollision(), Overlap()], asking=[brancher] if brancher else [],
         )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ def run(place, forcer=None, agent=None, **more):
     spec = TrialSpec(0, place.seed, {}, place.given, place.steps, **more)
     return run_episode(
         spec, simulator=place.simulator, make_agent=lambda *_: agent or KeepLaneWithSpeed(place.speed), box=place.box,
-        oracles=[ReportedCollision(), Overlap()], forcer=forcer,
+        oracles=[ReportedCollision(), Overlap()], asking=[forcer] if forcer else [],
     )  # fmt: skip
 
 

@@ -222,7 +222,7 @@ def probes(stage):
         spec = TrialSpec(0, 4, {}, {"gap_m": 12.0, **more.pop("arguments", {})}, more.pop("steps", 60), **more)
         oracles = [ReportedCollision(), Overlap()]
         return run_episode(
-            spec, simulator=simulator, make_agent=make, box=box, oracles=oracles, prober=prober, reset=None
+            spec, simulator=simulator, make_agent=make, box=box, oracles=oracles, asking=[prober] if prober else []
         )
 
     def starts_thread(*_):

@@ -13,7 +13,7 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
-from crashhunt.episode import WorkerSettings
+from crashhunt.episode import FirstCopy, WorkerSettings
 from crashhunt.executors import _trial_process
 from crashhunt.executors._trial_process import TrialProcess, notices_of_late_imports
 from crashhunt.scenario import AgentSetup, Scenario
@@ -136,24 +136,24 @@ def test_copies_of_a_trial_are_those_that_the_settings_ask_for(process, monkeypa
     def copies(**given):
         made.clear()
         found = process(**given)
-        pairs = found._copies()
+        copies = found._copies()
         assert [one.what for one in found._fork_runners] == [name for name, _ in made]
-        return found, [name for name, _ in made], [one is not None for one in pairs], [words for _, words in made]
+        return found, [name for name, _ in made], len(copies), [words for _, words in made]
 
     crash_on = (Outcome.COLLISION,)
     _, names, there, _ = copies()
-    assert (names, there) == ([], [False] * 3)
+    assert (names, there) == ([], 0)
     found, names, there, ((every_s, on, delay, budget, notify, _),) = copies(probe_s=2.0)
-    assert (names, there) == (["Prober"], [True, False, False])
+    assert (names, there) == (["Prober"], 1)
     assert (every_s, on, delay, budget) == (2.0, crash_on, found._delay, _trial_process.BUDGET)
     notify("later")
     assert found._notices == ["a notice", "later"]
     _, names, there, (probed, branched) = copies(probe_s=2.0, branch=(1.0,))
-    assert (names, there) == (["Prober", "Brancher"], [True, True, False])
+    assert (names, there) == (["Prober", "Brancher"], 2)
     assert probed[3] == _trial_process.BUDGET_BESIDE != _trial_process.BUDGET
     assert branched[:2] == ((1.0,), crash_on)
     found, names, there, (forced,) = copies(force=("brake",))
-    assert (names, there) == (["OnsetForcer"], [False, False, True])
+    assert (names, there) == (["OnsetForcer"], 1)
     assert forced[:4] == (("brake",), crash_on, 9.0, found._delay)
     found._cannot_copy("it has threads")
     assert found._notices[-1] == "OnsetForcer are left out: it has threads"
@@ -326,7 +326,7 @@ def test_trial_runs_in_its_folder_and_reports(process, monkeypatch, tmp_path):
     monkeypatch.setattr(found, "_redirect", lambda folder: called.append(("redirect", folder)))
     monkeypatch.setattr(_trial_process, "encode_report", lambda report, dumps: report["result"])
     asked = SimpleNamespace(what="probes", why_not="a thread", stop=lambda why: None)
-    found._copies = lambda: setattr(found, "_fork_runners", (asked,)) or ("prober", "brancher", "forcer")
+    found._copies = lambda: setattr(found, "_fork_runners", (asked,)) or ["prober"]
     job = {"spec": SPEC.to_json(), "folder": str(tmp_path), "reserved": 64, "wants_map": False,
            "tries_copy": True}  # fmt: skip
     assert found._run(job, None) == 0
@@ -343,19 +343,19 @@ def test_trial_runs_in_its_folder_and_reports(process, monkeypatch, tmp_path):
     assert found._notices[-1] == "probes are left out from here on: a thread"
     ((spec, given),) = ran
     assert spec == SPEC
-    assert {name: given[name] for name in ("simulator", "make_agent", "oracles", "crash_on", "reset", "prober",
-                                           "brancher", "forcer")} == {
+    assert {name: given[name] for name in ("simulator", "make_agent", "oracles", "crash_on", "reset")} == {
         "simulator": simulator, "make_agent": "make agent", "oracles": "oracles", "crash_on": (Outcome.COLLISION,),
-        "reset": None, "prober": "prober", "brancher": "brancher", "forcer": "forcer",
+        "reset": None,
     }  # fmt: skip
-    assert given["first_copy"] is not None
+    first, probes = given["asking"]
+    assert (type(first), probes) == (FirstCopy, "prober")
     for more in ({"tries_copy": False}, {}):
         called.clear()
         if not more:
-            found._copies = lambda: setattr(found, "_fork_runners", ()) or (None, None, None)
+            found._copies = lambda: setattr(found, "_fork_runners", ()) or []
         found._run(job | more, "reset")
         assert "separate" not in called
-        assert ran[-1][1]["first_copy"] is None
+        assert ran[-1][1]["asking"] == (["prober"] if more else [])
         assert ran[-1][1]["reset"] == "reset"
     ran.insert(0, "fails")
     called.clear()

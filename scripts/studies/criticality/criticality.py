@@ -125,7 +125,7 @@ class Place:
             make_agent=self._parts.agent,
             box=self._box,
             oracles=self._parts.oracles(),
-            prober=share,  # type: ignore[arg-type]  # as far as an episode asks
+            asking=[share] if share is not None else [],
         )
 
 
@@ -142,7 +142,7 @@ class Share:
 
     def is_due(self, episode: Episode) -> bool:
         """Whether copies are to be asked now."""
-        return episode.steps % round(PROBE_S / episode.simulator.step_length_s) == 0
+        return episode.steps > 0 and episode.steps % round(PROBE_S / episode.simulator.step_length_s) == 0
 
     def ask(self, episode: Episode) -> None:
         """Ask a copy each."""

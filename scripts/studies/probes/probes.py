@@ -129,7 +129,7 @@ class Place:
             spec = self.specification(rng)
             probes, branches = asking(CRASHES) if copies else (None, None)
             try:
-                result = self.run(spec, prober=probes, brancher=branches)
+                result = self.run(spec, asking=[one for one in (probes, branches) if one is not None])
             except FoundError as found:
                 assert probes is not None
                 assert branches is not None
