@@ -20,7 +20,6 @@ from crashhunt.analysis import (
 from crashhunt.analysis._whatif_runs import _from_step, _Runs, future_seed
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.crashes import wilson
-from crashhunt.episode import HandedOver, _action_override
 from crashhunt.trial import ALL_AGENTS, KILLED, Failure, Handover, Outcome, Reseeding, TrialResult, TrialSpec
 
 
@@ -248,45 +247,3 @@ def test_specification_with_handover_and_reseeding_is_refused_by_versions_that_d
     assert data["requires"] == ["handover", "reseeding"]
     with pytest.raises(CrashhuntError, match="has later, which crashhunt"):
         TrialSpec.from_json({**data, "requires": ["handover", "later"]})
-
-
-class _Driver:
-    def __init__(self):
-        self.calls, self.closed = [], 0
-
-    def reset(self, seed):
-        self.calls.append(("reset", seed))
-
-    def act(self, observation):
-        self.calls.append(("act", observation))
-        return "own"
-
-    def close(self):
-        self.closed += 1
-
-
-@pytest.mark.parametrize("after", [0, 2])
-def test_agent_that_takes_over_is_reset_at_the_step_and_has_seen_nothing_before(monkeypatch, after):
-    class Log:
-        def __init__(self, log, agent):
-            assert (log, agent) == ("log.mcap", "ego")
-
-        def reset(self, seed):
-            self.place = 0
-
-        def act(self, observation):
-            self.place += 1
-            return f"recorded {self.place}"
-
-    monkeypatch.setattr(_action_override, "Recorded", Log)
-    driver = _Driver()
-    agent = HandedOver(driver, Handover("ego", after, "log.mcap"))
-    for _ in range(2):  # the second episode is like the first
-        driver.calls.clear()
-        agent.reset(11)
-        assert driver.calls == []
-        said = [agent.act(step) for step in range(4)]
-        assert said == [*(f"recorded {step + 1}" for step in range(after)), *["own"] * (4 - after)]
-        assert driver.calls == [("reset", 11), *(("act", step) for step in range(after, 4))]
-    agent.close()
-    assert driver.closed == 1

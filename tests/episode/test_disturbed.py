@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from crashhunt.episode import run_episode
-from crashhunt.episode._disturbance_injection import DisturbanceInjector
 from crashhunt.oracles import Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, first_divergence, read_black_box
 from crashhunt.scenario import AgentSetup, Scenario
@@ -274,22 +273,6 @@ def test_a_kind_that_the_simulator_cannot_do_makes_the_trial_invalid(run, tmp_pa
     box.close()
     assert result.outcome is Outcome.INVALID
     assert "does not support the disturbance 'fly'" in result.failure.message
-
-
-def test_new_plan_replaces_what_begins_after_the_next_step(tmp_path):
-    toy = ToySimulator(ONE, tmp_path)
-    toy.reset(seed=1)
-    old = [planned(step, long=0.1) for step in (1, 3, 4, 6)] + [planned(5, "late_action", "itself", 0.1, 0.1)]
-    took_place: list[Disturbance] = []
-    spec = TrialSpec(0, 1, {}, {}, 40, disturbances=tuple(old))
-    injector = DisturbanceInjector(spec, toy, [took_place.append])
-    injector.first({"ego": np.zeros((8, 7), np.float32)})
-    action = {"ego": toy.actions["ego"].encode((5.0, 0))}
-    for step in range(1, 9):
-        if step == 3:  # two steps have been run, so the third is the next
-            injector.replan([planned(7, long=0.1), planned(5, long=0.1)])
-        injector.step(action)
-    assert [(one.step, one.what) for one in took_place] == [(1, "brake"), (3, "brake"), (5, "brake"), (7, "brake")]
 
 
 def test_a_trial_and_its_result_survive_json():

@@ -12,11 +12,11 @@ from gymnasium import spaces
 
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
 from crashhunt.base.exceptions import message_of
-from crashhunt.episode import Braking, overruled_agent, run_episode
+from crashhunt.episode import run_episode
 from crashhunt.oracles import Finding, OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Phase, Recording, Tag, digest_of, read_black_box, read_header
-from crashhunt.simulators import FullBraking, MetaAction, SpeedAndLaneChange
-from crashhunt.trial import CRASHES, Collision, Outcome, Overruled, TrialSpec
+from crashhunt.simulators import SpeedAndLaneChange
+from crashhunt.trial import CRASHES, Collision, Outcome, TrialSpec
 from crashhunt.world import Actor, Contact, Event, Roster, Scene
 
 EGO, SECOND, OTHER = (Actor(name, "passenger", 5.0, 2.0) for name in ("ego", "second", "other"))
@@ -446,48 +446,3 @@ def test_a_message_that_cannot_be_had_is_no_obstacle(run):
     assert message_of(KeyError("x")) == "'x'"
     result = run(drivers={"ego": Driver({1: RuntimeError("two\n  lines")})})
     assert result.failure.message == "two lines"
-
-
-def test_braking_begins_after_a_step():
-    class Car(Scripted):
-        def full_braking(self, agent):
-            return FullBraking((0.0, 0), "hard") if agent == "ego" else None
-
-    log = []
-    driver = Braking(Driver(log=log), Car(), "ego", 2)
-    driver.reset(5)
-    assert [driver.act("seen") for _ in range(4)] == [(6.0, 0), (7.0, 0), (0.0, 0), (0.0, 0)]
-    driver.reset(6)
-    assert driver.act("seen") == (8.0, 0)
-    driver.close()
-    assert log == [("seed", 5), "seen", "seen", ("seed", 6), "seen", "closed"]
-    Braking(SimpleNamespace(), Car(), "ego", 2).close()
-    for simulator, agent in ((Car(), "second"), (Scripted(), "ego")):
-        with pytest.raises(InvalidEpisodeError, match=f"{agent} cannot be made to brake fully"):
-            Braking(Driver(), simulator, agent, 2)
-
-
-@pytest.mark.parametrize(
-    ("keeps", "form", "decided", "done"),
-    [
-        ("lane", SpeedAndLaneChange(), (30.0, -1), (30.0, 0)),
-        ("speed", SpeedAndLaneChange(), (30.0, -1), (17.0, -1)),
-        ("lane", MetaAction(), 0, 1),
-        ("lane", MetaAction(), 3, 3),
-        ("speed", MetaAction(), 3, 1),
-        ("speed", MetaAction(), 2, 2),
-    ],
-)
-def test_an_agent_is_kept_from_one_thing_after_a_step(keeps, form, decided, done):
-    scene = Scene(0.0, Roster((OTHER, EGO)), [(0.0, 0.0), (9.0, 0.0)], [0.0, 0.0], [3.0, 17.0])
-    car = SimpleNamespace(actions={"ego": form}, scene=lambda: scene)
-    driver = SimpleNamespace(reset=lambda seed: None, act=lambda observation: decided)
-    agent = overruled_agent(driver, car, Overruled("ego", 2, keeps=keeps))
-    agent.reset(1)
-    assert [agent.act("seen") for _ in range(4)] == [decided, decided, done, done]
-
-
-def test_what_no_one_understands_keeps_no_one_from_anything():
-    car = SimpleNamespace(actions={"ego": SimpleNamespace(names=(), space=spaces.Discrete(5))})
-    with pytest.raises(InvalidEpisodeError, match="ego cannot be held: it is unknown which lanes"):
-        overruled_agent(SimpleNamespace(), car, Overruled("ego", 2, keeps="lane"))

@@ -335,21 +335,6 @@ def test_trial_that_crashed_has_its_margin_whatever_was_not_asked(no_pauses):
     assert (stress.margin, stress.why_unasked, stress.may_be_asked_again) == (0.0, "", False)
 
 
-def test_kills_suspend_the_questions_of_one_trial_only(no_pauses):
-    asker, _ = prober()
-    road = Kills({}, kills="." + "k" * 9 + "." * 100)
-    asker.ask(road)
-    asked = road.forks
-    assert asked == 1 + 9  # who is there, and three questions, three times each
-    asker.ask(road)
-    assert road.forks == asked
-    stress = stress_of(asker)
-    assert (stress.extent, stress.may_be_asked_again) == ("asked 0 of 2", True)
-    assert asker.fork_runner.why_not == ""
-    asker.ask(road)
-    assert stress_of(asker).extent == "asked 1 of 1"
-
-
 def test_copies_that_fail_by_themselves_are_asked_once_and_three_in_turn_end_the_asking():
     told = []
     asker = Prober(2.0, CRASHES, lambda _: None, tell=told.append)
@@ -366,14 +351,6 @@ def test_copies_that_fail_by_themselves_are_asked_once_and_three_in_turn_end_the
     stress = stress_of(asker)
     assert (road.forks, stress.margin, stress.why_unasked) == (0, None, asker.fork_runner.why_not)
     assert not stress.may_be_asked_again
-
-
-def test_an_answer_between_failures_keeps_the_asking_going():
-    asker, _ = prober()
-    for answers in (False, False, True, False, False):
-        asker.ask(Road({}, answers=answers))
-    assert asker.fork_runner.why_not == ""
-    assert stress_of(asker).extent == "asked 1 of 5"
 
 
 def test_what_has_no_copy_is_reported_and_its_time_counts():
