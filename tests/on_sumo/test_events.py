@@ -113,9 +113,9 @@ def kinds(told):
     ),
 )
 def test_red_lights_are_those_that_another_way_of_counting_finds(drive, route, dt):
-    """Every two seconds of a cycle of 40: the signal's own state, and the lane before and after each step."""
+    """Every four seconds of a cycle of 40: the signal's own state, and the lane before and after each step."""
     total = 0
-    for departs in range(0, 40, 2):
+    for departs in range(0, 40, 4):
         seen = []
 
         def act(step, seen=seen):
@@ -137,7 +137,7 @@ def test_red_lights_are_those_that_another_way_of_counting_finds(drive, route, d
         assert kinds(told) == ["red_light"] * expected
         assert result.outcome in (Outcome.FINISHED, Outcome.SURVIVED)
         total += expected
-    assert 6 <= total <= 14
+    assert 3 <= total <= 7
 
 
 def test_red_light_of_the_second_junction_in_a_step_is_seen(drive):
@@ -202,29 +202,6 @@ def test_a_missed_route_is_reported_where_sumo_stops_the_vehicle(drive):
     assert later - step == 49
     assert result.outcome is Outcome.SURVIVED
     assert drive(steady(10.0), route="left", depart_lane="1")[1] == []
-
-
-def test_a_standstill_is_reported_once_and_after_its_limit_only(drive):
-    def stops(step):
-        return (10.0 if step < 20 or 180 <= step < 200 else 0.0), 0
-
-    _, told = drive(stops, limits={"not_moving": 4.0})
-    assert kinds(told) == ["not_moving"] * 2
-    assert told[0][1].what == "ego had stood still for 4 s"
-    assert drive(stops, steps=450)[1] == []  # 60 s by default
-    stop = '<stop lane="west_0" endPos="60" duration="8"/>'
-    vehicle = f'<vehicle id="ego" type="car" route="across" depart="0">{stop}</vehicle>'
-    kept = []
-
-    def act(step):
-        kept.append(libsumo.vehicle.getSpeed("ego"))
-        return 10.0, 0
-
-    assert kinds(drive(act, existing=True, traffic=vehicle, limits={"not_moving": 3.0})[1]) == [
-        "stop_missed",
-        "red_light",
-    ]
-    assert sum(speed < 0.1 for speed in kept) > 70  # it stood, as its schedule says
 
 
 def test_the_wrong_way(drive):

@@ -8,12 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from crashhunt.agents import REFERENCE_MODELS, ReferenceDriver
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.scenario import load_scenario
 from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._options import SumoSetup
-from crashhunt.testing._kinematic_cases import solve
 from crashhunt.world import manoeuvre_motions
 
 CUT_IN = {"ego_kmh": 60.0, "other_kmh": 40.0, "gap_m": 12.5, "lateral_mps": 0.9}
@@ -66,36 +64,9 @@ def test_vehicle_cuts_in_at_the_gap_and_with_the_lateral_speed_of_the_arguments(
     assert np.diff(gaps) == pytest.approx(-20 / 3.6 * 0.1)
 
 
-def test_vehicle_ahead_brakes_and_stands(simulate):
-    scenes = drive(*simulate("r157-deceleration", ego_kmh=60.0, decel_mps2=5.0, headway_s=2.0), KeepsSpeed(), 50)
-    speeds = [scene.speeds[scene.roster.index["leader"]] for scene in scenes]
-    assert speeds[:3] == pytest.approx([60 / 3.6, 60 / 3.6 - 0.5, 60 / 3.6 - 1.0])
-    assert speeds[-1] == 0.0
-
-
-def test_vehicle_ahead_shows_a_standing_vehicle(simulate):
-    values = {"ego_kmh": 60.0, "front_m": 60.0, "lateral_mps": 1.5, "headway_s": 2.0, "side": 1}
-    scenes = drive(*simulate("r157-cut-out", **values), KeepsSpeed(), 40)
-    first, last = scenes[0], scenes[-1]
-    ahead = [first.points[first.roster.index[name]][0] for name in ("ego", "leader", "standing")]
-    assert np.diff(ahead) == pytest.approx([60 / 3.6 * 2 + 4.3, 60.0 + 4.3])
-    assert last.points[last.roster.index["leader"]][1] == pytest.approx(-1.75)
-    assert last.speeds[last.roster.index["standing"]] == 0.0
-
-
-@pytest.mark.parametrize("model", REFERENCE_MODELS)
-def test_reference_driver_in_the_scenario_ends_as_in_the_plain_computation(simulate, model):
-    cases = [(40.0, 10.0, 8.0, 1.1), (60.0, 40.0, 3.0, 1.3), (70.0, 40.0, 25.0, 0.7), (90.0, 70.0, 30.0, 1.0)]
-    for values in cases:
-        arguments = dict(zip(CUT_IN, values, strict=True))
-        agent = ReferenceDriver(model=model, desired_speed=0, length=4.3, width=1.9)
-        scenes = drive(*simulate("r157-cut-in", **arguments, side=1), agent, 90)
-        touched = any(touch(scene) for scene in scenes)
-        columns = {name: np.array([value]) for name, value in arguments.items()}
-        assert touched == (solve("cut_in", columns, model)[model][0] > 0), (model, values)
-
-
 STRAIGHT = {
+    "deceleration": {"decel_mps2": 5.0, "headway_s": 2.0},
+    "cut-out": {"front_m": 60.0, "lateral_mps": 1.5, "headway_s": 2.0, "side": 1},
     "lane-keeping": {"swerve_m": 0.5, "period_s": 8.0, "beside_m": 5.0, "headway_s": 2.0, "side": 1},
     "following": {"offset_m": 0.5, "slower_kmh": 20.0, "period_s": 10.0, "headway_s": 2.0},
     "blocked-lane": {"distance_m": 100.0, "offset_m": -0.5},
@@ -114,11 +85,6 @@ def test_other_road_users_are_at_the_places_of_their_motions(simulate, name):
         found = {name: (*scene.points[row], scene.speeds[row]) for name, row in scene.roster.index.items()}
         assert found.pop("ego")[:2] == pytest.approx((300 + step * 6 / 3.6, -3.5 - 1.75 * side), abs=0.01)
         assert found == {name: pytest.approx((one.x, one.y, one.speed), abs=0.01) for name, one in motion.items()}
-
-
-def touch(scene):
-    (x, y), (other_x, other_y) = (scene.points[scene.roster.index[name]] for name in ("ego", "other"))
-    return abs(x - other_x) < 4.3 and abs(y - other_y) < 1.9
 
 
 def test_invalid_arguments_of_a_manoeuvre_are_refused(simulate):

@@ -113,26 +113,6 @@ def test_who_departs_further_on_is_replaced_there(town, tmp_path):
     assert entered(town, tmp_path, "here") == ("north", ("north", "west"))
 
 
-def test_who_has_departed_in_the_warm_up_is_reported_of(town, tmp_path):
-    with pytest.raises(
-        InvalidEpisodeError, match=r"'odd.name#1.0' had departed in the warm-up already; lower warmup_s"
-    ):
-        entered(town, tmp_path, "odd.name#1.0", warmup_s=20.0)
-    assert entered(town, tmp_path, "odd.name#1.4", warmup_s=20.0)[0] == "south"
-
-
-def test_who_is_nowhere_is_reported_of(town, tmp_path):
-    with pytest.raises(InvalidEpisodeError, match=r"the vehicle 'nobody' was not on the road"):
-        entered(town, tmp_path, "nobody")
-    assert entered(town, tmp_path, "odd.name#1.2") == ("south", ("south", "east", "north", "west"))
-
-
-def test_two_agents_cannot_take_one_place(town, tmp_path):
-    (setup,) = load_scenario(town.folder / "town.sumocfg", ego="any").agents.values()
-    with pytest.raises(InvalidEpisodeError, match=r"a and b both replace the vehicle 'odd.name#1.2'"):
-        entered(town, tmp_path, "odd.name#1.2", agents={"a": setup, "b": setup})
-
-
 def test_a_vehicle_that_never_enters_is_invalid(town):
     words = ("run", "h", "1", "4", "100", "--scenario", "town.sumocfg", "--ego", "odd.name#1.7", "--json")
     done = town.crashhunt(*words, expect=3)  # the flow has five

@@ -40,6 +40,12 @@ def config(folder: Path, text: str, routes: str = "r.rou.xml") -> Path:
     return path
 
 
+def write_scenario(folder: Path, more: str = "") -> None:
+    """Write a scenario of the town's network and routes."""
+    text = 'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
+    (folder / "scenario.toml").write_text(text + more)
+
+
 def staged(scenario, folder: Path, **values) -> dict[str, str]:
     folder.mkdir(exist_ok=True)
     words = StagedFiles(scenario, folder).arguments(1, {"scale": 1.0, **values})
@@ -128,9 +134,7 @@ def test_a_scenario_reads_nothing_outside_its_folder(town):
     (town.parent / "other.xml").write_text("<routes/>")
     (town / "r.rou.xml").write_text(ROUTES.format('<include href="../other.xml"/>'))
     assert load_scenario(config(town, "")).folder == town.parent  # a configuration may lie anywhere
-    (town / "scenario.toml").write_text(
-        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
-    )
+    write_scenario(town)
     with pytest.raises(ScenarioError, match="outside the scenario's folder"):
         load_scenario(town)
 
@@ -174,9 +178,7 @@ def test_what_an_actor_wrote_is_kept_or_reported(town, tmp_path, text, kept, say
 
 
 def test_a_jam_of_a_scenario_stays_one_unless_it_states_otherwise(town, tmp_path):
-    (town / "scenario.toml").write_text(
-        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
-    )
+    write_scenario(town)
     assert staged(load_scenario(town), tmp_path / "a")["time-to-teleport"] == "-1"
     assert "literal" not in as_plain_data(load_scenario("loop"))["sumo"]  # so that hunts of before can go on
     with (town / "scenario.toml").open("a") as file:
@@ -191,10 +193,7 @@ def test_a_value_is_never_taken_for_the_next_option(town, tmp_path):
 
 @pytest.mark.parametrize("value", ['"yes"', "true", "1", '"T"', '"x"', '"ON"', '" true"'])
 def test_queues_are_refused(town, value):
-    (town / "scenario.toml").write_text(
-        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
-        f"[sumo.options]\nmesosim = {value}\n"
-    )
+    write_scenario(town, f"[sumo.options]\nmesosim = {value}\n")
     with pytest.raises(ScenarioError, match="none can be driven"):
         load_scenario(town)
     with pytest.raises(ScenarioError, match="none can be driven"):
@@ -220,9 +219,7 @@ def test_vehicles_are_not(town, value):
     ],
 )
 def test_options_under_any_name(town, text, says):
-    (town / "scenario.toml").write_text(
-        f'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n{text}\n'
-    )
+    write_scenario(town, f"{text}\n")
     with pytest.raises(ScenarioError) as caught:
         load_scenario(town)
     assert says in str(caught.value) or "does not exist" in str(caught.value)
@@ -237,18 +234,12 @@ def test_options_under_any_name(town, text, says):
     ],
 )  # fmt: skip
 def test_an_option_with_a_side_effect_is_named_and_a_harmless_one_is_not(town, options, found):
-    (town / "scenario.toml").write_text(
-        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
-        f"[sumo.options]\n{options}\n"
-    )
+    write_scenario(town, f"[sumo.options]\n{options}\n")
     assert side_effect(load_scenario(town), {"scale": 1.0}, ()) == found
 
 
 def test_an_option_that_every_trial_has_is_refused_with_the_fix_and_an_output_is_disabled(town):
-    (town / "scenario.toml").write_text(
-        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
-        "[sumo.options]\nseed = 3\n"
-    )
+    write_scenario(town, "[sumo.options]\nseed = 3\n")
     with pytest.raises(ScenarioError, match=r"'seed'.*is an option that crashhunt sets itself") as caught:
         load_scenario(town)
     assert caught.value.fix == "remove it"

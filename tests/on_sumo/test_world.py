@@ -132,12 +132,6 @@ def test_who_is_ahead_on_a_slope_is_on_the_same_level(drive):
     assert (result.outcome, result.collision.role) == (Outcome.COLLISION, "collider")
 
 
-def test_a_flat_map_is_recorded_as_before(drive):
-    _, recording, _ = drive("street", vehicle("ego", "wc ce"), steps=5)
-    assert not recording.scene(5).heights
-    assert all(actor.height == 0 for actor in recording.actors)
-
-
 # Long vehicles.
 
 TRAIN = '<vType id="train" vClass="rail" length="200"/><vType id="bus" vClass="bus" length="18"/>'
@@ -290,12 +284,6 @@ def test_no_one_drives_through_another_between_two_steps(drive):
         assert result.closest.gap_m == 0
         between += not outlines_overlap(*(outlines(scene, row)[0] for row in range(2)))
     assert between
-
-
-def test_with_long_steps_it_looks_around_more_often(drive):
-    _, recording, _ = drive("street", vehicle("ego", "wc ce") + vehicle("late", "wc ce"), step_s=1.0, steps=12)
-    assert len(recording.scene(0).roster) == 1
-    assert "late" in recording.scene(5).roster.index
 
 
 def test_film_page_and_views_show_trains_and_persons(drive, tmp_path):

@@ -18,7 +18,6 @@ from crashhunt.sumo.maps._traffic import (
     PlainRun,
     Route,
     _counted,
-    _ego_routes,
     _entry_capacity,
     find_demand,
     route_file,
@@ -123,16 +122,6 @@ def test_routes_in_a_file_are_counted_in_its_order(tmp_path):
     )
     assert list(_counted(file, "route").items()) == [(("b", "a"), 2), (("a",), 1)]
     assert _counted(file, "walk") == {("c",): 1}
-
-
-def test_at_most_twelve_routes_are_those_of_an_agent():
-    ways = [
-        Route(id=f"r{number}", edges=(f"e{number % 9}",), weight=number, length_m=260.0 - number, free_s=1.0)
-        for number in range(20)
-    ]
-    found = _ego_routes(ways)
-    assert found == ("r11", "r10", "r9", "r8", "r7", "r6", "r5", "r4", "r3", "r2", "r1", "r0")
-    assert len(_ego_routes(ways[:3])) == 3
 
 
 DEMAND = Demand(

@@ -42,24 +42,10 @@ def test_name_of_place_is_file_without_ending(tmp_path, name, kind, expected):
     assert source(tmp_path / name, kind).name == expected
 
 
-def test_a_shape_has_its_numbers_in_the_order_in_which_they_are_given():
-    assert parse_shape("3x5", "--grid") == (3, 5)
-
-
 def test_a_generated_map_is_named_by_its_kind_and_shape():
     grid, spider = MapSource(kind="grid", shape=(2, 3)), MapSource(kind="spider", shape=(5, 1))
     assert (grid.name, spider.name) == ("grid-2x3", "spider-5x1")
     assert (grid.title, spider.title) == ("a grid of 2 by 3 junctions", "a spider's web of 5 arms and 1 rings")
-
-
-def test_a_bbox_without_roads_is_answered_with_that_of_the_map_or_with_its_order():
-    bounds = (11.0, 48.0, 11.2, 48.1)  # west, south, east, north
-    assert fix_of_bbox((48.02, 11.05, 48.05, 11.1), bounds).startswith(
-        "give --bbox=11.05,48.02,11.1,48.05, since the order"
-    )
-    for far in ((9.0, 50.0, 9.1, 50.1), (11.3, 48.0, 11.4, 48.1), (11.0, 48.2, 11.2, 48.3)):
-        assert fix_of_bbox(far, bounds) == "choose a --bbox with streets; the map spans 11,48,11.2,48.1"
-    assert fix_of_bbox((1, 2, 3, 4), None) == ""
 
 
 @given(st.text())
@@ -106,17 +92,8 @@ def test_bbox_without_roads_is_compared_with_that_of_the_map(bbox, fix):
     assert fix_of_bbox(bbox, None) == ""
 
 
-@given(st.integers(0, 10_000), st.integers(0, 10_000))
-def test_shape_has_two_numbers_in_range(first, second):
-    text = f"{first}x{second}"
-    if 2 <= first <= 40 and 2 <= second <= 40:
-        assert parse_shape(text, "--grid") == (first, second)
-    else:
-        with pytest.raises(UsageError, match="--grid"):
-            parse_shape(text, "--grid")
-
-
 def test_smallest_and_largest_shapes_are_accepted():
+    assert parse_shape("3x5", "--grid") == (3, 5)
     assert parse_shape("2X40", "--grid") == (2, 40)
     assert parse_shape("40x2", "--grid") == (40, 2)
     assert parse_shape("3x2", "--spider") == (3, 2)
