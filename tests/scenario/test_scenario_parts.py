@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -23,7 +21,6 @@ from crashhunt.scenario import (
     ObservationSetup,
     Scenario,
     _load,
-    _scenario,
     argument_values,
     as_plain_data,
     backend_of,
@@ -34,9 +31,8 @@ from crashhunt.scenario import (
 from crashhunt.scenario._load import check, copy_shipped_scenario, scenario_from_dict
 from crashhunt.scenario._scenario import STEP_LENGTH_S, digest_of_described, with_action
 from crashhunt.sumo import BACKEND as SUMO, SumoSetup, _ego
-from crashhunt.sumo._files import StagedFiles, filled_in, movable, nested_files, read_xml, references, written_by
+from crashhunt.sumo._files import StagedFiles, filled_in, movable, read_xml, references, written_by
 from crashhunt.sumo._options import HARMLESS
-from crashhunt.sumo._side_effects import _check_text, _SideEffectError
 
 ROUTES = (
     '<routes><route id="way" edges="south east north west"/>'
@@ -381,25 +377,6 @@ def test_file_in_a_folder_that_moves_names_others_relatively(tmp_path):
     assert movable(file) is None  # what is written goes nowhere
 
 
-def test_files_are_followed_and_stay_inside_the_folder(tmp_path):
-    (tmp_path / "in").mkdir()
-    (tmp_path / "out.xml").write_text("<routes/>")
-    (tmp_path / "in/a.xml").write_text('<routes><include href="b.xml"/><include href="c.xml"/></routes>')
-    (tmp_path / "in/b.xml").write_text('<routes><include href="a.xml"/><include href="c.xml"/></routes>')
-    (tmp_path / "in/c.xml").write_text("<routes/>")
-    assert nested_files(tmp_path / "in", ("a.xml",), inside=True) == ("b.xml", "c.xml")
-    (tmp_path / "in/c.xml").write_text('<routes><include href="../out.xml"/></routes>')
-    assert nested_files(tmp_path / "in", ("a.xml",)) == ("b.xml", "c.xml", "../out.xml")
-    said, advice, where = refusal(nested_files, tmp_path / "in", ("a.xml",), inside=True)
-    assert "'../out.xml'" in said
-    assert advice.startswith("move ")
-    assert where == str(tmp_path / "in/c.xml")
-    (tmp_path / "in/c.xml").write_text('<routes><include href="no.xml"/></routes>')
-    assert refusal(nested_files, tmp_path / "in", ("c.xml",))[1].startswith("correct ")
-    (tmp_path / "in/d.xml").write_text('<routes><include href="${who}.xml"/></routes>')
-    assert refusal(nested_files, tmp_path / "in", ("d.xml",))[1].startswith("name one ")
-
-
 @pytest.mark.parametrize(("count", "more"), [(0, None), (1, ""), (2, " and 1 more"), (3, " and 2 more")])
 def test_discarded_output_is_reported_once(tmp_path, count, more):
     loops = "".join(f'<inductionLoop id="{number}" file="o{number}.xml"/>' for number in range(count))
@@ -450,91 +427,7 @@ def test_values_are_filled_into_files(town, tmp_path):
     assert "--scale=2.0" in words
 
 
-def refused(text, *, reads=True):
-    with pytest.raises(_SideEffectError) as caught:
-        _check_text("f", text.encode(), reads=reads)
-    return str(caught.value)
-
-
-def test_untrusted_file_of_sumo_may_only_simulate():
-    fine = '<additional><param key="origId" value="a/b:c"/><param key="other" value="7"/></additional>'
-    _check_text("f", fine.encode(), reads=False)
-    include = '<routes><include href="{}"/></routes>'
-    _check_text("f", include.format("b.xml").encode(), reads=True)
-    reads = "f has <include href='{}'>, and SUMO would read that file"
-    assert refused(include.format("b.xml"), reads=False) == reads.format("b.xml")
-    assert refused(include.format("/b.xml")) == reads.format("/b.xml")
-    assert refused(include.format("${b}.xml")) == reads.format("${b}.xml")
-    assert refused("<odd/>") == "f has the element <odd>, which has an unknown effect in SUMO"
-    assert refused('<routes odd="1"/>') == "f has <routes odd=…>, which has an unknown effect in SUMO"
-    _check_text("f", b'<additional><inductionLoop id="d" file="o.xml"/></additional>', reads=False)
-    for value in ("a/b", "a\\b", "a:b"):
-        assert refused(f'<routes><param key="x" value="{value}"/></routes>') == (
-            f"f has the parameter x = {value!r}, which might name a file that SUMO reads or writes"
-        )
-    assert refused("<!DOCTYPE a><routes/>") == "f has a document type, which may change its content"
-    assert refused("<routes>").startswith("f cannot be checked: ")
-
-
-@pytest.mark.parametrize(
-    ("option", "harmless"),
-    [("remote-port", False), ("tripinfo-output", False), ("gui-settings-file", False), ("lateral-resolution", True)],
-)
-def test_untrusted_option_of_sumo_may_only_change_the_traffic(town, option, harmless):
-    found = town.with_table(replace(town.table(SumoSetup), options={option: "1"}))
-    assert SUMO.side_effect(found, {}, []) == ("" if harmless else f"it sets SUMO's option {option!r}")
-    asked = replace(town, arguments={"count": ArgumentSetup(default=3, option=option)})
-    assert bool(SUMO.side_effect(asked, {"count": 3}, [])) is not harmless
-
-
-def test_descriptor_of_a_plugin_is_a_backend(monkeypatch):
-    plugin, other = Backend(title="mine"), "no descriptor"
-    monkeypatch.setattr(_scenario, "_plugin_backends", lambda: {"mine": SimpleNamespace(value="m:B")})
-    monkeypatch.setattr(
-        _scenario, "load_attribute", lambda value, *, shown, installed: (plugin, other)[shown != "mine"]
-    )
-    find = getattr(backend_of, "__wrapped__", backend_of)
-    assert find("mine") is plugin
-    assert find("nobody") is None
-
-
 def test_options_of_every_device_are_harmless_and_those_of_windows_are_not():
     assert {"device.rerouting.probability", "device.ssm.explicit", "person-device.rerouting.deterministic"} <= HARMLESS
     assert not any(option.startswith(("game.", "gui-testing")) for option in HARMLESS)
     assert not any(option.endswith((".file", "-output")) for option in HARMLESS)
-
-
-@pytest.mark.parametrize(
-    ("flow", "interval_s"),
-    [
-        ('vehsPerHour="1800"', 2.0), ('perHour="900"', 4.0), ('probability="0.25"', 4.0), ('period="3"', 3.0),
-        ('period="exp(0.5)"', 2.0), ('begin="0" end="90" number="30"', 3.0),
-    ],
-)  # fmt: skip
-def test_interval_of_a_flow_follows_its_attributes(flow, interval_s):
-    assert _ego._interval(ET.fromstring(f"<flow {flow}/>"), 0.0) == pytest.approx(interval_s)
-
-
-def test_gridlock_leaves_the_vehicles_before_it():
-    departures = [SimpleNamespace(depart_s=float(time)) for time in range(0, 1000, 10)]
-    before = _ego._entering_before_gridlock
-    assert before(None, departures) == departures
-    early = [one for one in departures if one.depart_s < 900 - _ego.GRIDLOCK_BUILDS_UP_S]
-    assert before(900.0, departures) == early
-    few = _ego.GRIDLOCK_BUILDS_UP_S + 10 * (_ego.FEW_CANDIDATES - 1)
-    assert len(before(few + 0.5, departures)) == _ego.FEW_CANDIDATES
-    assert len(before(few, departures)) == few / 10  # too few depart before it builds up
-    assert [one.depart_s for one in before(25.0, departures)] == [0.0, 10.0, 20.0]
-    assert before(0.0, departures) == departures
-
-
-def test_traffic_without_a_car_names_what_enters(town):
-    def says(*classes):
-        entries = [("v", 1.0, one, False) for one in classes]
-        runs = [{"begin_s": 10.0, "end_s": end, "entries": entries} for end in (70.0, 40.0)]
-        return refusal(_ego._refuse_undrivable, town, runs)[0]
-
-    assert says("rail", "tram") == "only rail vehicles enter in 60 s of simulation (vehicle classes: rail, tram)"
-    assert says("ship", "rail").startswith("no vehicle that an agent can drive enters in 60 s")
-    assert says("passenger").startswith("only parked vehicles enter in 60 s")
-    assert _ego._refuse_undrivable(town, [{"begin_s": 0.0, "end_s": 9.0, "entries": []}]) is None

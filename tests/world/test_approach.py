@@ -155,20 +155,6 @@ def test_who_is_on_a_bridge_above_is_no_danger():
     assert nearest(scene(*crossing, heights=(5.0, 0.0), tall={"ego": 5.2}))[0] == [math.inf]
 
 
-def test_on_a_ramp_who_is_ahead_is_on_the_same_road():
-    ahead = ("ego", 0, 0, 0, 20), ("other", 45, 0, 0, 10)
-    ramp = scene(*ahead, heights=(0.0, 4.5), grades=(0.1, 0.1))
-    assert nearest(ramp) == nearest(scene(*ahead))
-    assert nearest(scene(*ahead, heights=(0.0, 4.5), grades=(0.1, 0.0)))[0] == pytest.approx([4.0])
-    assert nearest(scene(*ahead, heights=(0.0, 4.5), grades=(0.0, 0.1)))[0] == pytest.approx([4.0])
-    assert nearest(scene(*ahead, heights=(0.0, 4.5)))[0] == [math.inf]
-    assert nearest(scene(*ahead, heights=(0.0, 4.5), grades=(-0.1, -0.1)))[0] == [math.inf]
-    # The same ramp, driven along y by both, and by the other one backwards.
-    turned = ("ego", 0, 0, math.pi / 2, 20), ("other", 0, 40, -math.pi / 2, 10)
-    assert nearest(scene(*turned, heights=(0.0, 4.0), grades=(0.1, -0.1)))[0] == pytest.approx([4 / 3])
-    assert nearest(scene(*turned, heights=(0.0, 4.0), grades=(-0.1, 0.1)))[0] == [math.inf]
-
-
 def test_a_bent_vehicle_is_where_its_parts_are():
     def bus(*spine, heights=(), **more):
         views = ("ego", 0, 0, 0, 10), ("bus", 30, 0, 0, 5)

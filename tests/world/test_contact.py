@@ -37,28 +37,6 @@ def touched(turned, before, after, **more):
 
 
 @pytest.mark.parametrize("turned", TURNS)
-def test_a_rear_end_collision_within_a_step(turned):
-    found = touched(turned, [(0, 0, 0, 20), (12, 0, 0, 4)], [(18, 0, 0, 16), (15, 0, 0, 2)])
-    share = 7 / (18 - 3)
-    assert found.share == pytest.approx(share, abs=1e-6)
-    assert found.time_s == pytest.approx(10 + share, abs=1e-6)
-    assert (found.speed, found.other_speed) == pytest.approx((20 - 4 * share, 4 - 2 * share), abs=1e-5)
-    assert (found.x, found.y) == pytest.approx((18 * share * math.cos(turned), 18 * share * math.sin(turned)), abs=1e-4)
-    assert found.drives_into
-    behind = touched(turned, [(12, 0, 0, 4), (0, 0, 0, 20)], [(15, 0, 0, 2), (18, 0, 0, 16)])
-    assert not behind.drives_into
-    assert behind.share == pytest.approx(share, abs=1e-6)
-
-
-@pytest.mark.parametrize("seconds", [0.1, 0.5, 2.0])
-def test_a_step_may_be_of_any_length(seconds):
-    before = [(0, 0, 0, 15 / seconds), (12, 0, 0, 0)]
-    found = touched(0.0, before, [(15, 0, 0, 15 / seconds), (12, 0, 0, 0)], seconds=seconds)
-    assert found.share == pytest.approx(7 / 15, abs=1e-6)
-    assert found.time_s == pytest.approx(10 + seconds * 7 / 15, abs=1e-6)
-
-
-@pytest.mark.parametrize("turned", TURNS)
 def test_who_passes_next_to_or_stays_behind_touches_no_one(turned):
     assert touched(turned, [(0, 0, 0, 20), (12, 2.01, 0, 4)], [(18, 0, 0, 16), (15, 2.01, 0, 2)]) is None
     assert touched(turned, [(0, 0, 0, 20), (12, 2.0, 0, 4)], [(18, 0, 0, 16), (15, 2.0, 0, 2)]) is None
@@ -69,20 +47,6 @@ def test_who_passes_next_to_or_stays_behind_touches_no_one(turned):
     assert touched(turned, [(0, 0, 0, 7), (12, 0, 0, 0)], [(7.0001, 0, 0, 7), (12, 0, 0, 0)]).share == pytest.approx(
         1, abs=1e-3
     )
-
-
-@pytest.mark.parametrize("turned", TURNS)
-def test_the_one_that_crosses_is_driven_into_from_the_front(turned):
-    right = math.pi / 2
-    before, after = [(0, 0, 0, 10), (8, -8, right, 10)], [(10, 0, 0, 10), (8, 2, right, 10)]
-    found = touched(turned, before, after)
-    # The other one reaches the lane of the ego, 1 m to its right, at 7 m; the ego reaches its side, 1 m before, at 7 m.
-    assert found.share == pytest.approx(0.7, abs=1e-3)
-    late = touched(turned, before, [(7.5, 0, 0, 7.5), (8, 3, right, 11)])  # its front meets the side of the other
-    assert late.drives_into
-    early = touched(turned, [(0, 0, 0, 10), (4, -6, right, 6)], [(7, 0, 0, 7), (4, 0, right, 6)])
-    assert early.share == pytest.approx(5 / 6, abs=1e-3)
-    assert not early.drives_into
 
 
 @pytest.mark.parametrize("turned", TURNS)

@@ -105,25 +105,6 @@ def test_who_drives_through_another_between_two_steps_is_seen():
     assert (hit.time_s, hit.x, hit.collider_speed, hit.victim_speed) == pytest.approx((7 / 18, 140 / 18, 20, 2))
 
 
-def test_speeds_are_those_of_the_first_contact():
-    before = scene(0.0, ("ego", 0, 0, 0, 20), ("other", 12.2, 0, 0, 6))
-    after = scene(1.0, ("ego", 16, 0, 0, 12), ("other", 15.2, 0, 0, 0))
-    hit = found(before, after)
-    assert (hit.time_s, hit.collider_speed, hit.victim_speed) == pytest.approx(
-        (7.2 / 13, 20 - 8 * 7.2 / 13, 6 - 6 * 7.2 / 13)
-    )
-
-
-def test_speeds_agree_with_the_distance_of_the_step():
-    """SUMO drives a whole step at its new speed: the vehicle behind is the faster one, though it was the slower one."""
-    before = scene(0.0, ("ego", 0, 0, 0, 5), ("other", 5.5, 0, 0, 12))
-    after = scene(1.0, ("ego", 8, 0, 0, 8), ("other", 12.5, 0, 0, 7))
-    hit = found(before, after)
-    assert (hit.time_s, hit.collider_speed, hit.victim_speed) == pytest.approx((0.5, 8, 7))
-    halfway = scene(1.0, ("ego", 7.25, 0, 0, 8), ("other", 12.0, 0, 0, 7))  # half of the way between both ways
-    assert found(before, halfway).collider_speed == pytest.approx((8 + 5 + 3 * hit_share(before, halfway)) / 2)
-
-
 def hit_share(before, after):
     return found(before, after).time_s
 
@@ -138,40 +119,11 @@ def test_who_ends_up_ahead_of_the_vehicle_that_it_rear_ended_was_not_hit_by_it(c
     assert found(before, after, agent="other").role == "victim"
 
 
-def test_a_lane_change_at_once_touches_no_one_on_the_way():
-    # In SUMO a vehicle moves in its old lane first. Driving slantwise it would have met the other one.
-    before = scene(0.0, ("ego", 0, 0, 0, 20), ("other", 1, 3.2, 0, 25))
-    after = scene(1.0, ("ego", 20, 3.2, 0, 20), ("other", 26, 3.2, 0, 25))
-    assert found(before, after) is None
-    into = scene(1.0, ("ego", 20, 3.2, 0, 20), ("other", 24, 3.2, 0, 23))
-    hit = found(before, into)
-    assert (hit.role, hit.time_s) == ("collider", 1.0)
-    through = scene(0.0, ("ego", 0, 0, 0, 20), ("other", 12, 0, 0, 0))
-    assert found(through, scene(1.0, ("ego", 20, 3.2, 0, 20), ("other", 12, 0, 0, 0))).time_s == pytest.approx(7 / 20)
-
-
-def test_who_is_put_elsewhere_did_not_drive_there():
-    before = scene(0.0, ("ego", 0, 0, 0, 10), ("other", 30, 0, 0, 0))
-    after = scene(1.0, ("ego", 60, 0, 0, 10), ("other", 30, 0, 0, 0))
-    assert found(before, after) is None
-    assert found(scene(0.0, ("ego", 0, 0, 0, 10)), after) is None  # not there before
-
-
 def test_scenes_that_are_no_way_are_not_swept():
     before = scene(0.0, ("ego", 0, 0, 0, 20), ("other", 12, 0, 0, 2))
     after = scene(1.0, ("ego", 20, 0, 0, 20), ("other", 14, 0, 0, 2))
     after.swept = False
     assert found(before, after) is None
-
-
-def test_a_bend_is_driven_along_not_across():
-    # A quarter of a circle, on whose chord, but not on whose arc, somebody stands.
-    radius, size = 20.0, (4.0, 1.8)
-    start, end = bend("ego", 0, 0, 0, radius * math.pi / 2, math.pi / 2, size, 1.0)
-    standing = ("other", 9.2 + 1.5, 10.8, math.pi / 4, 0, 3.0, 1.8)
-    assert found(scene(0.0, start, standing), scene(1.0, end, standing)) is None
-    there = ("other", 14.14 + 1.06, 5.86 + 1.06, math.pi / 4, 0, 3.0, 1.8)
-    assert found(scene(0.0, start, there), scene(1.0, end, there)).role == "collider"
 
 
 def test_a_person_who_steps_aside_is_not_swept_along_a_bend():
@@ -186,15 +138,3 @@ def test_a_person_who_steps_aside_is_not_swept_along_a_bend():
 def heights(view, *values, grades=None):
     view.heights, view.grades = values, grades or (0.0,) * len(values)
     return view
-
-
-def test_who_is_on_another_level_is_not_touched():
-    actors = ("ego", 0, 0, 0, 10), ("other", -2, 1, math.pi / 2, 10)
-    assert found(scene(0.0, *actors)) is not None
-    assert found(heights(scene(0.0, *actors), 0.0, 8.0)) is None
-    assert found(heights(scene(0.0, *actors), 0.0, 2.0)) is not None  # an uneven junction
-    lower = heights(scene(0.0, *actors), 0.0, 4.0)
-    assert found(lower) is None
-    tall = heights(scene(0.0, *actors), 0.0, 4.0)
-    tall.roster = Roster(tuple(Actor(a.id, a.kind, a.length, a.width, 4.2) for a in tall.roster.actors))
-    assert found(tall) is not None  # a lorry that does not fit under the bridge

@@ -46,14 +46,6 @@ def test_in_a_queue_it_is_the_time_gap():
     assert level(straight(0, 0, 0, 10), straight(25, 0, 0, 10))[0].max() == pytest.approx(math.exp(-2 / 1.2), abs=0.02)
 
 
-def test_who_follows_is_in_danger_and_not_who_is_followed():
-    ways = straight(0, 0, 0, 10), straight(15, 0, 0, 10)
-    assert level(*ways, agents=("other",))[0].max() == 0.0
-    steps, most = level(*ways, agents=("other", "ego"))
-    assert most.agent == "ego"
-    assert steps.max() == pytest.approx(math.exp(-1 / 1.2), abs=0.02)
-
-
 def test_who_closes_in_from_behind_is_a_danger_of_its_own():
     """10 m between them, at 10 m/s: as many s as the one behind is behind."""
     frames = [frame(straight(15, 0, 0, 10), straight(0, 0, 0, 10), straight(40, 0, 0, 10))]
@@ -93,17 +85,6 @@ def test_oncoming_traffic_in_a_bend_is_no_danger():
     assert steps.max() == 0.0
     meets, _ = level(round_a_bend(50, 12), round_a_bend(51, 12, start=3.6, way=-1))  # in the same lane, soon
     assert meets.max() > 0.4
-
-
-@pytest.mark.parametrize("late_s", [0.6, 1.4])
-@pytest.mark.parametrize("first", [True, False])
-def test_where_ways_cross_it_is_the_time_between_the_two(late_s, first):
-    """Both pass the same place at 10 m/s; a car takes (5 + 2) m / (10 m/s) to leave the way of the other."""
-    ego = straight(-50, 0, 0, 10)
-    other = straight(0, -50 - (1 if first else -1) * 10 * (late_s + 0.7), math.pi / 2, 10)
-    steps, _ = level(ego, other)
-    # Samples are 0.3 s apart, and the place that both share is met at its edge.
-    assert late_s - 0.3 < -1.2 * math.log(steps.max()) < late_s + 0.65
 
 
 def test_an_agent_that_has_to_brake_hard_is_in_danger_though_it_never_gets_there():
@@ -166,17 +147,6 @@ def test_that_of_a_trial_grows_with_time_and_is_that_of_the_agent_in_the_greates
     assert danger(300, ("other",)) < danger(300)
 
 
-def test_it_does_not_matter_how_scenes_come_in():
-    generator = np.random.default_rng(3)
-    ways = [straight(0, 0, 0, 8, 900), straight(20, 0, 0, 8, 900) + generator.normal(0, 0.05, (900, 3))]
-    whole = frame(*ways)
-    at_once, in_parts = DangerMeter(("ego",), 0.1), DangerMeter(("ego",), 0.1)
-    at_once.add([whole])
-    for first in range(0, 900, 7):
-        in_parts.add([whole._replace(columns=whole.columns[first : first + 7])])
-    assert in_parts.danger == at_once.danger
-
-
 def test_a_long_episode_is_measured_in_parts_that_add_up(monkeypatch):
     from crashhunt.world import _danger
 
@@ -198,14 +168,6 @@ def test_long_steps_are_filled_in():
     crossing = straight(34, -84, math.pi / 2, 20, 12, 1.0)  # on the ego's way at 4.2 s, which is there at 3.4 s
     steps, _ = level(ego, crossing, step_s=1.0)
     assert steps.max() > math.exp(-1.2 / 1.2)
-
-
-def test_a_bridge_is_no_crossing():
-    under = frame(straight(-50, 0, 0, 10), straight(0, -58, math.pi / 2, 10))
-    assert dangers([under], ("ego",), 0.1)[1].danger > 0.3
-    heights = np.zeros((100, 4))
-    heights[:, 1] = 6.0
-    assert dangers([under._replace(heights=heights)], ("ego",), 0.1)[1].danger == 0.0
 
 
 def test_heights_count_from_the_front_and_the_lower_one_is_who_has_to_fit():
@@ -256,17 +218,6 @@ def test_towards_an_actor_who_stands_it_is_the_braking_that_it_takes(seed):
         checked += expected > 1
     assert checked
     assert most.other == "other"
-
-
-def test_who_would_have_passed_before_the_other_one_came_need_not_have_braked():
-    """It stops, and 2 s later somebody crosses where it would have been gone."""
-    way = straight(0, 0, 0, 10)
-    way[:, 0] = np.minimum(way[:, 0], 9.0)  # as of a sample
-    for late_s, needed in ((2.5, False), (0.6, True)):
-        crossing = straight(16, -10 * (1 + late_s), math.pi / 2, 10)
-        steps, _ = level(way, crossing)
-        assert (steps.max() > 0.05) == needed, late_s
-        assert needed or steps.max() < 0.02
 
 
 def test_who_is_meant_is_the_nearest_of_several():
