@@ -32,7 +32,7 @@ from crashhunt.crashes import (
 )
 from crashhunt.replays import ReplayOptions, prepare, reruns_of
 from crashhunt.trial import Outcome
-from crashhunt.trial_reruns import NotUnderstoodError, StoppedError
+from crashhunt.trial_reruns import EndedRun, NotUnderstoodError, Reruns, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialResult
-    from crashhunt.trial_reruns import EndedRun, Reruns
 
 
 # The search for the last step from which a manoeuvre avoids a collision: which runs it asks for, and in what order.

@@ -20,7 +20,7 @@ from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why, change
 from crashhunt.plans import read_settings
 from crashhunt.recording import has_same_scenes, read_lanes
 from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled
-from crashhunt.trial_reruns import StoppedError
+from crashhunt.trial_reruns import EndedRun, Reruns, StoppedError
 from crashhunt.world import first_contact
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
     from crashhunt.trial import Distribution, TrialResult, TrialSpec, Value
-    from crashhunt.trial_reruns import EndedRun, Reruns
     from crashhunt.world import Scene
 
 

@@ -10,14 +10,12 @@ on earlier results, and not on the number of workers.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from crashhunt.trial import TrialSpec, Value
 
 T = TypeVar("T")

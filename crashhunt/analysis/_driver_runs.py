@@ -32,7 +32,7 @@ from crashhunt.crashes import (
 )
 from crashhunt.replays import ReplayOptions, prepare, reruns_of
 from crashhunt.trial import Outcome, Overruled
-from crashhunt.trial_reruns import StoppedError
+from crashhunt.trial_reruns import EndedRun, StoppedError
 from crashhunt.world import is_person
 
 if TYPE_CHECKING:
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialResult, TrialSpec
-    from crashhunt.trial_reruns import EndedRun
 
 PREVENTABILITY_RUNS = len(COMPETENT_DRIVERS)
 """The number of runs that the models need at most."""

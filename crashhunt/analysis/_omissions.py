@@ -33,7 +33,7 @@ from crashhunt.recording import has_same_scenes
 from crashhunt.replays import is_current_code, reruns_of
 from crashhunt.scenario import with_recorded_load_order
 from crashhunt.trial import Outcome, Overruled
-from crashhunt.trial_reruns import StoppedError
+from crashhunt.trial_reruns import EndedRun, Reruns, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Without
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialResult, TrialSpec
-    from crashhunt.trial_reruns import EndedRun, Reruns
 
 _BEFORE_S = 10.0  # a period that ended longer before the crash has not led to it
 _EARLIER_S = (0.0, 0.5, 1.0)  # the reference driver takes over from these times before the period

@@ -12,7 +12,7 @@ from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError
 from crashhunt.base.integrity import digest_of_data
 from crashhunt.crashes import signature_of, write_bundle
 from crashhunt.replays import reruns_of
-from crashhunt.trial_reruns import Budget, StoppedError
+from crashhunt.trial_reruns import Budget, EndedRun, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Signature
     from crashhunt.replays import Rerun
     from crashhunt.trial import TrialSpec
-    from crashhunt.trial_reruns import EndedRun
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.analysis._interventions import LeaveOut, Reseed, SetArguments
+from crashhunt.analysis._interventions import Intervention, LeaveOut, Reseed, SetArguments
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import UsageError, WorkerError
 from crashhunt.base.text import format_percent
@@ -34,17 +34,15 @@ from crashhunt.crashes import wilson
 from crashhunt.recording import first_divergence
 from crashhunt.replays import ReplayOptions, is_current_code, prepare, reruns_of, up_to
 from crashhunt.trial import ALL_AGENTS, Outcome, Reseeding
-from crashhunt.trial_reruns import Budget, NotUnderstoodError, StoppedError
+from crashhunt.trial_reruns import Budget, EndedRun, NotUnderstoodError, Reruns, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from crashhunt.analysis._interventions import Intervention
     from crashhunt.base.progress import Watch
     from crashhunt.crashes import Bundle
     from crashhunt.replays import Code, Rerun
     from crashhunt.trial import TrialSpec
-    from crashhunt.trial_reruns import EndedRun, Reruns
 
 
 FUTURES = 50

@@ -12,9 +12,7 @@ from crashhunt.cli._common import add_build, add_crash, add_json, answer, build_
 from crashhunt.cli._trust import add_trust, check_trust, run_trusted
 
 if TYPE_CHECKING:
-    import argparse
-
-    from crashhunt.cli._common import Commands
+    from crashhunt.cli._common import Commands, Options
     from crashhunt.corpus import Got
 
 
@@ -43,7 +41,7 @@ def add_bisect(commands: Commands) -> None:
     bisect.set_defaults(command=_bisect)
 
 
-def _bisect(options: argparse.Namespace, _words: list[str]) -> int:
+def _bisect(options: Options, _words: list[str]) -> int:
     from crashhunt.corpus import bisect
 
     def show(revision: str, got: Got, why: str) -> None:

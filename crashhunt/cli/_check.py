@@ -8,12 +8,9 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line, count_of
-from crashhunt.cli._common import add_json, say
+from crashhunt.cli._common import Commands, Options, add_json, say
 
 if TYPE_CHECKING:
-    import argparse
-
-    from crashhunt.cli._common import Commands
     from crashhunt.hunts import Checked
 
 
@@ -39,7 +36,7 @@ def add_check(commands: Commands) -> None:
     check.set_defaults(command=_check)
 
 
-def _check(options: argparse.Namespace, _words: list[str]) -> int:
+def _check(options: Options, _words: list[str]) -> int:
     from crashhunt.hunts import check, salvage
 
     found = check(options.directory)

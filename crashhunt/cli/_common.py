@@ -47,6 +47,9 @@ OUTPUT_CLOSED: Final = 141
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 """What a command is added to; argparse has no other name for it."""
 
+Options: TypeAlias = argparse.Namespace
+"""The values of a command's arguments."""
+
 
 class Parser(argparse.ArgumentParser):
     """A parser that reports errors in one line, with the most similar name."""

@@ -5,17 +5,11 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import add_json, say
+from crashhunt.cli._common import Commands, Options, add_json, say
 from crashhunt.plans import RATE_PERS
-
-if TYPE_CHECKING:
-    import argparse
-
-    from crashhunt.cli._common import Commands
 
 
 def add_compare(commands: Commands) -> None:
@@ -40,7 +34,7 @@ def add_compare(commands: Commands) -> None:
     compare.set_defaults(command=_compare)
 
 
-def _compare(options: argparse.Namespace, _words: list[str]) -> int:
+def _compare(options: Options, _words: list[str]) -> int:
     from crashhunt.report import comparison_page, describe_comparison
     from crashhunt.results import find_searches
     from crashhunt.statistics import compare

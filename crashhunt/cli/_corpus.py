@@ -25,9 +25,7 @@ from crashhunt.cli._common import (
 from crashhunt.cli._trust import add_trust, check_trust, run_trusted
 
 if TYPE_CHECKING:
-    import argparse
-
-    from crashhunt.cli._common import Commands
+    from crashhunt.cli._common import Commands, Options, Parser
     from crashhunt.corpus import CaseReport
 
 
@@ -93,11 +91,11 @@ def _add_run(commands: Commands) -> None:
     run.set_defaults(command=_run)
 
 
-def _add_places(parser: argparse.ArgumentParser) -> None:
+def _add_places(parser: Parser) -> None:
     parser.add_argument("places", metavar="CORPUS", type=Path, nargs="+", help="the folder of a corpus, or of a case")
 
 
-def _add(options: argparse.Namespace, _words: list[str]) -> int:
+def _add(options: Options, _words: list[str]) -> int:
     from crashhunt.corpus import add_case
     from crashhunt.crashes import list_bundles
 
@@ -145,7 +143,7 @@ def _note(note: str) -> str:
     return f", note {note!r}" if note else ""
 
 
-def _run(options: argparse.Namespace, _words: list[str]) -> int:
+def _run(options: Options, _words: list[str]) -> int:
     from crashhunt.base.signals import stop_requests
     from crashhunt.corpus import find_cases, run_cases
     from crashhunt.report import corpus_annotations, corpus_summary
@@ -168,7 +166,7 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
     return 0 if all(report.ok for report in reports) else 1
 
 
-def _trust_cases(cases: list[Path], options: argparse.Namespace) -> None:
+def _trust_cases(cases: list[Path], options: Options) -> None:
     """Check that every case is trusted before the first case runs; ask at the terminal once for each origin."""
     from crashhunt.corpus import untrusted_case
 
@@ -209,7 +207,7 @@ def _summary_of(reports: list[CaseReport], count: int) -> str:
     return "\n".join(lines)
 
 
-def _list(options: argparse.Namespace, _words: list[str]) -> int:
+def _list(options: Options, _words: list[str]) -> int:
     from crashhunt.corpus import find_cases, read_case
 
     cases = [read_case(path) for path in find_cases(options.places)]

@@ -24,11 +24,10 @@ from crashhunt.cli._common import (
 from crashhunt.cli._trust import add_trust, check_trust
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Sequence
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.cli._common import Commands
+    from crashhunt.cli._common import Commands, Options, Parser
     from crashhunt.corpus import Case, KnownType
     from crashhunt.crashes import CauseGroup, Group, Groups, Signature
 
@@ -60,7 +59,7 @@ def add_crashes(commands: Commands) -> None:
     crashes.set_defaults(command=_crashes)
 
 
-def add_known(parser: argparse.ArgumentParser) -> None:
+def add_known(parser: Parser) -> None:
     """Add the options that compare crash types with a corpus."""
     parser.add_argument(
         "--known", metavar="CORPUS", type=Path,
@@ -73,7 +72,7 @@ def add_known(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
+def _crashes(options: Options, _words: list[str]) -> int:
     from crashhunt.crashes import count_causes, group_crashes, join_causes, list_bundles, read_notes
     from crashhunt.report import describe_causes, describe_groups, describe_note, describe_types_by_version
     from crashhunt.results import crashes_by_version, dropped_crashes, find_hunts
@@ -206,7 +205,7 @@ def compare_with_corpus(directory: Path, cases: list[Case], *, as_json: bool) ->
     return {"groups": comparison.to_json(), "not_compared": list(found.left_out)}, comparison.has_news
 
 
-def _divide_types(options: argparse.Namespace, groups: Sequence[Group]) -> tuple[list[tuple[CauseGroup, ...]], bool]:
+def _divide_types(options: Options, groups: Sequence[Group]) -> tuple[list[tuple[CauseGroup, ...]], bool]:
     """Return the crashes of each type, divided by cause, and whether the user has interrupted the division."""
     from crashhunt.analysis import divide_by_cause
     from crashhunt.base.signals import stop_requests
@@ -228,7 +227,7 @@ def _divide_types(options: argparse.Namespace, groups: Sequence[Group]) -> tuple
         return divided, bool(stops)
 
 
-def checked_cases(options: argparse.Namespace) -> list[Case] | None:
+def checked_cases(options: Options) -> list[Case] | None:
     """Return the cases of the corpus of ``--known``; None without this option.
 
     Raises:
@@ -254,7 +253,7 @@ def checked_cases(options: argparse.Namespace) -> list[Case] | None:
     return [read_case(path) for path in find_cases([corpus])]
 
 
-def _print_groups(options: argparse.Namespace, groups: Sequence[Group], known: dict[Signature, str] | None) -> None:
+def _print_groups(options: Options, groups: Sequence[Group], known: dict[Signature, str] | None) -> None:
     from crashhunt.report import crash_annotations, crashes_summary, findings_of, write_sarif
 
     if options.sarif is None and options.summary is None and not options.annotate:

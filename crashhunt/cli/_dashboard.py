@@ -8,12 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.cli._common import DONE, add_json, integer, say
+from crashhunt.cli._common import DONE, Commands, Options, add_json, integer, say
 
 if TYPE_CHECKING:
-    import argparse
-
-    from crashhunt.cli._common import Commands
     from crashhunt.dashboard import Address
 
 
@@ -53,7 +50,7 @@ def add_dashboard(commands: Commands) -> None:
     dashboard.set_defaults(command=_dashboard)
 
 
-def _dashboard(options: argparse.Namespace, _words: list[str]) -> int:
+def _dashboard(options: Options, _words: list[str]) -> int:
     from crashhunt.dashboard import serve
 
     def announce(address: Address) -> None:

@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import add_crash, add_json, answer, opened_crash, shown_progress
+from crashhunt.cli._common import Commands, Options, add_crash, add_json, answer, opened_crash, shown_progress
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Callable
 
-    from crashhunt.cli._common import Commands
 
 _FORMATS = {"commonroad": ".xml", "openscenario": ".xosc"}
 _WRITTEN_BY = {
@@ -56,7 +54,7 @@ def add_export(commands: Commands) -> None:
     export.set_defaults(command=_export)
 
 
-def _export(options: argparse.Namespace, _words: list[str]) -> int:
+def _export(options: Options, _words: list[str]) -> int:
     if options.form:
         return _convert(options)
     if options.recorded_agent:
@@ -78,7 +76,7 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
     return 0
 
 
-def _convert(options: argparse.Namespace) -> int:
+def _convert(options: Options) -> int:
     from crashhunt.formats import write_commonroad, write_openscenario
 
     suffix = _FORMATS[options.form]

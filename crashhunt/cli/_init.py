@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import DONE, add_json, answer
+from crashhunt.cli._common import DONE, Commands, Options, add_json, answer
 
 if TYPE_CHECKING:
-    import argparse
-
     from crashhunt.base.json_types import Plain
-    from crashhunt.cli._common import Commands
     from crashhunt.sumo.maps import MapSource, PlainTrial
 
 
@@ -69,7 +66,7 @@ def add_init(commands: Commands) -> None:
     init.set_defaults(command=_init)
 
 
-def _init(options: argparse.Namespace, _words: list[str]) -> int:
+def _init(options: Options, _words: list[str]) -> int:
     if options.xosc is not None:
         return _init_from_parameters(options)
     from crashhunt.sumo.maps import MapOptions, describe_place, make_scenario, parse_bbox
@@ -104,7 +101,7 @@ def _init(options: argparse.Namespace, _words: list[str]) -> int:
     return DONE
 
 
-def _init_from_parameters(options: argparse.Namespace) -> int:
+def _init_from_parameters(options: Options) -> int:
     """Make a scenario from an OpenSCENARIO file."""
     from crashhunt.formats import scenario_from_openscenario
 
@@ -127,7 +124,7 @@ def _init_from_parameters(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _source(options: argparse.Namespace) -> MapSource:
+def _source(options: Options) -> MapSource:
     from crashhunt.sumo.maps import MapSource, parse_shape
 
     if options.grid:

@@ -5,16 +5,10 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_line, visible
-from crashhunt.cli._common import GivenOnce, chosen_runs, integer, refuse_below
-
-if TYPE_CHECKING:
-    import argparse
-
-    from crashhunt.cli._common import Commands
+from crashhunt.cli._common import Commands, GivenOnce, Options, chosen_runs, integer, refuse_below
 
 
 def add_logs(commands: Commands) -> None:
@@ -45,7 +39,7 @@ def add_logs(commands: Commands) -> None:
     logs.set_defaults(command=_logs)
 
 
-def _logs(options: argparse.Namespace, _words: list[str]) -> int:
+def _logs(options: Options, _words: list[str]) -> int:
     from crashhunt.results import LogKind, LogReader, hunt_state
 
     if options.errors_only and options.type not in (None, "error"):

@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.text import count_of, listed
-from crashhunt.cli._common import DONE, CrashId, add_json, integer, opened_hunt, say
+from crashhunt.cli._common import DONE, Commands, CrashId, Options, add_json, integer, opened_hunt, say
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Sequence
 
-    from crashhunt.cli._common import Commands
     from crashhunt.crashes import Note
 
 _MAX_KNOWN, _MAX_TEXT = 8, 40  # tags and texts, and characters of a text, in the answer to --find
@@ -56,7 +54,7 @@ def add_note_command(commands: Commands) -> None:
     note.set_defaults(command=_note)
 
 
-def _note(options: argparse.Namespace, _words: list[str]) -> int:
+def _note(options: Options, _words: list[str]) -> int:
     from crashhunt.report import describe_note
 
     tags = [tag for given in options.tags for tag in given.split(",")]
@@ -97,13 +95,13 @@ def _nothing_found(words: str, known: Sequence[Note]) -> str:
     return f"no note of {count_of(len(known), 'note')} contains {words!r} ({'; '.join(what)})"
 
 
-def _added(options: argparse.Namespace, hunt: Path, crash: str, tags: list[str]) -> Note:
+def _added(options: Options, hunt: Path, crash: str, tags: list[str]) -> Note:
     from crashhunt.crashes import add_note
 
     return add_note(hunt, crash, " ".join(options.text), tags)
 
 
-def _removed(options: argparse.Namespace, hunt: Path, crash: str) -> list[Note]:
+def _removed(options: Options, hunt: Path, crash: str) -> list[Note]:
     """Remove the given notes; refuse all of them if one does not exist or is about another crash."""
     from crashhunt.crashes import read_notes, remove_note
 
@@ -117,7 +115,7 @@ def _removed(options: argparse.Namespace, hunt: Path, crash: str) -> list[Note]:
     return [remove_note(hunt, number) for number in missing or dict.fromkeys(options.remove)]
 
 
-def _subject(options: argparse.Namespace) -> tuple[Path, str]:
+def _subject(options: Options) -> tuple[Path, str]:
     """Return the directory of the hunt to change, and the name of the crash; empty for the whole hunt.
 
     Raises:
@@ -143,7 +141,7 @@ def _subject(options: argparse.Namespace) -> tuple[Path, str]:
     return directory, ""
 
 
-def _listed(options: argparse.Namespace) -> list[tuple[str, tuple[Note, ...]]]:
+def _listed(options: Options) -> list[tuple[str, tuple[Note, ...]]]:
     """Return the notes of each hunt in the directory, or of the crash that the user names."""
     from crashhunt.crashes import find_bundle, read_notes, subject_of
     from crashhunt.results import find_hunts

@@ -31,14 +31,13 @@ from crashhunt.cli._trust import add_trust, run_trusted
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.cli._common import Commands
+    from crashhunt.cli._common import Commands, Options, Parser
     from crashhunt.crashes import Bundle
     from crashhunt.recording import Recording
     from crashhunt.render import FilmOptions, Shot
@@ -49,7 +48,7 @@ if TYPE_CHECKING:
 # The options of ``crashhunt replay`` that make films.
 
 
-def add_film_options(parser: argparse.ArgumentParser) -> None:
+def add_film_options(parser: Parser) -> None:
     """Add the options for films to the parser."""
     film = parser.add_argument_group(
         "to watch it",
@@ -92,7 +91,7 @@ def add_film_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def film_options(options: argparse.Namespace) -> FilmOptions | None:
+def film_options(options: Options) -> FilmOptions | None:
     """Return the options of a film; None if the user wants no film.
 
     Raises:
@@ -163,7 +162,7 @@ def recorded_shot(bundle: Bundle) -> Shot:
     return _shot(bundle, bundle.recording(), bundle.result, {}, crashed=not bundle.is_near_miss)
 
 
-def write_films(options: argparse.Namespace, shots: list[Shot], film: FilmOptions) -> dict[str, int]:
+def write_films(options: Options, shots: list[Shot], film: FilmOptions) -> dict[str, int]:
     """Write the requested films; return the number of pictures of each file.
 
     Raises:
@@ -312,7 +311,7 @@ def add_replay(commands: Commands) -> None:
     replay.set_defaults(command=_replay)
 
 
-def _replay(options: argparse.Namespace, _words: list[str]) -> int:
+def _replay(options: Options, _words: list[str]) -> int:
     from crashhunt.replays import ReplayOptions
 
     chosen = ReplayOptions(
@@ -359,7 +358,7 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
     return 0 if good else 1
 
 
-def _replay_often(options: argparse.Namespace, chosen: ReplayOptions) -> int:
+def _replay_often(options: Options, chosen: ReplayOptions) -> int:
     """Replay one crash several times; after a Ctrl-C, report the replays that finished."""
     from crashhunt.base.signals import stop_requests
     from crashhunt.trial_reruns import StoppedError
@@ -384,7 +383,7 @@ def _replay_often(options: argparse.Namespace, chosen: ReplayOptions) -> int:
     return 0 if set(report.verdicts) == {options.expect} else 1
 
 
-def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions | None) -> None:
+def _refuse_what_would_be_ignored(options: Options, film: FilmOptions | None) -> None:
     """Refuse options that contradict each other, instead of ignoring one of them."""
     look = {
         "--gui": options.gui,
@@ -417,7 +416,7 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
 
 
 def _replay_one(
-    options: argparse.Namespace,
+    options: Options,
     bundle: Bundle,
     chosen: ReplayOptions,
     stopped: Callable[[], bool] = lambda: False,
@@ -441,7 +440,7 @@ def _replay_one(
     return report, answer
 
 
-def _view_of(options: argparse.Namespace, bundle: Bundle) -> Look | None:
+def _view_of(options: Options, bundle: Bundle) -> Look | None:
     """Return the options of a debugged replay; None for a plain replay."""
     from crashhunt.replays import Look
 
@@ -465,7 +464,7 @@ def _view_of(options: argparse.Namespace, bundle: Bundle) -> Look | None:
     return Look(until=until, stop_at=until if options.pdb else 0, to_stderr=options.json) if until else None
 
 
-def _last_step(options: argparse.Namespace, bundle: Bundle) -> int:
+def _last_step(options: Options, bundle: Bundle) -> int:
     """Return the step at which to stop; 0 without ``--until`` or ``--before``."""
     crash, what = bundle.result.steps, "the crash is"
     if bundle.is_near_miss and (options.before is not None or options.pdb):

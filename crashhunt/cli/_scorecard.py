@@ -6,7 +6,6 @@ import json
 import re
 from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.files import whole_file
@@ -14,6 +13,8 @@ from crashhunt.base.text import command_line
 from crashhunt.cli._common import (
     DONE,
     NO_ANSWER,
+    Commands,
+    Options,
     WordsWithCommas,
     add_json,
     add_options,
@@ -24,11 +25,6 @@ from crashhunt.cli._common import (
 )
 from crashhunt.cli._suite import run_with_trust, states_watcher
 from crashhunt.cli._trust import add_trust
-
-if TYPE_CHECKING:
-    import argparse
-
-    from crashhunt.cli._common import Commands
 
 _HUNT_OPTIONS = (
     "action", "observe", "arguments", "seed", "timeout_s", "native", "snapshot_roots", "snapshot_limit_mb",
@@ -65,7 +61,7 @@ def add_scorecard(commands: Commands) -> None:
     scorecard.set_defaults(command=_scorecard)
 
 
-def _scorecard(options: argparse.Namespace, _words: list[str]) -> int:
+def _scorecard(options: Options, _words: list[str]) -> int:
     from crashhunt.report import describe_scorecard, scorecard_page, scorecard_table
     from crashhunt.suites import run_scorecard
 

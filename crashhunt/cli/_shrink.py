@@ -21,11 +21,10 @@ from crashhunt.cli._common import (
 from crashhunt.cli._trust import add_trust, run_trusted
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Sequence
 
     from crashhunt.analysis import Shrunk
-    from crashhunt.cli._common import Commands
+    from crashhunt.cli._common import Commands, Options
     from crashhunt.crashes import Bundle
 
 _DEFAULT_TRIALS = 500
@@ -63,7 +62,7 @@ def add_shrink(commands: Commands) -> None:
     shrink.set_defaults(command=_shrink)
 
 
-def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
+def _shrink(options: Options, _words: list[str]) -> int:
     from crashhunt.analysis import shrink
     from crashhunt.base.signals import stop_requests
 

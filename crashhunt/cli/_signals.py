@@ -3,15 +3,9 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
 
 from crashhunt.base.text import aligned, visible
-from crashhunt.cli._common import add_json, pairs
-
-if TYPE_CHECKING:
-    import argparse
-
-    from crashhunt.cli._common import Commands
+from crashhunt.cli._common import Commands, Options, add_json, pairs
 
 
 def add_signals(commands: Commands) -> None:
@@ -34,7 +28,7 @@ def add_signals(commands: Commands) -> None:
 _ANY_STEPS = 1_000_000  # so that windows of requirements in the scenario fit; only one step runs
 
 
-def _signals(options: argparse.Namespace, _words: list[str]) -> int:
+def _signals(options: Options, _words: list[str]) -> int:
     from crashhunt.hunts import list_signals
     from crashhunt.plans import Request, plan
 

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from crashhunt.cli._common import DONE, add_json, say
-
-if TYPE_CHECKING:
-    import argparse
-
-    from crashhunt.cli._common import Commands
+from crashhunt.cli._common import DONE, Commands, Options, add_json, say
 
 _PARTS = ("training", "test")
 
@@ -40,7 +34,7 @@ def add_split(commands: Commands) -> None:
     split.set_defaults(command=_split)
 
 
-def _split(options: argparse.Namespace, _words: list[str]) -> int:
+def _split(options: Options, _words: list[str]) -> int:
     from crashhunt.training import check_test_share, split_crashes
 
     found = split_crashes(options.places, check_test_share(options.test, "--test"))

@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import count_of, one_line, out_of
-from crashhunt.cli._common import BAD_INPUT, DONE, add_json, make_console
+from crashhunt.cli._common import BAD_INPUT, DONE, Commands, Options, add_json, make_console
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Iterator, Sequence
 
     from rich.console import Console, ConsoleOptions, Group
     from rich.table import Table
 
-    from crashhunt.cli._common import Commands
     from crashhunt.results import BranchSums, HuntState, ProbeSums
 
 _COLUMNS_WITHOUT_TERMINAL = 120
@@ -45,7 +43,7 @@ def add_status(commands: Commands) -> None:
     status.set_defaults(command=_status)
 
 
-def _status(options: argparse.Namespace, _words: list[str]) -> int:
+def _status(options: Options, _words: list[str]) -> int:
     from rich.live import Live
 
     if options.json:

@@ -5,16 +5,10 @@ from __future__ import annotations
 import io
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line, one_of, visible
-from crashhunt.cli._common import WordsWithCommas
-
-if TYPE_CHECKING:
-    import argparse
-
-    from crashhunt.cli._common import Commands
+from crashhunt.cli._common import Commands, Options, WordsWithCommas
 
 
 def add_trials(commands: Commands) -> None:
@@ -43,7 +37,7 @@ def add_trials(commands: Commands) -> None:
     trials.set_defaults(command=_trials)
 
 
-def _trials(options: argparse.Namespace, _words: list[str]) -> int:
+def _trials(options: Options, _words: list[str]) -> int:
     from crashhunt.base.files import whole_file
     from crashhunt.crashes import read_notes
     from crashhunt.report import describe_note

@@ -11,13 +11,11 @@ from typing import TYPE_CHECKING, TypeVar
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.text import command_line, near_path, one_line
-from crashhunt.cli._common import add_json, say
+from crashhunt.cli._common import Commands, Options, Parser, add_json, say
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Callable
 
-    from crashhunt.cli._common import Commands
     from crashhunt.crashes import Archive, Bundle, TrustedOrigin
 
 
@@ -45,7 +43,7 @@ def add_trust_command(commands: Commands) -> None:
     trust.set_defaults(command=_trust)
 
 
-def _trust(options: argparse.Namespace, _words: list[str]) -> int:
+def _trust(options: Options, _words: list[str]) -> int:
     from crashhunt.crashes import list_trusted, remove_trusted
 
     if options.places and options.remove:
@@ -114,7 +112,7 @@ def _line(origin: TrustedOrigin) -> str:
 T = TypeVar("T")
 
 
-def add_trust(parser: argparse.ArgumentParser) -> None:
+def add_trust(parser: Parser) -> None:
     """Add the option ``--trust``, which is the same for every command that runs code of a crash."""
     parser.add_argument(
         "--trust", action="store_true",
@@ -127,7 +125,7 @@ def run_trusted(
     run: Callable[[bool | None], T],
     bundle: Bundle,
     archive: Archive | None,
-    options: argparse.Namespace,
+    options: Options,
     *,
     path: Path | None = None,
 ) -> T:

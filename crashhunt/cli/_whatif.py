@@ -25,10 +25,8 @@ from crashhunt.cli._common import (
 from crashhunt.cli._trust import add_trust, run_trusted
 
 if TYPE_CHECKING:
-    import argparse
-
     from crashhunt.analysis import Counts
-    from crashhunt.cli._common import Commands
+    from crashhunt.cli._common import Commands, Options
 
 
 def add_whatif(commands: Commands) -> None:
@@ -107,7 +105,7 @@ def add_whatif(commands: Commands) -> None:
     whatif.set_defaults(command=_whatif)
 
 
-def _whatif(options: argparse.Namespace, _words: list[str]) -> int:
+def _whatif(options: Options, _words: list[str]) -> int:
     from crashhunt.base.signals import stop_requests
 
     refuse_below(options, times=1, parallel=0)

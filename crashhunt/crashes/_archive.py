@@ -16,19 +16,16 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
-from crashhunt.base.integrity import FILES, digest_of_content, parse_object, too_large, typed
-from crashhunt.base.progress import watched
+from crashhunt.base.integrity import FILES, FileEntry, digest_of_content, parse_object, too_large, typed
+from crashhunt.base.progress import Watch, watched
 from crashhunt.base.temporary import temporary_folder
-from crashhunt.crashes._bundle import ArchiveIndex, is_bundle_made_here, snapshot_of
+from crashhunt.crashes._bundle import ArchiveIndex, Bundle, is_bundle_made_here, snapshot_of
 from crashhunt.crashes._bundle_trust import is_made_here, signature
 from crashhunt.crashes._notes import notes_as_text, read_notes, subject_of, user_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from crashhunt.base.integrity import FileEntry
-    from crashhunt.base.progress import Watch
-    from crashhunt.crashes._bundle import Bundle
 
 SCHEMA = 1
 _MAX_BYTES = 4 * 10**9  # unpacked size, because a small zip file can contain terabytes

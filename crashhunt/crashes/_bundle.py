@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base import layout
-from crashhunt.base.codec import merged
+from crashhunt.base.codec import JsonObject, merged
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree, whole_file
 from crashhunt.base.integrity import (
+    FileEntry,
     authentication_code,
     changed_file,
     describe_files,
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from crashhunt.base.codec import JsonObject
-    from crashhunt.base.integrity import FileEntry
     from crashhunt.base.json_types import Plain
     from crashhunt.trial import TrialResult, Value
     from crashhunt.world import Lane

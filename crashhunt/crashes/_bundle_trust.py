@@ -18,9 +18,9 @@ from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, UntrustedE
 from crashhunt.base.files import whole_file
 from crashhunt.base.git import git_directory, tracked_files, work_tree
 from crashhunt.base.integrity import parse_object, state_folders, user_key
-from crashhunt.base.plugins import registered
+from crashhunt.base.plugins import Group, registered
 from crashhunt.base.text import command_line
-from crashhunt.crashes._bundle import is_bundle_made_here, snapshot_of
+from crashhunt.crashes._bundle import ArchiveIndex, Bundle, is_bundle_made_here, snapshot_of
 from crashhunt.oracles import oracle_name
 from crashhunt.plans import read_settings, with_settings
 from crashhunt.scenario import backend_of
@@ -29,8 +29,6 @@ from crashhunt.trial import Choice, Constant, is_stored_signal
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from crashhunt.base.plugins import Group
-    from crashhunt.crashes._bundle import ArchiveIndex, Bundle
     from crashhunt.plans import HuntSettings
     from crashhunt.scenario import Scenario
     from crashhunt.snapshots import Snapshot

@@ -6,13 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from crashhunt.base.codec import Serializable
+from crashhunt.base.codec import JsonObject, Serializable
 from crashhunt.crashes import Encounter
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, Factor, Group, Judgement, Omission, Why
     from crashhunt.recording import Recording
     from crashhunt.world import Scene

@@ -12,7 +12,7 @@ from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError
 from crashhunt.base.text import count_of, unescape_letters
 from crashhunt.crashes import Bundle, judgement_of, preventable_by
-from crashhunt.crashes._contact_record import contact_record
+from crashhunt.crashes._contact_record import ContactRecord, contact_record
 from crashhunt.crashes._fault import Verdict, fault_of
 from crashhunt.crashes._lanes import LaneMap
 from crashhunt.trial import UNUSABLE_VALUE, Outcome
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from crashhunt.crashes._contact_record import ContactRecord
     from crashhunt.recording import Recording
     from crashhunt.trial import Collision, Failure, TrialResult
 

@@ -11,7 +11,7 @@ import numpy as np
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.crashes._bundle import snapshot_of
-from crashhunt.crashes._contact_record import SAME_WAY, contact_record
+from crashhunt.crashes._contact_record import SAME_WAY, ContactRecord, contact_record
 from crashhunt.trial import Outcome
 from crashhunt.world import STANDS_MPS, is_person
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from crashhunt.crashes import Bundle
-    from crashhunt.crashes._contact_record import ContactRecord
     from crashhunt.recording import Recording
     from crashhunt.world import RightOfWay, StopLine
 

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Literal
 
 from crashhunt.crashes._contact_record import record_in
 from crashhunt.crashes._encounter import Encounter, last_escape
-from crashhunt.crashes._lanes import LaneMap
+from crashhunt.crashes._lanes import Borders, LaneMap
 from crashhunt.recording import has_same_scenes
 from crashhunt.trial import Escape, Outcome, Overruled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from crashhunt.crashes._lanes import Borders
     from crashhunt.recording import Recording
     from crashhunt.simulators import FullBraking
     from crashhunt.trial import Collision, TrialResult, TrialSpec

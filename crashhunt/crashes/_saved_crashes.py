@@ -9,9 +9,9 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.codec import known_part, typed_where_there
+from crashhunt.base.codec import JsonObject, known_part, typed_where_there
 from crashhunt.base.errors import BundleError
-from crashhunt.base.integrity import FILES, changed_file, digest_of_data, read_object, typed
+from crashhunt.base.integrity import FILES, FileEntry, changed_file, digest_of_data, read_object, typed
 from crashhunt.base.older_versions import HOW_TO_READ
 from crashhunt.base.text import listed, near_path, one_of
 from crashhunt.crashes._bundle import _DAMAGE_FIX, SCHEMA, Bundle
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from crashhunt.base.codec import JsonObject
-    from crashhunt.base.integrity import FileEntry
     from crashhunt.base.json_types import Plain
 
 

@@ -11,7 +11,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.text import command_line
 from crashhunt.crashes import crash_folders, fault_of, most_dangerous, preventable_by, read_bundle, signature_of
-from crashhunt.dashboard._catalog import is_inside, unreadable, unreadable_below
+from crashhunt.dashboard._catalog import FoundHunt, is_inside, unreadable, unreadable_below
 from crashhunt.dashboard._hunt_page import read_tail
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.recording import read_lanes, read_obstacles
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle
-    from crashhunt.dashboard._catalog import FoundHunt
 
 _BUNDLE_FOLDERS = (layout.CRASHES, layout.NEAR_MISSES)
 _MAX_LISTED = 2_000

@@ -12,7 +12,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.crashes import crash_folders
 from crashhunt.dashboard._catalog import unreadable
-from crashhunt.dashboard._hunt_page import read_tail
+from crashhunt.dashboard._hunt_page import HuntView, read_tail
 from crashhunt.ledger import leave_untouched
 from crashhunt.recording import Phase, read_header
 from crashhunt.report import UNCHOSEN, describe_versions, importance_of
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.dashboard._hunt_page import HuntView
     from crashhunt.dashboard._trial_counts import Point
     from crashhunt.plans import HuntSettings
     from crashhunt.statistics import Comparison

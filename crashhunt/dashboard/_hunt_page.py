@@ -13,7 +13,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.base.text import command_line
 from crashhunt.crashes import read_notes
-from crashhunt.dashboard._catalog import unreadable, unreadable_below
+from crashhunt.dashboard._catalog import FoundHunt, unreadable, unreadable_below
 from crashhunt.dashboard._trial_counts import Sample, TrialCounts
 from crashhunt.ledger import Ledger, damaged, has_begun
 from crashhunt.plans import read_settings
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Note
-    from crashhunt.dashboard._catalog import FoundHunt
     from crashhunt.ledger import Facts, KindData
     from crashhunt.plans import HuntSettings
     from crashhunt.statistics import CrashRate

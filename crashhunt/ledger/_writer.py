@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Unpack
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.ledger._reader import LedgerReader, Turn as Turn
+from crashhunt.ledger._reader import Facts, LedgerReader, Noted, Turn as Turn
 from crashhunt.ledger._schema import (
     COLUMNS,
     SEAL,
     VERSION,
+    Row,
     create,
     damaged,
     explained,
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from crashhunt.ledger._reader import Facts, Noted
-    from crashhunt.ledger._schema import Row
     from crashhunt.trial import TrialResult
 
 

@@ -18,7 +18,7 @@ from crashhunt.base.plugins import locate, registered
 from crashhunt.base.programs import is_program
 from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import signals_of_fixed
-from crashhunt.plans._settings import AgentSettings, ArgumentSpec, spec_words
+from crashhunt.plans._settings import AgentSettings, ArgumentSpec, Request, spec_words
 from crashhunt.trial import (
     FILLED_BY_NAME,
     Argument,
@@ -33,7 +33,6 @@ from crashhunt.trial import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
 
-    from crashhunt.plans._settings import Request
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Value
 

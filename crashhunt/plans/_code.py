@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import ProgramError
 from crashhunt.base.isolation import files_read_apart, work_apart
-from crashhunt.base.plugins import ImportedModules, is_foreign, is_foreign_module, locate
+from crashhunt.base.plugins import Group, ImportedModules, is_foreign, is_foreign_module, locate
 from crashhunt.base.programs import can_fork, is_program
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.text import listed
 from crashhunt.disturbances import described_model, modules_of_models, parse_rates
 from crashhunt.oracles import described_oracle, modules_of, oracle_name
-from crashhunt.plans._settings import executor_name
+from crashhunt.plans._settings import HuntSettings, executor_name
 from crashhunt.trial import Signature, signature_of
 
 if TYPE_CHECKING:
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from crashhunt.base.isolation import Report
     from crashhunt.base.json_types import Plain
-    from crashhunt.base.plugins import Group
-    from crashhunt.plans._settings import HuntSettings
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Category
 

@@ -6,7 +6,7 @@ import hashlib
 import operator
 import os
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, overload
 
@@ -30,7 +30,6 @@ from crashhunt.recording._blackbox import (
 from crashhunt.recording.records._agent_records import OBSERVATION
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from crashhunt.native import Core

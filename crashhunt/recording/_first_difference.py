@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from crashhunt.recording._reading import Divergence
+from crashhunt.recording._reading import AgentChannel, Divergence
 from crashhunt.recording.records import RECORD_TYPES
 
 if TYPE_CHECKING:
-    from crashhunt.recording._reading import AgentChannel
     from crashhunt.recording._recording import Recording
     from crashhunt.recording.records._type import Difference
 

@@ -27,7 +27,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from crashhunt.base.errors import BundleError
 from crashhunt.recording.records import RECORD_TYPES
-from crashhunt.recording.records._type import BytesForm
+from crashhunt.recording.records._type import BytesForm, Message
 from crashhunt.world import approaches, is_person, join_frames, levels, outlines
 
 if TYPE_CHECKING:
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.recording._recording import Recording
-    from crashhunt.recording.records._type import Message
     from crashhunt.trial import TrialResult
     from crashhunt.world import Actor, Lane, Scene
 

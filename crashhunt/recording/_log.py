@@ -27,13 +27,12 @@ from crashhunt.recording._recording import Compact, Recording
 from crashhunt.recording.records import RECORD_TYPES
 from crashhunt.recording.records._agent_records import ACTION, OBSERVATION
 from crashhunt.recording.records._scene_record import DISTURBANCES, STEP, time_of
-from crashhunt.recording.records._type import BytesForm, TextForm
+from crashhunt.recording.records._type import BytesForm, Form, TextForm
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from crashhunt.recording.records._type import Form
     from crashhunt.trial import TrialResult
     from crashhunt.world import Lane
 

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
-from crashhunt.base.codec import OMIT_DEFAULT, Serializable
+from crashhunt.base.codec import OMIT_DEFAULT, JsonObject, Serializable
 from crashhunt.world import Roster
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from crashhunt.base.codec import JsonObject
     from crashhunt.world import Actor, Contact, Event, Scene, Spine
 
 

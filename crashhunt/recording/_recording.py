@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, overload
 
@@ -14,8 +14,8 @@ import numpy as np
 from crashhunt.base.errors import BundleError
 from crashhunt.base.text import format_time, one_of
 from crashhunt.recording._blackbox import is_evidence
-from crashhunt.recording._blackbox_file import Records, digest_of
-from crashhunt.recording._reading import Prologue, Reading, StepRecord
+from crashhunt.recording._blackbox_file import Record, Records, digest_of
+from crashhunt.recording._reading import AgentChannel, Prologue, Reading, StepRecord
 from crashhunt.recording._values import is_opaque
 from crashhunt.recording.records import RECORD_TYPES
 from crashhunt.recording.records._agent_records import OBSERVATION, PROLOGUE
@@ -34,12 +34,8 @@ from crashhunt.recording.records._scene_record import (
 from crashhunt.world import Roster
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
-
     from numpy.typing import NDArray
 
-    from crashhunt.recording._blackbox_file import Record
-    from crashhunt.recording._reading import AgentChannel
     from crashhunt.trial import Disturbance
     from crashhunt.world import Actor, Scene
 

@@ -14,7 +14,7 @@ from PIL import Image, ImageSequence
 from crashhunt.base.errors import UsageError
 from crashhunt.base.extras import install_command
 from crashhunt.base.files import cannot_write, whole_file
-from crashhunt.base.progress import watched
+from crashhunt.base.progress import Watch, watched
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.crashes import Encounter, danger_course
 from crashhunt.panels import Action, Curve, Panel, Text
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.base.progress import Watch
     from crashhunt.recording import Recording
     from crashhunt.world import Scene
 

@@ -25,7 +25,7 @@ from crashhunt.crashes import (
 from crashhunt.recording import describe_value, is_opaque
 from crashhunt.report._headline import verdict_of
 from crashhunt.report._live_screen import draw_signals, format_inputs, input_signals
-from crashhunt.report._step_table import NEAREST, stacked, steps_table
+from crashhunt.report._step_table import NEAREST, TableCell, stacked, steps_table
 from crashhunt.report._words import (
     COLUMNS,
     MAX_STANDING_SPEED_MPS,
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
     from crashhunt.base.binaries import BinaryFacts
     from crashhunt.crashes import Bundle, Moment
     from crashhunt.recording import StepRecord
-    from crashhunt.report._step_table import TableCell
 
 _MAX_ACTION_CHARACTERS = 60  # of an action that is no array of numbers
 _MAX_TABLE_ROWS = 20  # of the table; of more steps, the table shows a selection

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.isolation import work_apart
-from crashhunt.base.plugins import is_foreign, locate, registered
+from crashhunt.base.plugins import Group, is_foreign, locate, registered
 from crashhunt.base.text import aligned
 from crashhunt.requirements import TRAFFIC_RULES
 from crashhunt.scenario import ACTIONS, installed_backends, load_scenario, shipped_scenarios
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from crashhunt.base.json_types import Plain
-    from crashhunt.base.plugins import Group
     from crashhunt.simulators import Setting
     from crashhunt.trial import Argument, Kind, Value
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.base.files import whole_file
-from crashhunt.base.progress import watched
+from crashhunt.base.progress import Watch, watched
 from crashhunt.base.version import __version__
 from crashhunt.crashes import closest_actors, read_notes, signature_of
 from crashhunt.ledger import Ledger, has_begun
@@ -50,7 +50,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.base.progress import Watch
     from crashhunt.crashes import Bundle, Encounter
     from crashhunt.ledger import RunningRate
     from crashhunt.plans import HuntSettings

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from crashhunt.base import layout
-from crashhunt.base.codec import OMIT_DEFAULT, Serializable, written_if
+from crashhunt.base.codec import OMIT_DEFAULT, JsonObject, Serializable, written_if
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.temporary import (
     owner_in,
@@ -28,7 +28,6 @@ from crashhunt.results._found_crashes import outcomes_of_crashes, tally_crashes
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from crashhunt.base.codec import JsonObject
     from crashhunt.ledger import Facts, HuntOwner
     from crashhunt.plans import HuntSettings
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.base.integrity import changed_file, open_at_once
+from crashhunt.base.integrity import FileEntry, changed_file, open_at_once
 from crashhunt.crashes import files_of
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.results._hunt_state import hunt_state, is_hunt
@@ -17,8 +17,6 @@ from crashhunt.results._hunt_state import hunt_state, is_hunt
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-
-    from crashhunt.base.integrity import FileEntry
 
 
 LogKind = Literal["run", "error", "state"]

@@ -19,13 +19,11 @@ from crashhunt.base.integrity import changed_file
 from crashhunt.base.plugins import registered
 from crashhunt.base.programs import can_fork, files_of, is_program, libraries_folder, words_of
 from crashhunt.snapshots._environment import differing_versions
-from crashhunt.snapshots._snapshot import may_run
+from crashhunt.snapshots._snapshot import Snapshot, may_run
 from crashhunt.snapshots._take import code_of_tree
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-
-    from crashhunt.snapshots._snapshot import Snapshot
 
 
 # Differences between two snapshots on which the results of trials may depend.

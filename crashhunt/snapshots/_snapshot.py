@@ -10,13 +10,14 @@ import shutil
 from contextlib import suppress
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NotRequired, TypedDict
+from typing import NotRequired, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.codec import typed_where_there
 from crashhunt.base.errors import BundleError
 from crashhunt.base.integrity import (
     FILES,
+    FileEntry,
     authentication_code,
     changed_file,
     describe_files,
@@ -31,9 +32,6 @@ from crashhunt.base.older_versions import HOW_TO_READ
 from crashhunt.plans import HuntSettings, read_settings
 from crashhunt.scenario import Scenario, digest_of_described, load_scenario
 from crashhunt.snapshots._environment import Environment, environment_of_simulation
-
-if TYPE_CHECKING:
-    from crashhunt.base.integrity import FileEntry
 
 
 class Manifest(TypedDict):

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.binaries import describe_binary
+from crashhunt.base.binaries import BinaryFacts, describe_binary
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import BundleError, SnapshotError, UsageError, remedy
 from crashhunt.base.exceptions import INSTALLED_FOLDERS
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree
 from crashhunt.base.git import query
-from crashhunt.base.integrity import describe_files, digest_of_content, digest_of_data, digest_of_file
+from crashhunt.base.integrity import FileEntry, describe_files, digest_of_content, digest_of_data, digest_of_file
 from crashhunt.base.opened_files import output_files
 from crashhunt.base.programs import (
     can_fork,
@@ -35,23 +35,14 @@ from crashhunt.base.programs import (
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, load_order_of
-from crashhunt.snapshots._environment import differing_versions, environment
-from crashhunt.snapshots._snapshot import (
-    SCHEMA,
-    Snapshot,
-    code_of_manifest,
-    digest_of_manifest,
-)
+from crashhunt.snapshots._environment import Environment, differing_versions, environment
+from crashhunt.snapshots._snapshot import SCHEMA, Manifest, Snapshot, code_of_manifest, digest_of_manifest
 from crashhunt.trial import Choice, Constant
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from crashhunt.base.binaries import BinaryFacts
-    from crashhunt.base.integrity import FileEntry
     from crashhunt.base.plugins import ImportedModules
-    from crashhunt.snapshots._environment import Environment
-    from crashhunt.snapshots._snapshot import Manifest
 
 
 # The code that a hunt runs: the agents' own projects, found through the imported modules.

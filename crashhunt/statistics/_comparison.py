@@ -28,9 +28,9 @@ from crashhunt.results import HuntResults
 from crashhunt.statistics._anytime_interval import Interval
 from crashhunt.statistics._hunt_rate import measure_rates
 from crashhunt.statistics._paired_rates import difference_of_rates
-from crashhunt.statistics._paired_test import PairSequence, PairTest
+from crashhunt.statistics._paired_test import Pair as TrialPair, PairSequence, PairTest
 from crashhunt.statistics._rate_of_running_hunt import counting_rule
-from crashhunt.statistics._units_and_exposure import PER_WORDS, PERS, Per, facts_of_plain
+from crashhunt.statistics._units_and_exposure import PER_WORDS, PERS, CountingRule, Per, TrialFacts, facts_of_plain
 from crashhunt.training import HeldOutTraffics, held_out_traffics
 from crashhunt.trial import Constant, Outcome
 
@@ -41,9 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.plans import HuntSettings
-    from crashhunt.statistics._paired_test import Pair as TrialPair
     from crashhunt.statistics._rate_report import CrashRate
-    from crashhunt.statistics._units_and_exposure import CountingRule, TrialFacts
     from crashhunt.training import TrainedOn
 
 Answer = Literal["first", "second", "undecided", ""]

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from crashhunt.statistics._paired_test import PairTest
+from crashhunt.statistics._paired_test import Pair, PairTest
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from crashhunt.statistics._paired_test import Pair
 
 PairVerdict = Literal["better", "worse", "no_difference", "undecided"]
 """The verdict of pairs on the second agent, compared with the first."""

@@ -20,9 +20,9 @@ from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.statistics._comparison import why_unpaired
 from crashhunt.statistics._hunt_rate import crash_types
-from crashhunt.statistics._paired_test import PairSequence, PairTest, SideCounts
+from crashhunt.statistics._paired_test import Pair, PairSequence, PairTest, SideCounts
 from crashhunt.statistics._rate_of_running_hunt import counting_rule
-from crashhunt.statistics._units_and_exposure import facts_of_plain
+from crashhunt.statistics._units_and_exposure import TrialFacts, facts_of_plain
 from crashhunt.training import HeldOutTraffics, held_out_traffics
 from crashhunt.trial import KILLED
 
@@ -33,9 +33,7 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.statistics._anytime_interval import Interval
     from crashhunt.statistics._gate_verdict import PairVerdict, PairWatch
-    from crashhunt.statistics._paired_test import Pair
     from crashhunt.statistics._rate_report import CrashRate
-    from crashhunt.statistics._units_and_exposure import TrialFacts
 
 _FAILED_STATES = ("no_valid_trial", "error")
 _KILLED_SIGN = f'"kind": "{KILLED}"'

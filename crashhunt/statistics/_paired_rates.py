@@ -29,18 +29,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.statistics._anytime_interval import Interval, RateTest, log_of_sum
-from crashhunt.statistics._paired_test import failures_of
-from crashhunt.statistics._units_and_exposure import exposure_of
+from crashhunt.statistics._anytime_interval import Bets, Interval, RateTest, log_of_sum
+from crashhunt.statistics._paired_test import Pair, failures_of
+from crashhunt.statistics._units_and_exposure import CountingRule, Per, exposure_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from crashhunt.statistics._anytime_interval import Bets
-    from crashhunt.statistics._paired_test import Pair
-    from crashhunt.statistics._units_and_exposure import CountingRule, Per
 
 _NODES = 16  # of the shares from 0 to 1
 _SHARES: NDArray[np.float64] = np.append(np.cos(np.pi * (np.arange(_NODES) + 0.5) / (2 * _NODES)), 0.5)

@@ -51,19 +51,17 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from crashhunt.base.codec import Serializable, plain
+from crashhunt.base.codec import JsonObject, Serializable, plain
 from crashhunt.base.text import format_number, format_percent
 from crashhunt.disturbances import COPIES_PER_ROOT, SECONDS_PER_COPY
-from crashhunt.statistics._anytime_interval import Bets, RateTest
+from crashhunt.statistics._anytime_interval import Bets, Interval, RateTest
 from crashhunt.statistics._units_and_exposure import why_too_many_invalid
 from crashhunt.trial import Forcing, Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from crashhunt.base.codec import JsonObject
     from crashhunt.ledger import RunningRate
-    from crashhunt.statistics._anytime_interval import Interval
     from crashhunt.trial import Forced, TrialResult
 
 BLOCK: Final = 32

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from crashhunt.base.text import format_percent
 from crashhunt.plans import RATE_PERS, RatePer
@@ -27,7 +27,6 @@ from crashhunt.trial import KILLED, Failure, Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-    from typing import Any
 
     from crashhunt.trial import TrialResult
 

@@ -6,7 +6,7 @@ new speed; contact is examined before the step. Both vehicles are 4.3 m long and
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from crashhunt.agents import GRAVITY_MPS2, REFERENCE_MODELS, Situation
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from types import TracebackType
-    from typing import Self
 
     from numpy.typing import NDArray
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,8 +32,6 @@ from crashhunt.simulators import (
 from crashhunt.trial import CELLS, Disturbance, Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from crashhunt.simulators import Observations
     from crashhunt.world import Event
 

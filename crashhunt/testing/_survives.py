@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypedDict
@@ -18,7 +18,6 @@ from crashhunt.plans import Request, plan
 from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, TextIO
 
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.files import whole_file
@@ -24,7 +24,6 @@ from crashhunt.base.text import listed, one_line, one_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-    from typing import TextIO
 
     import numpy as np
     from numpy.typing import NDArray

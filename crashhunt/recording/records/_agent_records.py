@@ -6,17 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.recording._reading import Divergence, first_difference
+from crashhunt.recording._reading import AgentChannel, Divergence, Prologue, Reading, StepRecord, first_difference
 from crashhunt.recording._values import describe_value, is_opaque
-from crashhunt.recording.records._type import Form, RecordType, TextForm
+from crashhunt.recording.records._type import Fields, Form, Message, RecordType, TextForm
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
-
-    from crashhunt.recording._reading import AgentChannel, Prologue, Reading, StepRecord
-    from crashhunt.recording.records._type import Fields, Message
 
 
 # The first record: what the episode consists of, as JSON.

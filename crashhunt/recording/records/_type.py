@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from crashhunt.recording._reading import Divergence
+from crashhunt.recording._reading import AgentChannel, Divergence, Prologue, Reading, StepRecord
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-
-    from crashhunt.recording._reading import AgentChannel, Prologue, Reading, StepRecord
 
     Difference = Callable[[StepRecord, StepRecord, AgentChannel | None], Divergence | None]
 
