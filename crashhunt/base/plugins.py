@@ -149,7 +149,8 @@ class ImportedModules:
         places = {}
         for name, found in list(sys.modules.items()):
             if "." not in name:
-                folders = tuple(map(str, getattr(found, "__path__", None) or ()))
+                # A package without __init__.py names a folder once for each entry of sys.path that leads there.
+                folders = tuple(dict.fromkeys(map(str, getattr(found, "__path__", None) or ())))
                 places[name] = getattr(found, "__file__", None), folders
         return cls(
             places=places, path=tuple(sys.path), named=frozenset(name.partition(".")[0] for name in named),

@@ -102,6 +102,17 @@ def test_installed_package_with_libraries_next_to_it_is_not_copied(tmp_path, mon
     assert not [place for place in kept if place.startswith("code/boxed_world")]
 
 
+def test_package_without_init_is_copied_although_two_entries_of_the_path_lead_to_it(tmp_path, monkeypatch):
+    (tmp_path / "spaced_planner").mkdir()
+    (tmp_path / "spaced_planner" / "plans.py").write_text("")
+    for _ in range(2):  # as a planner that appends its own folder
+        monkeypatch.syspath_prepend(tmp_path)
+    kept = find_sources(ImportedModules.here([], ["spaced_planner.plans"])).files
+    for name in ("spaced_planner", "spaced_planner.plans"):
+        monkeypatch.delitem(sys.modules, name)
+    assert "code/spaced_planner/plans.py" in kept
+
+
 def test_zip_file_that_holds_a_module_is_copied_and_imported_from(tmp_path, monkeypatch):
     archive = tmp_path / "drivers.zip"
     with zipfile.ZipFile(archive, "w") as packed:
