@@ -37,7 +37,7 @@ _RECENT_LANES = 4  # looked at before SUMO is asked for the lane below a point
 _LOOK_S, _MIN_LOOK_M = 0.5, 4.0  # how far ahead a vehicle that keeps its lane looks
 _MAX_LANES_AHEAD = 10
 _CATCH_UP_S = 1.0  # in which a vehicle makes up for its distance from a pose that it cannot reach in time
-_MAX_GAP_M = 5.0  # distance of a pursued trajectory from the vehicle
+_MAX_GAP_M = 5.0  # distance of a pursued trajectory from the vehicle, beyond the way to its first point
 _OBSTACLES = ("building", "obstacle")  # types of polygons
 _STANDING_M = 0.01  # a vehicle that moves by less in a step does not turn
 _KERB_M = 0.1  # an outline that is less off the road drives over no kerb
@@ -184,9 +184,10 @@ class FreeMotion:
             return
         if self._pursues:
             gap = min(math.dist(point[1:3], (state.x, state.y)) for point in self._in_map(action).tolist())
-            if gap > _MAX_GAP_M:
+            reach = _MAX_GAP_M + values[0][0] * values[0][4]  # the vehicle has yet to drive to a first point in future
+            if gap > reach:
                 message = f"the trajectory is {gap:.1f} m away from the vehicle"
-                raise ActionError(message, fix=f"return a point within {_MAX_GAP_M:g} m")
+                raise ActionError(message, fix=f"return a point within {reach:.1f} m")
             return
         refusal = self._refusal(self._next(values))
         if refusal is not None:

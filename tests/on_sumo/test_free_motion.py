@@ -541,7 +541,8 @@ def test_pursued_trajectory_that_is_elsewhere_is_refused(start):
     simulator.actions["ego"].encode([[0.1, 4.0, 2.9, 0.0, 5.0]])
     with pytest.raises(ActionError, match=r"the trajectory is 6\.0 m away from the vehicle") as caught:
         simulator.actions["ego"].encode([[0.1, 6.0, 0.0, 0.0, 5.0]])
-    assert caught.value.fix == "return a point within 5 m"
+    assert caught.value.fix == "return a point within 5.5 m"
+    simulator.actions["ego"].encode([[0.5, 10.0, 0.0, 0.0, 20.0], [1.0, 20.0, 0.0, 0.0, 20.0]])  # of a coarse planner
 
 
 def drive_to(motion, *pose):
