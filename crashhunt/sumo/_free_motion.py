@@ -383,7 +383,7 @@ class FreeMotion:
         ahead = (x - state.x) * cos + (y - state.y) * sin
         speed = max(0.0, speed + (ahead - speed * time_s) / _CATCH_UP_S)
         on = np.arange(0.0, abs(ahead) + 2 * (_MIN_LOOK_M + _LOOK_S * state.speed))
-        line = np.broadcast_to((time_s, x, y, heading, speed), (len(on), 5)).copy()
+        line = np.broadcast_to((self._dt, x, y, heading, speed), (len(on), 5)).copy()
         line[:, 1:3] += np.outer(on, (math.cos(heading), math.sin(heading)))
         return self._pursue(line)
 
@@ -395,7 +395,9 @@ class FreeMotion:
         pursuit; R. C. Coulter, Implementation of the pure pursuit path tracking algorithm, CMU-RI-TR-92-01, 1992).
         """
         state = self.state
-        speed = float(np.interp(self._dt, points[:, 0], points[:, 4]))
+        begin = [(0.0, state.speed)] if points[0, 0] > 0.0 else []  # it leads from the present speed to its first point
+        times, speeds = np.array([*begin, *points[:, (0, 4)]]).T
+        speed = float(np.interp(self._dt, times, speeds))
         away = np.hypot(points[:, 1] - state.x, points[:, 2] - state.y)
         nearest = int(away.argmin())
         far = away[nearest:] >= _MIN_LOOK_M + _LOOK_S * state.speed

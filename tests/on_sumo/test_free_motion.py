@@ -536,6 +536,14 @@ def test_pure_pursuit_returns_to_a_line_within_the_limits_of_the_vehicle(start):
     assert abs(offsets[-1]) < 0.02
 
 
+def test_pursuit_reaches_the_speed_of_a_later_first_point_at_its_time(start):
+    simulator, step = start("trajectory:frame=ego:tracker=pure_pursuit", **EMPTY)
+    motion = simulator._driving.moving["ego"]
+    speed = motion.state.speed
+    step([[0.5, 0.5 * speed, 0.0, 0.0, speed - 1.0], [1.0, speed, 0.0, 0.0, speed - 2.0]])
+    assert motion.state.speed == pytest.approx(speed - 0.2)
+
+
 def test_pursued_trajectory_that_is_elsewhere_is_refused(start):
     simulator, _ = start("trajectory:frame=ego:tracker=pure_pursuit", **EMPTY)
     simulator.actions["ego"].encode([[0.1, 4.0, 2.9, 0.0, 5.0]])
