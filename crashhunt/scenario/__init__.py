@@ -11,6 +11,7 @@ if TYPE_CHECKING:
         action_settings as action_settings,
         canonical_action as canonical_action,
         check_action as check_action,
+        refuse_repeated_settings as refuse_repeated_settings,
         with_stated_choice as with_stated_choice,
         with_whole_vehicle_visible as with_whole_vehicle_visible,
     )

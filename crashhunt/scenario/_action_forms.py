@@ -267,6 +267,7 @@ def action_settings(name: str | None, where: str = "action") -> dict[str, float 
         raise UsageError(f"{where}: {form!r} is not a form of actions", fix=one_of(form, ACTIONS))
     known = {one.name: one for one in ACTIONS[canonical_action(form)].settings}
     values = {one.name: one.default for one in known.values()}
+    refuse_repeated_settings(form, given, where)
     for text in given:
         setting, _, word = text.partition("=")
         if setting not in known:
@@ -283,6 +284,17 @@ def action_settings(name: str | None, where: str = "action") -> dict[str, float 
             raise UsageError(f"{where}: {form}:{setting} is {word!r}", fix=fix)
         values[setting] = value
     return values
+
+
+def refuse_repeated_settings(name: str, given: Sequence[str], where: str) -> None:
+    """Refuse settings, each as ``NAME=VALUE``, that contain a name twice.
+
+    Raises:
+        UsageError: a name occurs twice.
+    """
+    names = [text.partition("=")[0] for text in given]
+    for setting in (one for one in names if names.count(one) > 1):
+        raise UsageError(f"{where}: {name} has the setting {setting!r} twice", fix="name each setting once")
 
 
 def with_whole_vehicle_visible(name: str | None) -> str | None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_of
+from crashhunt.scenario import refuse_repeated_settings
 from crashhunt.simulators._observation_parts import (
     HISTORY,
     KINEMATICS,
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
     from crashhunt.base.program_message_types import SpaceDescription
     from crashhunt.scenario import AgentSetup
     from crashhunt.simulators._observation_parts import Part
+
+
+_MAX_SIZE = 10**7  # of numbers of an observation, which is in the recording of each step
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +99,7 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
             raise UsageError(f"{where} names the part {name!r} twice", fix="name each part once")
         part = PARTS[name] if name in PARTS else MODIFIERS[name]
         settings = {setting.name: setting.default for setting in part.settings}
+        refuse_repeated_settings(name, given, where)
         for text in given:
             setting, value = _parse_setting(part, text, where)
             settings[setting] = value
@@ -108,6 +113,11 @@ def parse_parts(words: Iterable[str], available: Iterable[str] = PARTS, *, where
     parts = tuple(one for one in found.values() if one.part.name not in MODIFIERS)
     if found and not parts:
         raise UsageError(f"{where} names {next(iter(found))} and no part", fix="name at least one part as well")
+    history = found[HISTORY.name].settings["steps"] if HISTORY.name in found else 1
+    size = int(history * sum(math.prod(one.shape) for one in parts))
+    if size > _MAX_SIZE:
+        fix = f"give smaller parts or a shorter history, with at most {_MAX_SIZE:,} numbers"
+        raise UsageError(f"{where}: an observation has {size:,} numbers", fix=fix)
     return parts
 
 

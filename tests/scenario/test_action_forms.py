@@ -50,6 +50,11 @@ def test_settings_follow_the_name_of_the_form():
     ("name", "message", "fix"),
     [
         ("fly", "--action: 'fly' is not a form of actions", "give one of"),
+        (
+            "trajectory:frame=ego:frame=map",
+            "--action: trajectory has the setting 'frame' twice",
+            "name each setting once",
+        ),
         ("meta:frame=ego", "--action: meta has no setting 'frame'", "no settings"),
         ("trajectory:frame=moon", "--action: trajectory:frame is 'moon'", "give map or ego"),
         ("acceleration:lane_change_duration_s=-1", "lane_change_duration_s is '-1'", "a number in s within 0 and 20"),

@@ -118,6 +118,12 @@ def test_columns_give_the_index_of_each_column():
         (["actors:rows=2.5"], "--observe: actors:rows is '2.5'", "give a whole number within 1 and 1000"),
         (["actors:radius=nan"], "--observe: actors:radius is 'nan'", "give a number in m within 1 and 120"),
         (["actors:radius"], "--observe: actors:radius is ''", "give a number in m within 1 and 120"),
+        (["actors:rows=2:rows=3"], "--observe: actors has the setting 'rows' twice", "name each setting once"),
+        (
+            ["image:rows=1000:columns=1000", "history=4"],
+            "--observe: an observation has 12,000,000 numbers",
+            "at most 10,000,000 numbers",
+        ),
         (["kinematics", "ego"], "--observe names kinematics and parts: kinematics,ego", "name kinematics alone"),
     ],
 )
