@@ -141,21 +141,7 @@ def test_what_is_kept_is_bounded_and_what_is_damaged_is_let_go(settings, tmp_pat
     assert store.find("large") is None
 
 
-def test_a_place_is_removed_by_the_one_that_comes_after_its_owner(tmp_path):
-    store = Store(tmp_path / "store")
-    mine = store.place()
-    left = store.place()
-    left._lock.close()  # as when its process is killed
-    other = Store(tmp_path / "store").place()
-    assert mine.path.exists()
-    assert not left.path.exists()
-    for place in (mine, other):
-        place.remove()
-    assert not list((tmp_path / "store").iterdir())
-
-
-@pytest.mark.parametrize("make", [lambda path: Store(path).place(), Folder])
-def test_a_folder_that_is_being_made_is_not_taken_for_one_that_was_left(make, tmp_path, monkeypatch):
+def test_a_folder_that_is_being_made_is_not_taken_for_one_that_was_left(tmp_path, monkeypatch):
     """Two hunts begin at once: one looks for what was left while the other one makes its folder, whenever that is."""
     (tmp_path / "store").mkdir()
     others, lock = [], fcntl.flock
@@ -163,12 +149,12 @@ def test_a_folder_that_is_being_made_is_not_taken_for_one_that_was_left(make, tm
     def late(file, operation):
         if not others:
             others.append(None)
-            others[0] = make(tmp_path / "store")
+            others[0] = Folder(tmp_path / "store")
         lock(file, operation)
 
     monkeypatch.setattr(fcntl, "flock", late)
-    mine = make(tmp_path / "store")
-    last = make(tmp_path / "store")
+    mine = Folder(tmp_path / "store")
+    last = Folder(tmp_path / "store")
     for place in (mine, *others, last):
         assert place.path.exists()
         place.remove()

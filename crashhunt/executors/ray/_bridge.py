@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 import traceback
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -369,4 +370,4 @@ class Bridge:
     def _send_figures(self, *, now: bool = False) -> None:
         if now or time.monotonic() - self._told > _LOOK_EVERY_S:
             self._told = time.monotonic()
-            self._send(nodes=self._scheduler.figures())
+            self._send(nodes=[asdict(node) for node in self._scheduler.figures()])

@@ -13,11 +13,12 @@ import zlib
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.integrity import digest_of_data, digest_of_file
+from crashhunt.base.temporary import TemporaryFolder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -192,9 +193,13 @@ class Folder:
         usual = tempfile.gettempdir()
         parent = parent or Path(usual if len(usual) <= _MAX_FOLDER_CHARACTERS and usual.isascii() else "/tmp")
         for old in parent.glob(f"{_PREFIX}*"):
-            remove_if_left(old / _FOLDER_LOCK)
+            _remove_if_left(old)
         self.path = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
-        self._lock = owned(self.path / _FOLDER_LOCK)
+        # Locked when it appears: a folder without a lock is foreign, or was created a moment ago.
+        part = self.path / f".{_FOLDER_LOCK}"
+        self._lock = part.open("w")
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        part.rename(self.path / _FOLDER_LOCK)
 
     def fileno(self) -> int:
         """Return the file descriptor of the folder's lock; a process that inherits it owns the folder as well."""
@@ -206,30 +211,20 @@ class Folder:
         self._lock.close()
 
 
-def owned(lock: Path) -> IO[str]:
-    """Create and hold the lock of a folder until the returned file is closed. The file is locked when it appears."""
-    part = lock.with_name(f".{lock.name}")
-    file = part.open("w")
-    fcntl.flock(file, fcntl.LOCK_EX)
-    part.rename(lock)
-    return file
-
-
-def remove_if_left(lock: Path) -> None:
-    """Delete a folder whose lock is free; a folder without a lock is foreign, or was created a moment ago."""
+def _remove_if_left(folder: Path) -> None:
+    """Delete a folder whose lock is free, because its owners have ended."""
     with suppress(OSError):
-        found = lock.parent.lstat()
+        found = folder.lstat()
         if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid():
-            with lock.open("r+") as file:
+            with (folder / _FOLDER_LOCK).open("r+") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(lock.parent, ignore_errors=True)
+                shutil.rmtree(folder, ignore_errors=True)
 
 
-# What a node keeps on its disk: parcels that it was sent, for hunts to come, and a folder for each hunt that runs.
+# What a node keeps on its disk: parcels that it was sent, for hunts to come; and a folder for each hunt that runs.
 
 _KEPT_BYTES = 10**9  # of parcels
 _MAX_KEPT_ARCHIVES = 32
-_LOCK_NAME = "lock"
 
 
 class Store:
@@ -278,16 +273,6 @@ class Store:
         with suppress(OSError):
             self._file(digest).unlink()
 
-    def place(self) -> Place:
-        """Create a folder for one hunt, and delete such folders whose processes have ended.
-
-        Raises:
-            OSError: the disk is full.
-        """
-        for old in self._folder.glob("hunt-*"):
-            remove_if_left(old / _LOCK_NAME)
-        return Place(Path(tempfile.mkdtemp(prefix="hunt-", dir=self._folder)))
-
     def _file(self, digest: str) -> Path:
         return self._folder / f"{digest}.zip"
 
@@ -304,14 +289,17 @@ class Store:
                     file.unlink()
 
 
-class Place:
-    """The folder of one hunt on a node, which belongs to this process as long as the process lives."""
+class Place(TemporaryFolder):
+    """The folder of one hunt on a node.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.code = path / "parcel"
-        self.scratch = path / "scratch"
-        self._lock = owned(path / _LOCK_NAME)
+    Raises:
+        OSError: the disk is full.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("node")
+        self.code = self.path / "parcel"
+        self.scratch = self.path / "scratch"
         self.scratch.mkdir()
 
     def unpack(self, packed: bytes, digest: str) -> bool:
@@ -322,8 +310,3 @@ class Place:
             shutil.rmtree(self.code, ignore_errors=True)
             return False
         return True
-
-    def remove(self) -> None:
-        """Delete the folder."""
-        shutil.rmtree(self.path, ignore_errors=True)
-        self._lock.close()

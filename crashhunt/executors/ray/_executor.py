@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from crashhunt.episode import WorkerSettings
-    from crashhunt.executors.ray._messages import BridgeJob, Figures, FromBridge, ToBridge
+    from crashhunt.executors.ray._messages import BridgeJob, FromBridge, ToBridge
     from crashhunt.trial import TrialSpec
 
 _CHUNK_BYTES = 1 << 18  # bytes at a time
@@ -68,7 +68,7 @@ class RayExecutor:
         self._tickets = itertools.count()
         self._open: dict[int, TrialSpec] = {}  # ticket to trial
         self._where: dict[str, dict[int, BlackBoxHeader]] = {}
-        self._nodes: list[Figures] = []
+        self._nodes: list[NodeFigures] = []
         self._notes = Notes(settings.scratch)
         self._found: list[TrialResult] = []
         self._losses = 0
@@ -121,7 +121,7 @@ class RayExecutor:
 
     def nodes(self) -> list[NodeFigures]:
         """Return the nodes that currently run trials."""
-        return [NodeFigures(**figures) for figures in self._nodes]
+        return self._nodes
 
     def notes(self) -> list[str]:
         """Return new notices for the user."""
@@ -240,7 +240,7 @@ class RayExecutor:
         if "note" in message:
             self._notes.add(message["note"])
         if "nodes" in message:
-            self._nodes = message["nodes"]
+            self._nodes = [NodeFigures(**figures) for figures in message["nodes"]]
         if "where" in message:
             self._where[message["node"]] = {
                 int(number): BlackBoxHeader(

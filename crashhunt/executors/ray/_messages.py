@@ -52,20 +52,11 @@ class ToBridge(TypedDict, total=False):
     cancel: int
 
 
-class Figures(TypedDict):
-    """The figures of a node on the status screen: trials at a time, ended trials, and trials per second."""
-
-    name: str
-    parallel: int
-    trials: int
-    rate_per_s: float
-
-
 class FromBridge(TypedDict, total=False):
     """A message of a bridge to the hunt: a trial has ended, or the state of a node has changed.
 
     ``passing`` marks an error that may be gone at the next attempt, ``token`` an error because of a missing token.
-    ``where`` is the progress of trials on a ``node``.
+    ``nodes`` has the fields of `NodeFigures`. ``where`` is the progress of trials on a ``node``.
     """
 
     ticket: int
@@ -75,7 +66,7 @@ class FromBridge(TypedDict, total=False):
     token: bool
     capacity: int
     note: str
-    nodes: list[Figures]
+    nodes: list[JsonObject]
     node: str
     where: dict[int, Header]
 

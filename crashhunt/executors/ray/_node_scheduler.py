@@ -7,11 +7,13 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.executors._protocol import NodeFigures
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.executors.ray._messages import Figures, Submitted
+    from crashhunt.executors.ray._messages import Submitted
 
 
 _TRIALS_PER_CPU = 2  # trials that a node has for each of its CPUs, so that none waits for the wire
@@ -106,17 +108,21 @@ class NodeScheduler:
         """Whether no trial is waiting or running."""
         return not self.waiting and not any(node.running for node in self.nodes.values())
 
-    def figures(self) -> list[Figures]:
+    def figures(self) -> list[NodeFigures]:
         """Return the figures of the ready machines for the status screen."""
-        found: dict[str, Figures] = {}
+        machines: dict[str, list[Node]] = {}
         for node in self.nodes.values():
             if node.ready:
-                none: Figures = {"name": node.name, "parallel": 0, "trials": 0, "rate_per_s": 0.0}
-                figures = found.setdefault(node.machine, none)
-                figures["parallel"] += node.slots
-                figures["trials"] += node.done
-                figures["rate_per_s"] += node.rate_per_s
-        return list(found.values())
+                machines.setdefault(node.machine, []).append(node)
+        return [
+            NodeFigures(
+                name=nodes[0].name,
+                parallel=sum(node.slots for node in nodes),
+                trials=sum(node.done for node in nodes),
+                rate_per_s=sum(node.rate_per_s for node in nodes),
+            )
+            for nodes in machines.values()
+        ]
 
     def parts(self, machine: str) -> list[Node]:
         """Return the nodes on a machine that run trials."""
