@@ -7,7 +7,6 @@ import struct
 from collections import Counter
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from conftest import examples
 from hypothesis import given, settings, strategies as st
@@ -210,10 +209,3 @@ def test_a_log_that_is_written_and_read_in_parts_is_the_log(records, request, tm
     write_log(tmp_path / "long.mcap", Recording(records))
     assert (tmp_path / "long.mcap").read_bytes() == (tmp_path / "kept.mcap").read_bytes()
     assert read_log(tmp_path / "long.mcap").records == records
-
-
-def test_joined_frames_have_the_columns_of_their_scenes(records, arrival):
-    scenes = Recording(records).scenes()
-    frames = list(join_frames(scenes))
-    assert [len(frame.columns) for frame in frames] == [arrival, 20, STEPS - arrival - 20]
-    assert np.array_equal(np.concatenate([scene.frame.columns for scene in scenes[:arrival]]), frames[0].columns)

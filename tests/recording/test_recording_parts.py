@@ -133,13 +133,6 @@ def test_without_steps_there_is_a_recording_all_the_same():
     assert recording.actions("b").shape == (0, 2)
 
 
-def test_notes_are_no_part_of_the_digest():
-    note = Record(Tag.NOTES, 0, encode_notes([Event("teleport", "b", "x")]))
-    assert Recording([*START, note, step(0)]).digest == Recording([*START, step(0)]).digest
-    assert Recording([*START, step(0)]).digest == digest_of(record.encode() for record in [*START, step(0)])
-    assert Recording(START).digest != Recording([*START, step(0)]).digest
-
-
 # The digest of a trial whose agents observe parts: of the first observation of each agent and the changes since.
 
 compiled = importlib.import_module("_crashhunt_core") if importlib.util.find_spec("_crashhunt_core") else None
