@@ -215,13 +215,6 @@ def test_type_is_that_of_the_contact_not_of_the_end_of_the_step(phase, angle):
     assert same_in_every_view(case, angle)[:2] == ("rear end", "ego")
 
 
-def test_crossing_names_the_side_from_which_the_other_comes():
-    case = record(drives(12.0), lambda t: (3.5, 2.5 + 8.0 * t, math.pi / 2, 8.0), step_s=0.1)
-    assert (case.manner, case.collider) == ("crossing from the right", "ego")
-    assert mirrored(case).manner == "crossing from the left"
-    assert record(drives(12.0), lambda t: (5.0 - 9 * t, 0.3, math.pi, 9.0), step_s=0.1).manner == "head-on"
-
-
 def stood(since_s):
     """Faces the traffic along the x axis; it has stood for some time before the contact."""
     return lambda t: (5.0 - 9.0 * min(0.0, t + since_s), 0.3, math.pi, 9.0 if t < -since_s else 0.0)

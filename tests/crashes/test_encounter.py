@@ -96,12 +96,6 @@ def test_looking_back_has_an_end():
     assert last_escape(slow, "ego", "other", braking=0.018) is not None  # 28 m
 
 
-def test_who_drives_past_is_no_crash_to_escape_from():
-    passing = [{"ego": (2.0 * n, 0.0, 0.0, 20.0), "other": (30.0, 2.5, 0.0, 0.0)} for n in range(12)]
-    assert last_escape(recording(*passing), "ego", "other", braking=8.0) is None
-    assert last_escape(recording({"ego": (0, 0, 0, 1)}), "ego", "other", braking=8.0) is None
-
-
 def test_an_outline_that_is_met_within_a_step_counts():
     """At 40 m/s it jumps over a motorcycle between two steps."""
     steps = [{"ego": (20.0 * n, 0.0, 0.0, 40.0), "other": (68.0, 7.5 - 2.0 * n, -math.pi / 2, 4.0)} for n in range(5)]
@@ -235,24 +229,6 @@ def test_a_driven_path_is_found_by_its_length_and_continues_straight():
     assert path.between(0, 0.25) == pytest.approx((1, 0, 0))
 
 
-@pytest.mark.parametrize(
-    ("other", "manner"),
-    [
-        ((20, 0, 0), "ahead"),
-        ((-20, 0, 0.1), "behind"),
-        ((20, 3, math.pi), "oncoming"),
-        ((10, -10, math.pi / 2), "crossing from the right"),
-        ((10, 10, -math.pi / 2), "crossing from the left"),
-        ((1, 3, 0), "left"),
-        ((1, -3, 0), "right"),
-    ],
-)
-@pytest.mark.parametrize("turned", [0.0, 1.0, 3.0, -2.0])
-def test_the_manner_of_an_encounter_does_not_depend_on_the_map(other, manner, turned):
-    two = recording({"ego": (0, 0, 0, 5), "other": (*other, 5)}, turned=turned)
-    assert Encounter(two, "ego", "other").manner(0) == manner
-
-
 def test_the_moments_before_a_rear_end_collision():
     moments = Encounter(follow(speed=20, gap=38.5, leader=10), "ego", "other").moments
     first, *_, last, touch = moments
@@ -262,13 +238,6 @@ def test_the_moments_before_a_rear_end_collision():
     assert 0 < last.time_to_collision_s < 0.2
     assert last.required_deceleration == pytest.approx(10 / (2 * last.time_to_collision_s))
     assert [moment.step for moment in moments] == list(range(len(moments)))
-
-
-def test_where_brakes_do_not_help_there_is_no_escape():
-    assert last_escape(follow(speed=30, gap=20), "ego", "other", braking=8.0) is None
-    overlap = {"ego": (0, 0, 0, 5), "other": (3, 0, 0, 0)}
-    assert last_escape(recording(overlap), "ego", "other", braking=8.0) is None
-    assert Encounter(recording(), "ego", "other").moments == []
 
 
 @pytest.mark.parametrize(("speed_at_the_end", "found"), [(10.0, 0), (0.0, None)])

@@ -276,12 +276,6 @@ def test_who_steps_out_so_late_that_no_one_could_have_stopped():
     assert verdict(drive(straight(12), walks(1.2), name="person 1")) == "nobody can tell"
 
 
-def test_a_crash_in_the_first_scene_has_no_lane_changes():
-    case = drive(straight(20), straight(10, 5), seconds=0.0)
-    assert case.lane_changers(5.0) == ()
-    assert verdict(case) == "nobody can tell"
-
-
 def test_who_turns_off_behind_an_actor_has_changed_no_lanes():
     """Where it turns into the way of who stands in the junction, it leaves its lane over the side."""
     cases_by_name = {data["name"]: case_of(data) for data in cases()}

@@ -128,16 +128,6 @@ def test_braking_run_reports_the_lane_change_that_it_drops(gap, changed):
     assert world.escape().changed == ()  # without a map
 
 
-def test_a_run_continues_for_as_long_as_stopping_takes():
-    world = World()
-    world.escape(said=4.0)
-    assert world.last.max_steps == world.crash()[0].steps + math.ceil((5.0 + 20 / 4.0) / DT)
-    assert world.last.overruled.agent == "ego"
-    assert (world.last.seed, world.last.arguments) == (SPEC.seed, SPEC.arguments)
-    world.escape(said=None)
-    assert world.last.max_steps == world.crash()[0].steps + math.ceil((5.0 + 20 / 4.5) / DT)
-
-
 def test_brakes_that_never_help_or_always_do():
     none = World(gap=30.0, braking=2.0)  # 100 m to stop
     found = none.escape(said=2.0)

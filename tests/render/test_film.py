@@ -19,7 +19,7 @@ from crashhunt.trial import Disturbance
 from crashhunt.world import Actor, Roster, Scene
 
 ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "truck", 12.0, 2.5)))
-ORANGE, RED, GREY = (255, 179, 26), (143, 15, 63), (154, 165, 179)
+RED = (143, 15, 63)
 
 
 def shot(steps: int = 20, *, crash: bool = True, other: str = "other", panels=None) -> Shot:
@@ -118,27 +118,12 @@ def test_several_crashes_have_blank_pictures_between_them():
     assert len({picture.shape for picture in pictures}) == 1
 
 
-def test_the_ego_stays_in_the_middle_and_everybody_has_a_colour():
-    for picture in film(shot(20), panels=False, size=(400, 200)):
-        rows, columns = np.nonzero((picture[80:120] == ORANGE).all(axis=2))
-        assert abs(columns.mean() - 200) < 8
-        assert abs(rows.mean() - 20) < 3
-    assert count(film(shot(20), panels=False)[20], RED) > count(film(shot(20), panels=False)[20], GREY)
-    assert count(film(shot(20, other=""), panels=False)[20], GREY) > 200
-
-
 def test_vehicles_have_their_true_size():
     picture = film(shot(20, crash=False), panels=False, size=(600, 200))[20]
     red = (picture[80:120] == RED).all(axis=2)
     # 12 m by 2.5 m at 8 pixels a metre, less outline and windscreen.
     assert np.nonzero(red.any(axis=0))[0].size == pytest.approx(96, abs=4)
     assert np.nonzero(red.any(axis=1))[0].size == pytest.approx(20, abs=3)
-
-
-def test_the_crash_is_marked_only_where_it_is():
-    crashed, passed = film(shot(20), panels=False), film(shot(20, crash=False), panels=False)
-    changed = [n for n, (a, b) in enumerate(zip(crashed, passed, strict=True)) if (a != b).any()]
-    assert changed == list(range(20, len(crashed)))
 
 
 def test_the_agents_own_panels_are_shown_in_their_step():
@@ -271,10 +256,6 @@ def test_an_interrupted_video_leaves_nothing_behind(tmp_path, monkeypatch):
 def test_impossible_options_are_named(options, message):
     with pytest.raises(UsageError, match=message):
         FilmOptions(**options)
-
-
-def test_picture_may_have_8192_pixels_each_way():
-    assert FilmOptions(size=(8192, 8192)).size == (8192, 8192)
 
 
 def test_places_are_looked_at_before_anything_is_run(tmp_path):

@@ -55,26 +55,10 @@ def test_whatever_an_agent_shows_becomes_a_picture_or_one_clear_error(panel, siz
     assert picture.dtype == np.uint8
 
 
-def test_a_heatmap_has_its_first_row_on_top_and_grey_where_there_is_nothing():
-    picture = Heatmap([[0.0, 1.0], [np.nan, 0.0]]).draw(240, 160)
-    assert tuple(picture[40, 30]) == (68, 1, 84)
-    assert tuple(picture[40, 170]) == (253, 231, 37)
-    assert tuple(picture[130, 30]) == (200, 200, 200)
-    assert (Heatmap([[0.0, 1.0]], annotate=True).draw() != Heatmap([[0.0, 1.0]]).draw()).any()
-
-
 def test_fixed_limits_keep_colours_comparable_between_steps():
     assert (Heatmap([[1.0]], low=0.0, high=2.0).draw() == Heatmap([[2.0]], low=0.0, high=4.0).draw())[
         30:150, :180
     ].all()
-
-
-def test_a_contour_has_as_many_levels_as_asked_for():
-    slope = np.linspace(0, 1, 50)[None].repeat(40, axis=0)
-    middle = Contour(slope, levels=5).draw()[80, 10:186]
-    fills = {tuple(color) for color in middle[:: 176 // 40]}
-    assert 5 <= len(fills) <= 25  # and lines between them
-    assert len({tuple(color) for color in Contour(slope, levels=1).draw()[80, 12:184]}) == 1
 
 
 def test_a_curve_goes_up_where_its_values_do_and_has_gaps_where_there_are_none():
@@ -85,33 +69,10 @@ def test_a_curve_goes_up_where_its_values_do_and_has_gaps_where_there_are_none()
     assert not ((columns > 115) & (columns < 165)).any()
 
 
-def test_several_curves_have_colours_and_names_of_their_own():
-    found = colors(Curve({"speed": [0, 1, 2], "limit": [2, 2, 2]}).draw())
-    assert {BLUE, (213, 94, 0)} <= set(found)
-
-
 def test_a_cursor_marks_a_place():
     plain, marked = Curve([0, 1, 2]).draw(), Curve([0, 1, 2], cursor=1.0).draw()
     changed = np.nonzero((plain != marked).any(axis=2))[1]
     assert set(changed.tolist()) == {134}  # the middle of the axis
-
-
-def test_bars_are_as_long_as_their_values():
-    picture = Bar({"a": 1.0, "b": 3.0, "c": -1.0}).draw()
-    blue = (picture == BLUE).all(axis=2).sum(axis=0)
-    a, b, c = (blue[8 + round(75 * place) + 37] for place in range(3))
-    assert b == pytest.approx(3 * a, abs=3)
-    assert c == pytest.approx(a, abs=3)
-
-
-def test_an_action_lies_within_its_bounds():
-    lengths = [
-        int((Action([value], low=[0.0], high=[10.0]).draw() == BLUE).all(axis=2).any(axis=0).sum())
-        for value in (0.0, 5.0, 10.0, 20.0)
-    ]
-    assert lengths[0] <= 3
-    assert lengths[1] == pytest.approx(lengths[2] / 2, abs=2)
-    assert lengths[2] == lengths[3]
 
 
 def test_a_discrete_action_is_written_by_its_name_with_the_number_below():
@@ -124,24 +85,10 @@ def test_a_discrete_action_is_written_by_its_name_with_the_number_below():
     assert np.array_equal(unknown, Action(7).draw())
 
 
-def test_a_distribution_of_discrete_actions_is_bars_up_to_one():
-    half = (ActionDistribution([0.5, 0.5]).draw() == BLUE).all(axis=2).any(axis=1).sum()
-    whole = (ActionDistribution([1.0, 0.0]).draw() == BLUE).all(axis=2).any(axis=1).sum()
-    assert half == pytest.approx(whole / 2, abs=2)
-
-
 def test_a_distribution_of_a_continuous_action_has_a_curve_for_each_part():
     assert {BLUE, (213, 94, 0)} <= set(colors(ActionDistribution(mean=[0.0, 2.0], std=[1.0, 0.5]).draw()))
     with pytest.raises(ValueError, match="mean has 2 values, but std has 1"):
         ActionDistribution(mean=[0.0, 1.0], std=[1.0]).draw()
-
-
-@pytest.mark.parametrize("image", [np.full((8, 8, 3), 255, np.uint8), np.ones((8, 8)), np.ones((8, 8, 1))])
-def test_a_picture_is_shown_as_it_is(image):
-    image[:4] = 0
-    picture = Picture(image, title="camera").draw()
-    assert tuple(picture[40, 120]) == (0, 0, 0)
-    assert tuple(picture[130, 120]) == (255, 255, 255)
 
 
 def test_text_keeps_its_lines():

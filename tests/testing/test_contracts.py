@@ -29,7 +29,7 @@ from crashhunt.samplers import (
     SobolSampler,
     SweepSampler,
 )
-from crashhunt.scenario import AgentSetup, Scenario, with_action
+from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.simulators.toy import ToySimulator
 from crashhunt.space import Choice, Constant, Range
@@ -254,52 +254,8 @@ class TestRecorded(_Agents):
             agent.act(observations[0])
 
 
-def test_meta_actions_are_in_the_order_of_highway_env():
-    from highway_env.envs.common.action import DiscreteMetaAction
-
-    from crashhunt.simulators import META_ACTIONS
-
-    assert dict(enumerate(META_ACTIONS)) == DiscreteMetaAction.ACTIONS_ALL
-    assert replace(TOY, name="x")
-    assert with_action(TOY, "ego", "meta").agents["ego"].action == "meta"
-
-
 @pytest.mark.parametrize("kind", [KeepLaneWithSpeed, CarFollowing, LaneChanger, IntelligentDriver])
 @pytest.mark.parametrize("space", [spaces.Discrete(2), spaces.Discrete(9), spaces.Box(-1.0, 1.0, (2,))])
 def test_agents_of_ours_refuse_actions_that_they_do_not_know(kind, space):
     with pytest.raises(ValueError, match="meta-actions, not"):
         kind(action_space=space)
-
-
-ROAD = [[1, 0, 4, 25, 0, 1, 0], [1, 25, 0, -10, 0, 1, 0]]
-
-
-@pytest.mark.parametrize(
-    ("others", "change"),
-    [
-        ([], 1),  # nobody there: overtakes on the left
-        ([[1, -3, -4, 0, 0, 1, 0]], 0),  # somebody beside it
-        ([[1, -12, -4, 12, 0, 1, 0]], 0),  # somebody comes fast from behind
-        ([[1, 20, -4, -12, 0, 1, 0]], 0),  # even slower ahead over there
-    ],
-)
-def test_the_idm_driver_changes_lanes_for_a_gain_and_not_into_danger(others, change):
-    observation = np.zeros((8, 7), np.float32)
-    rows = ROAD + others
-    observation[: len(rows)] = rows
-    driver = IntelligentDriver(step_length_s=1.0)
-    driver.reset(0)
-    target, chosen = driver.act(observation)
-    assert chosen == change
-    assert target < 25
-
-
-def test_meta_actions_that_a_space_does_not_have_are_idle():
-    driver = CarFollowing(action_space=MetaAction(("SLOWER", "IDLE", "FASTER")).space)
-    brake, free = np.zeros((2, 7), np.float32), np.zeros((2, 7), np.float32)
-    brake[:], free[0] = ([1, 0, 0, 20, 0, 1, 0], [1, 9, 0, -15, 0, 1, 0]), [1, 0, 0, 5, 0, 1, 0]
-    answers = []
-    for shown in (brake, free):
-        driver.reset(0)
-        answers.append(driver.act(shown))
-    assert answers == [0, 2]

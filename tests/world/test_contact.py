@@ -107,16 +107,6 @@ def test_who_was_not_there_or_was_put_there_did_not_drive():
     assert first_contact(before, wide, 0, 1) is None
 
 
-def test_rows_are_those_of_each_scene():
-    """Somebody entered in between, and everybody has moved on by a row."""
-    before = scene(("other", 12, 0, 0, 2), ("ego", 0, 0, 0, 20), time_s=0.0)
-    after = scene(("new", 80, 0, 0, 1), ("ego", 18, 0, 0, 16), ("other", 15, 0, 0, 4), time_s=1.0, swept=True)
-    found = first_contact(before, after, 1, 2)
-    share = 7 / 15
-    assert found.share == pytest.approx(share, abs=1e-6)
-    assert (found.speed, found.other_speed) == pytest.approx((20 - 4 * share, 2 + 2 * share), abs=1e-5)
-
-
 @pytest.mark.parametrize("turned", TURNS)
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_lane_change_comes_at_the_end_of_the_step(turned, side):

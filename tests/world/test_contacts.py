@@ -105,10 +105,6 @@ def test_who_drives_through_another_between_two_steps_is_seen():
     assert (hit.time_s, hit.x, hit.collider_speed, hit.victim_speed) == pytest.approx((7 / 18, 140 / 18, 20, 2))
 
 
-def hit_share(before, after):
-    return found(before, after).time_s
-
-
 @pytest.mark.parametrize("contacts", [(), (Contact("other", "ego", "collision", "a_0", 4.0, 25.0),)])
 def test_who_ends_up_ahead_of_the_vehicle_that_it_rear_ended_was_not_hit_by_it(contacts):
     before = scene(0.0, ("ego", 0, 0, 0, 25), ("other", 20, 0, 0, 4))

@@ -160,34 +160,6 @@ def test_a_long_episode_is_measured_in_parts_that_add_up(monkeypatch):
     assert in_parts.danger == pytest.approx(at_once.danger, rel=0.02)
 
 
-def test_long_steps_are_filled_in():
-    """A car that crosses between two scenes is seen, and a queue is as dangerous as with short steps."""
-    ego, leader = straight(0, 0, 0, 10, 12, 1.0), straight(15, 0, 0, 10, 12, 1.0)
-    steps, _ = level(ego, leader, step_s=1.0)
-    assert steps[:8] == pytest.approx(math.exp(-1 / 1.2), abs=0.02)
-    crossing = straight(34, -84, math.pi / 2, 20, 12, 1.0)  # on the ego's way at 4.2 s, which is there at 3.4 s
-    steps, _ = level(ego, crossing, step_s=1.0)
-    assert steps.max() > math.exp(-1.2 / 1.2)
-
-
-def test_heights_count_from_the_front_and_the_lower_one_is_who_has_to_fit():
-    """Two on crossing ways are on one level if they are less than 3 m apart, or less than the lower one is high."""
-
-    def danger(above, own=1.5, its=1.5):
-        roster = Roster((Actor("ego", "car", LENGTH, WIDTH, own), Actor("other", "truck", LENGTH, WIDTH, its)))
-        both = frame(straight(-50, 0, 0, 10), straight(0, -58, math.pi / 2, 10))._replace(roster=roster)
-        heights = np.zeros((100, 4))
-        heights[:, 1] = above
-        return dangers([both._replace(heights=heights)], ("ego",), 0.1)[1].danger
-
-    assert danger(0.0) == danger(2.9) == danger(-2.9) > 0.3
-    assert danger(3.1) == danger(-3.1) == 0.0
-    assert danger(3.9, own=4.0) > 0.3  # the agent is the lower one, and high
-    assert danger(-3.9, own=4.0) == danger(4.1, own=4.0) == 0.0
-    assert danger(-3.9, its=4.0) > 0.3
-    assert danger(3.9, its=4.0) == danger(-4.1, its=4.0) == 0.0
-
-
 @pytest.mark.parametrize("seed", range(12))
 def test_towards_an_actor_who_stands_it_is_the_braking_that_it_takes(seed):
     """Of any size, at any angle: the place of the first touch is found by trying, and the rest is calculated.
