@@ -17,8 +17,6 @@ from conftest import _commands, outdated_entry_points
 
 from crashhunt.episode._failures import _contents_of
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals to stopped processes are of Linux")
-
 NOTHING = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 

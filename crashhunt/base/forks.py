@@ -192,11 +192,8 @@ class Watchdog:
 
 
 def threads() -> frozenset[str]:
-    """Return the ids of the threads of this process; an empty set on systems other than Linux."""
-    try:
-        return frozenset(os.listdir("/proc/self/task"))  # noqa: PTH208 - names are enough
-    except OSError:
-        return frozenset()
+    """Return the ids of the threads of this process."""
+    return frozenset(os.listdir("/proc/self/task"))  # noqa: PTH208 - names are enough
 
 
 watchdog = Watchdog()
@@ -226,15 +223,11 @@ def held(shared: frozenset[str] | None = None) -> Held:
     Args:
         shared: names of shared memory, if the caller already knows them; see `Held`.
     """
-    if sys.platform != "linux":
-        return Held()
     return Held(_open(), children_now(), shared)
 
 
 def shared_memory() -> frozenset[str]:
     """Return the names of writable memory that this process shares with other processes."""
-    if sys.platform != "linux":
-        return frozenset()
     with Path("/proc/self/maps").open("rb") as lines:
         names = [line.split(maxsplit=5)[-1] for line in lines if b" rw-s " in line]
     return frozenset(os.fsdecode(name.strip()) for name in names if MEMORY.encode() not in name)
@@ -389,8 +382,6 @@ def fork(work: Callable[[], object], known: Held | None = None, *, keeps: Collec
         CannotForkError: this process cannot be forked.
     """
     global _copying
-    if sys.platform != "linux":
-        raise CannotForkError("forks need Linux")
     parent = os.getpid()
     with watchdog.paused():
         replaced, drawn = _replacements(known or Held(), keeps), random.getstate()

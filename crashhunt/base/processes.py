@@ -1,8 +1,7 @@
 """Process trees that end together with the process that owns them.
 
-An agent may start programs, and these may leave their session, their group and their parent. On Linux, a process can
-adopt all orphans below it (*subreaper*, prctl(2)), so `end_descendants` finds and ends the whole tree. On other
-systems, processes that an agent has started may remain.
+An agent may start programs, and these may leave their session, their group and their parent. A process can adopt all
+orphans below it (*subreaper*, prctl(2)), so `end_descendants` finds and ends the whole tree.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
-import sys
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # of <sys/prctl.h>
-_libc = ctypes.CDLL(None) if sys.platform == "linux" else None  # looked up once, not in every fork
+_libc = ctypes.CDLL(None)  # looked up once, not in every fork
 _PATIENCE_S = 2.0  # for processes that do not die at once; processes of another user never do
 
 
@@ -155,5 +153,4 @@ def _children_by_search(pid: int) -> list[int]:
 
 
 def _prctl(option: int, value: int) -> None:
-    if _libc is not None:
-        _libc.prctl(option, value, 0, 0, 0)
+    _libc.prctl(option, value, 0, 0, 0)

@@ -134,7 +134,7 @@ def _wait(child: int, lifeline: int, resume: Callable[[int], None]) -> int | Non
     the whole job stays suspended.
     """
     ended = None
-    with suppress(AttributeError, OSError):  # an old kernel, or not Linux
+    with suppress(OSError):  # an old kernel
         ended = os.pidfd_open(child)
     while True:
         ready, _, _ = select.select([lifeline, *([ended] if ended is not None else [])], [], [],

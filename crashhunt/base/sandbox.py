@@ -36,8 +36,6 @@ _SYSTEM_PATHS = """
 
 def landlock_version() -> int:
     """Return the version of the kernel's Landlock interface; 0 if there is none."""
-    if sys.platform != "linux":
-        return 0
     return max(0, int(ctypes.CDLL(None, use_errno=True).syscall(_CREATE_RULESET, None, 0, _VERSION_ONLY)))
 
 

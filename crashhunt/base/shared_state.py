@@ -17,7 +17,6 @@ import fcntl
 import mmap
 import os
 import stat
-import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,8 +67,6 @@ class SharedState:
         self._files: list[_File] = []
         self._mappings: list[_Mapping] = []
         self.remaining = ""
-        if sys.platform != "linux":
-            return
         for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - names are enough
             with suppress(OSError):  # the descriptor by which they are listed
                 self._add_file(int(name), known)

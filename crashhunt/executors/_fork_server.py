@@ -186,7 +186,7 @@ class _Server:
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
                 be_supervisor(pool, zygote, self._settings, self._conditions, server)
         self._slots[pid] = message["slot"]
-        with suppress(AttributeError, OSError):
+        with suppress(OSError):
             self._ends[pid] = os.pidfd_open(pid)
         return True
 
@@ -384,7 +384,7 @@ class _Zygote:
         killed = partial(self._kill, pid)
         try:
             end = os.pidfd_open(pid)
-        except (AttributeError, OSError):
+        except OSError:
             while (found_pid := os.waitpid(pid, os.WNOHANG))[0] == 0:
                 self._wait(None, killed)
             code = os.waitstatus_to_exitcode(found_pid[1])

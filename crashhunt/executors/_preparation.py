@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from crashhunt.base.codec import prepare
-from crashhunt.base.forks import ended
+from crashhunt.base.forks import ended, threads
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.processes import end_descendants
 from crashhunt.episode import Parts, WorkerSettings, run_episode
@@ -156,9 +156,5 @@ def _is_forkable_with(parts: Parts) -> bool:
 
 def _can_be_forked() -> bool:
     """Return whether this process can be forked after its imports: it has no other threads and uses no GPU."""
-    try:
-        threads = len(os.listdir("/proc/self/task"))  # noqa: PTH208 - how many is enough
-    except OSError:
-        threads = len(sys._current_frames())
     torch = sys.modules.get("torch")
-    return threads == 1 and not (torch is not None and torch.cuda.is_initialized())
+    return len(threads()) == 1 and not (torch is not None and torch.cuda.is_initialized())

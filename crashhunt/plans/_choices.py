@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import sys
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -323,8 +322,6 @@ def check_branch(settings: HuntSettings) -> None:
     if settings.branch and not parse_rates(settings.disturb):
         fix = "give rates, such as --disturb brake=0.02,cut_in=0.02"
         raise UsageError("--branch needs disturbances, but the hunt has none", fix=fix)
-    if settings.branch and sys.platform != "linux":
-        raise UsageError("--branch forks processes, which needs Linux", fix="omit --branch")
 
 
 def check_rare(
@@ -363,8 +360,6 @@ def check_rare(
                 f"step, which is above {_MAX_RARE_CHANCE:g}"
             )
             raise UsageError(message, fix=f"give at most {most:g} a second, or omit --rare")
-    if sys.platform != "linux":
-        raise UsageError("--rare forks processes, which needs Linux", fix="omit --rare")
 
 
 def with_notes_on_crashes(

@@ -138,7 +138,7 @@ class OneLine:
 def _file_positions() -> dict[int, int]:
     """Return the read positions of this process in its open files."""
     found = {}
-    for name in os.listdir("/proc/self/fd") if sys.platform == "linux" else ():  # noqa: PTH208 - names are enough
+    for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - names are enough
         with suppress(OSError):
             read = fcntl.fcntl(int(name), fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
             if int(name) > 2 and read and stat.S_ISREG(os.fstat(int(name)).st_mode):
@@ -173,7 +173,7 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
         CrashhuntError: the crash could not be run.
         KeyboardInterrupt: the user left the debugger or closed the window.
     """
-    if look.window is not None and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    if look.window is not None and not os.environ.get("DISPLAY"):
         raise UsageError("a window needs a display, but DISPLAY is not set", fix="log in with ssh -X, or give --video")
     # A user who sits at the debugger or at a window may have killed it, and begins again on purpose only.
     attempts = 1 if look.stop_at or look.window is not None else _MAX_ATTEMPTS

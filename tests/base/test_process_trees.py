@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import traceback
 from pathlib import Path
 
@@ -24,7 +23,6 @@ from crashhunt.base.processes import (
     resume,
 )
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are read from /proc")
 TREE = "sleep 60 & setsid sh -c 'sleep 60 & sleep 60; :' & wait"
 
 

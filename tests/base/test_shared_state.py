@@ -8,15 +8,12 @@ import mmap
 import multiprocessing
 import os
 import socket
-import sys
 import tempfile
 from pathlib import Path
 
 import pytest
 
 from crashhunt.base.shared_state import SharedState
-
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks are told apart on Linux only")
 
 
 def in_fork(work):

@@ -42,7 +42,6 @@ from crashhunt.base.temporary import (
     this_process,
 )
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="owners are known by /proc")
 KEPT: list[object] = []  # what is lost is removed
 ODD = ["plain", "with space\nand line", "-f", "Zürich 東京", "*?[x]", "x" * 250, os.fsdecode(b"\xff\xfe")]
 

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-import sys
 
 import pytest
-
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 TOY = """
 title = "A toy"

@@ -8,7 +8,6 @@ import json
 import os
 import signal
 import sqlite3
-import sys
 import threading
 import time
 from contextlib import closing, contextmanager, suppress
@@ -17,8 +16,6 @@ import pytest
 from conftest import wait_for
 
 from crashhunt.base.processes import children_of
-
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 TOY = """
 title = "A toy"

@@ -32,8 +32,6 @@ from crashhunt.plans import Request, plan
 from crashhunt.results import hunt_state
 from crashhunt.suites import _hunt_reruns, _processes
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="owners are known by /proc")
-
 # What a command does to files, and to processes; opening is one where it is for writing.
 STEPS = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.symlink", "os.link", "os.truncate", "subprocess.Popen",
          "shutil.copyfile", "shutil.copytree", "shutil.rmtree", "sqlite3.connect"}  # fmt: skip

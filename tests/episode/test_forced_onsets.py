@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from types import SimpleNamespace
 
 import pytest
@@ -11,8 +10,6 @@ from single_threaded import answer_of
 
 from crashhunt.episode import OnsetForcer
 from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
-
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 
 @pytest.fixture

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 from single_threaded import answer_of, wait_for_the_end_of
-
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 
 class Words(str):

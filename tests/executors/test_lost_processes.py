@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import select
 import signal
-import sys
 import time
 
 import pytest
@@ -16,8 +15,6 @@ from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
-
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the processes of a pool are found on Linux only")
 
 DEADLINE_S = 300.0
 

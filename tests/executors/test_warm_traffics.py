@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -17,8 +16,6 @@ from crashhunt.executors import PoolExecutor
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
 from crashhunt.trial import Outcome, TrialSpec
-
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 HERE = Path(__file__).parent
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
@@ -30,8 +29,6 @@ from crashhunt.trial import (
     TrialResult,
     TrialSpec,
 )
-
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks need Linux")
 
 TOY = """
 title = "A toy"
