@@ -67,9 +67,14 @@ def driven(folder, form):
         simulator.close()
 
 
+@pytest.fixture(scope="module")
+def by_target_speed(tmp_path_factory):
+    return driven(tmp_path_factory.mktemp("by_target_speed"), "speed_and_lane")
+
+
 @pytest.mark.parametrize("form", [*(form for form in KEEPS_SPEED if form != "speed_and_lane"), "trajectory"])
-def test_driver_brakes_as_with_a_target_speed(tmp_path, form):
-    expected, seen = driven(tmp_path, "speed_and_lane")
+def test_driver_brakes_as_with_a_target_speed(tmp_path, by_target_speed, form):
+    expected, seen = by_target_speed
     speeds, also_seen = driven(tmp_path, form)
     assert expected.min() < 8 < expected[0]  # the driver brakes
     assert speeds == pytest.approx(expected, abs=0.15)

@@ -421,7 +421,7 @@ def test_an_agent_that_cannot_even_be_closed_has_driven_all_the_same(run, capsys
 
 def test_the_closest_approach_is_that_of_all_steps(run):
     """Measured many steps at a time: in the first, the last, and across their edges."""
-    for at in (0, 1, 255, 256, 257, 300):
+    for at in (0, 255, 256, 300):
         result = run(Scripted({at: {"scene": {"xs": (0.0, 6.5, 20.0)}}}), max_steps=300)
         assert result.closest.gap_m == pytest.approx(1.5), at
         assert result.steps == 300

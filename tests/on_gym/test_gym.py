@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
+from conftest import mostly_nightly
 from gymnasium import spaces
 
 from crashhunt.base.foreign_code import ForeignError
@@ -76,10 +77,11 @@ def simulator_of(tmp_path, *words, **options):
     return GymSimulator(scenario_of(*words, **options), tmp_path)
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["CartPole-v1", "MountainCarContinuous-v0", "FrozenLake-v1", "Blackjack-v1", "Tray-v0", "tests_tray:make_tray"],
-)
+BY_DAY = ("CartPole-v1", "FrozenLake-v1", "Tray-v0")  # arrays, numbers and tables
+NAMES = (*BY_DAY, "MountainCarContinuous-v0", "Blackjack-v1", "tests_tray:make_tray")
+
+
+@pytest.mark.parametrize("name", mostly_nightly(NAMES, BY_DAY))
 class TestGym(SimulatorContract):
     @pytest.fixture
     def make(self, tmp_path, name, monkeypatch):

@@ -42,9 +42,14 @@ def steps_of(simulator, seed, count):
         observations, *_ = simulator.step({"ego": simulator.actions["ego"].encode(space.sample())})
 
 
-def samples(lane, step_m=0.05):
-    places = np.linspace(0.0, lane.length, max(2, math.ceil(lane.length / step_m) + 1))
-    return places, np.array([lane.position(place, 0.0) for place in places])
+def samples(lane, place, step_m=0.05):
+    """Return points along a lane; of a long lane, those within 300 m of a place."""
+    begin, end = 0.0, lane.length
+    if lane.length > 1000.0:
+        along, _ = lane.local_coordinates(place)
+        begin, end = max(0.0, along - 300.0), min(lane.length, along + 300.0)
+    places = np.linspace(begin, end, max(2, math.ceil((end - begin) / step_m) + 1))
+    return np.array([lane.position(place, 0.0) for place in places])
 
 
 def lanes_at(network, row, columns, margin_m=0.01):
@@ -68,7 +73,7 @@ def test_lanes_and_route_are_those_of_the_road_network(name):
             position, (start, end, number) = vehicle.position, vehicle.lane_index
             roads = network.lanes_dict()
             if not sampled:
-                sampled = {index: samples(lane)[1] for index, lane in roads.items()}
+                sampled = {index: samples(lane, position) for index, lane in roads.items()}
             away = {index: np.hypot(*(points - position).T).min() for index, points in sampled.items()}
             own, left, right, *others = parts["lanes"]
             for row in [*own, *parts["lanes"].reshape(-1, len(LANES)), *left][::7]:
