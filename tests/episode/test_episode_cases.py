@@ -11,12 +11,11 @@ import pytest
 from gymnasium import spaces
 
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
-from crashhunt.base.exceptions import message_of
 from crashhunt.episode import run_episode
-from crashhunt.oracles import Finding, OffRoad, Overlap, ReportedCollision
+from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Phase, Recording, Tag, digest_of, read_black_box, read_header
 from crashhunt.simulators import SpeedAndLaneChange
-from crashhunt.trial import CRASHES, Collision, Outcome, TrialSpec
+from crashhunt.trial import CRASHES, Outcome, TrialSpec
 from crashhunt.world import Actor, Contact, Event, Roster, Scene
 
 EGO, SECOND, OTHER = (Actor(name, "passenger", 5.0, 2.0) for name in ("ego", "second", "other"))
@@ -395,22 +394,6 @@ def test_what_a_simulator_raises_is_no_agents_fault(run, at, error, outcome, kin
     assert result.sim_time_s == result.steps / 2
 
 
-def test_an_oracle_of_an_actor_elses_is_asked_with_the_others(run):
-    seen = []  # how late it was in the scene before
-
-    class Sees:
-        name = "sees"
-
-        def check(self, scene, agents):
-            seen.append(scene.previous and scene.previous.time_s)
-            hit = Collision("ego", "collider", "ego", "other", (self.name,))
-            return [Finding(Outcome.COLLISION, hit)] if scene.time_s == 1.0 else []
-
-    result = run(oracles=(Overlap(), Sees()))
-    assert seen == [None, 0.0, 0.5]
-    assert (result.outcome, result.steps, result.collision.seen_by) == (Outcome.COLLISION, 2, ("sees",))
-
-
 def test_an_agent_that_cannot_even_be_closed_has_driven_all_the_same(run, capsys):
     result = run(drivers={"ego": Driver({"close": RuntimeError("stuck")})})
     assert result.outcome is Outcome.SURVIVED
@@ -435,14 +418,3 @@ def test_a_structured_observation_is_shown_as_it_is_meant(run):
     assert logs["ego"][1].tolist() == [0, 0]
     assert {name: value.tolist() for name, value in logs["second"][2].items()} == {"place": [1], "who": [1]}
     assert run.recording().observations("second").tolist() == [[0, 1], [1, 1], [2, 1]]
-
-
-def test_a_message_that_cannot_be_had_is_no_obstacle(run):
-    class Silent(Exception):  # noqa: N818
-        def __str__(self):
-            raise ValueError("not even this")
-
-    assert message_of(Silent()) == "(its message cannot be had: ValueError)"
-    assert message_of(KeyError("x")) == "'x'"
-    result = run(drivers={"ego": Driver({1: RuntimeError("two\n  lines")})})
-    assert result.failure.message == "two lines"

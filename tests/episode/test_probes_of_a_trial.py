@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.foreign_code import members
-from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
+from crashhunt.base.forks import NoAnswer
 from crashhunt.episode import BUDGET_BESIDE, Prober, _forks
 from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import CRASHES, Disturbance, Outcome, Stress, TrialResult, TrialSpec
@@ -351,36 +351,3 @@ def test_copies_that_fail_by_themselves_are_asked_once_and_three_in_turn_end_the
     stress = stress_of(asker)
     assert (road.forks, stress.margin, stress.why_unasked) == (0, None, asker.fork_runner.why_not)
     assert not stress.may_be_asked_again
-
-
-def test_what_has_no_copy_is_reported_and_its_time_counts():
-    class Refused(Road):
-        def fork(self, work, *, observed=True):
-            raise CannotForkError("a process with several threads cannot be forked", fix="none")
-
-    asker, waited = prober()
-    asker.ask(Refused({}))
-    assert asker.fork_runner.why_not == "a process with several threads cannot be forked"
-    assert len(waited) == 1
-    stress = stress_of(asker)
-    assert (stress.margin, stress.extent, stress.why_unasked) == (
-        None,
-        "asked 0 of 1",
-        "a process with several threads cannot be forked",
-    )
-    assert not stress.may_be_asked_again
-
-
-def test_system_that_starts_no_process_for_a_while_does_not_end_the_asking(no_pauses):
-    class Full(Road):
-        left = 2
-
-        def fork(self, work, *, observed=True):
-            self.left -= 1
-            if self.left >= 0:
-                raise NoProcessError("no process could be started: Cannot allocate memory")
-            return super().fork(work, observed=observed)
-
-    asker, _ = prober()
-    asker.ask(Full({"brake": 0.5}))
-    assert (asker.fork_runner.why_not, stress_of(asker).margin) == ("", 0.5)
