@@ -14,7 +14,7 @@ from branching import Place, Sleeps
 from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.base.processes import children_of
 from crashhunt.disturbances import disturber_of, first_forcing, parse_rates
-from crashhunt.episode import OnsetForcer, run_episode
+from crashhunt.episode import OnsetForcer, _forks as forks, run_episode
 from crashhunt.oracles import Overlap, ReportedCollision
 from crashhunt.trial import CRASHES, Forcing, TrialSpec
 
@@ -75,7 +75,7 @@ def roots(name, stage, speed, seed, steps, rates=RATES):
 def lost(stage):
     """What becomes of a root with copies that hang or die."""
     place, found = Place("toy", stage, 9.5, 2, 60), {}
-    forcing = Forcing(0.1)
+    forcing, forks._PAUSES_S = Forcing(0.1), (0.0, 0.0)
     for name, how in {"hangs": lambda: time.sleep(600), "dies": lambda: os.kill(os.getpid(), 9)}.items():
         result = run(place, forcer_of(RATES, patience_s=0.3), Sleeps(how), forcing=forcing)
         found[name] = [

@@ -170,7 +170,7 @@ def ends(stage):
             "forges": lambda copy: [os.write(end, b"[1]\n") for end in ends_of_copies],
         }
         copies = {name: episode.fork(how) for name, how in ways.items()}
-        answers = {name: copy.answer(2.0 if name == "hangs" else 60.0) for name, copy in copies.items()}
+        answers = {name: copy.answer(0.5 if name == "hangs" else 60.0) for name, copy in copies.items()}
         whys = {name: [copy.no_answer.why, copy.no_answer.is_from_outside] for name, copy in copies.items()}
         divides = copies["divides"]
         # What a copy has started that is killed goes with it, so that there can be another copy.

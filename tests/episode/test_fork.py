@@ -49,7 +49,7 @@ def test_copies_end_with_their_process_and_before_it_when_they_hang(ask):
     found = ask("ends")
     assert found["answers"] == [None] * 7
     assert found["whys"] == {
-        "hangs": ["took longer than 2 s", False],
+        "hangs": ["took longer than 0.5 s", False],
         "is killed": ["was killed by SIGKILL", True],
         "segfaults": ["was killed by SIGSEGV", False],
         "exits": ["exited with 3", False],
