@@ -36,32 +36,30 @@ FOREIGN = (
     "left-grid",
     *(pytest.param(name, marks=NIGHTLY) for name in FURTHER),
 )
-FEW_FOES = {"grid-skew", "spider-lights", *PUBLIC}
 STEP_S, LENGTH_M = 0.5, 4.5
 READERS = {
     "lanes": readers.LanesReader,
     "route": readers.RouteReader,
     "route_state": readers.RouteStateReader,
     "signals": _signal_readers.SignalsReader,
-    "right_of_way": readers.RightOfWayReader,
     "speed_limit": readers.SpeedLimitReader,
     "stop_line": readers.StopLineReader,
     "time_to_switch": _signal_readers.SwitchTimesReader,
 }
 
 
-def moment_of(*vehicles):
-    """The scene of some vehicles as seen by the first of them."""
+def moment_of(vehicle):
+    """The scene of a vehicle alone, as seen by itself."""
     return Moment(
         scene=SimpleNamespace(
-            points=list(map(libsumo.vehicle.getPosition, vehicles)),
-            headings=[math.radians(90 - libsumo.vehicle.getAngle(one)) for one in vehicles],
-            speeds=list(map(libsumo.vehicle.getSpeed, vehicles)),
-            roster=SimpleNamespace(actors=[SimpleNamespace(id=one, length=LENGTH_M) for one in vehicles]),
+            points=[libsumo.vehicle.getPosition(vehicle)],
+            headings=[math.radians(90 - libsumo.vehicle.getAngle(vehicle))],
+            speeds=[libsumo.vehicle.getSpeed(vehicle)],
+            roster=SimpleNamespace(actors=[SimpleNamespace(id=vehicle, length=LENGTH_M)]),
             time_s=libsumo.simulation.getTime(),
         ),
         row=0,
-        lane=libsumo.vehicle.getLaneID(vehicles[0]),
+        lane=libsumo.vehicle.getLaneID(vehicle),
         hidden=frozenset(),
     )
 
@@ -77,7 +75,6 @@ class Town:
     """Vehicles that SUMO drives on random routes through a network, with a reader of each part for each of them."""
 
     def __init__(self, name, folder, vehicles=30):
-        self.name = name
         path = PUBLIC.get(name, NETS / f"{name}.net.xml.gz")
         self.net = sumolib.net.readNet(str(path), withInternal=True)
         self.graph = LaneGraph(read_network(path, with_junctions=True))
@@ -344,47 +341,3 @@ def next_connection(town, vehicle):
         if connection.getToLane().getID() == links[0][0] and connection.getViaLaneID():
             return connection, libsumo.lane.getLength(lane) - libsumo.vehicle.getLanePosition(vehicle)
     return None
-
-
-def is_red(connection):
-    light = connection.getTLSID()
-    return bool(light) and libsumo.trafficlight.getRedYellowGreenState(light)[connection.getTLLinkIndex()] in "rRus"
-
-
-def test_right_of_way_is_that_of_the_junctions_rules_and_geometry(town):
-    seen = {"listed": 0, "yields": 0, "traci": 0}
-    for number, vehicles in enumerate(town.steps(90)):
-        ahead = {one: next_connection(town, one) for one in vehicles} if number % 3 == 0 else {}
-        for vehicle, other in (
-            (one, two) for one in ahead for two in ahead if one != two and ahead[one] and ahead[two]
-        ):
-            (own, line), (theirs, away) = ahead[vehicle], ahead[other]
-            node = own.getFrom().getToNode()
-            if theirs.getFrom().getToNode() is not node or line > 80:
-                continue
-            row = town.reader(vehicle, "right_of_way").observe(moment_of(vehicle, other))[0]
-            rules = node._foes
-            where = crossing(path_of(town, own), path_of(town, theirs))
-            is_foe = rules and node.areFoes(node.getLinkIndex(own), node.getLinkIndex(theirs))
-            if own.getFromLane() is theirs.getFromLane() or not is_foe or where is None:
-                assert not row[0] or where is None or row[4] > away + 50  # on its way around the block
-                continue
-            assert row[0] == 1
-            seen["listed"] += 1
-            must_yield = node.forbids(theirs, own) and not is_red(theirs)
-            assert row[1] == must_yield or (own.getState() == "w" and not row[1])
-            assert row[7] == (own.getState() in "sw")
-            seen["yields"] += must_yield
-            assert row[2] == pytest.approx(line)
-            assert row[3] <= line + where[0] + 0.3
-            assert row[4] <= away + max(where[1], 31.0) + 0.3
-            assert row[5] == libsumo.vehicle.getSpeed(other)
-            wanted = row[4] / row[5] if row[5] > 0.1 else readers.NEVER_S
-            assert row[6] == pytest.approx(min(wanted, readers.NEVER_S))
-            for foe in libsumo.vehicle.getJunctionFoes(vehicle, line + 15):
-                if foe[0] == other and (foe[7] or foe[8]) and foe[5].startswith(f":{node.getID()}_") and foe[2] > 0:
-                    assert bool(foe[7]) == node.forbids(theirs, own)
-                    assert -8 < foe[1] - row[3] < 12
-                    seen["traci"] += 1
-    # At lights with a phase for each turn, no vehicle yields; SUMO names a foe only while both are about to enter.
-    assert min(seen.values()) > 2 or (seen["listed"] > 2 and town.name in FEW_FOES), seen

@@ -283,18 +283,6 @@ def test_commands_for_a_folder_with_odd_characters_are_quoted():
 # The picture.
 
 
-def test_busy_roads_are_drawn_in_other_colors(tmp_path):
-    image_of = pytest.importorskip("PIL.Image")
-    found = network(a=[lane()], b=[lane(at_m=30.0)])
-    draw_map(found, {"a": 90.0, "b": 3.0}, tmp_path / "m.png", title="t", hours=0.1, busiest=[("a", 900.0)])
-    with image_of.open(tmp_path / "m.png") as image:
-        colors = {color: count for count, color in image.convert("RGB").getcolors(1 << 24)}
-    red = sum(count for (r, g, b), count in colors.items() if r > 180 and g < 80 and b < 80)
-    blue = sum(count for (r, g, b), count in colors.items() if (r, g, b) < (160, 190, 255) and b > r + 40)
-    assert red > 1000
-    assert blue > 500
-
-
 def test_a_busy_road_is_drawn_over_a_quiet_one_that_it_crosses(tmp_path):
     image_of = pytest.importorskip("PIL.Image")
     across = NetworkLane(length_m=100.0, speed_mps=10.0, allowed=None, disallowed=frozenset(),

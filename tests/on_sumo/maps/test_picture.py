@@ -121,23 +121,6 @@ def test_legend_has_the_most_vehicles_of_a_road_per_hour(tmp_path, monkeypatch):
     assert seen == [180.0]
 
 
-@pytest.mark.parametrize(("apart_m", "labels"), [((0.0, 1.0), 1), ((0.0, 60.0), 2), ((70.0, 0.0), 2)])
-def test_names_of_roads_that_would_cover_each_other_are_excluded(monkeypatch, apart_m, labels):
-    pytest.importorskip("PIL")
-    from PIL import Image, ImageDraw
-
-    roads = {
-        name: Edge(name, "", (NetworkLane(length_m=2.0, speed_mps=9.0, allowed=None, disallowed=frozenset(),
-                                          shape=((x, y), (x + 2, y))),))
-        for name, (x, y) in (("a", (10.0, 10.0)), ("b", (10.0 + apart_m[0], 10.0 + apart_m[1])))
-    }  # fmt: skip
-    draw = ImageDraw.Draw(Image.new("RGB", (400, 400), (255, 255, 255)))
-    drawn = []
-    monkeypatch.setattr(draw, "text", lambda place, text, **more: drawn.append(text))
-    _draw_labels(draw, RoadNetwork(edges=roads), [("a", 9.0), ("b", 8.0)], lambda point: point, (400, 400))
-    assert drawn == ["a: 9/h", "b: 8/h"][:labels]
-
-
 class Drawing:
     """In place of Pillow's drawing: it notes each call, and every letter is 7 pixels wide."""
 
