@@ -302,14 +302,7 @@ def _argument(name: str, value: Value) -> _Argument:
 
 
 class _Leaf:
-    """An array of an observation, with a copy of its values at a fixed address.
-
-    Args:
-        name: the path of the part in nested observations.
-        space: the space of the part.
-        columns: the names of its columns.
-        get: function that returns the part of an observation.
-    """
+    """An array of an observation, with a copy of its values at a fixed address."""
 
     def __init__(self, name: str, space: Space[object], columns: Collection[str], get: Getter) -> None:
         self.name, self.get = name, get

@@ -139,9 +139,6 @@ class ProgramExchange:
     def attach(self, folder: Path) -> None:
         """Use a program that has driven in earlier trials, if it still runs; otherwise start the program.
 
-        Args:
-            folder: the folder of the reused program.
-
         Raises:
             ProgramError: the program does not run, and cannot be started.
         """

@@ -211,9 +211,6 @@ def reused_folder(agent: str) -> Path | None:
 class AttachedProgram:
     """A reused program in the process of a trial, which is not its parent.
 
-    Args:
-        folder: the folder of the program.
-
     Raises:
         OSError: the program has ended.
     """

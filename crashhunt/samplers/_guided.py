@@ -360,11 +360,7 @@ _FORGET = 0.95  # factor of earlier rewards of a conjunct at each of its proposa
 
 
 class _Arm:
-    """The search for the violation of one conjunct.
-
-    Args:
-        make: function that creates a portfolio.
-    """
+    """The search for the violation of one conjunct."""
 
     def __init__(self, make: Callable[[], Portfolio]) -> None:
         self._make = make

@@ -184,11 +184,7 @@ class _Parameters(NamedTuple):
 
 
 class Model:
-    """Proposes the candidate with the greatest chance to exceed the best score.
-
-    Args:
-        cube: the unit cube whose dimensions are the arguments that vary.
-    """
+    """Proposes the candidate with the greatest chance to exceed the best score."""
 
     def __init__(self, cube: Cube) -> None:
         self._cube = cube

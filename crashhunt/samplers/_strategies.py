@@ -212,9 +212,6 @@ class CmaEs:
     Successive runs start from the most critical of the last ten trials before each run. The first run starts after ten
     trials; the ten trials before a later run may include proposals of the previous run.
 
-    Args:
-        cube: the unit cube whose dimensions are the arguments that vary.
-
     Raises:
         UsageError: the package is not installed.
     """
@@ -275,11 +272,7 @@ _TOGETHER = 0.5  # probability of the distribution around all elites
 
 
 class CrossEntropy:
-    """A mixture of normal distributions around the elites.
-
-    Args:
-        cube: the unit cube whose dimensions are the arguments that vary.
-    """
+    """A mixture of normal distributions around the elites."""
 
     def __init__(self, cube: Cube) -> None:
         self._categorical = cube.categorical
@@ -329,11 +322,7 @@ _OTHER_CATEGORY = 0.3  # probability that a selected categorical argument change
 
 
 class Mutation:
-    """Proposes mutants of the trials in the corpus.
-
-    Args:
-        cube: the unit cube whose dimensions are the arguments that vary.
-    """
+    """Proposes mutants of the trials in the corpus."""
 
     def __init__(self, cube: Cube) -> None:
         self._cube = cube

@@ -233,6 +233,7 @@ _TESTS_ELSEWHERE = {
     "analysis/_interventions.py": ("analysis/test_what_is_counted.py", "e2e/test_what_if.py"),
     "analysis/_types_by_cause.py": ("e2e/test_types_by_cause.py",),
     "world": ("world/test_*.py",),
+    "world/_events.py": ("on_sumo/test_events.py",),
     "world/_manoeuvre_motions.py": ("world/test_manoeuvre_motions.py",),
 }
 """Module or package to its nearest tests, as patterns below `tests`."""
