@@ -108,42 +108,6 @@ def test_the_outlines_say_who_of_a_report_drove_into_which():
     assert facts(hits(ReportedCollision(), before, after)[0]) == ("ego", "collider", "ego", "gone", 7, 3)
 
 
-@pytest.mark.parametrize("turned", [0.0, 1.0, 2.5])
-def test_no_one_nearby_is_excluded(turned):
-    """What spares the work of looking finds whoever was there within the step: passing, crossing, turning, entering."""
-    c, s = math.cos(turned), math.sin(turned)
-
-    def at(time_s, *vehicles):
-        placed = [(n, x * c - y * s, x * s + y * c, h + turned, v) for n, x, y, h, v in vehicles]
-        return scene(*placed, time_s=time_s, swept=True)
-
-    far = [("far", 300, 0, 0, 20), ("beside", 0, 4, 0, 20)]
-    cases = {
-        "through": ([("other", 20, 0, math.pi, 30)], [("other", -12, 0, math.pi, 30)]),
-        "crossed": ([("other", 11, -16, math.pi / 2, 36)], [("other", 11, 20, math.pi / 2, 36)]),
-        "brushed": ([("other", 10, -1.9, 0, 0)], [("other", 10, -1.9, 0, 0)]),
-        "turned": ([("other", 21, -3.5, 0, 4)], [("other", 22.5, -0.5, 1.2, 4)]),
-        "entered": ([], [("other", 24, 0.5, 0, 3)]),
-    }
-    for name, (was, now) in cases.items():
-        before = at(0.0, ("ego", 0, 0, 0, 22), *far, *was)
-        after = at(1.0, *now, ("ego", 22, 0, 0, 22), ("far", 320, 0, 0, 20), ("beside", 22, 4, 0, 22))
-        found = hits(Overlap(), before, after)
-        assert [{hit.collider, hit.victim} for hit in found] == [{"ego", "other"}], name
-        after.swept = False
-        assert bool(hits(Overlap(), before, after)) == (name in ("turned", "entered")), name
-    # One roster for both: nobody entered or left.
-    before, after = (at(time, ("ego", 22 * time, 0, 0, 22), ("other", 20, 0, 0, 0)) for time in (0.0, 1.0))
-    after.roster = before.roster
-    (hit,) = hits(Overlap(), before, after)
-    assert hit.time_s == pytest.approx(15 / 22)
-    clear = (
-        at(0.0, ("ego", 0, 0, 0, 22), *far),
-        at(1.0, ("ego", 22, 0, 0, 22), ("far", 44, 0, 0, 20), ("beside", 22, 4, 0, 22)),
-    )
-    assert hits(Overlap(), *clear) == []
-
-
 def test_the_one_that_turns_within_a_step_is_looked_at_with_what_that_sweeps():
     """Its back swings through a place where it is neither before nor after."""
     small = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("post", "post", 0.4, 0.4)))
@@ -156,22 +120,6 @@ def test_the_one_that_turns_within_a_step_is_looked_at_with_what_that_sweeps():
         before, after = at(0.0, place, 0.0), at(math.pi / 2, place, 1.0)
         assert bool(hits(Overlap(), before, after)) == touched, place
         assert hits(Overlap(), at(0.0, place, 0.0)) == hits(Overlap(), at(math.pi / 2, place, 0.0)) == []
-
-
-@pytest.mark.parametrize("same", [True, False], ids=["as before", "somebody came"])
-def test_the_one_that_drives_through_early_in_a_step_and_is_far_away_at_its_end_has_hit(same):
-    before = scene(("ego", 0, 0, 0, 0), ("other", -8, 0, 0, 60))
-    fresh = [] if same else [("new", 0, 30, 0, 0)]
-    after = scene(*fresh, ("ego", 0, 0, 0, 0), ("other", 52, 0, 0, 60), time_s=1.0, swept=True)
-    if same:
-        after.roster = before.roster
-    (hit,) = hits(Overlap(), before, after)
-    assert (hit.collider, hit.victim) == ("other", "ego")
-    assert hit.time_s == pytest.approx(3 / 60)
-    # Beside it, and no nearer at any time, nobody is hit.
-    before = scene(("ego", 0, 0, 0, 0), ("other", -8, 2.5, 0, 60))
-    after = scene(*fresh, ("ego", 0, 0, 0, 0), ("other", 52, 2.5, 0, 60), time_s=1.0, swept=True)
-    assert hits(Overlap(), before, after) == []
 
 
 def test_the_nearest_comes_first():
