@@ -714,16 +714,6 @@ def test_acceleration_is_that_to_the_next_target_speed(speeds, step):
     assert _surroundings._greatest_acceleration(vehicle) == pytest.approx(0.5 * step)
 
 
-def test_vehicles_around_are_the_nearest_of_each_lane():
-    found = around([(130.0, 1), (120.0, 1), (80.0, 1), (140.0, 0), (90.0, 0), (70.0, 0), (100.0, 2)])
-    (leader,) = found.ahead
-    assert (leader.actor, leader.gap_m, leader.speed_mps) == ("1", pytest.approx(15.0), 15.0)
-    assert (leader.braking_mps2, leader.acceleration_mps2) == (6.0, 6.0)
-    left, right = found.sides[1], found.sides[-1]
-    assert (left.ahead.actor, left.behind.actor, left.behind.gap_m) == ("3", "4", pytest.approx(5.0))
-    assert (right.ahead.actor, right.ahead.gap_m, right.behind) == ("6", pytest.approx(-5.0), None)
-
-
 @pytest.mark.parametrize(
     ("kind", "own"),
     [(type("A", (), {"__module__": "highway_env.envs"}), True),

@@ -28,7 +28,6 @@ from highway_env.road.lane import CircularLane, SineLane, StraightLane
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
-from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark
 from hypothesis import given, settings, strategies as st
 
@@ -36,7 +35,6 @@ from crashhunt.highway.accelerator import (
     Network,
     Onlooker,
     TrafficFrame,
-    _kernel,
     _supported,
     _switch as accelerator,
     kind_of,
@@ -314,36 +312,6 @@ def test_a_method_of_one_vehicle_is_called():
     assert called == ["act"]
 
 
-def test_a_road_of_another_class_keeps_its_own_methods():
-    class Looking(Road):
-        asked = 0
-
-        def neighbour_vehicles(self, vehicle, lane_index=None):
-            self.asked += 1
-            return super().neighbour_vehicles(vehicle, lane_index)
-
-    assert switch_on() == ""
-    road = Looking(RoadNetwork.straight_road_network(2), np_random=np.random.default_rng(1))
-    road.vehicles += [IDMVehicle(road, [30.0 * number, 0.0], 0.0, 20.0) for number in range(3)]
-    road.act()
-    assert road.asked >= 3
-
-
-def test_an_actor_who_moves_an_actor_is_noticed():
-    """Coordinates that were computed are not used where a vehicle is no longer there."""
-    assert switch_on() == ""
-    road = small_road(IDMVehicle, IDMVehicle, IDMVehicle)
-    first, second, third = road.vehicles
-    assert road.neighbour_vehicles(first)[0] is second
-    second.position[0] = 200.0
-    assert road.neighbour_vehicles(first)[0] is third
-    road.vehicles.remove(third)
-    assert road.neighbour_vehicles(first)[0] is second
-    road.network.add_lane("0", "1", StraightLane([0, 8], [10000, 8]))
-    second.position[:] = 40.0, 8.0
-    assert road.neighbour_vehicles(first, ("0", "1", 2))[0] is second
-
-
 def test_it_states_which_it_leaves_alone(caplog):
     class Odd(IDMVehicle):
         def mobil(self, lane_index):
@@ -364,12 +332,6 @@ def test_it_steps_aside_for_another_version(monkeypatch):
 def test_it_steps_aside_for_a_changed_installation(monkeypatch):
     monkeypatch.setattr(_supported, "ACCELERATED", {highway_env.__version__: "0123"})
     assert "not the published one" in reason_against()
-
-
-def test_it_steps_aside_without_a_usable_kernel(monkeypatch):
-    monkeypatch.setattr(_kernel, "_load_kernel", lambda: (None, "it is not built"))
-    assert switch_on() == "the compiled kernel is not used: it is not built"
-    assert Road.act.__module__ == "highway_env.road.road"
 
 
 # Each in a process of its own that has imported highway-env, which takes a second, but nothing of ours: in forks.
@@ -398,16 +360,6 @@ def test_it_steps_aside_where_another_has_replaced_a_method(tmp_path):
     for name, line in zip(names, done.stdout.splitlines(), strict=True):
         assert line.startswith(name)
         assert f" {name.removeprefix('highway_env.utils.')} has been replaced by" in line
-
-
-def test_it_is_undone():
-    before = {(owner, name): getattr(owner, name) for owner, name, _ in accelerator._REPLACEMENTS}
-    assert switch_on() == switch_on() == ""
-    assert all(getattr(owner, name) is not before[owner, name] for owner, name in before)
-    switch_off()
-    switch_off()
-    assert all(getattr(owner, name) is before[owner, name] for owner, name in before)
-    assert Vehicle.act.__module__ == "highway_env.vehicle.kinematics"
 
 
 @pytest.mark.parametrize(("owner", "name"), [(Road, "act"), (AbstractEnv, "_simulate")])
