@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -47,14 +48,14 @@ def test_missing_module_of_a_snapshot_ends_its_process(tmp_path):
 def test_signal_of_a_terminal_does_not_end_a_reaper_while_its_python_starts(tmp_path, number):
     (tmp_path / "waits.py").write_text("import time\ndef main():\n    time.sleep(0.3)\n")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    for attempt in range(8):
-        kept = Kept("waits", environment=environment, stdin=subprocess.DEVNULL)
-        try:
+    with ExitStack() as started:
+        keeps = []
+        for attempt in range(8):
+            keeps.append(Kept("waits", environment=environment, stdin=subprocess.DEVNULL))
+            started.callback(keeps[-1].end)
             time.sleep(attempt * 0.01)  # Python needs 10 to 80 ms to start
-            os.kill(kept.process.pid, number)
-            assert kept.process.wait(60) == 0
-        finally:
-            kept.end()
+            os.kill(keeps[-1].process.pid, number)
+        assert [kept.process.wait(60) for kept in keeps] == [0] * 8
 
 
 def test_kept_process_handles_signals_of_a_terminal(tmp_path):

@@ -288,17 +288,21 @@ def test_a_simulator_that_starts_threads_is_not_forked_once_it_is_there(monkeypa
     assert not _preparation._is_forkable_with(SimpleNamespace(simulator=fails))
 
 
-@pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE])
-def test_process_with_pygame_dies_of_the_signal_itself(tmp_path, number):
+def test_process_with_pygame_dies_of_the_signal_itself(tmp_path):
     """pygame aborts at a fatal signal, so crashes of agents in highway-env seemed to be SIGABRT."""
     code = f"""
-import os, pygame
+import os, pygame, signal
 from crashhunt.executors._trial_process import record_stack
-with open({str(tmp_path / "stack")!r}, "w") as stack:
-    for _ in range(2):
-        record_stack(stack)
-    os.kill(os.getpid(), {int(number)})
+for number in (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE):
+    if (pid := os.fork()) == 0:
+        with open({str(tmp_path)!r} + f"/{{number:d}}", "w") as stack:
+            for _ in range(2):
+                record_stack(stack)
+            os.kill(os.getpid(), number)
+    print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 """
-    died = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False)
-    assert died.returncode == -number
-    assert "most recent call first" in (tmp_path / "stack").read_text()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    numbers = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE)
+    assert [int(code) for code in done.stdout.split()[-3:]] == [-number for number in numbers]
+    for number in numbers:
+        assert "most recent call first" in (tmp_path / str(int(number))).read_text()
