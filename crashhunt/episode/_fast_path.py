@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from crashhunt.episode._observers import Observer
     from crashhunt.oracles import Oracle
     from crashhunt.simulators import FastStepper, Simulator
-    from crashhunt.world import Actor
 
 
 _EVENT_ORACLES = (ReportedCollision, OffRoad, TrafficEvents, RedLight, WrongWay, OffRoute, Teleport)
@@ -58,7 +57,7 @@ class FastPath:
         self.at_once = at_once
         self._recorder, self._agent, self._encode = recorder, agent, encode
         self.cannot_record = self.is_resuming = self.is_encoding = False
-        at_once.core.listen(self._meet, at_once.adopt, self._record_roster)
+        at_once.core.listen(at_once.meet, at_once.adopt, recorder.introduce, self._record_roster)
 
     def resume_after(self, come: int, agents: dict[str, Agent]) -> tuple[int, dict[str, NDArray[np.generic]] | None]:
         """Return the final status of a step and the agent's action; None if the agent has not acted.
@@ -92,14 +91,10 @@ class FastPath:
         self._record_roster()
         return True
 
-    def _meet(self, vehicle: str) -> tuple[str, Actor, float, float, float, bool, int] | None:
-        found = self.at_once.meet(vehicle)
-        return None if found is None else (*found, self._recorder.number(found[1]))
-
-    def _record_roster(self) -> None:
-        """Make the core record the steps of the actors in sight."""
+    def _record_roster(self, records: tuple[bytes, bytes] | None = None) -> None:
+        """Make the core record the steps of the actors in sight, after their records."""
         self.cannot_record = True
-        self._recorder.lend(self.at_once.core, self.at_once.roster)
+        self._recorder.lend(self.at_once.core, self.at_once.roster, records)
         self.cannot_record = False
 
 

@@ -286,15 +286,18 @@ class Recorder(Observer):
         self.observation = box.observation  # type: ignore[assignment, method-assign]
         self.action = box.action  # type: ignore[assignment, method-assign]
 
-    def lend(self, steps: UsualSteps, roster: Roster) -> None:
-        """Let the compiled core write the recording of its steps directly, for the given actors."""
-        if roster is not self._box.roster:
-            self._note_roster(roster)
-        self._box.lend(steps, roster, encode_roster([*map(self.number, roster.actors)]))
+    def lend(self, steps: UsualSteps, roster: Roster, records: tuple[bytes, bytes] | None = None) -> None:
+        """Let the compiled core write the recording of its steps directly, for the given actors.
 
-    def number(self, actor: Actor) -> int:
-        """Return the number of an actor in the recording; -1 before its first record."""
-        return self._same.get(id(actor), -1)
+        Args:
+            steps: steps of the core.
+            roster: the actors.
+            records: what `introduce` returns for these actors; None if it has not been called.
+        """
+        records = records or self.introduce(roster.actors)
+        if roster is not self._box.roster:
+            self._note_actors(*records)
+        self._box.lend(steps, roster, records[1])
 
     def begin(self, episode: ObservedEpisode) -> None:
         """Record the actors of the episode."""
@@ -334,7 +337,7 @@ class Recorder(Observer):
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Record a scene, and before it any changes of actors and lanes."""
         if scene.roster is not self._box.roster:
-            self._note_roster(scene.roster)
+            self._note_actors(*self.introduce(scene.roster.actors))
         if scene.lanes:
             self._box.append(Tag.LANES, 0, "\n".join(scene.lanes).encode())
         if scene.contacts or scene.off_road:
@@ -349,20 +352,27 @@ class Recorder(Observer):
                 self._events.update([event.kind for event in scene.events])
         self._box.step(step, scene, rewards)
 
-    def _note_roster(self, roster: Roster) -> None:
-        actors = roster.actors
+    def introduce(self, actors: Sequence[Actor]) -> tuple[bytes, bytes]:
+        """Return the payloads of two records: of those actors that are not recorded yet, and of a roster of all.
+
+        The first must be written next. It is empty if all actors have been recorded.
+        """
         # Most are the same objects as before: to look for an equal one takes longer than all else about a roster.
-        fresh, known = [], self._numbers
-        for actor in actors:
-            if id(actor) not in self._same:
+        fresh, known, same = [], self._numbers, self._same
+        numbers: list[Any] = [*map(same.get, map(id, actors))]
+        for row, actor in enumerate(actors) if None in numbers else ():
+            if numbers[row] is None:
                 free = len(known)
-                self._same[id(actor)] = known.setdefault(actor, free)
+                numbers[row] = same[id(actor)] = known.setdefault(actor, free)
                 self._kept.append(actor)  # so that no other actor gets its id()
                 if len(known) > free:
                     fresh.append(actor)
-        if fresh:
-            self._box.append(Tag.ACTORS, 0, encode_actors(fresh))
-        self._box.append(Tag.ROSTER, 0, encode_roster([*map(self.number, actors)]))
+        return encode_actors(fresh) if fresh else b"", encode_roster(numbers)
+
+    def _note_actors(self, introduction: bytes, numbers: bytes) -> None:
+        if introduction:
+            self._box.append(Tag.ACTORS, 0, introduction)
+        self._box.append(Tag.ROSTER, 0, numbers)
 
     def copied(self) -> None:
         """Continue recording in a private copy."""

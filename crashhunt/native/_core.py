@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 17
+_INTERFACE = 18
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -94,21 +94,24 @@ class UsualSteps(Protocol):
 
     def listen(
         self,
-        meet: Callable[[str], tuple[str, object, float, float, float, bool, int] | None],
+        meet: Callable[[str], tuple[str, object, float, float, float, bool] | None],
         adopt: Callable[[_Vehicles, tuple[str, ...], Any, int], object],
-        record_roster: Callable[[], object],
+        introduce: Callable[[Any], tuple[bytes, bytes]],
+        record_roster: Callable[[tuple[bytes, bytes]], object],
         /,
     ) -> None:
         """Set the functions that are called when the visible vehicles change.
 
         Args:
             meet: function that receives the id of a vehicle that was not in sight. It returns the id, the actor, its
-                length, width and reach (m), whether it is controlled, and its number in the recording, or -1 before its
-                first record. It returns None if the core cannot continue with this vehicle.
+                length, width and reach (m), and whether it is controlled. It returns None if the core cannot continue
+                with this vehicle.
             adopt: function that receives the vehicles in sight, their ids and actors, and the row of the agent; it
                 returns their roster.
-            record_roster: function that records this roster if an actor has no number yet, or if the buffer is full; it
-                provides a recording buffer again.
+            introduce: function that receives actors, and returns the payloads of two records: of those actors that are
+                not recorded yet, and of a roster of all of them.
+            record_roster: function that writes such records for the actors in sight if the buffer is full; it provides
+                a recording buffer again.
         """
 
     def perceive(
@@ -174,7 +177,7 @@ class UsualSteps(Protocol):
         """
 
     def borrow(
-        self, tape: object, offset: int, reserved: int, tags: tuple[int, int, int, int, int], roster: object,
+        self, tape: object, offset: int, reserved: int, tags: tuple[int, int, int, int, int, int], roster: object,
         numbers: bytes, /,
     ) -> None:  # fmt: skip
         """Record into a given buffer.
@@ -183,15 +186,15 @@ class UsualSteps(Protocol):
             tape: The buffer.
             offset: The offset of the next record.
             reserved: The number of bytes that may be used.
-            tags: The tags of observation, action, step, lanes and roster.
+            tags: The tags of observation, action, step, lanes, roster and actors.
             roster: The actors in sight, which have been recorded.
             numbers: The payload of the record of this roster.
         """
 
-    def give_back(self) -> tuple[int, int, Any, list[tuple[Any, int, None]]]:
+    def give_back(self) -> tuple[int, int, Any, list[tuple[Any, list[int]]]]:
         """Stop recording; return the end of the records, the last complete step, the last roster, and all steps.
 
-        A step consists of its roster and the offset of its numbers.
+        Consecutive steps with the same roster are given as this roster and the offsets of their numbers.
         """
 
     def pause(self) -> None:

@@ -47,8 +47,9 @@ struct Steps {
     long standstill = 0;
     int always_ask = 0, overlaps = 0;
     long long last = 0, now_and_then = 0;
-    // Called with a vehicle that comes into sight, with all that are then in sight, and to record them for the core.
-    PyObject *meet = nullptr, *adopt = nullptr, *record_roster = nullptr;
+    // Called with a vehicle that comes into sight, with all that are then in sight, for the records of these, and to make
+    // room for them.
+    PyObject *meet = nullptr, *adopt = nullptr, *introduce = nullptr, *record_roster = nullptr;
     // of the present roster, and of the step that is complete
     bool ready = false, stopped = false, known = false; // whether the vehicles were found in the step before
     long long made = 0; // by SUMO so far when they were, vehicles of this and other runs
@@ -56,7 +57,6 @@ struct Steps {
         Vehicles *vehicles = nullptr;
         PyObject *ids = nullptr, *actors = nullptr, *roster = nullptr; // the last as the black box has it
         std::vector<char> controlled;
-        std::vector<uint32_t> numbers; // of the actors, as they are recorded; empty where that is not known
         size_t row = 0;
     } sight, entered;
     Vehicles *before_vehicles = nullptr;
@@ -71,8 +71,10 @@ struct Steps {
     // of the black box
     PyObject *tape = nullptr;
     size_t offset = 0, reserved = 0;
-    long tags[5] = {}; // of an observation, an action, a step, lanes, a roster
-    PyObject *recorded = nullptr, *trail = nullptr; // the last roster; (roster, where the numbers begin, None) of each step
+    long tags[6] = {}; // of an observation, an action, a step, lanes, a roster, actors
+    PyObject *recorded = nullptr; // the last roster
+    std::unordered_map<PyObject *, uint32_t> numbers; // of the actors that are recorded, which the recorder keeps
+    std::vector<std::pair<PyObject *, size_t>> trail; // the roster of each step, and where its numbers begin
 
     Steps() = default;
     Steps(const Steps &) = delete;
@@ -81,10 +83,18 @@ struct Steps {
                               part_names, perceived, reinterpret_cast<PyObject *>(eyes),
                               limits, stood, reinterpret_cast<PyObject *>(sight.vehicles), sight.ids, sight.actors,
                               sight.roster, reinterpret_cast<PyObject *>(entered.vehicles), entered.ids, entered.actors,
-                              entered.roster, reinterpret_cast<PyObject *>(before_vehicles), meet, adopt, record_roster,
-                              observation, answer, tape, recorded, trail}) {
+                              entered.roster, reinterpret_cast<PyObject *>(before_vehicles), meet, adopt, introduce,
+                              record_roster, observation, answer, tape, recorded}) {
             Py_XDECREF(one);
         }
+        clear_trail();
+    }
+
+    void clear_trail() {
+        for (const auto &step : trail) {
+            Py_DECREF(step.first);
+        }
+        trail.clear();
     }
 
     bool able() const { return ready && !stopped && tape && sight.roster; }
@@ -322,7 +332,6 @@ struct Steps {
         keep(place.ids, ids);
         keep(place.actors, actors);
         Py_CLEAR(place.roster);
-        place.numbers.clear();
         place.row = static_cast<size_t>(row);
         return true;
     }
@@ -356,30 +365,27 @@ struct Steps {
         Py_XSETREF(entered.actors, PyTuple_New(static_cast<Py_ssize_t>(count)));
         Py_CLEAR(entered.roster);
         entered.controlled.clear();
-        entered.numbers.clear();
         if (!entered.vehicles || !entered.ids || !entered.actors) {
             return false;
         }
         const Roster &were = *sight.vehicles->roster;
         Roster &roster = *(entered.vehicles->roster = new Roster());
-        bool numbered = true, present = false;
+        bool present = false;
         for (size_t row = 0; row < count; row++) {
             const long was = earlier[row];
             double length, width, reach;
             PyObject *id, *actor, *met = nullptr;
             int controlled;
-            long number = -1;
             if (was >= 0) {
                 length = were.lengths[was], width = were.widths[was], reach = were.reaches[was];
                 id = PyTuple_GET_ITEM(sight.ids, was), actor = PyTuple_GET_ITEM(sight.actors, was);
                 controlled = sight.controlled[was];
-                number = sight.numbers.empty() ? -1 : static_cast<long>(sight.numbers[was]);
             } else {
                 PyObject *name = text_of(around.names[around.near[row]]);
                 met = name ? PyObject_CallOneArg(meet, name) : nullptr;
                 Py_XDECREF(name);
                 if (!met || !PyTuple_CheckExact(met) ||
-                    !PyArg_ParseTuple(met, "OOdddpl", &id, &actor, &length, &width, &reach, &controlled, &number)) {
+                    !PyArg_ParseTuple(met, "OOdddp", &id, &actor, &length, &width, &reach, &controlled)) {
                     Py_XDECREF(met);
                     return false;
                 }
@@ -392,15 +398,10 @@ struct Steps {
             roster.widths.push_back(width);
             roster.reaches.push_back(reach);
             entered.controlled.push_back(controlled != 0);
-            entered.numbers.push_back(static_cast<uint32_t>(number));
-            numbered = numbered && number >= 0;
             if (was == static_cast<long>(sight.row)) {
                 entered.row = row;
                 present = true;
             }
-        }
-        if (!numbered) {
-            entered.numbers.clear();
         }
         return present;
     }
@@ -415,14 +416,59 @@ struct Steps {
             return REFUSED;
         }
         Py_XSETREF(entered.roster, roster);
-        const std::vector<uint32_t> &numbers = entered.numbers;
-        if (!numbers.empty() && record(4, numbers.data(), 4 * numbers.size(), SIMULATING)) {
-            keep(recorded, roster);
-            return DONE;
+        PyObject *fresh = PyList_New(0);
+        bool good = fresh;
+        for (Py_ssize_t row = 0; good && row < PyTuple_GET_SIZE(entered.actors); row++) {
+            PyObject *actor = PyTuple_GET_ITEM(entered.actors, row);
+            good = numbers.count(actor) || PyList_Append(fresh, actor) == 0;
         }
-        PyObject *done = PyObject_CallNoArgs(record_roster);
-        Py_XDECREF(done);
-        return !done ? -1 : able() ? DONE : REFUSED;
+        PyObject *records = nullptr;
+        const char *actors = "", *places;
+        Py_ssize_t length = 0, size;
+        if (good && PyList_GET_SIZE(fresh)) {
+            records = PyObject_CallOneArg(introduce, fresh);
+            good = records && PyArg_ParseTuple(records, "y#y#", &actors, &length, &places, &size) &&
+                   number(fresh, places, size);
+        }
+        const int noted = good ? note_sight(actors, length) : -1;
+        Py_XDECREF(records);
+        Py_XDECREF(fresh);
+        return noted;
+    }
+
+    // Records those who are in sight now, and before them the actors that have been numbered; as `note_roster`.
+    int note_sight(const char *actors, Py_ssize_t length) {
+        std::vector<uint32_t> present;
+        for (Py_ssize_t row = 0; row < PyTuple_GET_SIZE(entered.actors); row++) {
+            present.push_back(numbers.at(PyTuple_GET_ITEM(entered.actors, row)));
+        }
+        const size_t size = 4 * present.size();
+        if (offset + static_cast<size_t>(length) + size + 64 > reserved) {
+            PyObject *done = PyObject_CallFunction(record_roster, "((y#y#))", actors, length,
+                                                   reinterpret_cast<const char *>(present.data()),
+                                                   static_cast<Py_ssize_t>(size));
+            Py_XDECREF(done);
+            return !done ? -1 : able() ? DONE : REFUSED;
+        }
+        if (length) {
+            record(5, actors, static_cast<size_t>(length), SIMULATING);
+        }
+        record(4, present.data(), size, SIMULATING);
+        keep(recorded, entered.roster);
+        return DONE;
+    }
+
+    // Takes the numbers of actors from the payload of a record; false with an exception.
+    bool number(PyObject *actors, const char *bytes, Py_ssize_t length) {
+        const Py_ssize_t count = PySequence_Fast_GET_SIZE(actors);
+        if (length != 4 * count) {
+            PyErr_SetString(PyExc_ValueError, "these are not the numbers of the actors");
+            return false;
+        }
+        for (Py_ssize_t row = 0; row < count; row++) {
+            memcpy(&numbers[PySequence_Fast_GET_ITEM(actors, row)], bytes + 4 * row, 4);
+        }
+        return true;
     }
 
     // What has come of a step that has been simulated; negative with an exception. Everything is read before anything
@@ -486,6 +532,9 @@ struct Steps {
             if (offset + records > reserved) {
                 return SIMULATED;
             }
+            if (trail.size() == trail.capacity()) {
+                trail.reserve(2 * trail.size() + 64); // where there is no memory, the step is Python's
+            }
             seen = shown(present, who);
             if (!seen) {
                 if (PyErr_Occurred() && !PyErr_ExceptionMatches(PyExc_Exception)) {
@@ -530,11 +579,7 @@ struct Steps {
         char *start = static_cast<char *>(buffer.buf);
         char *rewards = put_step(start + offset, tags[2], step, now.time_s, 1, now.values);
         memcpy(rewards, &reward, 8);
-        PyObject *step_in_trail = Py_BuildValue("(OnO)", sight.roster, static_cast<Py_ssize_t>(offset + 32), Py_None);
-        if (!step_in_trail || PyList_Append(trail, step_in_trail) < 0) {
-            PyErr_Clear();
-        }
-        Py_XDECREF(step_in_trail);
+        trail.emplace_back(Py_NewRef(sight.roster), offset + 32);
         offset += 32 + 8 * now.values.size();
         say_where(start, offset, step, SIMULATING, 0);
         PyBuffer_Release(&buffer);
@@ -621,15 +666,16 @@ PyObject *usual_heed(PyObject *object, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
-// listen(meet, adopt, record_roster): who is called where others than before are in sight
+// listen(meet, adopt, introduce, record_roster): who is called where others than before are in sight
 PyObject *usual_listen(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
-    PyObject *meet, *adopt, *record_roster;
-    if (!PyArg_ParseTuple(arguments, "OOO", &meet, &adopt, &record_roster)) {
+    PyObject *meet, *adopt, *introduce, *record_roster;
+    if (!PyArg_ParseTuple(arguments, "OOOO", &meet, &adopt, &introduce, &record_roster)) {
         return nullptr;
     }
     keep(steps.meet, meet);
     keep(steps.adopt, adopt);
+    keep(steps.introduce, introduce);
     keep(steps.record_roster, record_roster);
     Py_RETURN_NONE;
 }
@@ -721,15 +767,15 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
-// borrow(map, offset, reserved, (tags of an observation, an action, a step, lanes, a roster), roster, numbers): the roster
-// is of those in sight, and has been recorded with these numbers
+// borrow(map, offset, reserved, (tags of an observation, an action, a step, lanes, a roster, actors), roster, numbers): the
+// roster is of those in sight, and has been recorded with these numbers
 PyObject *usual_borrow(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
     PyObject *tape, *roster;
     Py_ssize_t offset, reserved, length;
     const char *numbers;
-    if (!PyArg_ParseTuple(arguments, "Onn(lllll)Oy#", &tape, &offset, &reserved, &steps.tags[0], &steps.tags[1],
-                          &steps.tags[2], &steps.tags[3], &steps.tags[4], &roster, &numbers, &length)) {
+    if (!PyArg_ParseTuple(arguments, "Onn(llllll)Oy#", &tape, &offset, &reserved, &steps.tags[0], &steps.tags[1],
+                          &steps.tags[2], &steps.tags[3], &steps.tags[4], &steps.tags[5], &roster, &numbers, &length)) {
         return nullptr;
     }
     Py_buffer buffer;
@@ -743,32 +789,43 @@ PyObject *usual_borrow(PyObject *object, PyObject *arguments) {
         PyErr_SetString(PyExc_ValueError, "nothing can be written there");
         return nullptr;
     }
-    Py_XSETREF(steps.trail, PyList_New(0));
-    if (!steps.trail) {
-        return nullptr;
-    }
+    steps.clear_trail();
     keep(steps.tape, tape);
     steps.offset = static_cast<size_t>(offset);
     keep(steps.recorded, roster);
     Steps::Sight &seen = steps.earlier.empty() ? steps.sight : steps.entered;
     keep(seen.roster, roster);
-    seen.numbers.clear();
-    if (seen.vehicles && static_cast<size_t>(length) == 4 * seen.vehicles->roster->ids.size()) {
-        seen.numbers.resize(static_cast<size_t>(length) / 4);
-        memcpy(seen.numbers.data(), numbers, static_cast<size_t>(length));
+    if (seen.actors && !steps.number(seen.actors, numbers, length)) {
+        return nullptr;
     }
     Py_RETURN_NONE;
 }
 
-// give_back() -> (offset, step, the last roster, [(roster, where the numbers begin, None) of each step])
+// give_back() -> (offset, step, the last roster, [(roster, [where the numbers begin of each of its steps])])
 PyObject *usual_give_back(PyObject *object, PyObject *) {
     Steps &steps = steps_of(object);
-    if (!steps.trail && !(steps.trail = PyList_New(0))) {
+    PyObject *runs = PyList_New(0), *places = nullptr; // borrowed
+    bool good = runs;
+    for (size_t number = 0; good && number < steps.trail.size(); number++) {
+        const auto &[roster, begin] = steps.trail[number];
+        if (!number || roster != steps.trail[number - 1].first) {
+            places = PyList_New(0);
+            PyObject *run = places ? Py_BuildValue("(ON)", roster, places) : nullptr;
+            good = run && PyList_Append(runs, run) == 0;
+            Py_XDECREF(run);
+        }
+        PyObject *place = good ? PyLong_FromSize_t(begin) : nullptr;
+        good = place && PyList_Append(places, place) == 0;
+        Py_XDECREF(place);
+    }
+    if (!good) {
+        Py_XDECREF(runs);
         return nullptr;
     }
+    steps.clear_trail();
     Py_CLEAR(steps.tape);
     return Py_BuildValue("(nLON)", static_cast<Py_ssize_t>(steps.offset), steps.step,
-                         steps.recorded ? steps.recorded : Py_None, std::exchange(steps.trail, nullptr));
+                         steps.recorded ? steps.recorded : Py_None, runs);
 }
 
 // take(agents) -> what has come of it

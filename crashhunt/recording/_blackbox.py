@@ -24,7 +24,7 @@ import numpy as np
 from crashhunt.base.errors import DISK, RecorderError
 from crashhunt.base.forks import MEMORY
 from crashhunt.recording.records._agent_records import ACTION, OBSERVATION, PROLOGUE
-from crashhunt.recording.records._scene_record import LANES, NOTES, ROSTER, STEP
+from crashhunt.recording.records._scene_record import ACTORS, LANES, NOTES, ROSTER, STEP
 from crashhunt.world import joined_frame
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Phase(IntEnum):
 
 # Attributes of modules, and members of an enum, are looked up at every use; these are used in every step.
 _STEP, _OBSERVATION, _ACTION = STEP.tag, OBSERVATION.tag, ACTION.tag
-_CORE_TAGS = _OBSERVATION, _ACTION, _STEP, LANES.tag, ROSTER.tag  # records of another writer
+_CORE_TAGS = _OBSERVATION, _ACTION, _STEP, LANES.tag, ROSTER.tag, ACTORS.tag  # records of another writer
 _ACT, _SIMULATE = int(Phase.ACT), int(Phase.SIMULATE)
 
 
@@ -101,7 +101,7 @@ class BlackBox:
         self._roster: Roster | None = None
         self._core: Core | None = None
         self._steps: dict[int, struct.Struct] = {}
-        self._trail: list[tuple[Roster | None, int, Scene | None]] = []
+        self._trail: list[tuple[Roster | None, list[int], list[Scene | None]]] = []
         self._aside: list[tuple[int, int]] = []
         self._lent: UsualSteps | None = None
         try:
@@ -200,11 +200,11 @@ class BlackBox:
 
     def _stop_core(self) -> None:
         if self._lent is not None:
-            self._offset, step, self._roster, places = self._lent.give_back()
+            self._offset, step, self._roster, runs = self._lent.give_back()
             self._lent = None
-            if places:
+            if runs:
                 self._step = step
-                self._trail += places
+                self._trail += [(roster, places, [None] * len(places)) for roster, places in runs]
 
     def _raw(self, tag: int, agent: int, array: NDArray[np.generic], phase: int) -> None:
         if self._lent is not None:
@@ -260,7 +260,7 @@ class BlackBox:
             _PROGRESS.pack_into(self._map, _PROGRESS_OFFSET, end, step, _SIMULATE, 0)
         self._roster, self._core = scene.roster, core
         rest = scene if scene.heights or scene.spines else None
-        self._trail.append((scene.roster, end - 32 * count, rest))
+        self._trail.append((scene.roster, [end - 32 * count], [rest]))
         self._offset, self._step = end, step
 
     def mark(self, phase: int, agent: int = 0) -> None:
@@ -272,12 +272,12 @@ class BlackBox:
         """Return the scenes recorded since the last call, as plain columns."""
         self._stop_core()
         frames: list[Frame] = []
-        for roster, group in groupby(self._trail, key=itemgetter(0)):
-            run = list(group)
-            size = 32 * len(roster)
-            data = b"".join([self._map[offset : offset + size] for _, offset, _ in run])
-            columns = np.frombuffer(data, "<f8").reshape(len(run), 4 * len(roster))
-            frames.append(joined_frame(roster, columns, [scene for *_, scene in run], self._core))
+        for roster, runs in groupby(self._trail, key=itemgetter(0)):
+            _, places, rest = zip(*runs, strict=True)
+            scenes, size = [*chain.from_iterable(rest)], 32 * len(roster)
+            data = b"".join([self._map[offset : offset + size] for offset in chain.from_iterable(places)])
+            columns = np.frombuffer(data, "<f8").reshape(len(scenes), 4 * len(roster))
+            frames.append(joined_frame(roster, columns, scenes, self._core))
         self._trail.clear()
         return frames
 

@@ -219,11 +219,12 @@ def joined_frame(
         core: the compiled core for this frame.
     """
     heights = spines = None
-    if any(scene is not None and scene.heights for scene in scenes):
+    has_scenes = any(scenes)
+    if has_scenes and any(scene is not None and scene.heights for scene in scenes):
         flat = [0.0] * (2 * len(roster))
         rows = [[*scene.heights, *scene.grades] if scene is not None and scene.heights else flat for scene in scenes]
         heights = np.array(rows).reshape(len(scenes), 2 * len(roster))
-    if any(scene is not None and scene.spines for scene in scenes):
+    if has_scenes and any(scene is not None and scene.spines for scene in scenes):
         spines = tuple(scene.spines if scene is not None else _NO_SPINES for scene in scenes)
     if roster.traffic is not None:
         count, (roster, kept) = len(roster), roster.traffic
