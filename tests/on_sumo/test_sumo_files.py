@@ -246,22 +246,6 @@ def test_an_option_that_every_trial_has_is_refused_with_the_fix_and_an_output_is
     check_options({"device.ssm.file": "ssm.xml", "device.toc.file": "toc.xml"}, "here")
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ('<net value="net.net.xml"/>', "given twice"),
-        ('<step-length value="0"/>', "not a time step"),
-        ('<step-length value="0.0001"/>', "not a time step"),
-        ('<b value="1:0"/><e value="30"/>', "before begin"),
-        ('<a value="gone.add.xml"/>', "additional-files: the file"),
-        ('<a value="${NOWHERE_AT_ALL}/r.rou.xml"/>', "NOWHERE_AT_ALL} is not set"),
-    ],
-)
-def test_a_configuration_that_sumo_would_not_take_either(town, text, says):
-    with pytest.raises(ScenarioError, match=says):
-        load_scenario(config(town, text))
-
-
 def test_weights_are_read_from_the_stage(town, tmp_path):
     (town / "w.xml").write_text('<meandata><interval begin="0" end="9"><edge id="south"/></interval></meandata>')
     scenario = load_scenario(config(town, '<w v="w.xml"/>'))

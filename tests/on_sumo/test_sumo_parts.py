@@ -271,7 +271,9 @@ def test_configuration_becomes_a_scenario(write, tmp_path):
     [
         ('<begin v="10"/><end v="5"/>', "end = 5 .*begin = 10"), ('<step-length v="0"/>', "step-length = '0'"),
         ('<step-length v="inf"/>', "step-length = 'inf'"), ('<a v="no.xml"/>', "no.xml"),
-        ('<some-file v="x"/>', "some-file = 'x'"),
+        ('<some-file v="x"/>', "some-file = 'x'"), ('<step-length v="0.0001"/>', "not a time step"),
+        ('<a v="${NOWHERE_AT_ALL}/r.xml"/>', "NOWHERE_AT_ALL} is not set"), ('<scale v="x"/>', "'x'"),
+        ("<input>", "not valid XML"), ('<weight-files v="w.xml"/>', "weight-files"),
     ],
 )  # fmt: skip
 def test_configuration_with_a_mistake_names_the_option(write, text, says):

@@ -1,10 +1,7 @@
 from __future__ import annotations
 
-import gzip
-import math
 import shutil
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,15 +10,11 @@ from hypothesis import given, strategies as st
 
 from crashhunt.errors import ScenarioError
 from crashhunt.scenario import (
-    AgentSetup,
-    Scenario,
     load_scenario,
     scenario_from_dict,
     shipped_folder,
     shipped_scenarios,
 )
-from crashhunt.scenario._load import check
-from crashhunt.sumo import SumoSetup
 
 LOOP = shipped_folder() / "loop"
 
@@ -207,140 +200,6 @@ def test_no_content_raises_anything_else(data):
         assert error.where == "here"
 
 
-def sumocfg(folder: Path, text: str, name: str = "town.sumocfg") -> Path:
-    path = folder / name
-    path.write_text(f"<configuration>{text}</configuration>")
-    return path
-
-
-@pytest.fixture
-def town(tmp_path):
-    """What people have: a network, routes, and a configuration with outputs."""
-    shutil.copy(LOOP / "loop.net.xml", tmp_path / "net.net.xml")
-    (tmp_path / "r.rou.xml").write_text(
-        '<routes><vType id="t"/><route id="way" edges="south east"/>'
-        '<flow id="late" type="t" route="way" begin="50" end="60" number="3"/>'
-        '<vehicle id="odd name #1" type="t" route="way" depart="7.5"/></routes>'
-    )
-    return tmp_path
-
-
-def test_a_bare_sumocfg_is_a_scenario(town):
-    path = sumocfg(
-        town,
-        '<input><net-file value="net.net.xml"/><route-files value="r.rou.xml"/></input>'
-        '<time><begin value="5"/><end value="100"/><step-length value="0.5"/></time>'
-        '<processing><lateral-resolution value="0.8"/><time-to-teleport value="300"/></processing>'
-        '<output><summary-output value="s.xml"/></output><tripinfo-output value="t.xml"/>'
-        '<random_number><seed value="7"/></random_number><gui_only><start value="true"/></gui_only>',
-    )
-    scenario = load_scenario(path)
-    assert scenario.agents["ego"].replaces == "vehicle"
-    assert scenario.arguments["vehicle"].range == "late.0|late.1|late.2"  # the first departs before there is traffic
-    assert scenario.step_length_s == 0.5
-    assert scenario.table(SumoSetup).options == {
-        "begin": 5.0,
-        "end": "100",
-        "lateral-resolution": "0.8",
-        "time-to-teleport": "300",
-    }
-    assert scenario.arguments["scale"].option == "scale"
-    assert scenario.notes[0].endswith("each trial replaces one random vehicle (3 candidates, departing at 50-57 s)")
-
-
-def test_which_a_controlled_vehicle_may_replace(town):
-    """Whoever departs when there is traffic, on a road, and can be named; of very many, as many as can be looked at."""
-    path = sumocfg(town, '<input><n v="net.net.xml"/><r v="r.rou.xml"/></input>')
-
-    def drawn(demand: str) -> list[str]:
-        (town / "r.rou.xml").write_text(f'<routes><vType id="tram" vClass="tram"/>{demand}</routes>')
-        scenario = load_scenario(path, ego="any")
-        return scenario.arguments["vehicle"].range.split("|") if "vehicle" in scenario.arguments else []
-
-    trips = [f'<trip id="t{at}" depart="{at}" from="a" to="b"/>' for at in range(0, 1000, 10)]
-    assert drawn("".join(trips)) == [f"t{at}" for at in range(200, 501, 10)]
-    assert drawn("".join(trips[:7])) == ["t20", "t30", "t40", "t50", "t60"]  # less of a warm-up
-    tram, odd = '<trip id="x" type="tram" depart="0"/>', '<trip id="a|b" depart="1"/>'
-    assert drawn(trips[0] + tram + odd) == []  # only one is left
-    (town / "r.rou.xml").write_text(f'<routes><vType id="tram" vClass="tram"/>{tram.replace("0", "900")}</routes>')
-    assert load_scenario(path, ego="x").agents["x"].depart_s == 900.0  # who is named is waited for, on rails too
-    for some, told in ((trips[0], "departs"), (trips[0] + trips[3], "departs from 10 to 310 s")):
-        assert drawn(some) == []
-        assert load_scenario(path, ego="any").notes[0].endswith(f"the only one that {told}")
-    flow = '<flow id="f" begin="0" end="3600" period="0.5" from="a" to="b"/>'
-    many = drawn(flow)
-    assert len(many) == len(set(many)) == 200
-    assert (many[0], many[-1]) == ("f.400", "f.997")
-    assert drawn('<flow id="f" begin="0" period="9" number="3" from="a" to="b"/>') == ["f.1", "f.2"]
-    (town / "r.rou.xml").write_text("<routes><vehicle id='ego' depart='0'/><vehicle id='b' depart='0'/></routes>")
-    assert list(load_scenario(path).agents) == ["crashhunt.ego"]  # there is one of that name
-
-
-@pytest.mark.parametrize(
-    ("ego", "agent", "attribute", "value"),
-    [
-        ("late.0", "late.0", "existing", True),
-        ("vehicle=odd name #1", "odd name #1", "existing", True),
-        ("route=way", "ego", "route", "way"),
-        ("edges=south,east", "ego", "edges", ("south", "east")),
-    ],
-)
-def test_the_controlled_vehicle_can_be_named(town, ego, agent, attribute, value):
-    path = sumocfg(town, '<input><n v="net.net.xml"/><r v="r.rou.xml"/></input>')
-    scenario = load_scenario(path, ego=ego)
-    assert getattr(scenario.agents[agent], attribute) == value
-
-
-@pytest.mark.parametrize(
-    ("rate", "depart_s"),
-    [
-        ('period="4"', 46.0),
-        ('vehsPerHour="1800"', 28.0),
-        ('perHour="1800"', 28.0),
-        ('probability="0.5"', 28.0),
-        ('period="exp(0.25)"', 46.0),
-        ('end="1:50" number="10"', 100.0),
-        ('period="whenever"', 0.0),
-        ("", 0.0),
-    ],
-)
-def test_a_vehicle_of_a_flow_is_waited_for(town, rate, depart_s):
-    (town / "r.rou.xml").write_text(f'<routes><flow id="a.b" from="south" to="east" begin="10" {rate}/></routes>')
-    path = sumocfg(town, '<input><n v="net.net.xml"/><r v="r.rou.xml"/></input>')
-    assert load_scenario(path, ego="a.b.9").agents["a.b.9"].depart_s == depart_s
-
-
-def test_files_next_to_and_above_and_compressed(town):
-    (town / "cfg").mkdir()
-    with gzip.open(town / "r.rou.xml.gz", "wb") as file:
-        file.write((town / "r.rou.xml").read_bytes())
-    path = sumocfg(town / "cfg", '<net-file value="../net.net.xml"/><route-files value="../r.rou.xml.gz"/>')
-    scenario = load_scenario(path)
-    assert scenario.origin == str(path)
-    assert scenario.folder == town
-    assert sorted(scenario.files()) == ["net.net.xml", "r.rou.xml.gz"]
-    assert "late.0" in scenario.arguments["vehicle"].range
-
-
-@pytest.mark.parametrize(
-    ("text", "ego", "says"),
-    [
-        ("<input>", "", "not valid XML"),
-        ("", "", "net-file"),
-        ('<net-file value="gone.net.xml"/>', "", "gone.net.xml"),
-        ('<net-file value="net.net.xml"/>', "", "--ego edges=FROM,TO"),
-        ('<net-file value="net.net.xml"/>', "colour=red", "route=ID"),
-        ('<net-file value="net.net.xml"/><step-length value="x"/>', "route=a", "'x'"),
-        ('<net-file value="net.net.xml"/><scale value="x"/>', "route=a", "'x'"),
-        ('<net-file value="net.net.xml"/><weight-files value="w.xml"/>', "route=a", "weight-files"),
-    ],
-)
-def test_a_sumocfg_that_cannot_be_used_states_why(town, text, ego, says):
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario(sumocfg(town, text), ego=ego)
-    assert says in str(caught.value)
-
-
 @pytest.mark.parametrize("outside", ["../loop.net.xml", "../own beside/loop.net.xml", "absolute"])
 def test_a_file_that_exists_outside_of_the_folder_is_refused(loop, tmp_path, outside):
     (tmp_path / "own beside").mkdir()
@@ -354,28 +213,6 @@ def test_a_file_that_exists_outside_of_the_folder_is_refused(loop, tmp_path, out
 def test_a_way_out_and_in_again_is_inside(loop):
     change(loop, "sumo", "net", value="../own/loop.net.xml")
     assert load_scenario(loop).tables["sumo"].net == "../own/loop.net.xml"
-
-
-@pytest.mark.parametrize(
-    ("changes", "where", "says", "fix"),
-    [
-        ({"step_length_s": 0.0}, "step_length_s = 0.0", "is not a time above 0", "give seconds, such as 0.1"),
-        ({"insertion_timeout_s": math.inf}, "insertion_timeout_s = inf", "is not a time above 0", "give seconds"),
-        ({"warmup_s": -1.0}, "warmup_s = -1.0", "is not a time", "give seconds, such as 20.0"),
-        ({"agents": {}}, "agents = {}", "names no controlled vehicle", "add a table [agents.ego]"),
-        ({"events": {"odd": 1.0}}, "events = 'odd'", "has no limit", "give some of "),
-        ({"events": {"not_moving": 0.0}}, "events.not_moving = 0.0", "is not a limit", "above 0"),
-        ({"simulator": "sumo"}, "sumo = None", "is missing", "add a table [sumo] with "),
-    ],
-)  # fmt: skip
-def test_a_wrong_value_is_named_with_its_key_and_the_fix(changes, where, says, fix):
-    scenario = replace(Scenario(simulator="toy", agents={"ego": AgentSetup()}), **changes)
-    with pytest.raises(ScenarioError) as caught:
-        check(scenario, "file", kept=False)
-    assert caught.value.message == f"{where} {says}"
-    assert fix in caught.value.fix
-    assert caught.value.where == "file"
-    check(Scenario(simulator="toy", agents={"ego": AgentSetup()}, events={"not_moving": 3.0}), "file", kept=False)
 
 
 def test_arguments_have_their_names_and_a_mistake_in_them_is_found_by_file_and_table(loop):
