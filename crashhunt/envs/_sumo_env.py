@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import weakref
+from collections.abc import Iterable
 from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -86,7 +87,8 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         if max_steps is not None and (not isinstance(max_steps, Integral) or max_steps < 1):
             raise UsageError(f"max_steps is {max_steps!r}", fix="give at least 1, or None for no limit")
         words = _words_in(disturb)
-        parts = _words_in(observation) if isinstance(observation, str) else tuple(observation)
+        given: object = _words_in(observation) if isinstance(observation, str) else observation
+        parts = tuple(given) if isinstance(given, Iterable) else (given,)
         if not all(isinstance(part, str) for part in parts):
             raise UsageError(f"observation is {observation!r}", fix="give the names of parts as text, or omit it")
         self._max_steps = max_steps

@@ -124,7 +124,7 @@ class NumbersAction:
             array = cast(action, np.dtype(np.float64))
         if array is None or array.shape != (self._count,):
             fix = f"return {self._count} numbers"
-            raise ActionError(f"the action {describe_value(action)} is not {layout}", fix=fix)
+            raise ActionError(f"the action {describe_value(action)}{_form_of(action, array)} is not {layout}", fix=fix)
         for value, component in zip(array.tolist(), self._components, strict=True):
             if not component.low <= value <= component.high:  # NaN fails the comparison
                 allowed = f"within {component.low:g} and {component.high:g} {component.unit}".rstrip()
@@ -171,11 +171,9 @@ class TrajectoryAction:
         with suppress(Exception):  # converting the agent's object runs the agent's code, which may raise anything
             array = cast(action, np.dtype(np.float64))
         if array is None or array.ndim != 2 or array.shape[1] != _WIDTH or not 0 < array.shape[0] <= MAX_POINTS:
-            shape = "" if array is None else f" of the shape {array.shape}"
-            if array is None and isinstance(action, np.ndarray):
-                shape = f" of the type {action.dtype}"
             fix = f"return an array (K, {_WIDTH}) of time, x, y, heading and speed, with 1 to {MAX_POINTS} rows"
-            raise ActionError(f"the action {describe_value(action)}{shape} is not a trajectory", fix=fix)
+            message = f"the action {describe_value(action)}{_form_of(action, array)} is not a trajectory"
+            raise ActionError(message, fix=fix)
         points = array.astype(np.float64, copy=False)
         for component, column in zip(self._components, points.T, strict=True):
             wrong = ~((component.low <= column) & (column <= component.high))  # NaN fails both comparisons
@@ -258,6 +256,13 @@ class MetaAction(SpaceAction):
         if isinstance(action, np.ndarray) and action.size == 1:
             action = action.reshape(())
         return super().encode(action).reshape(1)
+
+
+def _form_of(action: object, array: NDArray[np.generic] | None) -> str:
+    """Return the shape of an action, in words; or its type, if it is an array that is not of numbers."""
+    if array is not None:
+        return f" of the shape {array.shape}"
+    return f" of the type {action.dtype}" if isinstance(action, np.ndarray) else ""
 
 
 def cast(action: object, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:

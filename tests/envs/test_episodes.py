@@ -194,8 +194,9 @@ def test_environment_with_parts_passes_the_checker_of_gymnasium_and_names_the_ac
         env.close()
     with pytest.raises(UsageError, match="observation: 'eggo' is not a part of observations; did you mean 'ego'"):
         gymnasium.make("crashhunt:crashhunt/SUMO-v0", observation=["eggo"])
-    with pytest.raises(UsageError, match="give the names of parts as text"):
-        gymnasium.make("crashhunt:crashhunt/SUMO-v0", observation=[3])
+    for wrong in ([3], 3, None):
+        with pytest.raises(UsageError, match="give the names of parts as text"):
+            gymnasium.make("crashhunt:crashhunt/SUMO-v0", observation=wrong)
 
 
 @pytest.mark.parametrize(

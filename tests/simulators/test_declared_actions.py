@@ -38,6 +38,8 @@ def test_none_and_overrides_are_encoded_for_a_vehicle_that_the_simulator_drives(
         ((10.0,), "is not .target_speed, lateral_speed."),
         ("fast", "is not .target_speed, lateral_speed."),
         (np.ma.masked_array([1.0, 1.0], [True, False]), "is not"),
+        (np.array([1.0, 1.0], object), "dtype=object. of the type object is not"),
+        (np.ones((2, 1)), r"of the shape .2, 1. is not"),
     ],
 )
 def test_number_beyond_its_limit_is_named(action, message):
