@@ -272,16 +272,6 @@ def test_keys_that_the_scenario_names_are_reported_as_present_or_absent(tmp_path
     assert topic == f"gym.crash.info = 'felt'{ABSENT_WORDS}info had only the keys fell"
 
 
-def test_observations_are_recorded_flat_and_shown_as_they_are(tmp_path):
-    simulator = simulator_of(tmp_path, "Tray-v0")
-    observations, _ = simulator.reset(seed=4)
-    flat, space = observations["ball"], simulator.shown_spaces["ball"]
-    assert flat.shape == (2 + 2 + 1,)
-    shown = spaces.unflatten(space, flat)
-    assert space.contains(shown)
-    assert np.array_equal(shown["ball"], simulator._env.unwrapped.ball)
-
-
 def test_scenario_argument_that_is_a_signal_is_a_function_of_the_time(tmp_path):
     arguments = {"wide": ArgumentSetup(default=3.0, option="size")}
     simulator = simulator_of(tmp_path, f"{__name__}:Wide", arguments=arguments)
@@ -307,19 +297,6 @@ def make_nested(config=None, **kwargs):
 
 def make_nothing():
     return "a tray"
-
-
-def test_a_dotted_option_is_an_entry_of_a_table_and_the_rest_of_it_stays(tmp_path):
-    config = {"friction": {"of": 0.1, "type": "dry"}}
-    arguments = {"wet": ArgumentSetup(default=0.5, option="config.friction.of")}
-    name = f"{__name__}:make_nested"
-    simulator = simulator_of(tmp_path, name, arguments=arguments, config=config, size=1.0)
-    assert simulator._env.config == {"friction": {"of": 0.5, "type": "dry"}}
-    simulator.reset(seed=1, options={"arguments": {"wet": 0.7}})
-    assert simulator._env.config == {"friction": {"of": 0.7, "type": "dry"}}
-    assert config == {"friction": {"of": 0.1, "type": "dry"}}
-    with pytest.raises(InvalidEpisodeError, match="friction is"):
-        simulator.reset(seed=1, options={"arguments": {"wet": -1.0}})
 
 
 class OldTray(Tray):

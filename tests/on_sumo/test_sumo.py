@@ -143,7 +143,7 @@ def test_what_is_simulated_before_the_first_step_is_counted(town, tmp_path, only
 @pytest.mark.parametrize("damage", ["</net", pytest.param("<net><edge", marks=pytest.mark.nightly)])
 def test_a_malformed_network_is_no_crash(town, damage):
     (town.folder / "net.net.xml").write_text(damage)
-    done = town.crashhunt("run", "h", "1", "40", "100", "--scenario", "town.sumocfg", "--json", expect=3)
+    done = town.crashhunt("run", "h", "1", "4", "100", "--scenario", "town.sumocfg", "--json", expect=3)
     assert set(done.json["outcomes"]) == {"invalid"}
     assert done.json["crashes"] == []
 

@@ -70,10 +70,6 @@ def test_any_row_of_words_is_a_formula_or_refused(words):
         assert error.fix
 
 
-def test_parentheses_may_be_nested_deeply():
-    assert parse("(" * 4000 + "x" + ")" * 4000 + " > 1").satisfied({"x": [2.0]}, 1.0)
-
-
 def test_names_of_signals_have_dots_and_indices_and_may_begin_like_an_operator():
     assert parse("always info.speed > observation[3] and android and until_now").signals == (
         "info.speed", "observation[3]", "android", "until_now",
