@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import importlib
 import os
 import re
 import shutil
@@ -38,7 +37,7 @@ import weakref
 import zlib
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache, wraps
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -189,9 +188,9 @@ def start_time(pid: int) -> int:
 #
 # A segment is a file in ``/dev/shm``, and the kernel does not say who created it. Two facts prove that a trial did:
 #
-# * Python reported in a process of the trial that it creates the file, by `multiprocessing.shared_memory` or by opening
-#   it. Python's own resource tracker is no replacement: it is killed with the trial. Before Python 3.13 it also removes
-#   segments of other programs to which an agent only attached.
+# * Python reported in a process of the trial that it creates the file by opening it, or maps a new file, as
+#   `multiprocessing.shared_memory` does. Python's own resource tracker is no replacement: it is killed with the trial.
+#   Before Python 3.13 it also removes segments of other programs to which an agent only attached.
 # * The file is new since the trial began, a process of the trial has it open or mapped for writing, and no process
 #   outside the trial has. This finds segments of C code and of programs that an agent starts.
 #
@@ -199,13 +198,12 @@ def start_time(pid: int) -> int:
 
 _SHARED_MEMORY_RECORD = "shared-memory-{}.txt"  # with the token of the process that created what the file names
 _SHARED_MEMORY_FOLDER = Path("/dev/shm")
-_CREATE_FLAGS = os.O_CREAT | os.O_EXCL  # with both, shm_open has made the segment
-_OPENED, _USED = "opened", "used"  # first words of lines in records; the line of a new segment begins with its device
+_OPENED, _USED = "opened", "used"  # first words of lines in records
 _CLOCK_NS = 20_000_000  # the time of a file is that of the last tick of the kernel's clock
 _recording_process: list[int] = []  # for this process and its forks; else each process records for itself
-_records: list[Callable[[object, object, str], None]] = []  # writes a line of a record
+_records: list[Callable[[str, int, str], None]] = []  # writes a line of a record
 _listed: list[tuple[int, frozenset[tuple[str, int]]]] = []  # time of the last change of the folder, and its files
-_before: list[frozenset[tuple[str, int]]] = []  # name and inode of the files before the trial of this process
+_before: list[frozenset[tuple[str, int]]] = []  # name and inode of the files before the records, or the trial
 
 
 def record_shared_memory(scratch: Path) -> None:
@@ -217,8 +215,9 @@ def record_shared_memory(scratch: Path) -> None:
     """
     folder = scratch.absolute()
     _boot()  # here, or each fork reads it again
+    _before[:] = [_shared_memory()]
 
-    def record(kind: object, value: object, name: str) -> None:
+    def record(kind: str, value: int, name: str) -> None:
         owner = _owner(_recording_process[0]) if _recording_process else this_process()
         with suppress(OSError, ValueError):
             path = folder / _SHARED_MEMORY_RECORD.format(owner.token)
@@ -236,7 +235,7 @@ def record_shared_memory(scratch: Path) -> None:
                 writes = fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE != os.O_RDONLY
                 if writes and (target := os.readlink(f"/proc/self/fd/{descriptor}")).startswith(prefix):  # noqa: PTH115
                     name, number = target.removeprefix(prefix), os.fstat(descriptor).st_ino
-                    if _before and "/" not in name and (name, number) not in _before[0]:
+                    if "/" not in name and (name, number) not in _before[0]:
                         record(_USED, number, name)
         if event not in ("open", "os.mkdir"):
             return
@@ -249,22 +248,6 @@ def record_shared_memory(scratch: Path) -> None:
         if isinstance(flags, int) and flags & os.O_CREAT and not os.path.lexists(path):
             record(_OPENED, time.time_ns(), os.path.basename(path))  # noqa: PTH119
 
-    try:
-        module = importlib.import_module("_posixshmem")
-    except ImportError:  # Python was built without it
-        return
-    original = vars(module)["shm_open"]
-
-    @wraps(original)
-    def shm_open(path: str, flags: int, mode: int = 0o777) -> int:
-        descriptor: int = original(path, flags, mode=mode)
-        if flags & _CREATE_FLAGS == _CREATE_FLAGS:
-            with suppress(OSError):
-                found = os.fstat(descriptor)
-                record(found.st_dev, found.st_ino, path.lstrip("/"))
-        return descriptor
-
-    vars(module)["shm_open"] = shm_open
     sys.addaudithook(look)
     os.register_at_fork(before=_know_owner)
     _records[:] = [record]
@@ -383,11 +366,8 @@ def _release(kind: str, value: int, name: str) -> None:
     """Remove what a line of a record names, unless it is a later file of the same name."""
     if kind == _USED:
         _remove_unused([(name, value)])
-    elif kind == _OPENED:
-        _remove(name, lambda found: found.st_ctime_ns >= value - _CLOCK_NS)
     else:
-        device = int(kind)
-        _remove(name, lambda found: (found.st_dev, found.st_ino) == (device, value))
+        _remove(name, lambda found: found.st_ctime_ns >= value - _CLOCK_NS)
 
 
 def _remove(name: str, is_meant: Callable[[os.stat_result], bool]) -> None:
