@@ -363,9 +363,9 @@ def _expanded(command: argparse.ArgumentParser, action: argparse.Action) -> str:
 
 
 def _plain(text: str | None) -> str:
-    """Return a text in which characters with a meaning in Markdown are escaped."""
+    """Return a text in which characters with a meaning in Markdown are escaped; ``names`` become code."""
     said = " ".join((text or "").split())
-    return "".join(f"\\{letter}" if letter in "*<[`" else letter for letter in said)
+    return re.sub(r"``([^`]+)``|[*<[`]", lambda found: f"`{found[1]}`" if found[1] else f"\\{found[0]}", said)
 
 
 # The keys of each `--json` output, made from the JSON Schema files that tests compare with all outputs.
@@ -474,7 +474,7 @@ def _described_entries(entries: Iterable[ListingEntry]) -> Iterator[str]:
         if entry["arguments"]:
             yield "| setting | unit | range | default | meaning |\n| --- | --- | --- | --- | --- |"
             for given in entry["arguments"]:
-                facts = given["unit"], given["range"], given["default"], given["help"]
+                facts = given["unit"], given["range"], given["default"], _plain(given["help"])
                 cells = (str(fact).replace("|", "\\|") for fact in facts)
                 yield f"| `{given['name']}` | {' | '.join(cells)} |"
             yield ""

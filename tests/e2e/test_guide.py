@@ -184,6 +184,12 @@ def test_keys_of_outputs_are_those_of_the_schemas():
     assert '"certain": {"low": number|null, "high": number|null}|null, "estimated": {"low"' in " ".join(text.split())
 
 
+def test_names_in_the_texts_of_parts_are_code():
+    text = find_page("observation-parts").text(make_parser())
+    assert "| `left` |  | 0:1 | with relation=true only: 1 if `same_lane` is 0, " in text
+    assert "followed as far as `radius` |" in text
+
+
 def test_every_module_is_listed_with_what_it_is_about():
     text = describe_modules()
     package = Path(crashhunt.__file__).parent
