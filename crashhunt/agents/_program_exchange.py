@@ -157,10 +157,8 @@ class ProgramExchange:
     def ask(self, message: ProgramRequest, shown: str, limit_s: float | None = None) -> dict[str, Any]:
         """Send a message, and return the program's answer to it.
 
-        Args:
-            message: the message.
-            shown: the message in errors, such as ``observe of step 3``.
-            limit_s: time limit for the answer, in s; None if the time limit of the trial applies.
+        ``shown`` names the message in errors, such as ``observe of step 3``. Without ``limit_s``, the time limit of the
+        trial applies.
 
         Raises:
             ProgramError: the program has ended, or its answer is not the one that the protocol defines.

@@ -48,12 +48,8 @@ def launch(
 ) -> subprocess.Popen[bytes]:
     """Start a program.
 
-    Args:
-        command: the program and its words.
-        folder: the folder in which the program runs; it is created.
-        log: file descriptor for its standard error.
-        libraries: folder with copies of the libraries that the program loads; empty if there are none.
-        pipes: file descriptors for its standard input and output; by default those of new pipes.
+    The folder is created. ``libraries`` is a folder with copies of the libraries that the program loads; empty if there
+    are none. Without ``pipes``, its standard input and output are new pipes.
 
     Raises:
         OSError: the operating system cannot run the program.
@@ -235,8 +231,7 @@ class AttachedProgram:
     def detach(self, *, is_idle: bool) -> None:
         """Close the pipes of this trial.
 
-        Args:
-            is_idle: whether the program has answered every message, so that it can drive in the next trial.
+        An idle program has answered every message, so that it can drive in the next trial.
         """
         assert self.stdin is not None
         assert self.stdout is not None

@@ -104,13 +104,7 @@ class ReferenceModel(Protocol):
 
 
 class _Delay:
-    """Counts the steps since a risk is present.
-
-    Args:
-        count: number of situations.
-        reaction_s: reaction time, in s.
-        step_length_s: time from one step to the next, in s.
-    """
+    """Counts the steps since a risk is present."""
 
     def __init__(self, count: int, reaction_s: float, step_length_s: float) -> None:
         self._steps = math.ceil(reaction_s / step_length_s - _STEP_TOLERANCE)

@@ -389,10 +389,7 @@ def merged(data: Plain, rest: Plain) -> dict[str, object]:
 def slip(rest: Plain, known: Plain, kind: type) -> str:
     """Return an unknown key that resembles a missing key (a typing error or damage); empty if there is none.
 
-    Args:
-        rest: the unknown part, from `known_part`.
-        known: the known part, from `known_part`.
-        kind: the dataclass.
+    Both parts are those of `known_part`.
     """
     missing = [item.name for item in fields(kind) if item.name not in known]
     return next((name for name in rest if name not in known and did_you_mean(name, missing)), "")

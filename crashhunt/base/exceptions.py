@@ -89,10 +89,7 @@ def is_users(filename: str) -> bool:
 def blamed(what: str, error: BaseException, *, fix: str = "correct the code") -> PluginError:
     """Return the error for a failure of user code: the failed action, the reason and the place.
 
-    Args:
-        what: the failed action, such as ``the sampler 'mine' cannot be made``.
-        error: the exception that the user code raised.
-        fix: the fix, as an instruction to the user.
+    ``what`` is the failed action, such as ``the sampler 'mine' cannot be made``.
     """
     return PluginError(f"{what}: {in_words(error)}", fix=fix, where=place_of(error))
 

@@ -148,9 +148,7 @@ def checked_out(top: Path, commit: str, *, purpose: str, name: str = "") -> Iter
 def import_environment(folder: Path, tree: Path) -> dict[str, str]:
     """Return the environment variables with which modules are imported from a work tree.
 
-    Args:
-        folder: folder inside the work tree from which modules are imported.
-        tree: root of the work tree; modules in this folder and in its ``src`` are found as well.
+    Modules in the root of the work tree and in its ``src`` are found as well.
     """
     places = dict.fromkeys(map(str, (folder, tree, tree / "src")))
     paths = [*places, *filter(None, [os.environ.get("PYTHONPATH")])]
@@ -170,11 +168,8 @@ def run_to_end(
 def git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str:
     """Run a git command in a folder, and return its output.
 
-    Args:
-        folder: folder of the repository.
-        words: words of the git command.
-        what: revision that the command resolves, for the error message.
-        skipped: whether to return the output even if git reports an error.
+    ``what`` is the revision that the command resolves, for the error message. With ``skipped``, the output is returned
+    even if git reports an error.
 
     Raises:
         UsageError: the revision does not exist.
@@ -220,13 +215,8 @@ def run_build(
 ) -> None:
     """Run the command that builds a commit; the time limit and the end of this process end all its processes.
 
-    Args:
-        command: command line for the shell.
-        folder: folder of the work tree in which the command runs.
-        log: file for the output; None for a temporary file, which stays only if the build fails.
-        limit_s: time limit, in s.
-        name: name of the built version, for messages.
-        tell: function called with a note if the build takes more than some seconds.
+    The output goes to ``log``; without it to a temporary file, which stays only if the build fails. ``tell`` is called
+    with a note if the build takes more than some seconds.
 
     Raises:
         BuildError: the command failed, or took too long.

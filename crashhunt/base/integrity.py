@@ -137,12 +137,7 @@ _MAX_BYTES_OF_OTHERS = 64 << 20
 
 
 def too_large(name: str, size: int) -> str:
-    """Return how the size of a file exceeds the limit of files of its name; empty if it does not, or has no limit.
-
-    Args:
-        name: name of the file, without its folder.
-        size: size of the file in bytes.
-    """
+    """Return how the size of a file exceeds the limit of files of its name; empty if it does not, or has no limit."""
     most = _MAX_BYTES.get(name)
     return f"{name} has {size:,} bytes (allowed: {most:,})" if most is not None and size > most else ""
 
@@ -165,9 +160,7 @@ def read_bounded(path: Path) -> bytes:
 def read_object(path: Path, shape: type[T]) -> T:
     """Read a JSON object from a file.
 
-    Args:
-        path: path of the file.
-        shape: the expected `TypedDict`; the caller checks the keys that it needs with `typed`.
+    The caller checks the keys that it needs with `typed`.
 
     Raises:
         OSError: the file cannot be read.
@@ -178,10 +171,6 @@ def read_object(path: Path, shape: type[T]) -> T:
 
 def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the type checker
     """Parse a text as a JSON object.
-
-    Args:
-        text: text in UTF-8.
-        shape: the expected `TypedDict`, as for `read_object`.
 
     Raises:
         ValueError: the text is not a JSON object; the message is one line.
@@ -257,9 +246,7 @@ _KEY_OF_THIS_PROCESS = secrets.token_bytes(_KEY_BYTES)
 def authentication_code(purpose: str, statement: Mapping[str, object]) -> str:
     """Return the authentication code of a statement, in hexadecimal.
 
-    Args:
-        purpose: purpose of the code, such as ``crash bundle``.
-        statement: JSON-compatible data; the order of keys makes no difference.
+    The purpose is a text such as ``crash bundle``. The order of the keys makes no difference.
     """
     text = json.dumps(statement, sort_keys=True, separators=(",", ":"))
     return hmac.new(user_key(), f"crashhunt {purpose}\0{text}".encode(), "sha256").hexdigest()

@@ -177,10 +177,8 @@ class ImportedModules:
 def load_object(target: str, *, shown: str = "", installed: bool = False) -> Any:
     """Import the class or function that a ``module:attribute`` names, and return it.
 
-    Args:
-        target: the module and the class or function in it.
-        shown: name of the value in error messages.
-        installed: whether an installed package names the module, so that the current folder is not searched.
+    ``shown`` names the value in error messages. With ``installed``, an installed package names the module, so that the
+    current folder is not searched.
 
     Raises:
         PluginError: the object does not exist, or its import failed.
@@ -196,10 +194,7 @@ def load_object(target: str, *, shown: str = "", installed: bool = False) -> Any
 def load_attribute(target: str, *, shown: str = "", installed: bool = False) -> Any:
     """Import the object of any kind that a ``module:attribute`` names, and return it.
 
-    Args:
-        target: the module and the attribute.
-        shown: name of the value in error messages.
-        installed: whether an installed package names the module, so that the current folder is not searched.
+    The arguments are those of `load_object`.
 
     Raises:
         PluginError: the object does not exist, or its import failed.
@@ -226,12 +221,7 @@ def import_module(name: str, *, shown: str = "", installed: bool = False) -> typ
 
     The current folder may be a stranger's: no command imports a module from it that the user has not named. Once the
     user has named a module of this folder, the folder comes first, as with ``python -m``, for the modules that the
-    named module imports.
-
-    Args:
-        name: name of the module.
-        shown: name of the value in error messages.
-        installed: whether an installed package names the module, so that the current folder is not searched.
+    named module imports. The arguments are those of `load_object`.
 
     Raises:
         PluginError: the import of the module failed.

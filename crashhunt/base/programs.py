@@ -81,9 +81,7 @@ def words_of(locator: str) -> tuple[str, ...]:
 def command_of(locator: str, files: Mapping[str, str] | None = None) -> tuple[str, ...]:
     """Return the command to run, in which the files of the current folder have absolute paths.
 
-    Args:
-        locator: locator of the agent.
-        files: file of a snapshot by the word that names the original file; such a word becomes the path of the copy.
+    A word for which ``files`` has the file of a snapshot becomes the path of the copy.
 
     Raises:
         PluginError: the program does not exist or cannot be executed.
@@ -160,9 +158,7 @@ def libraries_folder(locator: str) -> str:
 def library_path(locator: str, files: Mapping[str, str]) -> str:
     """Return the folder in which a snapshot has the libraries of an agent's program; empty if it has none.
 
-    Args:
-        locator: locator of the agent.
-        files: file of a snapshot by the text that names the original file.
+    ``files`` has the file of the snapshot for each text that names an original file.
     """
     name = libraries_folder(locator)
     return next((folder for folder in map(os.path.dirname, files.values()) if os.path.basename(folder) == name), "")  # noqa: PTH119
@@ -309,9 +305,7 @@ def describe_library(locator: str, path: Path) -> Library:
 def load_order(locator: str, files: Mapping[str, str]) -> list[Path]:
     """Return the libraries to load for an agent, the agent's own last.
 
-    Args:
-        locator: locator of the agent.
-        files: file of the snapshot by the text that names the original file; empty if there is no snapshot.
+    ``files`` has the file of the snapshot for each text that names an original file.
 
     Raises:
         PluginError: the library does not exist.
@@ -325,10 +319,6 @@ def load_order(locator: str, files: Mapping[str, str]) -> list[Path]:
 @cache
 def _probed(path: Path, *_version: int) -> Library:
     """Return the contents of a library.
-
-    Args:
-        path: path of the library.
-        _version: numbers that change with the file.
 
     Raises:
         PluginError: the library cannot be used.
@@ -379,9 +369,7 @@ def _files_of_fmu(locator: str) -> dict[str, Path]:
 def fmu_files(locator: str, files: Mapping[str, str]) -> tuple[Path, Path | None]:
     """Return the FMU to run, and its table of variables; None if it has none.
 
-    Args:
-        locator: locator of the agent.
-        files: file of the snapshot by the text that names the original file; empty if there is no snapshot.
+    ``files`` has the file of the snapshot for each text that names an original file.
 
     Raises:
         PluginError: the FMU does not exist.

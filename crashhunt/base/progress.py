@@ -14,13 +14,7 @@ Watch = Callable[[int, int], None]
 
 
 def watched(items: Iterable[T], total: int, watch: Watch | None) -> Iterator[T]:
-    """Yield items, and report the number of finished items after each.
-
-    Args:
-        items: the items to process.
-        total: the number of items.
-        watch: function that receives the progress; None for no reports.
-    """
+    """Yield items, and report the number of finished items after each."""
     for done, item in enumerate(items, 1):
         yield item
         if watch is not None:

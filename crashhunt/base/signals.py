@@ -203,8 +203,7 @@ def interruptible() -> Iterator[None]:
 def is_sent_from_outside(exit_code: int) -> bool:
     """Return whether a process died of a signal that another process or the kernel may have sent.
 
-    Args:
-        exit_code: exit code in the form of `subprocess`, negative for a signal.
+    The exit code is that of `subprocess`, negative for a signal.
     """
     return -exit_code in _SENT_FROM_OUTSIDE
 
@@ -212,8 +211,7 @@ def is_sent_from_outside(exit_code: int) -> bool:
 def describe_death(exit_code: int) -> str:
     """Return how a process ended: "was killed by SIGKILL", "exited with 3".
 
-    Args:
-        exit_code: exit code in the form of `subprocess`, negative for a signal.
+    The exit code is that of `subprocess`, negative for a signal.
     """
     return f"exited with {exit_code}" if exit_code >= 0 else f"was killed by {signal_name(exit_code)}"
 
@@ -221,8 +219,7 @@ def describe_death(exit_code: int) -> str:
 def signal_name(exit_code: int) -> str:
     """Return the name of the signal that ended a process, such as ``SIGKILL``.
 
-    Args:
-        exit_code: exit code in the form of `subprocess`, negative for a signal.
+    The exit code is that of `subprocess`, negative for a signal.
     """
     try:
         return signal.Signals(-exit_code).name

@@ -311,9 +311,7 @@ def _shared_memory() -> frozenset[tuple[str, int]]:
 def _shared_memory_of(processes: Iterable[int], *, written: bool) -> frozenset[tuple[str, int]]:
     """Return name and inode of the files in ``/dev/shm`` that processes have open or mapped.
 
-    Args:
-        processes: process ids.
-        written: whether to return only files that the processes may write.
+    With ``written``, only files that the processes may write are returned.
     """
     prefix, found = f"{_SHARED_MEMORY_FOLDER}/", set[tuple[str, int]]()
     for pid in processes:
@@ -344,9 +342,7 @@ def _remove_unused(files: Iterable[tuple[str, int]]) -> None:
 def release_shared_memory(scratch: Path, *, of_ended: bool = False) -> None:
     """Remove the files in ``/dev/shm`` that are recorded in a folder.
 
-    Args:
-        scratch: the folder with the records.
-        of_ended: whether to remove only files of processes that have ended.
+    With ``of_ended``, only files of processes that have ended are removed.
     """
     name = _SHARED_MEMORY_RECORD.format("*")
     # At the end at any depth: processes that confirm crashes have folders of their own inside.
@@ -414,8 +410,7 @@ class TemporaryFolder:
 def temporary_folder(purpose: str) -> Iterator[Path]:
     """Yield a new folder that only this process and its children use, and remove it at the end.
 
-    Args:
-        purpose: first part of the folder's name, such as ``replay``.
+    The name of the folder begins with ``purpose``, such as ``replay``.
 
     Raises:
         OSError: the disk is full, or no folder for temporary files can be written.
@@ -457,11 +452,8 @@ def new_folder(path: Path, *, mode: int = 0o777) -> Iterator[Path]:
     """Yield a temporary folder, which becomes the given folder at the end.
 
     An existing folder receives the contents and stays the same folder, because it may be the current folder of the
-    user, a mount point, or the target of a link.
-
-    Args:
-        path: the final path; a folder that exists must be empty.
-        mode: permissions of the folder, if it is new.
+    user, a mount point, or the target of a link. A folder that exists must be empty. ``mode`` has the permissions of a
+    new folder.
 
     Raises:
         OSError: the folder cannot be written, or another process has written into it in the meantime.

@@ -202,14 +202,7 @@ def listed(known: Iterable[str], *, none: str = "none") -> str:
 
 
 def one_of(name: str, known: Iterable[str], *, give: str = "give one of", none: str = "none") -> str:
-    """Return the fix for an unknown name: the most similar name, and all names.
-
-    Args:
-        name: the unknown name.
-        known: the known names.
-        give: the text before the known names.
-        none: the text if there are no known names.
-    """
+    """Return the fix for an unknown name: the most similar name, and all names."""
     names = list(known)
     similar = did_you_mean(name, names)
     if len(names) == 1:  # the question and the list would say the same

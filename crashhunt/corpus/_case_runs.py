@@ -194,10 +194,7 @@ _lock = threading.Lock()  # of all work but the trials: a snapshot lists the mod
 def _run_case(path: Path, keep: Path | None, stopped: Callable[[], bool]) -> CaseReport:
     """Run a case; return its report.
 
-    Args:
-        path: The folder of the case.
-        keep: The directory for the crash; None to keep no crash.
-        stopped: Function that returns whether to stop; called repeatedly.
+    Without ``keep``, no crash is kept.
 
     Raises:
         StoppedError: A stop was requested before the end of the case.

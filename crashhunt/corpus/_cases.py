@@ -223,13 +223,8 @@ def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None,
     """Add a crash to a corpus. If the corpus has the crash already, update only the expectation and the note.
 
     The function runs no code. After the call, the case counts as made by this user, so check before that the bundle is
-    trusted. Two processes may add to the same corpus at the same time.
-
-    Args:
-        bundle: The crash.
-        corpus: The folder of the corpus; created if it does not exist.
-        expect: The expected status; ``still`` by default.
-        note: A note of the user.
+    trusted. Two processes may add to the same corpus at the same time. The folder of the corpus is created if it does
+    not exist. The expected status is ``still`` by default.
 
     Raises:
         BundleError: The crash is damaged.
@@ -391,12 +386,8 @@ def compare_types(
     """Return the crash types that a corpus contains; no code of the crashes runs.
 
     Crashes of one type may have different causes. If a cause is known on both sides, it decides: a crash of a known
-    type with another cause than all cases is new.
-
-    Args:
-        groups: the crashes, one group for each crash type.
-        cases: the cases of the corpus.
-        causes: the causes of the crashes of each group; by default, the causes that are stored in their bundles.
+    type with another cause than all cases is new. By default, the causes are those that are stored in the bundles of
+    the crashes.
     """
     cases = list(cases)
     today = cache(signature_today)

@@ -40,10 +40,7 @@ def is_fixed(word: str) -> bool:
 def parse_fixed(words: Iterable[str], agents: Sequence[str], *, shown: str = "--disturb") -> tuple[Disturbance, ...]:
     """Return the disturbances at given steps, ``[AGENT.]KIND@STEP=WHO:HOW_STRONG:HOW_LONG``, in the order of steps.
 
-    Args:
-        words: the words of the option; words with a rate are ignored.
-        agents: the controlled vehicles, around which the disturbances occur.
-        shown: option or key that contains the words, for error messages.
+    Words with a rate are ignored. ``shown`` names the option or key of the words in error messages.
 
     Raises:
         UsageError: a word is invalid, or two disturbances of a kind begin in the same step around the same agent.
@@ -155,9 +152,7 @@ _OPTION = "--disturb"
 def parse_rates(words: Iterable[str]) -> dict[str, float]:
     """Return the rate of each disturbance in 1/s, from words such as ``NAME=RATE``; rates of 0 are omitted.
 
-    Args:
-        words: the words of the option; ``none`` for no disturbances. Words that give a disturbance at a given step are
-            ignored.
+    The word ``none`` stands for no disturbances. Words that give a disturbance at a given step are ignored.
 
     Raises:
         UsageError: a word has no rate, or a name occurs twice.
@@ -202,14 +197,8 @@ def disturber_of(
 ) -> DisturbanceSampler:  # fmt: skip
     """Return the sampler of a hunt's disturbances.
 
-    Args:
-        rates: rate per second around each agent, by name of the model.
-        agents: the controlled vehicles, around which disturbances occur.
-        step_length_s: step length in s.
-        known: the kinds that the simulator supports; None if they are unknown.
-        simulator: name of the simulator in messages.
-        fixed: disturbances that every trial has in addition.
-        find: function that returns the model of a name; by default `locate_model`.
+    Every trial has the ``fixed`` disturbances in addition. If it is not known which kinds the simulator supports,
+    ``known`` is None. By default, `locate_model` finds the models.
 
     Raises:
         PluginError: a model does not exist.
@@ -319,12 +308,7 @@ class DisturbanceSampler:
     fixed: tuple[Disturbance, ...] = ()
 
     def draw(self, seed: int, max_steps: int) -> tuple[Disturbance, ...]:
-        """Return the disturbances of a trial in order; a longer trial with the same seed begins with the same ones.
-
-        Args:
-            seed: seed of the trial.
-            max_steps: maximum number of steps of the trial.
-        """
+        """Return the disturbances of a trial in order; a longer trial with the same seed begins with the same ones."""
         found: list[Disturbance] = []
         for number, agent in enumerate(self.agents):
             for name in self.models:
@@ -336,12 +320,8 @@ class DisturbanceSampler:
     def draw_another(self, seed: int, number: int, after: int, soon: int, last: int) -> tuple[Disturbance, ...]:
         """Return other disturbances after a step of a trial: at least one begins soon, the others are drawn as usual.
 
-        Args:
-            seed: seed of the trial.
-            number: number that distinguishes several draws.
-            after: the step after which the disturbances begin.
-            soon: number of steps within which the first disturbance begins.
-            last: the last step in which a disturbance begins.
+        The first one begins within ``soon`` steps, and none after the step ``last``. ``number`` distinguishes several
+        draws.
         """
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_BRANCH_STREAM, after, number)))
         places = [(agent, name) for agent in self.agents for name in self.models]
@@ -354,11 +334,7 @@ class DisturbanceSampler:
     def draw_strongest(self, seed: int, number: int, after: int, soon: int) -> tuple[tuple[Disturbance, ...], ...]:
         """Return the strongest disturbances with which each model may soon disturb each agent, from many draws.
 
-        Args:
-            seed: seed of the trial.
-            number: number that distinguishes several draws.
-            after: the step after which the disturbances begin.
-            soon: number of steps within which all disturbances begin.
+        All begin within ``soon`` steps. ``number`` distinguishes several draws.
 
         Returns:
             Several alternatives for each model and agent, because a place may have no actor that can be disturbed.
@@ -381,12 +357,7 @@ class DisturbanceSampler:
     def draw_between(self, after: int, last: int, name: str, agent: str, rng: np.random.Generator) -> list[Disturbance]:
         """Return the disturbances that a model begins around an agent between two steps.
 
-        Args:
-            after: the step before the first step in which a disturbance may begin.
-            last: the last step in which a disturbance may begin.
-            name: name of the model.
-            agent: identifier of the controlled vehicle.
-            rng: random generator for steps and disturbances.
+        A disturbance may begin after the step ``after`` and up to the step ``last``.
         """
         chance, step, found = self.chance(name), after, []
         # A waiting time can be longer than any number of steps: that of a rate near 0.
@@ -409,11 +380,8 @@ class DisturbanceSampler:
     def log_likelihood(self, disturbances: Iterable[Disturbance], steps: int) -> float:
         """Return the natural logarithm of the probability that exactly these disturbances begin in the given steps.
 
-        Disturbances at given steps always begin, regardless of the models' draws in these steps.
-
-        Args:
-            disturbances: the drawn disturbances; disturbances after the given steps are ignored.
-            steps: number of steps of the trial.
+        Disturbances at given steps always begin, regardless of the models' draws in these steps. Disturbances after the
+        given steps are ignored.
         """
         given = {_key(one) for one in self.fixed if one.step <= steps}
         begun = [one for one in disturbances if one.step <= steps and _key(one) not in given]

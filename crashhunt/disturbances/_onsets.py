@@ -130,10 +130,6 @@ def first_forcing(sampler: DisturbanceSampler, last: int) -> Forcing:
     If only later roots had second onsets, crashes that need two onsets would have large weights in the first roots, and
     small weights in later roots. An estimate that has missed the large weights would look precise, but would be too
     low.
-
-    Args:
-        sampler: sampler of the hunt's disturbances.
-        last: number of the last step of a trial.
     """
     draws = len(sampler.agents) * max(0, last - FIRST_STEP + 1)
     log_none = draws * math.fsum(math.log1p(-sampler.chance(name)) for name in sampler.models)

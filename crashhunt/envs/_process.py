@@ -276,11 +276,7 @@ def _serve(pipe: Ours, is_orphan: Callable[[], bool], episodes: Episodes | None)
 def _fork(pipe: Ours, episodes: Episodes, seed: int | None, owner: int) -> tuple[int, str]:
     """Fork this process; return the id of the fork, and the reason if there is none.
 
-    Args:
-        pipe: pipe from which the connection of the fork is received.
-        episodes: the running episode.
-        seed: seed of the random generators in the fork; None to keep their state.
-        owner: process id of the user's program.
+    Without a seed, the random generators keep their state. ``owner`` is the process id of the user's program.
     """
     end = recv_handle(pipe)
 

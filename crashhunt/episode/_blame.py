@@ -70,14 +70,9 @@ def party_of_simulator(simulator: Simulator) -> Party:
 def blame(error: BaseException, simulator: Simulator, place: str = "") -> Blame:
     """Return the owner of the code that raised an exception, if the code is not an agent's.
 
-    Code at a boundary wraps an exception and names the owner. Exceptions without a wrapper are
-    crashhunt's own, except for two cases: an adapter has raised a `SimulatorError`, or the exception has
-    passed through `foreign_packages`.
-
-    Args:
-        error: The exception.
-        simulator: The simulator of the episode.
-        place: The purpose for which the simulator was called, if it was called.
+    Code at a boundary wraps an exception and names the owner. Exceptions without a wrapper are crashhunt's own, except
+    for two cases: an adapter has raised a `SimulatorError`, or the exception has passed through `foreign_packages`.
+    ``place`` is the purpose for which the simulator was called.
     """
     if type(error) is ForeignError:
         return Blame(error.error, error.party, error.place)
@@ -189,10 +184,7 @@ def _arrays(observations: Any) -> dict[str, NDArray[Any]]:
 def internal_error(error: BaseException, trial: int | None = None, steps: int | None = None) -> InternalError:
     """Return the error that ends a hunt because crashhunt itself failed.
 
-    Args:
-        error: The exception.
-        trial: Number of the trial; None if it is unknown.
-        steps: Number of completed steps; -1 if the trial was being set up; None if it is unknown.
+    The number of completed steps is -1 if the trial was being set up.
     """
     if type(error) is InternalError:
         return error

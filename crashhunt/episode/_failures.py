@@ -56,12 +56,8 @@ _PARTY_BY_ERROR: tuple[tuple[type[BaseException], str], ...] = (
 def failure_of(error: BaseException, agent: str, *, cause: str = "", party: str = "", place: str = "") -> Failure:
     """Return the evidence on an exception for the result of a trial.
 
-    Args:
-        error: The exception. A long message or traceback is cut, and a note says so.
-        agent: The agent whose code failed; empty if it was not an agent's code.
-        cause: Why the exception was raised, as a clause; empty if its message contains the reason.
-        party: The owner of the code that failed; empty if it is unknown.
-        place: The purpose for which the failed code was called; empty if it is unknown.
+    A long message or traceback is cut, and a note says so. ``cause`` is a clause that says why the exception was
+    raised; empty if its message does. ``place`` is the purpose for which the failed code was called.
     """
     with blocked_signals(), _deep_enough():
         # crashhunt's own messages are complete, so they need no traceback.
@@ -500,10 +496,7 @@ class Ending:
     def _fail_in_simulator(self, error: BaseException, place: str = "step", *, is_set_up: bool = False) -> TrialResult:
         """End the episode with an exception that the simulator or an agent raised outside the agents' own methods.
 
-        Args:
-            error: The exception.
-            place: The purpose for which the simulator was called.
-            is_set_up: Whether this was before the first step, so that the trial is invalid.
+        Before the first step (``is_set_up``), the trial is invalid.
 
         Raises:
             RecorderError: the disk is full.

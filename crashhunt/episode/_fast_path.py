@@ -63,10 +63,6 @@ class FastPath:
         """Return the final status of a step and the agent's action; None if the agent has not acted.
 
         If the status is `ANSWERED`, observers have not been called for the action yet.
-
-        Args:
-            come: The status that the core has returned.
-            agents: The agents by name.
         """
         core = self.at_once.core
         if come == REFUSED:
@@ -105,15 +101,7 @@ def make_fast_path(
     max_steps: int,
     encoders: Sequence[Callable[[object], NDArray[np.generic]]],
 ) -> FastPath | None:
-    """Return the fast path; None if an observer, an oracle or the simulator needs each part of each step.
-
-    Args:
-        simulator: the simulator, after its reset.
-        observers: observers of the episode.
-        oracles: oracles of the episode.
-        max_steps: maximum number of steps of the episode.
-        encoders: function that encodes the actions of each agent, by agent id.
-    """
+    """Return the fast path; None if an observer, an oracle or the simulator needs each part of each step."""
     first = observers[0] if observers else None
     if not isinstance(first, Recorder) or type(first) is not Recorder or not supports(simulator, SupportsFastSteps):
         return None

@@ -72,9 +72,8 @@ class ForkRunner:
     ) -> Plain | None:
         """Return the result of a fork. If no fork returns a result, count the failure and return None.
 
-        Args:
-            attempt: function that runs one fork; it returns the result, or None and the reason.
-            can_retry: whether another fork can be made at the same step.
+        ``attempt`` runs one fork, and returns its result, or None and the reason. ``can_retry`` returns whether another
+        fork can be made at the same step.
         """
         reason = NoAnswer("")
         for number in range(_MAX_ATTEMPTS):
@@ -115,10 +114,8 @@ class ForkRunner:
     def skip(self, why: str = "", *, is_from_outside: bool = False) -> None:
         """Count a fork without a result, without consequences for the next forks.
 
-        Args:
-            why: the reason, as text; empty if no more forks run.
-            is_from_outside: whether the reason lies outside of the trial, so that another run of the trial may return a
-                result.
+        Without a reason, no more forks run. If the reason lies outside of the trial, another run of the trial may
+        return a result.
         """
         if not why:
             why, is_from_outside = self.why_not or self._paused_because, not self.why_not

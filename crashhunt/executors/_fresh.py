@@ -264,10 +264,7 @@ def _run(job: FreshJob, answer: Callable[[Answer], None]) -> int:
 def fork_zygote(settings: WorkerSettings, *, late: bool = False, rehearses: bool = False) -> socket.socket:
     """Fork a zygote that imports the modules that trials need; return a socket to it. The zygote ends with the socket.
 
-    Args:
-        settings: settings of the hunt.
-        late: whether each trial imports its agents itself.
-        rehearses: whether to rehearse a trial, as for `import_parts`.
+    With ``late``, each trial imports its agents itself.
 
     Raises:
         ImportKilledError: the zygote was killed during its imports, by a signal that may come from outside.
@@ -317,10 +314,7 @@ def _import_for_zygote(
 def _not_started(number: int, log: Path, exit_code: int) -> WorkerError:
     """Return the error for a trial whose process ended before the trial began.
 
-    Args:
-        number: number of the trial.
-        log: file with the output of the process, which is empty if the disk is full.
-        exit_code: exit code of the process.
+    The log is empty if the disk is full.
     """
     what = f"the process of trial {number} could not start"
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()

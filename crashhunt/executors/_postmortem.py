@@ -99,13 +99,8 @@ def died(spec: TrialSpec, scratch: Path, exit_code: int, agents: Mapping[str, st
     """Return the result of a trial whose process died.
 
     If the process died before the first step, the trial is invalid because of a start-up failure. If it died later, the
-    result is a crash.
-
-    Args:
-        spec: the trial that was run.
-        scratch: scratch folder of the trial, which contains its recording.
-        exit_code: exit code of the trial's process; negative for a signal.
-        agents: module of each agent, by identifier, if no other agent uses the module.
+    result is a crash. The exit code is negative for a signal. ``agents`` has the module of each agent whose module no
+    other agent uses.
     """
     header = where_it_is(scratch, spec.number)
     message = (
@@ -119,12 +114,7 @@ def result_of_death(attempt: TrialAttempt, scratch: Path, exit_code: int) -> Tri
     """Return the result of a trial whose process died, if the trial is not run again.
 
     The trial is invalid if its processes were killed from outside at different steps. In all other cases, `died` gives
-    the result.
-
-    Args:
-        attempt: the attempts to run the trial; `TrialAttempt.again` has been called for the last process.
-        scratch: the folder in which the trial records.
-        exit_code: exit code of the process; negative for a signal.
+    the result. `TrialAttempt.again` has been called for the last process. The exit code is negative for a signal.
     """
     result = died(attempt.spec, scratch, exit_code)
     if not attempt.is_killed_from_outside:
@@ -138,10 +128,7 @@ def result_of_death(attempt: TrialAttempt, scratch: Path, exit_code: int) -> Tri
 def killed_from_outside(spec: TrialSpec, why: str, exit_code: int) -> TrialResult:
     """Return the result of a trial that was killed from outside, so that a resumed hunt runs it again.
 
-    Args:
-        spec: the trial that was run.
-        why: text with the number of the kills, and the steps at which they happened.
-        exit_code: exit code of the trial's last process; negative for a signal.
+    ``why`` has the number of the kills, and the steps at which they happened. The exit code is negative for a signal.
     """
     return TrialResult(spec, Outcome.INVALID, failure=Failure(KILLED, why, exit_code=exit_code))
 
@@ -149,12 +136,7 @@ def killed_from_outside(spec: TrialSpec, why: str, exit_code: int) -> TrialResul
 def damaged(spec: TrialSpec, scratch: Path, message: str, *, agent: str = "", recorded: bool = True) -> TrialResult:
     """Return the result of a trial whose process damaged itself or its recording.
 
-    Args:
-        spec: the trial that was run.
-        scratch: scratch folder of the trial, which contains its recording.
-        message: description of the damage, as a sentence.
-        agent: identifier of the agent that did the damage, if the recording cannot be read; empty if unknown.
-        recorded: whether the recording can be read.
+    ``agent`` is the one that did the damage, if the recording cannot be read.
     """
     if recorded:
         header = where_it_is(scratch, spec.number)
@@ -252,10 +234,6 @@ def agent_in_stack(stack: str, agents: Mapping[str, str]) -> str:
 
     The simulator may be interrupted by a signal handler of an agent. In that case, the frames of the handler lie above
     those of crashhunt.
-
-    Args:
-        stack: the stack in the format that `faulthandler` writes for a fatal signal.
-        agents: module of each agent, by identifier.
     """
     _, _, frames = stack.rpartition("\nCurrent thread ")
     for line in frames.split("\n\n", 1)[0].splitlines():
@@ -339,12 +317,8 @@ def check_report(
 ) -> tuple[TrialResult, Report] | str:
     """Check the report that the process of a trial wrote, and the trial's recording.
 
-    Args:
-        report: the bytes that follow the recording.
-        spec: the requested trial.
-        header: header of the trial's black box.
-        records: all committed records of the trial's black box.
-        pid: id of the process that should have run the trial.
+    The report follows the committed records of the trial's black box. ``pid`` is the process that should have run the
+    trial.
 
     Returns:
         The result and the whole report, or a description of the first disagreement.

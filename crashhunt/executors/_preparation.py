@@ -42,9 +42,7 @@ _AGENT = "crashhunt.agents:KeepLaneWithSpeed"
 def rehearse_trial(scratch: Path, report: Callable[[str], None]) -> None:
     """Run short trials of the toy in this process; they take some 20 ms. A failure has no consequence.
 
-    Args:
-        scratch: scratch folder of the hunt.
-        report: function called before the import of Gymnasium, as in `Parts.load`.
+    ``report`` is called before the import of Gymnasium, as in `Parts.load`.
     """
     report("Gymnasium cannot be imported")
     path = scratch / f"rehearsal-{os.getpid()}"
@@ -102,10 +100,8 @@ def import_parts(
 ) -> Imported | None:
     """Import the modules that trials need, and check whether a zygote may create the simulator.
 
-    Args:
-        settings: settings of the hunt.
-        report: function called before each import, as in `Parts.load`, and with an empty text at the end.
-        rehearses: whether to rehearse a trial, which is worth its 20 ms if many trials follow.
+    ``report`` is called before each import, as in `Parts.load`, and with an empty text at the end. A rehearsal is worth
+    its 20 ms if many trials follow.
 
     Returns:
         The result; None if this process can no longer be forked.

@@ -301,12 +301,7 @@ def be_supervisor(
 ) -> NoReturn:
     """Run trials until the pool has no more trials; this function does not return.
 
-    Args:
-        pool: connection to the pool.
-        zygote: connection to the zygote of this slot.
-        settings: settings of the hunt.
-        conditions: the conditions under which trials can run, as they were before the first trial.
-        parent: the process that started this process; this process ends when its parent ends.
+    This process ends when its ``parent`` ends.
     """
     code = 1
     try:

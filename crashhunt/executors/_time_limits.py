@@ -130,10 +130,7 @@ class ImportWatch:
 def import_died(importing: str, exit_code: int, *, times: int = 1) -> CrashhuntError:
     """Return the error of an import that ended its process.
 
-    Args:
-        importing: description of the failed import, as in `ImportWatch`.
-        exit_code: exit code of the process; negative for a signal.
-        times: number of attempts.
+    ``importing`` describes the failed import, as in `ImportWatch`. The exit code is negative for a signal.
     """
     again = f", {times} times" if times > 1 else ""
     return CrashhuntError(
@@ -145,10 +142,8 @@ def import_died(importing: str, exit_code: int, *, times: int = 1) -> CrashhuntE
 def await_imports(reports: socket.socket, pid: int, timeout_s: float) -> None:
     """Wait until a child process has imported the modules that trials need.
 
-    Args:
-        reports: connection from the child, which sends a message before each import and an empty message at the end.
-        pid: process id of the child.
-        timeout_s: wall-clock limit of a trial, in s, as in `ImportWatch`.
+    The child sends a message before each import, and an empty message at the end. The time limit is that of
+    `ImportWatch`.
 
     Raises:
         ImportKilledError: the child was killed by a signal that may come from outside.

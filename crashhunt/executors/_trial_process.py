@@ -133,8 +133,7 @@ class TrialProcess:
     def record_shared_state(self, control: int) -> str:
         """Record the files and memory of which each trial's process needs its own copy.
 
-        Args:
-            control: file descriptor of the zygote's connection to its supervisor; trials have no such connection.
+        Trials have no connection to the supervisor, which is ``control``.
 
         Returns:
             The resources that trials would share, as text; empty if there are none.
@@ -145,9 +144,7 @@ class TrialProcess:
     def run(self, job: Job, reset: Reset | None = None) -> NoReturn:
         """Run a trial, write its report to the black box, and end this process.
 
-        Args:
-            job: the job of the trial.
-            reset: function that replaces the simulator's `reset` if the simulator has already been reset.
+        If the simulator has already been reset, ``reset`` replaces its `reset`.
         """
         code = 1
         try:
@@ -345,11 +342,7 @@ def notices_of_late_imports(before: frozenset[str], code: Sequence[str]) -> list
     """Return a notice for each module that a trial has imported from a user's folder and not from the snapshot.
 
     A snapshot contains the modules that are imported with an agent. If an agent imports a module only while it drives,
-    a replay would run today's code of this module.
-
-    Args:
-        before: names of the modules that were imported before the trial.
-        code: folders of the snapshot; empty if the hunt has no snapshot, so there are no notices.
+    a replay would run today's code of this module. Without a snapshot, there are no notices.
     """
     found = []
     with suppress(Exception):  # the code of a trial may have put anything into `sys.modules`

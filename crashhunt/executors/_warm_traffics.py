@@ -89,10 +89,7 @@ class WarmTraffics:
     def run(self, job: Job, wait: Wait) -> tuple[int, int] | None:
         """Run a trial in a fork of the suspended process for its traffic; create that process if it is missing.
 
-        Args:
-            job: the job of the trial.
-            wait: function that waits until a descriptor can be read; its second argument is a function that kills the
-                process.
+        ``wait`` waits until a descriptor can be read; its second argument is a function that kills the process.
 
         Returns:
             The process that ran the trial and its exit code; None if the trial has to run in a fork of the zygote.

@@ -156,11 +156,7 @@ class LaneParts:
     ) -> _LaneIndex | None:
         """Return the lane with the smallest turn, of those that join a lane; None if no lane does.
 
-        Args:
-            roads: the roads that meet the lane.
-            index: the lane.
-            here: the point of the lane where they meet.
-            end: the row of their lanes where they meet: 0 or -1.
+        The row ``end``, where the roads meet, is 0 or -1.
         """
         found = []
         for road in roads:

@@ -36,11 +36,7 @@ def is_steered(kind: Any) -> bool:
 def motion_of(kind: Any, vehicle: Any, action: NDArray[Any], step_s: float) -> Motion:
     """Return what an action does within the next step. Changes nothing, and draws no random number.
 
-    Args:
-        kind: action type of the vehicle, as `is_steered` accepts it.
-        vehicle: the vehicle.
-        action: acceleration and steering, each from -1 to 1.
-        step_s: step length, in s.
+    The action is acceleration and steering, each from -1 to 1.
     """
     throttle, wheel = np.clip(action, -1.0, 1.0) if kind.clip else action
     acceleration = lmap(float(throttle), [-1, 1], kind.acceleration_range)
@@ -83,13 +79,8 @@ def action_with(
 ) -> NDArray[Any]:
     """Return an action with another speed, or with the steering that keeps the lane.
 
-    Args:
-        kind: action type of the vehicle, as `is_steered` accepts it.
-        vehicle: the vehicle.
-        action: the action that is corrected; may be None if both its speed and its steering are replaced.
-        step_s: step length, in s.
-        speed_mps: speed after the step, at least 0, as far as the vehicle can reach it; None leaves the acceleration.
-        keeps_lane: whether the vehicle steers to the middle of its lane.
+    The action may be None if both its speed and its steering are replaced. The vehicle reaches the speed, at least 0,
+    as far as it can; None leaves the acceleration.
     """
     found = np.zeros(2) if action is None else np.array(action)
     if speed_mps is not None:

@@ -32,12 +32,7 @@ def surroundings_of(
 ) -> Surroundings:
     """Return the surroundings of a vehicle. Reads positions only, and draws no random number.
 
-    Args:
-        network: network of roads.
-        vehicle: vehicle of the agent.
-        others: all other vehicles and obstacles.
-        name_of: function that returns the identifier of an actor.
-        acceleration_range: accelerations of continuous actions, in m/s²; None for a vehicle with meta-actions.
+    The accelerations of continuous actions are in m/s²; None for a vehicle with meta-actions.
     """
     things = list(others)
     ahead: dict[str, Neighbor] = {}

@@ -189,9 +189,7 @@ class PendingAudits:
 def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, list[int]]:
     """Run audited trials again; return the result, and the numbers of the trials that are still pending.
 
-    Args:
-        again: object that runs trials of the hunt again. A remark is added to its ledger for each trial that differs.
-        numbers: numbers of the trials.
+    A remark is added to the hunt's ledger for each trial that differs.
     """
     ledger = again.ledger
     wanted = {number: result for number in numbers if (result := ledger.result(number)) is not None and result.digest}

@@ -189,8 +189,7 @@ class ForkCrashes:
     def look(self, tell: Callable[[], None] = lambda: None) -> bool:
         """Run the crashes of the added trials' forks from the start; return whether one of them ends the hunt.
 
-        Args:
-            tell: function called before the first run.
+        ``tell`` is called before the first run.
         """
         waiting = sorted(self._waiting, key=lambda result: result.spec.number)
         self._waiting = [result for result in waiting if self._comes_later(result.spec.number)]
@@ -245,9 +244,7 @@ def verify_fork_results(copies: VerificationRuns) -> tuple[ProbeReport | None, B
 def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport | None:
     """Estimate the crash rate, and run the fork crashes with the greatest weights from the start, in new processes.
 
-    Args:
-        copies: object that runs crashes of forks from the start.
-        differences: number of audited trials that were not bit-identical.
+    ``differences`` is the number of audited trials that were not bit-identical.
 
     Returns:
         The report; None if the hunt is not in rare mode.

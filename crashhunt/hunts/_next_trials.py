@@ -128,10 +128,6 @@ def growing_lag(number: int, most: int) -> int:
     A sampler learns most from its first results, and a delay costs it about as many trials as its length (Joulani,
     György and Szepesvári 2013, for stochastic bandits). With this growing delay, two workers are never idle, and 16
     workers are idle only before trial 96.
-
-    Args:
-        number: number of the trial.
-        most: the maximum delay.
     """
     return min(most, _FIRST_LAG + number // _TRIALS_PER_LAG)
 
@@ -330,9 +326,7 @@ class Trials:
     def _resume(self, finished: set[int], known: set[int]) -> None:
         """Pass earlier results to the sampler in their original order, and find the proposals without a result.
 
-        Args:
-            finished: the numbers of the finished trials.
-            known: those of the trials whose results the sampler receives.
+        The sampler receives the results of the trials in ``known``.
         """
         told = set()
         for turn in self._ledger.turns():
@@ -362,9 +356,7 @@ class Pace:
     def room(self, upcoming: int | None, lead: int) -> int:
         """Return how many trials may start now.
 
-        Args:
-            upcoming: number of the next trial; None if no trial is left.
-            lead: number of trials that this hunt may be ahead of the other hunt.
+        ``lead`` is the number of trials that this hunt may be ahead of the other hunt.
         """
         if upcoming is None:
             return sys.maxsize
@@ -414,9 +406,7 @@ class Unanswered:
     def account(self, result: TrialResult, progress: Progress) -> bool:
         """Register a finished trial; return whether its result is to be recorded.
 
-        Args:
-            result: result of the trial.
-            progress: progress of the hunt, which has already counted the trial once if it runs again.
+        The progress has already counted the trial once if it runs again.
         """
         if result.is_to_be_run_again:
             self._open.add(result.spec.number)

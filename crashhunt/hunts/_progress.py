@@ -285,10 +285,7 @@ class Progress:
     def count(self, result: TrialResult, *, crashed: bool, planned: int) -> None:
         """Count a finished trial.
 
-        Args:
-            result: The result of the trial. A crash has already been saved, or ends the hunt and is then saved.
-            crashed: Whether the outcome counts as a crash.
-            planned: Planned number of trials of the hunt.
+        A crash has already been saved, or ends the hunt and is then saved.
         """
         self.ended_here += 1
         self.steps_here += result.steps
@@ -384,9 +381,7 @@ class Progress:
     def expect_end(self, planned: int, parallel: int) -> None:
         """Estimate the time at which the last trial ends.
 
-        Args:
-            planned: number of planned trials; 0 if only the time is limited.
-            parallel: number of trials that run at a time.
+        The number of planned trials is 0 if only the time is limited.
         """
         left = planned - sum(self.outcomes.values())
         found = self.remaining.seconds_left(time.monotonic(), left, parallel) if left > 0 else 0.0
@@ -399,11 +394,7 @@ class Progress:
     ) -> HuntStatus:
         """Return the present progress for the status screen.
 
-        Args:
-            phase: phase of the hunt, as in `HuntStatus`.
-            planned: number of planned trials; 0 if only the time is limited.
-            workers: progress of each running trial, by number.
-            has_disturbances: whether the trials have disturbances.
+        The phase is one of `HuntStatus`. The number of planned trials is 0 if only the time is limited.
         """
         elapsed = time.monotonic() - self.began
         kinds, newest_s, newest_trials = self.about_kinds(running=phase != "done")
@@ -441,8 +432,7 @@ class Progress:
     def running_rate(self, *, now: bool = False) -> RunningRate | None:
         """Return the current crash rate; None if the trials give no bound.
 
-        Args:
-            now: whether the rate must be up to date; otherwise it may be some moments old.
+        Unless ``now``, the rate may be some moments old.
         """
         watch = self.rare or self.counted
         return None if watch is None else watch.running(now=now)
@@ -450,8 +440,7 @@ class Progress:
     def noted(self, *, now: bool = False) -> Noted:
         """Return the present progress in the form that the ledger stores.
 
-        Args:
-            now: whether the rate must be up to date; otherwise it may be some moments old.
+        Unless ``now``, the rate may be some moments old.
         """
         nodes: Noted = {} if self.nodes is None else {"nodes": [asdict(node) for node in self.nodes]}
         kinds: Noted = {}
@@ -517,10 +506,7 @@ class RemainingTime:
     def ended(self, now: float, left: int, parallel: int) -> None:
         """Count a finished trial.
 
-        Args:
-            now: time at which the trial ended, in s of the same clock.
-            left: number of trials that have not ended.
-            parallel: number of trials that run at a time.
+        The times are in s of a monotonic clock.
         """
         self._count += 1
         self._times.append(now)
@@ -537,10 +523,7 @@ class RemainingTime:
     def seconds_left(self, now: float, left: int, parallel: int) -> float:
         """Return the time until the last trial ends, in s; infinite before the first trial has ended.
 
-        Args:
-            now: current time, in s of the same clock.
-            left: number of trials that have not ended.
-            parallel: number of trials that run at a time.
+        The times are in s of a monotonic clock.
         """
         if not left:
             return 0.0
@@ -615,10 +598,7 @@ class PhaseClock:
     ) -> list[R]:
         """Call a function for each item in threads that wait for processes; return the results in item order.
 
-        Args:
-            function: function to call in a thread.
-            items: arguments of the calls, one for each call.
-            counts: function that returns whether a result counts as a finished run.
+        ``counts`` returns whether a result counts as a finished run.
         """
 
         def ended(result: R) -> None:

@@ -153,9 +153,8 @@ class TrialReruns:
     def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
         """Yield each trial as it ends, until a stop is requested.
 
-        Args:
-            specs: specifications of different trials of the hunt; fields other than the number may have been changed.
-            folder: subfolder of the hunt's directory into which bundles of the runs are written.
+        Fields of the specifications other than the number may have been changed. Bundles are written into ``folder``, a
+        subfolder of the hunt's directory.
 
         Raises:
             CrashhuntError: the trials cannot be run.
@@ -198,12 +197,7 @@ class TrialReruns:
         return self.is_stopped
 
     def confirm_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Bundle:
-        """Run a crash again that is not fully confirmed; return the updated crash.
-
-        Args:
-            bundle: the crash to confirm.
-            stopped: function that returns whether to cancel; called regularly.
-        """
+        """Run a crash again that is not fully confirmed; return the updated crash."""
         if is_settled(bundle) or self.is_stopped or stopped():
             return bundle
         try:
@@ -222,12 +216,7 @@ class TrialReruns:
         return bundle if found is None or not _write_if_kept(found, bundle.path) else found
 
     def judge_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Judged:
-        """Find the cause of a crash by runs, and write the result into its bundle.
-
-        Args:
-            bundle: the crash to judge.
-            stopped: function that returns whether to cancel; called regularly.
-        """
+        """Find the cause of a crash by runs, and write the result into its bundle."""
 
         def is_stopped() -> bool:
             return self.is_stopped or stopped()
@@ -425,10 +414,8 @@ class VerificationRuns:
 def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
     """Save bundles of the most critical trials of a hunt, and delete other bundles; return them in this order.
 
-    Args:
-        again: object that runs trials of the hunt again. The settings of the hunt contain the number of bundles to
-            keep; if this is 0, existing bundles are not changed. For each trial that could not be kept, a line with the
-            reason is added to the notes of the hunt.
+    If the hunt keeps none, existing bundles are not changed. For each trial that could not be kept, a line with the
+    reason is added to the notes of the hunt.
     """
     directory, ledger, keep = again.setup.place.path, again.ledger, again.setup.settings.run.near_misses
     if not keep or again.is_stopped:

@@ -191,12 +191,7 @@ def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
 def _may_touch(scene: Scene, previous: Scene | None, row: int, other: int, margin: float) -> bool:
     """Return whether two outlines overlap, or may have overlapped between the two scenes.
 
-    Args:
-        scene: the present scene.
-        previous: the scene one step before.
-        row: row of the first actor.
-        other: row of the second actor.
-        margin: distance that the two actors have moved relative to each other, in m.
+    The two actors have moved ``margin`` m relative to each other.
     """
     if scene.spines or (previous is not None and previous.spines):
         return True

@@ -240,9 +240,8 @@ def described_oracle(text: str) -> dict[str, Category]:
 def chosen_oracles(asked: Sequence[str], described: Collection[str] = ()) -> tuple[str, ...]:
     """Return the oracles of a hunt in the order of their checks: the default oracles, then the chosen oracles.
 
-    Args:
-        asked: the values of all ``--oracle`` options; ``none`` removes the default oracles.
-        described: oracles that another process has created and described, so that they are not created here.
+    ``asked`` has the values of all ``--oracle`` options, of which ``none`` removes the default oracles. Oracles that
+    another process has ``described`` are not created here.
 
     Raises:
         CrashhuntError: an oracle cannot be created, or no oracle is chosen.
@@ -262,9 +261,7 @@ def outcomes_brought(
 ) -> tuple[Outcome, ...]:
     """Return the outcomes that oracles add to those on which every hunt stops.
 
-    Args:
-        oracles: the chosen oracles.
-        described: outcomes, with their categories, of oracles that another process has created.
+    ``described`` has the outcomes of oracles that another process has created.
 
     Raises:
         CrashhuntError: an oracle cannot be created.

@@ -226,11 +226,7 @@ def requirement_oracles(texts: Iterable[str], option: str = "--require") -> list
 def check_requirement(oracle: str, step_length_s: float, max_steps: int, option: str = "--require") -> None:
     """Check that a requirement can be decided in a trial.
 
-    Args:
-        oracle: the requirement, as `requirement_oracles` returns it.
-        step_length_s: length of a step, in s.
-        max_steps: maximum number of steps of a trial.
-        option: the option or key of the requirement, for errors.
+    The requirement is in the form of `requirement_oracles`. Errors name the option or key.
 
     Raises:
         FormulaError: a window does not fit the step length.

@@ -90,13 +90,8 @@ def with_other_words(
     """Return the disturbances of a trial after an edit of ``disturb`` in its ``hunt.toml``.
 
     Disturbances at given steps are replaced by those of the new text. Drawn disturbances are removed if their kind no
-    longer has a rate. Drawn disturbances are not drawn again if their rate has changed.
-
-    Args:
-        planned: the planned disturbances of the trial.
-        before: value of ``disturb`` when the trial ran.
-        after: present value of ``disturb``.
-        agents: the controlled vehicles.
+    longer has a rate. Drawn disturbances are not drawn again if their rate has changed. ``before`` is the value when
+    the trial ran, and ``after`` the present value.
 
     Returns:
         The disturbances, the changes, and the edits without an effect, as text.
@@ -228,13 +223,8 @@ def edited_spec(
 ) -> tuple[TrialSpec, Edits]:
     """Return the trial to replay, and its differences from the recorded trial.
 
-    Args:
-        recorded: the recorded trial.
-        settings: the present ``hunt.toml``.
-        original: the ``hunt.toml`` with which the trial ran.
-        changes: new value by name (``NAME`` or ``AGENT.NAME``), applied last.
-        code: folders with the code of the agents, which is inspected for arguments that are not recorded; None if no
-            code may run.
+    ``original`` is the ``hunt.toml`` with which the trial ran. The changes, by ``NAME`` or ``AGENT.NAME``, are applied
+    last. The code of the agents, without which no code may run, is inspected for arguments that are not recorded.
 
     Raises:
         ArgumentError: an argument does not exist, or a range is given instead of one value.

@@ -205,13 +205,8 @@ def replay(
     """Run a crash again from its bundle alone, and compare every step with the log.
 
     The scenario comes from the snapshot, even if the original has changed. So does the agent's code, unless the options
-    choose other code. With recorded actions, no code of the bundle runs.
-
-    Args:
-        bundle: the crash to replay.
-        options: options of the replay.
-        stopped: function that returns whether to stop; called repeatedly. The report has the replays that finished
-            before.
+    choose other code. With recorded actions, no code of the bundle runs. After a stop, the report has the replays that
+    finished before.
 
     Raises:
         BundleError: the bundle is damaged.

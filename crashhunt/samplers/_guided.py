@@ -64,12 +64,8 @@ _FAR = 2.0  # times the mean distance to the nearest more critical trial: beyond
 def make_basins(points: Floats, scores: Floats, usual: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
     """Return the basin of each trial, as the index of its peak.
 
-    Of two trials with equal scores, the first is the more critical one, so that a plateau is one basin.
-
-    Args:
-        points: trials x arguments, in the unit cube.
-        scores: scores of the trials.
-        usual: which trials determine what is far away; None for all.
+    Of two trials with equal scores, the first is the more critical one, so that a plateau is one basin. The points are
+    trials x arguments, in the unit cube. The trials of ``usual`` determine what is far away; None for all.
     """
     order = np.argsort(-scores, kind="stable")
     ranked = points[order]

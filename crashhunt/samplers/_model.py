@@ -78,11 +78,8 @@ class Process:
     ) -> Floats:
         """Return by how many standard deviations the expected score at each point exceeds the target.
 
-        Args:
-            points: points in the same form as those of the trials.
-            seeds: seeds of the points; below 0 for a seed that no trial has.
-            ambition: by how much the target exceeds the best score, in standard deviations of all scores.
-            among: of which trials the best score is; None for all.
+        A seed below 0 is one that no trial has. The target exceeds the best score, of the trials ``among`` or of all,
+        by ``ambition`` standard deviations of all scores.
         """
         best = float((self._target if among is None else self._target[among]).max())
         half = self._solved(self._kernel(points, seeds).T)
@@ -217,10 +214,8 @@ class Model:
     ) -> Draft | None:
         """Return the best candidate; None if there is none, or while there are too few trials.
 
-        Args:
-            rng: source of the candidates.
-            excluded: returns which points and seeds are not proposed; None if all may be.
-            among: which trials are parents, and have the score to exceed; None for all.
+        ``excluded`` returns which points and seeds are not proposed. The trials of ``among`` are parents, and have the
+        score to exceed; None for all.
         """
         order = np.argsort(-self._scores, kind="stable") if self._is_ready else np.empty(0, dtype=np.intp)
         ranked = order if among is None else order[among[order]]
@@ -277,11 +272,7 @@ class Model:
         """Return candidate points, the index of the parent of each, and whether each keeps its parent's seed.
 
         A sixth is anywhere, a third around all parents, and half near one parent, which is drawn by its rank (Zipf
-        1949).
-
-        Args:
-            known: points of the trials, from the most to the least critical one.
-            rng: source of the candidates.
+        1949). The trials are known from the most to the least critical one.
         """
         shape, categorical = (_CANDIDATES, self._cube.dimensions), self._cube.categorical
         energy = np.cumsum(1.0 / (1.0 + np.arange(len(known))))

@@ -255,9 +255,7 @@ def canonical_action(name: str | None) -> str:
 def action_settings(name: str | None, where: str = "action") -> dict[str, float | str]:
     """Return the value of every setting of a form of actions, such as ``trajectory:frame=ego``.
 
-    Args:
-        name: name of the form and its settings; None for the default form.
-        where: the option or key that contains the name, for messages.
+    Without a name, the form is the default one. Messages name ``where``, the option or key.
 
     Raises:
         UsageError: the form or a setting does not exist, or a value is not allowed.
@@ -301,10 +299,8 @@ def with_whole_vehicle_visible(name: str | None) -> str | None:
     """Return a form of actions whose vehicle other vehicles see as a whole, unless the form names another choice.
 
     Without the setting, a form means what it meant before the setting existed, so recorded trials keep their meaning.
-    New hunts state the setting. They record the choice ``visible=front`` as the form without the setting.
-
-    Args:
-        name: name of a valid form and its settings; None for the default form.
+    New hunts state the setting. They record the choice ``visible=front`` as the form without the setting. Without a
+    name, the form is the default one.
     """
     if name is None or not can_be_in_two_lanes(name):
         return name

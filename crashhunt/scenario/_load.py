@@ -58,10 +58,7 @@ def unregistered(simulator: str, where: str) -> ScenarioError:
 def check(scenario: Scenario, where: str, *, kept: bool) -> None:
     """Refuse an invalid scenario.
 
-    Args:
-        scenario: the scenario, including the folder of its files.
-        where: path of the file from which the scenario was read.
-        kept: whether the scenario has already run in a hunt.
+    A scenario that was ``kept`` has already run in a hunt.
 
     Raises:
         ScenarioError: the scenario is invalid; the message names the key, the value and the fix.

@@ -379,9 +379,7 @@ def scenario_digest(scenario: Scenario) -> str:
 def digest_of_described(files: Mapping[str, HasDigest], *, plain_data: object = None) -> str:
     """Return a digest of files and of plain data together.
 
-    Args:
-        files: description of each file by name, which contains the file's digest as ``blake2b``.
-        plain_data: JSON-compatible data; None if only the files matter.
+    Each description contains the digest of its file as ``blake2b``. The data can be expressed as JSON.
     """
     content = {name: entry["blake2b"] for name, entry in files.items()}
     text = json.dumps(content if plain_data is None else [content, plain_data], sort_keys=True)
@@ -735,11 +733,8 @@ def load_order_of(scenario: Scenario) -> str | None:
 def with_recorded_load_order(scenario: Scenario, recorded: str | None) -> Scenario:
     """Return the scenario with the load order that a recorded crash had: the fixed order, or the simulator's own order.
 
-    The load order is the order in which the simulator processes objects when it loads the scenario.
-
-    Args:
-        scenario: the scenario to run again.
-        recorded: the value of ``load_order`` in the snapshot; None if the snapshot has none.
+    The load order is the order in which the simulator processes objects when it loads the scenario. ``recorded`` is the
+    value of ``load_order`` in the snapshot; None if the snapshot has none.
     """
     order = scenario.backend.load_order
     return scenario if order is None or recorded == FIXED_LOAD_ORDER else order.keep(scenario)
@@ -749,11 +744,8 @@ def load_order_change(scenario: Scenario, recorded: str | None) -> str:
     """Return how the load order here differs from the recorded order, as a clause; empty if both are equal.
 
     An order that was not fixed is kept by `with_recorded_load_order`. A difference therefore arises only if the
-    recorded order was fixed, and cannot be fixed here.
-
-    Args:
-        scenario: the scenario to run again.
-        recorded: the value of ``load_order`` in the snapshot; None if the snapshot has none.
+    recorded order was fixed, and cannot be fixed here. ``recorded`` is the value of ``load_order`` in the snapshot;
+    None if the snapshot has none.
     """
     order, now = scenario.backend.load_order, load_order_of(scenario)
     if order is None or recorded != FIXED_LOAD_ORDER or now == FIXED_LOAD_ORDER:

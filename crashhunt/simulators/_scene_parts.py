@@ -69,14 +69,8 @@ def nearest_actors(
 ) -> list[NearActor]:
     """Return the actors that an agent sees, the nearest first.
 
-    Actors on another level, such as a bridge above, are excluded, because they would look like obstacles.
-
-    Args:
-        scene: The scene after the last step.
-        row: Row of the agent's vehicle in the scene.
-        hidden: Identifiers of the actors that the agent does not see.
-        radius: Largest distance of the centres, in m.
-        limit: Largest number of actors; None for no limit.
+    Actors on another level, such as a bridge above, are excluded, because they would look like obstacles. The actors in
+    ``hidden`` are not seen by the agent. The radius is the largest distance of the centres, in m.
     """
     own_x, own_y = center_of(scene, row)
     actors = scene.roster.actors
@@ -100,12 +94,8 @@ def predictions_of(
 ) -> NDArray[np.float64]:
     """Return the positions of actors at constant velocity: the columns of the part ``predictions``.
 
-    Args:
-        scene: The scene after the last step.
-        near: The actors, one per row.
-        shape: Numbers of rows, times and columns.
-        interval: Time between two positions, in s; the first position is one interval from now.
-        reference_share: How far the reference point is ahead of the centre, as a share of the length.
+    The times are ``interval`` s apart, and the first is one interval from now. The reference point is ahead of the
+    centre by a share of the length.
     """
     found = np.zeros(shape)
     times = interval * np.arange(1, shape[1] + 1)
@@ -124,13 +114,8 @@ def covariances_of(
     """Return the covariances of the positions in `predictions_of`: the columns of ``prediction_covariance``.
 
     Let d be the standard deviation of an acceleration that is unknown, but constant. After the time t, the standard
-    deviation of the position is d t² / 2, along and across the heading.
-
-    Args:
-        scene: The scene after the last step.
-        near: The actors, one per row.
-        settings: The values of ``interval``, ``along`` and ``across``.
-        shape: Numbers of rows, times and columns.
+    deviation of the position is d t² / 2, along and across the heading. The settings are ``interval``, ``along`` and
+    ``across``.
     """
     found = np.zeros(shape)
     times = settings["interval"] * np.arange(1, shape[1] + 1)
@@ -147,15 +132,7 @@ def covariances_of(
 def with_range_noise(
     ranges: NDArray[np.float64], settings: Mapping[str, float], *, seed: int, agent: str, step: int
 ) -> NDArray[np.float64]:
-    """Return the values of ``lidar2d`` with their errors: the same ones for the same seed, agent and step.
-
-    Args:
-        ranges: The distances without errors, in m.
-        settings: The settings of the part.
-        seed: Seed of the trial.
-        agent: Identifier of the agent.
-        step: Number of the step.
-    """
+    """Return the values of ``lidar2d`` with their errors: the same ones for the same seed, agent and step."""
     if not settings["noise"]:
         return ranges
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_NOISE_STREAM, step, *agent.encode())))
@@ -183,10 +160,7 @@ def with_reference_point(
 ) -> None:
     """Move ``x`` and ``y`` of the parts ``ego`` and ``actors`` from the centre to another point.
 
-    Args:
-        arrays: The parts by name.
-        columns: The index of every column, by part and name of the column.
-        share: How far the point is ahead of the centre, as a share of the length.
+    The point is ahead of the centre by a share of the length.
     """
     for name in ("ego", "actors"):
         if name in arrays:
@@ -231,10 +205,7 @@ class ObstacleOutlines:
     def edges_near(self, x: float, y: float, reach_m: float) -> NDArray[np.float64]:
         """Return all edges of the obstacles whose bounding box touches a square around a point.
 
-        Args:
-            x: x of the point, in m.
-            y: y of the point, in m.
-            reach_m: Half the edge length of the square, in m.
+        The square reaches ``reach_m`` to each side.
 
         Returns:
             x and y of the start and of the end of each edge, counter-clockwise around each outline, shape (n, 4).
@@ -361,10 +332,7 @@ class RayCaster:
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return pairs of an index and a ray: the rays between two angles to the heading, and one more on each side.
 
-        Args:
-            begin: The smaller angle, in rad.
-            end: The larger angle, in rad.
-            is_near: Whether an index has pairs.
+        The angles are in rad. Only the indices in ``is_near`` have pairs.
         """
         step = math.tau / self._rays
         first, last = np.floor(begin / step).astype(np.intp), np.ceil(end / step).astype(np.intp)
@@ -437,10 +405,7 @@ class Raster:
     def on_lanes(self, scene: Scene, row: int, lanes: Sequence[tuple[Line, float]]) -> Mask:
         """Return whether the centre of each cell is on a lane: at most half its width from its centre line.
 
-        Args:
-            scene: The scene after the last step.
-            row: Row of the vehicle in the scene.
-            lanes: The points (n, 2) of each centre line, and the width of each lane, in m.
+        Each lane has the points of its centre line, shape (n, 2), and its width, in m.
         """
         found = np.zeros(self._shape, bool)
         lines = [(_in_frame(scene, row, line), width) for line, width in lanes]

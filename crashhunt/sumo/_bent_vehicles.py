@@ -54,12 +54,8 @@ class Bends:
     def spine(self, vehicle: str, length: float, front: Point, heading: float, *, high: bool) -> Spine | None:
         """Return the centre line of a vehicle; None if the vehicle is straight.
 
-        Args:
-            vehicle: Identifier of the vehicle.
-            length: Length of the vehicle, in m.
-            front: Centre of the front bumper.
-            heading: SUMO's heading, in rad; for a train, the heading of its first carriage.
-            high: Whether the network has heights; otherwise z is 0.
+        The heading is that of SUMO, in rad; of a train, that of its first carriage. Without ``high``, the network has
+        no heights, and z is 0.
         """
         lane = sumo.vehicle_getLaneID(vehicle)
         if not lane:

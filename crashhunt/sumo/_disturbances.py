@@ -56,12 +56,8 @@ _WALKING_AREA = re.compile(r"_w\d+_\d+$")  # netconvert's names of walking areas
 def roadside(scene: Scene, agent: str, who: str, reach_m: float, junctions: JunctionLanes) -> str:
     """Return the nearest person who walks on one side of the road ahead of an agent and can step onto the road.
 
-    Args:
-        scene: The current scene.
-        agent: Identifier of a controlled vehicle.
-        who: either ``left ahead`` or ``right ahead``; other places have no persons.
-        reach_m: The distance that the person can walk in half of the disturbance's duration.
-        junctions: The junction lanes of the network.
+    Only ``left ahead`` and ``right ahead`` have persons. The person can walk ``reach_m`` in half of the disturbance's
+    duration.
 
     Returns:
         The identifier of the actor; empty if no person can step out.

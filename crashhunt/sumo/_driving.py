@@ -144,11 +144,8 @@ class Driving:
         """Move the vehicle across its lane, or into the next lane when its centre is over the line.
 
         SUMO without its sublane model moves no vehicle across a lane, but keeps a lateral position that is set. Inside
-        a junction, where lanes have no neighbours, the vehicle keeps its lateral position.
-
-        Args:
-            agent: identifier of the vehicle.
-            left: distance to the left in the next step, in m.
+        a junction, where lanes have no neighbours, the vehicle keeps its lateral position. ``left`` is the distance to
+        the left in the next step, in m.
         """
         edge, lane = sumo.vehicle_getRoadID(agent), sumo.vehicle_getLaneIndex(agent)
         inside = edge.startswith(":") or lane < 0
@@ -235,11 +232,8 @@ class Driving:
     def neighboring_lane(self, agent: str, change: int) -> tuple[bool, int] | None:
         """Return whether the vehicle may use a neighbouring lane, and the difference of SUMO's lane indices.
 
-        The result is None inside a junction, where lanes have no neighbours, and for a vehicle off its lane.
-
-        Args:
-            agent: identifier of the vehicle.
-            change: 1 to the left, -1 to the right.
+        The result is None inside a junction, where lanes have no neighbours, and for a vehicle off its lane. The change
+        is 1 to the left, and -1 to the right.
         """
         edge, lane = sumo.vehicle_getRoadID(agent), sumo.vehicle_getLaneIndex(agent)
         if edge.startswith(":") or lane < 0:
@@ -299,9 +293,7 @@ class Driving:
 def hold_vehicle(vehicle: str, what: str) -> ActiveDisturbance | None:
     """Apply a hold to a vehicle from the next step on; return None if the vehicle is not in the simulation.
 
-    Args:
-        vehicle: Identifier of the vehicle.
-        what: One of `HELD`.
+    The hold is one of `HELD`.
     """
     if vehicle not in sumo.vehicle_getIDList():
         return None

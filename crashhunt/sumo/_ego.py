@@ -80,12 +80,8 @@ def seconds(text: str, path: Path) -> float:
 def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
     """Return the controlled vehicle that `--ego` selects.
 
-    Args:
-        ego: the controlled vehicle, as ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty
-            for ``any`` if a vehicle departs.
-        files: paths of route files and additional files.
-        begin: start of the simulation, in s.
-        path: path of the configuration, for error messages.
+    ``ego`` is ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty for ``any`` if a vehicle
+    departs.
 
     Raises:
         ScenarioError: the text has another form, or no vehicle matches.
@@ -133,12 +129,9 @@ def draw_among(
 ) -> Ego:
     """Return a controlled vehicle that replaces another vehicle in each trial, drawn from those entering amid traffic.
 
-    Args:
-        known: the vehicles, at least one, ordered by time.
-        why: beginning of the note for the user.
-        verb: verb of the note: what the vehicles do at their times, such as "depart".
-        few: minimum number of candidates in the time window; with fewer, all of ``known`` are candidates.
-        keep_agent: id that the controlled vehicle keeps if possible; empty to choose an id.
+    There is at least one vehicle, and they are ordered by time. The note begins with ``why``, and its ``verb`` says
+    what they do then, such as "depart". If the time window has fewer than ``few``, all are candidates. The controlled
+    vehicle keeps the id ``keep_agent`` if possible.
     """
     first, last = known[0].depart_s, known[-1].depart_s
     since = first + min(_BUSY_AFTER_S, (last - first) / 3)
@@ -315,9 +308,7 @@ class SurveyedRun(TypedDict):
 def refine(scenario: Scenario, answer: Json) -> Scenario:
     """Return the scenario with the vehicles that entered in every run as candidates, and with notes on the traffic.
 
-    Args:
-        scenario: scenario of a ``.sumocfg``, with the candidates from its route files.
-        answer: the runs as `SurveyedRun`; at least one.
+    The answer has at least one `SurveyedRun`.
 
     Raises:
         ScenarioError: an agent can drive none of the vehicles that enter.

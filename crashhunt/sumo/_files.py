@@ -136,10 +136,7 @@ def _is_written(key: str) -> bool:
 def rewritten(content: bytes, found: list[FileReference], name: Callable[[FileReference], str]) -> bytes:
     """Return an XML file with other file names in its attributes; the rest stays unchanged.
 
-    Args:
-        content: contents of the XML file.
-        found: the references that `references` has found in the file.
-        name: function that returns the new name for a reference; an equal name changes nothing.
+    The references are those that `references` has found. A name that is equal changes nothing.
     """
     from xml.sax.saxutils import quoteattr  # which imports urllib and ssl
 
@@ -182,10 +179,7 @@ def movable(path: Path) -> bytes | None:
 def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) -> tuple[str, ...]:
     """Return all files that SUMO reads because of the given files, directly or indirectly, relative to the folder.
 
-    Args:
-        folder: folder of the scenario.
-        names: names of files in the folder.
-        inside: whether to refuse files outside of the folder without reading them.
+    With ``inside``, files outside of the folder are refused and not read.
 
     Raises:
         ScenarioError: a file does not exist.

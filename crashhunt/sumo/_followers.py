@@ -93,9 +93,7 @@ class _Part(NamedTuple):
     def reach(self, right: float, left: float) -> tuple[float, float] | None:
         """Return the positions on the lane, in m, between which the outline is on a path; None if it is not.
 
-        Args:
-            right: right border of the path, in m to the left of the centre line.
-            left: left border of the path.
+        The borders of the path are in m to the left of the centre line.
         """
         found: list[float] = []
         for piece, outline in self.pieces:
@@ -161,9 +159,7 @@ class Followers:
     def react(self, agents: Collection[str], is_inside: Callable[[str], bool]) -> None:
         """Bound the speeds of vehicles in the next step, and release those that are not blocked any more.
 
-        Args:
-            agents: the agents whose vehicles are in the simulation.
-            is_inside: function that returns whether an agent's vehicle is inside a straight part of its own lane.
+        ``is_inside`` returns whether an agent's vehicle is inside a straight part of its own lane.
         """
         bounds: dict[str, float] = {}
         waiting: set[str] = set()
@@ -293,11 +289,8 @@ class Followers:
     ) -> Iterator[tuple[str, float]]:
         """Yield the first vehicle that a part blocks on each way to the start of a lane.
 
-        Args:
-            lane: id of the lane.
-            part: the part.
-            start: position of the start of this lane in the frame of the part's lane, in m; not above 0.
-            links: the links that lead from this lane to the part, in driving order.
+        The lane starts at ``start`` in the frame of the part's lane, in m, not above 0. The links lead from this lane
+        to the part, in driving order.
         """
         graph = self._graph
         for source, link in graph.lanes[lane].entries:
@@ -321,11 +314,8 @@ class Followers:
     ) -> tuple[str, float] | None:
         """Return the first vehicle of a lane that a part blocks, and its distance from the part in m.
 
-        Args:
-            vehicles: the vehicles of the lane, the last one first.
-            part: the part.
-            start: position of the start of the lane in the frame of the part's lane, in m.
-            links: the links that a vehicle must take to reach the part.
+        The last vehicle comes first. The lane starts at ``start`` in the frame of the part's lane, in m. A vehicle must
+        take the links to reach the part.
         """
         for vehicle in reversed(vehicles):
             aside = sumo.vehicle_getWidth(vehicle) / 2 + _SIDE_GAP_M
@@ -346,12 +336,7 @@ class Followers:
     def _bound_of(self, vehicle: str, gap: float, agent: str, speed: float, decel: float) -> float | None:
         """Return the highest speed of a vehicle in the next step; None if it is not bounded, or sees the part.
 
-        Args:
-            vehicle: the vehicle behind the part.
-            gap: its distance from the part, in m.
-            agent: the agent whose vehicle the part is of.
-            speed: speed of the part, in m/s.
-            decel: maximum deceleration of the agent's vehicle, in m/s².
+        The gap is that to the part, in m. Speed and deceleration are those of the agent's vehicle, in m/s and m/s².
         """
         commanded = VehicleCommand.speeds.get(vehicle, math.inf)
         if commanded is None or vehicle in commanded_elsewhere:

@@ -151,9 +151,8 @@ class FreeMotion:
     def _outline(self, places: Sequence[tuple[float, float]], inset_m: float = 0.0) -> list[tuple[float, float]]:
         """Return points of the vehicle's outline.
 
-        Args:
-            places: how far the points are ahead and to the left of the centre, as shares of half the size.
-            inset_m: distance of the points from the outline, to its inside, in m.
+        A place says how far a point is ahead and to the left of the centre, as shares of half the size. The points are
+        ``inset_m`` inside of the outline.
         """
         state, (cos, sin) = self.state, (math.cos(self.state.heading), math.sin(self.state.heading))
         half, half_width = self._half - inset_m, self._half_width - inset_m
@@ -515,13 +514,7 @@ class DrivableArea:
         return next((name for name, shape in found if _overlap(corners, shape)), "")
 
     def contains(self, x: float, y: float, kind: str) -> bool:
-        """Return whether a point is on a lane that a class of vehicles may use, or inside a junction.
-
-        Args:
-            x: position to the east, in m.
-            y: position to the north, in m.
-            kind: vehicle class.
-        """
+        """Return whether a point is on a lane that a class of vehicles may use, or inside a junction."""
         recent = self._recent.get(kind, [])
         for place, lane in enumerate(recent):
             if self._is_on(lane, x, y):
@@ -544,11 +537,7 @@ class DrivableArea:
     def lane_around(self, state: MotionState, half: float, half_width: float, kind: str) -> str:
         """Return the lane that was last found for a class of vehicles, if a rectangle is on one straight part of it.
 
-        Args:
-            state: the pose of its centre.
-            half: half its length, in m.
-            half_width: half its width, in m.
-            kind: vehicle class.
+        The rectangle has half the given length and width, in m, around the pose of its centre.
         """
         recent = self._recent.get(kind)
         if not recent:

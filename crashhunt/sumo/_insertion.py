@@ -56,11 +56,8 @@ def enter(
 ) -> None:
     """Warm up the traffic, add missing vehicles of agents, and wait until all agents' vehicles are on the road.
 
-    Args:
-        scenario: Scenario that contains the length of the warm-up and the maximum wait.
-        setups: The setups of the agents that drive.
-        replaced: The vehicles of the traffic that are replaced, each with its agent.
-        taking_part: Filter that removes excluded actors; None if all actors take part.
+    ``replaced`` has the vehicles of the traffic that are replaced, each with its agent. Without a filter, all actors
+    take part.
 
     Raises:
         InvalidEpisodeError: A controlled vehicle did not enter in time, or had already left the simulation.

@@ -193,9 +193,7 @@ class LaneGraph:
     def opposite(self, edge: str, median_m: float) -> list[GraphLane]:
         """Return the lanes of the roads that lead back between the junctions of a road, next to it.
 
-        Args:
-            edge: the road.
-            median_m: largest distance between the two directions, half way along the road, in m.
+        The two directions are at most ``median_m`` apart, half way along the road.
         """
         if edge not in self._ends:
             return []
@@ -460,12 +458,9 @@ class RouteGuide:
     def walk(self, number: int, lane: GraphLane, *, is_best: bool) -> Iterator[tuple[GraphLane, int, LaneLink | None]]:
         """Yield the lanes ahead, from a lane on: the lane, the index of its edge, and the link that follows.
 
-        Lanes inside junctions are yielded with the index of the edge before and the rest of their link.
-
-        Args:
-            number: index of the edge on the route; inside a junction, of the edge before.
-            lane: the lane.
-            is_best: whether to begin on the best lane instead; if not, a lane that leads on is kept.
+        Lanes inside junctions are yielded with the index of the edge before and the rest of their link. The number is
+        the index of the edge on the route; inside a junction, of the edge before. With ``is_best``, the walk begins on
+        the best lane instead; otherwise, a lane that leads on is kept.
         """
         graph, current = self.graph, lane
         if lane.is_internal:
@@ -492,9 +487,7 @@ class RouteGuide:
     def link(self, number: int, lane: GraphLane) -> LaneLink | None:
         """Return the link of a lane that leads along the route; inside a junction, the rest of it; None without one.
 
-        Args:
-            number: index of the lane's edge on the route; inside a junction, of the edge before.
-            lane: the lane.
+        The number is the index of the lane's edge on the route; inside a junction, of the edge before.
         """
         if not lane.is_internal:
             step = self.step(number, lane.id)

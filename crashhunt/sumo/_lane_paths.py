@@ -194,11 +194,7 @@ def straight_ahead(graph: LaneGraph, lane: GraphLane, vehicle_class: str) -> Ite
 def straight_behind(graph: LaneGraph, lane: GraphLane, vehicle_class: str, preferred: str = "") -> Iterator[GraphLane]:
     """Yield the lanes that lead into a lane with the smallest turns, the nearest first.
 
-    Args:
-        graph: the lanes of the network.
-        lane: the lane.
-        vehicle_class: class of the vehicle.
-        preferred: the edge from which the nearest road should be, if any lane of it leads into the lane.
+    The nearest road is from the edge ``preferred``, if any lane of it leads into the lane.
     """
     current = lane
     while True:

@@ -65,9 +65,7 @@ class Loading:
     def load(self, program: Sequence[str], command: Sequence[str]) -> str:
         """Load a simulation.
 
-        Args:
-            program: The program and its options, which only the first simulation of a process uses.
-            command: SUMO's options for the simulation.
+        Only the first simulation of a process uses the program and its options.
 
         Returns:
             A notice if the order of links is not fixed although the library for it is installed; otherwise empty. The

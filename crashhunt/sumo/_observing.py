@@ -142,11 +142,8 @@ class ObservedParts:
     ) -> None:
         """Begin an episode.
 
-        Args:
-            starts: The odometer of every agent's vehicle, in m.
-            time_s: The simulation time, in s.
-            steering: Functions that return the steering angle of vehicles whose actions contain one.
-            seed: The seed of the trial.
+        ``starts`` has the odometer of every agent's vehicle, in m. ``steering`` has functions that return the steering
+        angle of vehicles whose actions contain one.
         """
         known = steering or {}
         self._histories = {agent: History(layout) for agent, layout in self.layouts.items()}

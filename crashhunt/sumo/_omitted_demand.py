@@ -49,10 +49,8 @@ def is_searched(folder: Path, routes: tuple[str, ...]) -> bool:
 def unsorted_notes(folder: Path, routes: tuple[str, ...], begin_s: float) -> Iterator[str]:
     """Yield a warning for each route file from which SUMO omits demand that departs before an earlier element.
 
-    Args:
-        folder: folder of the scenario.
-        routes: names of the route files. SUMO does not check the order of additional files.
-        begin_s: start of the simulation, which is the departure time of a flow without one, in s.
+    A flow without a departure time departs at the start of the simulation. SUMO does not check the order of additional
+    files.
     """
     for name in routes if is_searched(folder, routes) else ():
         late: list[tuple[str, str]] = []

@@ -287,9 +287,7 @@ SIGNAL_ARGUMENTS: Mapping[str, tuple[str, ...]] = {
 def arguments_of(manoeuvre: str, given: Container[str]) -> tuple[str, ...]:
     """Return the arguments that a scenario with a manoeuvre must have.
 
-    Args:
-        manoeuvre: name of the manoeuvre.
-        given: the arguments that the scenario has. A cut-in may have ``slower_kmh`` instead of ``other_kmh``.
+    A cut-in may have ``slower_kmh`` instead of ``other_kmh``.
     """
     names = _MANOEUVRE_ARGUMENTS[manoeuvre]
     if "slower_kmh" in given:

@@ -101,9 +101,7 @@ _DEMAND_TAGS = "vehicle|trip|flow|person|personFlow|container|containerFlow|cali
 def check_names(scenario: Scenario, ego: str = "") -> None:
     """Refuse a controlled vehicle whose type, route, edges or traffic vehicle is not defined in any file.
 
-    Args:
-        scenario: scenario whose files exist.
-        ego: value of ``--ego`` on the command line, for the message.
+    The message contains the value of ``--ego``.
 
     Raises:
         ScenarioError: a name is unknown; the message contains the most similar known name.
@@ -223,10 +221,7 @@ _TAGS_BY_WORD = {
 def explained(message: str, output: str, scenario: Scenario) -> ScenarioError | None:
     """Return the error of a scenario in which no episode could be set up; None if SUMO is not the cause.
 
-    Args:
-        message: message of the exception in the worker.
-        output: the last output of SUMO.
-        scenario: the loaded scenario, not the worker's copy.
+    The message is that of the worker's exception. The scenario is the loaded one, not the worker's copy.
     """
     said, errors = message.removeprefix(_SET_UP_ERROR), _errors(output)
     died = message.startswith("the process died") and errors

@@ -83,15 +83,8 @@ def _along(
 ) -> NDArray[np.float64] | None:
     """Return the positions and the heading of an actor that drives some distances along a path, shape (N, 3).
 
-    The result is None for an actor that drives across the path or against it. Behind its end, the path is straight.
-
-    Args:
-        path: the path from the actor's lane on.
-        x: x of the actor's centre, in m.
-        y: y of the actor's centre, in m.
-        heading: heading of the actor, in rad.
-        ahead: how far the reference point is ahead of the centre, in m.
-        distances: the distances, in m.
+    The result is None for an actor that drives across the path or against it. Behind its end, the path is straight. The
+    heading is in rad, and all distances are in m. The reference point is ``ahead`` of the centre.
     """
     points = path.rows[path.begin :, 1:3]
     if len(points) < 2:

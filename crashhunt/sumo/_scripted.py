@@ -153,11 +153,7 @@ _ABOVE_ZERO = {"period_s": 0.1}
 def manoeuvre_paths(manoeuvre: str, agent: str, arguments: Mapping[str, Value], step_s: float) -> Paths:
     """Return the paths of all vehicles of a manoeuvre, with the controlled vehicle at its start.
 
-    Args:
-        manoeuvre: as in the table of the scenario.
-        agent: identifier of the controlled vehicle.
-        arguments: the arguments of the scenario, as in `arguments_of`.
-        step_s: step length, in s.
+    The arguments are those of `arguments_of`.
 
     Raises:
         InvalidEpisodeError: an argument is out of its range.

@@ -126,10 +126,7 @@ def side_effect(scenario: Scenario, values: Mapping[str, Value], _specifications
 def _check_text(file: str, content: bytes, *, reads: bool) -> None:
     """Refuse an XML file with elements other than those known to simulate.
 
-    Args:
-        file: name of the file.
-        content: contents as SUMO reads them.
-        reads: whether the files that the file names have been checked.
+    The contents are those that SUMO reads. With ``reads``, the files that the file names have been checked.
     """
     parser = expat.ParserCreate()
 

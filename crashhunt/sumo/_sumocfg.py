@@ -140,12 +140,7 @@ def load_sumocfg(path: Path, ego: str = "") -> Scenario:
 
     The network, routes, additional files and options of the configuration are kept. The output files that the
     configuration names are not written. Options that a trial sets itself (the seed, the number of threads) are ignored.
-    The notes list both. The demand becomes the scenario argument ``scale``.
-
-    Args:
-        path: path of the configuration.
-        ego: the controlled vehicle, as ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty
-            for ``any`` if a vehicle departs.
+    The notes list both. The demand becomes the scenario argument ``scale``. ``ego`` is as for `choose_ego`.
 
     Raises:
         ScenarioError: the file is not a configuration of SUMO, or defines no vehicle and no route.

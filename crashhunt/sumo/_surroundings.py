@@ -39,10 +39,7 @@ def surroundings_of(
 ) -> Surroundings:
     """Return the surroundings of a vehicle in the current step. Only getters of libsumo are called.
 
-    Args:
-        agent: identifier of the vehicle, which is on the road.
-        neighboring_lane: the method of `Driving` with this name.
-        unregulated: identifiers of the junctions without rules of right of way.
+    The vehicle is on the road. ``unregulated`` has the junctions without rules of right of way.
     """
     speed = max(0.0, float(sumo.vehicle_getSpeed(agent)))
     look_m = _look_m(speed)

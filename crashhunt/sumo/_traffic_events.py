@@ -183,11 +183,7 @@ class SumoEvents:
     ) -> None:
         """Reset the state of the last episode.
 
-        Args:
-            scene: The scene before the first step.
-            agents: Identifiers of the agents that act.
-            controlled: All controlled vehicles, by identifier.
-            routes: The edges of the route of each vehicle that can leave it, because it moves freely.
+        ``routes`` has the edges of the route of each vehicle that can leave it, because it moves freely.
         """
         self._controlled, self._routes = controlled, routes
         self._astray: set[str] = set()

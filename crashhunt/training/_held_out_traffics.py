@@ -46,10 +46,6 @@ def is_test_traffic(seed: int, test: float) -> bool:
 
     The first 64 bits of BLAKE2b of the seed in decimal digits, divided by 2**64, are compared with the share. A larger
     share adds traffics to the test part and removes none.
-
-    Args:
-        seed: seed of the trial.
-        test: share of the traffic seeds in the test part, from 0 to 1.
     """
     digest = hashlib.blake2b(str(seed).encode(), digest_size=_HASH_BYTES).digest()
     return bool(int.from_bytes(digest) < test * 2 ** (8 * _HASH_BYTES))
@@ -121,9 +117,7 @@ class Split(Serializable):
 def split_crashes(places: Iterable[Path | str], test: float) -> Split:
     """Return the crashes of hunts, corpora or single bundles, each with its part.
 
-    Args:
-        places: directories of hunts, of corpora, of corpus cases or of bundles.
-        test: share of the traffic seeds in the test part.
+    The places are directories of hunts, of corpora, of corpus cases or of bundles.
 
     Raises:
         BundleError: a directory contains no crash, or a crash is damaged.
@@ -269,9 +263,7 @@ class HeldOutTraffics:
 def held_out_traffics(settings: HuntSettings, hunts: Iterable[Path]) -> HeldOutTraffics:
     """Return the rule that selects the trials with held-out traffic, for comparisons of hunts and for crash rates.
 
-    Args:
-        settings: settings of one of the hunts; all have the same seed.
-        hunts: directories of the hunts; one directory for the rate of a single hunt.
+    All hunts have the same seed; for the rate of a single hunt, there is one directory.
 
     Raises:
         HuntDirectoryError: a training record is damaged.

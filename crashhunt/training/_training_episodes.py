@@ -113,9 +113,8 @@ class CrashEpisodes:
     def reset_to_plain(self, hunt: int, seed: int) -> tuple[object, dict[str, object]]:
         """Begin an episode with new traffic of a hunt.
 
-        Args:
-            hunt: Index of a crash; the traffic has the settings of the crash's hunt.
-            seed: Seed of the traffic and of the scenario arguments.
+        The traffic has the settings of the hunt of the crash with the index ``hunt``. The seed is also that of the
+        scenario arguments.
 
         Raises:
             SimulatorError: The episode cannot be set up.

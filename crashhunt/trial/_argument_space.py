@@ -197,13 +197,7 @@ class Range:
 def _check_range(text: str, low: float, high: float, step: float | None, *, log: bool, integer: bool) -> None:
     """Refuse an invalid range.
 
-    Args:
-        text: the range, as the message shows it.
-        low: as for `Range`.
-        high: as for `Range`.
-        step: as for `Range`.
-        log: as for `Range`.
-        integer: as for `Range`.
+    The message shows ``text``. The other arguments are those of `Range`.
 
     Raises:
         ArgumentError: the range is invalid.

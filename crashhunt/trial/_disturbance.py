@@ -145,10 +145,7 @@ class Disturbance(Serializable):
     def took_place(self, vehicle: str, how_strong: float, step_length_s: float = 0.0) -> Disturbance:
         """Return the disturbance as it took place, with durations and delays in whole steps.
 
-        Args:
-            vehicle: The vehicle that was at the place.
-            how_strong: The strength that this vehicle can reach.
-            step_length_s: Step length of the simulation, in s; 0 if it is unknown.
+        The strength is the one that this vehicle can reach. The step length is 0 if it is unknown.
         """
         if not step_length_s:
             return replace(self, vehicle=vehicle, how_strong=how_strong)
@@ -185,8 +182,7 @@ class Disturbance(Serializable):
 def why_not(one: Disturbance) -> tuple[str, str] | None:
     """Return the reason why a disturbance is invalid, and the fix; None if it is valid.
 
-    Args:
-        one: A planned disturbance of any kind; its step is not checked.
+    Its step is not checked.
     """
     kind = KINDS.get(one.what)
     if not 0 <= one.how_strong < math.inf:

@@ -78,11 +78,7 @@ class InputSignal:
 def expand_signal(name: str, spec: str, duration_s: float, *, where: str) -> dict[str, str]:
     """Return the specifications of an argument that is a signal, and of its points; empty for any other argument.
 
-    Args:
-        name: name of the argument.
-        spec: specification of the argument, as the user gave it.
-        duration_s: duration of a trial, in s.
-        where: option that an error names, such as ``--arg throttle``.
+    The specification is as the user gave it. An error names ``where``, an option such as ``--arg throttle``.
 
     Raises:
         ArgumentError: the specification is invalid.

@@ -192,11 +192,7 @@ def poses_between(start: Rectangle, end: Rectangle, shares: Sequence[float], *, 
 def first_contact(previous: Scene | None, present: Scene, row: int, other: int) -> Touch | None:
     """Return the first contact of two actors after the previous scene and up to the present scene.
 
-    Args:
-        previous: the scene one step before; if None, only the present scene is examined.
-        present: the present scene.
-        row: row of the first actor in the present scene.
-        other: row of the second actor in the present scene.
+    Without a previous scene, only the present scene is examined.
 
     Returns:
         The first contact; None if the actors do not touch, or pass each other on different levels.
@@ -464,12 +460,8 @@ def _direction(first: _Party, second: _Party) -> tuple[float, float, bool]:
 def _drives_into(first: _Party, second: _Party, x: float, y: float, *, jumps: bool) -> bool:
     """Return whether the first actor drives into the second.
 
-    Args:
-        first: the first actor.
-        second: the second actor.
-        x: x of the unit vector from the first to the second actor.
-        y: y of the unit vector from the first to the second actor.
-        jumps: whether an instantaneous lane change causes the contact.
+    The unit vector (x, y) points from the first to the second actor. With ``jumps``, an instantaneous lane change
+    causes the contact.
     """
     if jumps:  # the actor that moves into the other's lane
         own, its = first.jump[0] * x + first.jump[1] * y, -second.jump[0] * x - second.jump[1] * y

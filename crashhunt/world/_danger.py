@@ -127,10 +127,7 @@ class DangerMeter:
 def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float) -> tuple[Array, DangerousMoment]:
     """Return the criticality of each scene, shape (scenes,), and the most critical moment.
 
-    Args:
-        frames: frames of the whole episode, in order; later scenes determine the criticality of earlier scenes.
-        agents: identifiers of the controlled vehicles.
-        step_length_s: step length in s.
+    The frames are those of the whole episode, because later scenes determine the criticality of earlier ones.
     """
     count = sum(len(frame.columns) for frame in frames)
     whole: Array
@@ -184,10 +181,7 @@ def _measured(
 def measured_along(track: Track, others: Others, *, same_way: bool = False) -> tuple[Array, NDArray[np.intp]]:
     """Return the criticality of each sample of a path, and the number of the other actor (-1 for none).
 
-    Args:
-        track: the path of the agent.
-        others: the paths of the actors near the agent.
-        same_way: whether only those actors count that the agent would hit from behind, driving in the same direction.
+    With ``same_way``, only those actors count that the agent would hit from behind, driving in the same direction.
     """
     gaps, brakes, who = np.full(len(track.time), np.inf), np.zeros(len(track.time)), np.full(len(track.time), -1)
     if len(others.sample):
@@ -386,12 +380,8 @@ _SIDEWAYS_M = 10.0  # from the line through the agent: an actor never within it 
 def followers_danger(frames: Sequence[Frame], agent: str, step_length_s: float) -> tuple[Array, DangerousMoment, float]:
     """Return the rear criticality of an agent, caused by actors that approach the agent from behind.
 
-    The rear criticality is computed from a recording. For articulated vehicles, only the first part counts.
-
-    Args:
-        frames: frames of the whole episode, in order.
-        agent: identifier of the controlled vehicle.
-        step_length_s: step length in s.
+    The rear criticality is computed from a recording. For articulated vehicles, only the first part counts. The frames
+    are those of the whole episode, in order.
 
     Returns:
         The rear criticality of each scene, shape (scenes,); the most critical moment; and the value of the trial,

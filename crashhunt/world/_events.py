@@ -121,10 +121,7 @@ class RightOfWay:
     def places(self, lanes: tuple[str, ...], x: float, y: float) -> tuple[int, ...]:
         """Return the indices of the links on which an actor may be, or which it may just have left.
 
-        Args:
-            lanes: the lanes of the actor in order; a lane may occur several times.
-            x: x of the actor's front bumper, in m.
-            y: y of the actor's front bumper, in m.
+        The lanes are in order, and a lane may occur several times. The point is that of the actor's front bumper, in m.
         """
         for back in range(len(lanes) - 1, -1, -1):
             lane, later = lanes[back], lanes[back + 1 :]

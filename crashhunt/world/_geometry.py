@@ -257,14 +257,8 @@ def same_level(one: Rectangle, level: Level, two: Rectangle, other_level: Level,
     """Return whether two rectangles are on the same level; False if one rectangle is on a bridge above the other.
 
     If both rectangles are on the same road, the slopes of the road at the rectangles predict the difference of their
-    heights. The rectangles are on different levels if the difference deviates from this prediction.
-
-    Args:
-        one: the first rectangle.
-        level: height of the first rectangle, in m, and slope of the road there.
-        two: the second rectangle.
-        other_level: height of the second rectangle, in m, and slope of the road there.
-        lower_m: height of the lower actor itself, in m.
+    heights. The rectangles are on different levels if the difference deviates from this prediction. A level is the
+    height of a rectangle, in m, and the slope of the road there. ``lower_m`` is the height of the lower actor itself.
     """
     dx, dy = two[0] - one[0], two[1] - one[1]
     ahead = level[1] * (dx * math.cos(one[2]) + dy * math.sin(one[2]))

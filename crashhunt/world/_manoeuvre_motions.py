@@ -73,13 +73,8 @@ def manoeuvre_motions(
 ) -> Iterator[dict[str, ActorState]]:
     """Yield the states of the other road users after each step, without end; a road user may appear later.
 
-    Args:
-        manoeuvre: name of the manoeuvre.
-        values: arguments of the scenario. ``decel_mps2``, ``walk_kmh`` and, for ``following``, ``slower_kmh`` may be
-            functions of the time in s.
-        own_y: middle of the lane of the controlled vehicle, in m.
-        next_y: middle of the next lane, in m.
-        step_s: step length, in s.
+    The arguments ``decel_mps2``, ``walk_kmh`` and, for ``following``, ``slower_kmh`` may be functions of the time in s.
+    The lanes are given by their middle, in m.
     """
     constant = cast("Mapping[str, float]", values)
     return _MOTIONS[manoeuvre](constant, constant["ego_kmh"] / _KMH, own_y, next_y, step_s)

@@ -102,14 +102,7 @@ class CodeArchive:
 
 
 def settings_in(settings: WorkerSettings, folders: dict[str, str], root: Path, scratch: Path) -> WorkerSettings:
-    """Return the settings of a hunt, with the paths of an unpacked archive.
-
-    Args:
-        settings: settings of the hunt on its own machine.
-        folders: the folders of the archive.
-        root: folder into which the archive was unpacked on this machine.
-        scratch: folder on this machine into which workers write.
-    """
+    """Return the settings of a hunt, with the paths of an unpacked archive."""
     here = {there: str(root / place) for there, place in folders.items()}
     scenario = replace(settings.scenario, folder=Path(here[str(settings.scenario.folder)]))
     files = {value: here[file] for value, file in settings.argument_files.items()}
@@ -119,11 +112,6 @@ def settings_in(settings: WorkerSettings, folders: dict[str, str], root: Path, s
 
 def unpack(packed: bytes, digest: str, root: Path) -> None:
     """Unpack an archive into a new folder.
-
-    Args:
-        packed: the archive as compressed bytes.
-        digest: the expected digest of the archive.
-        root: path of the new folder, which must not exist.
 
     Raises:
         BundleError: the contents differ from the archive that was sent.

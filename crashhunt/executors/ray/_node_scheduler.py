@@ -175,9 +175,7 @@ class NodeScheduler:
 def shares(free: Mapping[str, int], wanted: int | None) -> dict[str, int]:
     """Divide the trials that run at a time evenly among nodes, without exceeding the free slots of any node.
 
-    Args:
-        free: number of trials that each node could run.
-        wanted: number of slots that the hunt wants; None for all free slots.
+    Without ``wanted``, the hunt wants all free slots.
     """
     left = {node: count for node, count in free.items() if count > 0}
     if wanted is None:

@@ -164,11 +164,8 @@ def _visible_rows(
 ) -> NDArray[np.float64] | None:
     """Return the rows of the agent and of close objects; None if highway-env's own code must run.
 
-    Args:
-        kinematic: The observation object.
-        frame: The positions on the road.
-        close: The close objects, nearest first; if there are too many, only the last objects are used.
-        replaced: Features of the agent that replace its own features.
+    The close objects come nearest first; if there are too many, only the last ones are used. ``replaced`` has features
+    that replace the agent's own.
     """
     vehicle, features = kinematic.observer_vehicle, kinematic.features
     close = close[-kinematic.vehicles_count + 1 :]
@@ -276,13 +273,8 @@ def observe_grid(grid: OccupancyGridObservation, frame: TrafficFrame | None) -> 
 def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, reach: float) -> bool:
     """Compute the result of `OccupancyGridObservation.fill_road_layer_by_lanes`, for all lanes together.
 
-    If a point is so near to a cell border that rounding matters, highway-env's own code decides.
-
-    Args:
-        grid: The observation object.
-        network: The lanes of the road.
-        layer: The number of the layer to fill.
-        reach: The distance for which lanes are followed in both directions, in m.
+    If a point is so near to a cell border that rounding matters, highway-env's own code decides. Lanes are followed for
+    ``reach`` m in both directions.
 
     Returns:
         Whether the layer was filled; False, with nothing changed, if the grid is too large or not finite.
@@ -316,12 +308,7 @@ def fill_times(
 ) -> NDArray[np.float64] | None:
     """Return the result of `compute_ttc_grid`; None if highway-env's own code must run.
 
-    Args:
-        env: The environment.
-        state: The current state of the environment's road.
-        vehicle: The observing vehicle.
-        quantum: The time between two cells, in s.
-        horizon: The time of the last cell, in s.
+    ``quantum`` is the time between two cells, and ``horizon`` that of the last cell, in s.
     """
     network, things = state.owner.network, env.road.vehicles
     kind, speeds = kind_of(type(vehicle)), getattr(vehicle, "target_speeds", None)
@@ -381,9 +368,7 @@ def _is_plain(thing: RoadObject, features: list[str]) -> bool:
 def _vehicle_values(thing: RoadObject, late: Iterable[str] = ()) -> dict[str, float]:
     """Return those values of highway-env's `to_dict` that observations use.
 
-    Args:
-        thing: A vehicle or an object.
-        late: The features of the lane and the destination that are shown.
+    ``late`` has the features of the lane and the destination that are shown.
     """
     x, y = thing.position.tolist()
     c, s = float(np.cos(thing.heading)), float(np.sin(thing.heading))

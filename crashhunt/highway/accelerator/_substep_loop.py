@@ -63,10 +63,6 @@ def collide_one_by_one(road: Road, dt: float) -> None:
 def enforce(road: RegulatedRoad, traffic: Traffic) -> bool:
     """Compute the result of `RegulatedRoad.enforce_road_rules`, with one prediction per vehicle.
 
-    Args:
-        road: The road.
-        traffic: The road's vehicles in the kernel, with their current state.
-
     Returns:
         Whether the rules were applied; False, with nothing changed, if highway-env must predict a path.
     """
@@ -110,11 +106,8 @@ def choose(env: AbstractEnv, action: object) -> bool:
     """Apply that part of `DiscreteMetaAction.act` whose effect remains after the next `Road.act`.
 
     `MDPVehicle.act` chooses a target speed or lane, and then computes steering and acceleration. `Road.act` computes
-    both again from the same state before any code reads them.
-
-    Args:
-        env: The environment, whose road has just been checked: no vehicle on it has own methods.
-        action: The action of the environment's agent.
+    both again from the same state before any code reads them. The road of the environment has just been checked: no
+    vehicle on it has own methods.
 
     Returns:
         Whether the action was applied; False, with nothing changed, if highway-env must apply it.
@@ -254,13 +247,7 @@ _kinds: dict[type, _EnvironmentKind] = {}
 
 
 def run_step(env: AbstractEnv, action: object, simulate_steps: Callable[..., None]) -> object:
-    """Run `AbstractEnv.step`, in which the environment observes directly after its last sub-step.
-
-    Args:
-        env: The environment.
-        action: The action of the environment's agents.
-        simulate_steps: The replacement of `AbstractEnv._simulate`.
-    """
+    """Run `AbstractEnv.step`, in which the environment observes directly after its last sub-step."""
     found = cached(env.road)
     in_place = "_simulate" not in vars(env) and vars(AbstractEnv).get("_simulate") is simulate_steps
     if found is None or found.in_step or not in_place:

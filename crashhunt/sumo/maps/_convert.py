@@ -72,11 +72,7 @@ class Converted:
 def convert(source: MapSource, options: ConvertOptions, tools: Tools, folder: Path) -> Converted:
     """Write the network of a map as ``map.net.xml``.
 
-    Args:
-        source: a map file that `check_source` has accepted, or the shape of a generated map.
-        options: options of the conversion.
-        tools: the programs of eclipse-sumo.
-        folder: folder into which the network is written; other files in it are not removed.
+    Other files in the folder are not removed.
 
     Raises:
         ScenarioError: a program refuses the map, or the map has no road for cars.

@@ -100,12 +100,8 @@ def scenario_toml(
 ) -> str:
     """Return the contents of ``scenario.toml``.
 
-    Args:
-        title: description of the scenario in one line.
-        arguments: arguments of the scenario.
-        warmup_s: duration of the warm-up, in s.
-        speed_limit_mps: usual speed limit on the routes, in m/s; agents want to drive at about this speed.
-        agent: agent that drives; by default crashhunt's car-following agent.
+    Agents want to drive at about the speed limit, which is the usual one on the routes. By default, crashhunt's
+    car-following agent drives.
     """
     lines = [
         f"title = {_text(title)}",
@@ -209,9 +205,7 @@ class Driver:
 def next_commands(folder: str, steps: int) -> list[str]:
     """Return the commands that the user can run next.
 
-    Args:
-        folder: folder of the scenario, as the user named it; empty for the current folder.
-        steps: maximum number of steps of a trial.
+    The folder is as the user named it; empty for the current folder.
     """
     enter = [command_line("cd", folder)] if folder else []
     return [
@@ -265,14 +259,7 @@ def readme(
 ) -> str:
     """Return the contents of the scenario's ``README.md``.
 
-    Args:
-        title: title of the place.
-        place: description of the place, in lines.
-        demand: traffic of the scenario.
-        steps: maximum number of steps of a trial.
-        run_s: simulated duration of the traffic without an agent, in s.
-        from_osm: whether the map comes from OpenStreetMap.
-        workflow_file: name of the workflow file; empty if there is none.
+    Without an agent, the traffic was simulated for ``run_s``.
     """
     walks = f", {len(demand.walks)} flows of persons" if demand.walks else ""
     row = (
@@ -319,9 +306,7 @@ SET_UP      - uses: crashhunt/crashhunt/.github/actions/corpus@vVERSION
 def workflow(folder: str, steps: int) -> str:
     """Return a GitHub workflow that uses both actions of crashhunt.
 
-    Args:
-        folder: folder of the scenario, relative to the root of the repository; ``.`` if it is the root.
-        steps: maximum number of steps of a trial.
+    The folder is relative to the root of the repository.
     """
     crashes = "crashes" if folder == "." else f"{folder}/crashes"
     # The action splits these words with shlex, which does not know all that a shell knows.

@@ -35,13 +35,7 @@ def draw_map(
 ) -> None:
     """Write a PNG with roads in the colour of their traffic, the names of the busiest roads, and a scale.
 
-    Args:
-        network: the network to draw.
-        vehicles: number of vehicles on each road in the simulated time.
-        path: path of the PNG file.
-        title: text above the map.
-        hours: simulated time, in hours.
-        busiest: roads whose names are drawn, with their vehicles per hour; the busiest road is first.
+    ``busiest`` has the roads whose names are drawn, with their vehicles per hour; the busiest road is first.
     """
     from PIL import Image, ImageDraw
 

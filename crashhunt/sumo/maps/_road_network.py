@@ -158,9 +158,8 @@ _DEAD_END_TYPES = {"dead_end", "unregulated", "district"}
 def read_network(path: Path, *, with_junctions: bool = False) -> RoadNetwork:
     """Return the contents of a network file.
 
-    Args:
-        path: path of the file, which may be compressed.
-        with_junctions: whether to read the lanes inside junctions, the connections and the rules of junctions, too.
+    The file may be compressed. With ``with_junctions``, lanes inside junctions, connections and the rules of junctions
+    are read, too.
 
     Raises:
         ScenarioError: the file is not a network of SUMO.

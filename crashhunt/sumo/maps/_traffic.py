@@ -315,17 +315,7 @@ def run_plain_traffic(
 ) -> PlainRun:  # fmt: skip
     """Simulate the traffic, with a probe vehicle on each route that the agent may get.
 
-    Args:
-        demand: the traffic of the scenario.
-        network: network in which the traffic drives.
-        tools: the programs of eclipse-sumo.
-        folder: folder that contains the network, and into which files are written.
-        values: values of the scenario's arguments.
-        net: name of the network file.
-        scale: traffic factor.
-        probes_at_s: times at which the probe vehicles are to enter, in s.
-        bicycles: whether cyclists take part.
-        step_s: step length of the simulation, in s.
+    The folder contains the network, and files are written into it. The probe vehicles are to enter at ``probes_at_s``.
 
     Raises:
         ScenarioError: SUMO refuses the network or the traffic.
@@ -402,16 +392,8 @@ def calibrate(
 ) -> tuple[Demand, PlainRun, PlainRun]:  # fmt: skip
     """Return the demand at which traffic flows with the usual and largest factor, and the two runs that show it.
 
-    Args:
-        demand: the traffic before calibration.
-        network: network in which the traffic drives.
-        tools: the programs of eclipse-sumo.
-        folder: folder that contains the network.
-        values: values of the scenario's arguments.
-        net: name of the network file.
-        scales: the usual and the largest traffic factor.
-        probes_at_s: times at which the probe vehicles are to enter, in s.
-        bicycles: whether cyclists take part.
+    ``scales`` has the usual and the largest traffic factor. The folder contains the network. The probe vehicles are to
+    enter at ``probes_at_s``.
 
     Raises:
         ScenarioError: even a tenth of the traffic jams, or no vehicle of an agent can enter.
