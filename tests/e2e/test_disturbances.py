@@ -38,15 +38,8 @@ def hunt_refused(shell, *more):
     return done.err
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        ("brake", "'brake' has no rate; write NAME=RATE"),
-        ("cut_in@5=left:4:2", "does not support the disturbance 'cut_in'; it supports brake, late_action"),
-    ],
-)
-def test_what_cannot_be_meant_is_one_line_before_the_hunt(toy, words, says):
-    assert says in hunt_refused(toy, "--disturb", words)
+def test_what_cannot_be_meant_is_one_line_before_the_hunt(toy):
+    assert "'brake' has no rate; write NAME=RATE" in hunt_refused(toy, "--disturb", "brake")
 
 
 @pytest.mark.nightly

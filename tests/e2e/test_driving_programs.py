@@ -48,28 +48,6 @@ def test_a_hunt_varies_what_a_program_declares_and_its_crash_replays_where_the_p
     assert toy.crashhunt("replay", "elsewhere", "--json").json["verdict"] == "reproduced"
 
 
-@pytest.mark.nightly
-def test_each_harm_costs_its_own_trial_with_a_message_that_names_the_vehicle_and_the_step(toy):
-    write_program(toy.folder)
-    harms = {
-        "garbage": "ego: its answer to observe of step 3 is not JSON: thinking",
-        "SIGSEGV": "ego: the program died of SIGSEGV instead of answering observe of step 3",
-        "late": "ego: it has not answered observe of step 3 within 20 s",
-        "NaN": "the action [nan, 0] is not (target_speed, lane_change)",
-    }
-    kinds = "|".join([*harms, "none"])
-    (toy.folder / "garbage").write_text("a file with the name of a value")
-    toy.crashhunt(
-        "run", "h", "2", "5", "20", "--agent", "exec:./planner - observe", "--arg", f"kind={kinds}", "--arg",
-        "speed=8.0", "--set", "gap_m=30.0", "--sampler", "grid", *RUN, "--keep-going", "--step-timeout", "20", "--json",
-    )  # fmt: skip
-    outcomes = {row["ego.kind"]: row["outcome"] for row in rows_of(toy, "h")}
-    assert outcomes == {**dict.fromkeys(harms, "agent_error"), "none": "survived"}
-    messages = {json.loads(file.read_text())["failure"]["message"] for file in (toy.folder / "h").rglob("crash.json")}
-    assert len(messages) == len(harms)
-    assert all(any(message.startswith(text) for message in messages) for text in harms.values()), messages
-
-
 def test_a_program_that_fails_at_once_is_an_error_of_the_agent_and_one_that_is_missing_is_refused(toy):
     program = toy.folder / "fails"
     program.write_text("#!/bin/sh\necho 'no planner.yaml' >&2\nexit 4\n")

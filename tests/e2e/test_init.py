@@ -18,7 +18,6 @@ needs_programs = pytest.mark.skipif(
     ("words", "message"),
     [
         (("--grid", "4"), "--grid '4' is not of the form NxM"),
-        (("--grid", "4x4", "--bbox=1,2,3,4"), "--bbox cannot be used with --grid"),
         (("--osm", "none.osm"), "there is no such map"),
         (("--osm", "empty.osm"), "the file is empty"),
         (("--osm", "faulty.py"), "does not have the ending"),
@@ -32,7 +31,6 @@ needs_programs = pytest.mark.skipif(
             "--agent json:loads: the agent needs the argument 's'; give",
         ),
         (("--grid", "2x2", "--agent", "ending:Driver"), "'ending:Driver' cannot be imported: its process exited"),
-        (("--net", "empty.osm", "--lefthand"), "--lefthand cannot be used with --net"),
         ((), "one of the arguments --osm"),
         (("--grid", "2x2", "--spider", "5x2"), "not allowed with"),
     ],

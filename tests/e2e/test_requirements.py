@@ -65,12 +65,9 @@ def test_requirements_of_the_scenario_hold_unless_others_are_given(toy):
 
 MISTAKES = [
     ("always (speed > 1", "--require: the requirement ends too early; close the parenthesis\n  always (speed > 1\n"),
-    ("calm=always[5:2] (speed > 1)", "--require calm: a window ends at 2 s, before it begins at 5 s; swap"),
     ("calm=", "--require calm: the requirement is empty"),
-    ("always[0:90] (speed > 1)", "its windows end 90 s after a sample, and 60 steps take"),
-    ("always[0:0.123] (speed > 1)", "a window has the bound 0.123 s, not a multiple of the step length of"),
     ("always (sped > 1)", "the signal 'sped' of ego is unknown; did you mean 'speed'?"),
-    ("always (1 / (speed - speed) > 1)", "it divides by zero at sample 0: 1 / (speed - speed)"),
+    ("always[0:90] (speed > 1)", "its windows end 90 s after a sample, and 60 steps take"),
 ]  # fmt: skip
 
 

@@ -138,8 +138,6 @@ def test_an_environment_of_ones_own_is_part_of_the_snapshot(shell):
     one_in(
         3,
         [
-            ('[highway]\nid = "highway-fast-v0"\nconfig = { vehicle_count = 3 }', "did you mean 'vehicles_count'"),
-            ('[highway]\nid = "higway-v0"', "higway"),
             ('[highway]\nid = "highway-v0"\nconfig = { observation = { type = "Sonar" } }', "Unknown observation type"),
             ('[highway]\nid = "highway-v0"\n[agents.ego]\nroute = "r"', "agents.ego.route = 'r' is for SUMO"),
             ('warmup_s = 5.0\n[highway]\nid = "highway-v0"', "warmup_s = 5.0 is for SUMO"),
