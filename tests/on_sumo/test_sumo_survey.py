@@ -93,7 +93,7 @@ def test_traffic_that_never_enters_leaves_no_valid_trial(town):
 def test_a_run_that_was_cut_short_refuses_nothing(town, entries):
     scenario = town(end=900)  # of which a note says that it is not heeded
     assert len(scenario.notes) > 1
-    found = refine(scenario, [run(entries, cut_short=True, steps=500_000)])
+    found = refine(scenario, [run(entries, cut_short=True, steps=500_000), run(entries, steps=700)])
     assert found.arguments == scenario.arguments
     assert "no vehicle that an agent can drive enters before step 500000" in found.notes[1]
     assert (found.notes[0], *found.notes[2:]) == scenario.notes
