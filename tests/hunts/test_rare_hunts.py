@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from test_hunt_loop import TOY as RANGED
 
 import crashhunt
 from crashhunt.disturbances import DisturbanceSampler, brake
@@ -30,17 +31,7 @@ from crashhunt.trial import (
     TrialSpec,
 )
 
-TOY = """
-title = "A toy"
-schema = 1
-simulator = "toy"
-[arguments.gap_m]
-default = 12.0
-[agents.ego]
-agent = "crashhunt.agents:KeepLaneWithSpeed"
-[agents.ego.arguments.speed]
-default = 9.0
-"""
+TOY = RANGED.replace('default = 8.0\nrange = "6:14"', "default = 9.0")
 OPTIONS = {"scenario": "toy.toml", "seed": 4, "snapshot_code": False, "rare": True}
 
 

@@ -10,6 +10,7 @@ from contextlib import closing
 from dataclasses import replace
 
 import pytest
+from test_hunt_loop import TOY
 
 import crashhunt
 from crashhunt.base.errors import InternalError
@@ -20,18 +21,6 @@ from crashhunt.ledger import Ledger
 from crashhunt.results import hunt_state
 from crashhunt.statistics import measure_rates
 
-TOY = """
-title = "A toy"
-schema = 1
-simulator = "toy"
-[arguments.gap_m]
-default = 12.0
-[agents.ego]
-agent = "crashhunt.agents:KeepLaneWithSpeed"
-[agents.ego.arguments.speed]
-default = 8.0
-range = "6:14"
-"""
 OPTIONS = {"scenario": "toy.toml", "seed": 4, "snapshot_code": False}
 
 

@@ -185,11 +185,7 @@ def test_one_that_was_killed_is_read_whole(tmp_path):
         Ledger(killed, writable=True)
 
 
-def test_what_is_no_file_or_no_ledger_is_reported(tmp_path, copy):
-    folder = tmp_path / "folder" / "ledger.sqlite"
-    folder.mkdir(parents=True)
-    with pytest.raises(HuntDirectoryError, match="a folder is where the file should be"):
-        Ledger(folder)
+def test_what_is_no_ledger_is_reported(tmp_path, copy):
     copy.write_text("my notes, which are long enough to be read as the header of a file " * 2)
     with pytest.raises(HuntDirectoryError, match="not a ledger of crashhunt"):
         Ledger(copy)
