@@ -22,8 +22,8 @@ import numpy as np
 
 from crashhunt.agents._library_agents import Action, Parts
 from crashhunt.agents._protocol import ForeignFactory
+from crashhunt.base.agent_locators import fmu_files
 from crashhunt.base.errors import ArgumentError, PluginError, ProgramError
-from crashhunt.base.programs import fmu_files
 from crashhunt.base.text import listed, one_line
 from crashhunt.simulators import PARTS
 from crashhunt.trial import Argument, Signature, parse_spec

@@ -13,10 +13,10 @@ import numpy as np
 
 from crashhunt.agents._programs import _signature_in, write_road_map
 from crashhunt.agents._protocol import ForeignFactory, shown_space
+from crashhunt.base.agent_locators import describe_library, library_file, load_order
 from crashhunt.base.errors import CrashhuntError, PluginError, ProgramError
 from crashhunt.base.foreign_code import supports
 from crashhunt.base.library_probe import declaration_of, loaded_files, missing_symbols
-from crashhunt.base.programs import describe_library, library_file, load_order
 from crashhunt.base.text import one_line
 from crashhunt.simulators import ObservesParts
 

@@ -23,9 +23,9 @@ from crashhunt.agents._program_processes import (
 )
 from crashhunt.agents._protocol import ForeignFactory, shown_space
 from crashhunt.base import forks
+from crashhunt.base.agent_locators import command_of, is_path, library_path, words_of
 from crashhunt.base.errors import ArgumentError, ProgramError
 from crashhunt.base.foreign_code import supports
-from crashhunt.base.programs import command_of, is_path, library_path, words_of
 from crashhunt.base.text import one_line
 from crashhunt.simulators import NamesMetaActions, ObservesParts, ProvidesRoadMaps
 from crashhunt.trial import Argument, Constant, Signature, kind_of, parse_spec

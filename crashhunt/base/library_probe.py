@@ -1,7 +1,7 @@
 """Loads a shared library with the C interface of agents, and returns its functions and the libraries that it needs.
 
-This file imports only the standard library, because `crashhunt.base.programs` runs it by its path in a process of its
-own. A library may end or stop the process that loads it.
+This file imports only the standard library, because `crashhunt.base.agent_locators` runs it by its path in a process of
+its own. A library may end or stop the process that loads it.
 """
 
 from __future__ import annotations

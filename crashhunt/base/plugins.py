@@ -15,10 +15,10 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from crashhunt.base.agent_locators import factory_of, is_program
 from crashhunt.base.errors import HuntWhileImportingError, PluginError
 from crashhunt.base.exceptions import INSTALLED_FOLDERS, in_words, place_of
 from crashhunt.base.extras import install_command
-from crashhunt.base.programs import factory_of, is_program
 from crashhunt.base.text import did_you_mean, one_of
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias
 
 from crashhunt.base import layout
+from crashhunt.base.agent_locators import is_program
 from crashhunt.base.errors import FULL, CrashhuntError, UsageError
 from crashhunt.base.files import cannot_write
 from crashhunt.base.integrity import MAX_INTEGER
 from crashhunt.base.older_versions import removed_fix
-from crashhunt.base.programs import is_program
 from crashhunt.base.text import command_line, did_you_mean, one_of, visible
 from crashhunt.plans import hunt_options
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.agent_locators import is_program
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.git import (
@@ -25,7 +26,6 @@ from crashhunt.base.git import (
     run_to_end,
     top_of,
 )
-from crashhunt.base.programs import is_program
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.corpus._case_runs import Got
 from crashhunt.corpus._cases import add_case

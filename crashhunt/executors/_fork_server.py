@@ -29,13 +29,13 @@ from typing import TYPE_CHECKING, NoReturn, cast
 
 from crashhunt.agents import ProgramFactory, offer_reused
 from crashhunt.base import layout
+from crashhunt.base.agent_locators import is_native
 from crashhunt.base.codec import prepare
 from crashhunt.base.errors import DISK, CrashhuntError
 from crashhunt.base.exceptions import message_of
 from crashhunt.base.forks import ended
 from crashhunt.base.plugins import locate
 from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill, resume
-from crashhunt.base.programs import is_native
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.base.temporary import SharedMemoryWatch

@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
+from crashhunt.base.agent_locators import is_native
 from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
 from crashhunt.base.exceptions import INSTALLED_FOLDERS, is_users
 from crashhunt.base.foreign_code import supports
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.opened_files import OpenedFiles
-from crashhunt.base.programs import is_native
 from crashhunt.base.shared_state import SharedState
 from crashhunt.base.signals import block_signals
 from crashhunt.base.temporary import begin_records, end_records

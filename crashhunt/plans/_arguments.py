@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from crashhunt.base.agent_locators import is_program
 from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError
 from crashhunt.base.plugins import locate, registered
-from crashhunt.base.programs import is_program
 from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import signals_of_fixed
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, Request, spec_words

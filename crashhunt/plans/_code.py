@@ -12,10 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.agent_locators import can_fork, is_program
 from crashhunt.base.errors import ProgramError
 from crashhunt.base.isolation import files_read_apart, work_apart
 from crashhunt.base.plugins import Group, ImportedModules, is_foreign, is_foreign_module, locate
-from crashhunt.base.programs import can_fork, is_program
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.text import listed
 from crashhunt.disturbances import described_model, modules_of_models, parse_rates

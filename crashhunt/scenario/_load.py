@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
+from crashhunt.base.agent_locators import anchored, is_program, relative_to
 from crashhunt.base.codec import known_part
 from crashhunt.base.errors import ArgumentError, HuntDirectoryError, ScenarioError, UsageError
 from crashhunt.base.files import cannot_write
 from crashhunt.base.integrity import read_bounded
 from crashhunt.base.layout import PACKAGE, SCENARIO
 from crashhunt.base.plugins import registered
-from crashhunt.base.programs import anchored, is_program, relative_to
 from crashhunt.base.text import any_of, did_you_mean, listed, near_path, one_of
 from crashhunt.base.validation import validate
 from crashhunt.scenario._action_forms import FORMER_DEFAULT_ACTION, action_settings

@@ -12,12 +12,12 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.agent_locators import can_fork, files_of, is_program, libraries_folder, words_of
 from crashhunt.base.binaries import describe_binary
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.exceptions import shown_path
 from crashhunt.base.integrity import changed_file
 from crashhunt.base.plugins import registered
-from crashhunt.base.programs import can_fork, files_of, is_program, libraries_folder, words_of
 from crashhunt.snapshots._environment import differing_versions
 from crashhunt.snapshots._snapshot import Snapshot, may_run
 from crashhunt.snapshots._take import code_of_tree

@@ -14,15 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.binaries import BinaryFacts, describe_binary
-from crashhunt.base.calls import clear_constructor
-from crashhunt.base.errors import BundleError, SnapshotError, UsageError, remedy
-from crashhunt.base.exceptions import INSTALLED_FOLDERS
-from crashhunt.base.files import put_in_place, sync_folder, sync_tree
-from crashhunt.base.git import query
-from crashhunt.base.integrity import FileEntry, describe_files, digest_of_content, digest_of_data, digest_of_file
-from crashhunt.base.opened_files import output_files
-from crashhunt.base.programs import (
+from crashhunt.base.agent_locators import (
     can_fork,
     files_of,
     is_path,
@@ -32,6 +24,14 @@ from crashhunt.base.programs import (
     neighbouring_modules,
     words_of,
 )
+from crashhunt.base.binaries import BinaryFacts, describe_binary
+from crashhunt.base.calls import clear_constructor
+from crashhunt.base.errors import BundleError, SnapshotError, UsageError, remedy
+from crashhunt.base.exceptions import INSTALLED_FOLDERS
+from crashhunt.base.files import put_in_place, sync_folder, sync_tree
+from crashhunt.base.git import query
+from crashhunt.base.integrity import FileEntry, describe_files, digest_of_content, digest_of_data, digest_of_file
+from crashhunt.base.opened_files import output_files
 from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, load_order_of

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crashhunt.base import layout
+from crashhunt.base.agent_locators import is_program
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, NoValidTrialError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.git import (
@@ -41,7 +42,6 @@ from crashhunt.base.git import (
     track_built,
 )
 from crashhunt.base.plugins import registered
-from crashhunt.base.programs import is_program
 from crashhunt.base.temporary import temporary_beside, temporary_folder
 from crashhunt.corpus import find_cases
 from crashhunt.ledger import Ledger

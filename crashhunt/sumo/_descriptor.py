@@ -144,7 +144,7 @@ BACKEND: Backend = Backend(
     stop_lines=import_at_call("crashhunt.sumo._right_of_way:stop_lines"),
     survey=TrafficSurvey(
         module="crashhunt.sumo._traffic_survey",
-        refine=import_at_call("crashhunt.sumo._ego:refine"),
-        restore=import_at_call("crashhunt.sumo._ego:restore"),
+        refine=import_at_call("crashhunt.sumo._ego_choice:refine"),
+        restore=import_at_call("crashhunt.sumo._ego_choice:restore"),
     ),
 )

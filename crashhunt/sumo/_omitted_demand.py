@@ -15,7 +15,7 @@ from xml.parsers import expat
 
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.base.text import NOTICE_TOPIC, count_of
-from crashhunt.sumo._ego import seconds
+from crashhunt.sumo._ego_choice import seconds
 from crashhunt.sumo._files import read_xml
 from crashhunt.sumo._options import SumoSetup
 from crashhunt.sumo._scenario_check import places_of

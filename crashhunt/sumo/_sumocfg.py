@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.scenario import ArgumentSetup, ObservationSetup, Scenario
-from crashhunt.sumo._ego import choose_ego, number, seconds
+from crashhunt.sumo._ego_choice import choose_ego, number, seconds
 from crashhunt.sumo._files import nested_files, read_xml, written_by
 from crashhunt.sumo._omitted_demand import unsorted_notes
 from crashhunt.sumo._options import (

@@ -18,7 +18,7 @@ import libsumo
 from libsumo import _libsumo as sumo
 
 from crashhunt.scenario import scenario_from_dict
-from crashhunt.sumo._ego import NOT_ON_A_ROAD, SurveyedRun
+from crashhunt.sumo._ego_choice import NOT_ON_A_ROAD, SurveyedRun
 from crashhunt.sumo._files import StagedFiles
 
 if TYPE_CHECKING:

@@ -55,7 +55,7 @@ _TESTS_ELSEWHERE = {
     "base/exceptions.py": ("base/test_exception_text.py", "episode/test_episode_cases.py"),
     "base/isolation.py": ("base/test_isolated_work.py",),
     "base/opened_files.py": ("snapshots/test_sources.py", "snapshots/test_unsaved.py"),
-    "base/programs.py": (
+    "base/agent_locators.py": (
         "agents/test_fmu_agents.py",
         "agents/test_library_agents.py",
         "agents/test_programs.py",

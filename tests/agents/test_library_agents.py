@@ -19,8 +19,8 @@ from gymnasium import spaces
 from programs import COMPILER, DRIVER
 
 from crashhunt.agents import FmuFactory, LibraryFactory, ProgramFactory
+from crashhunt.base.agent_locators import files_of
 from crashhunt.base.errors import ActionError, CrashhuntError, PluginError, ProgramError
-from crashhunt.base.programs import files_of
 from crashhunt.simulators import MetaAction, SpaceAction, SpeedAndLaneChange
 from crashhunt.trial import Range, signature_of
 

@@ -22,8 +22,8 @@ from programs import COMPILER, DRIVER, compile_program, write_binary_program, wr
 import crashhunt
 from crashhunt.agents import ProgramFactory
 from crashhunt.base import forks
+from crashhunt.base.agent_locators import command_of, files_of
 from crashhunt.base.errors import ActionError, PluginError, ProgramError
-from crashhunt.base.programs import command_of, files_of
 from crashhunt.panels import labelled
 from crashhunt.plans import Request, plan_with_code, takes_of
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange

@@ -13,8 +13,8 @@ import pytest
 from programs import COMPILER
 
 from crashhunt.base import binaries
+from crashhunt.base.agent_locators import libraries_folder, library_path, neighbouring_modules
 from crashhunt.base.binaries import describe_binary, own_libraries
-from crashhunt.base.programs import libraries_folder, library_path, neighbouring_modules
 from crashhunt.snapshots import program_warnings
 
 pytestmark = pytest.mark.skipif(

@@ -11,8 +11,8 @@ import pytest
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.scenario import AgentSetup, ObservationSetup, Scenario, shipped_folder
-from crashhunt.sumo import SumoSetup, _ego, _scenario_check, _sumocfg
-from crashhunt.sumo._ego import Departure, choose_ego, draw_among, number, seconds
+from crashhunt.sumo import SumoSetup, _ego_choice, _scenario_check, _sumocfg
+from crashhunt.sumo._ego_choice import Departure, choose_ego, draw_among, number, seconds
 from crashhunt.sumo._options import FIXED_OPTIONS
 from crashhunt.sumo._sumocfg import changes, load_sumocfg, read_config, split_names
 
@@ -108,7 +108,7 @@ def files(tmp_path):
 
 
 def test_vehicles_of_files_have_their_departures(files):
-    found = {one.vehicle: (one.depart_s, one.off_road) for one in _ego._departures(files)}
+    found = {one.vehicle: (one.depart_s, one.off_road) for one in _ego_choice._departures(files)}
     trains = {f"long.{place}": (100.0 * place, True) for place in range(10)}
     assert found == {
         "v": (5.0, False), "t": (7.0, False), "ice": (1.0, True), "f.0": (100.0, False), "f.1": (110.0, False),
@@ -119,9 +119,9 @@ def test_vehicles_of_files_have_their_departures(files):
     (files[0].parent / "speeds.txt").write_text("no XML")
     nested = '<include href="more.xml"/><variableSpeedSign id="s" lanes="a_0" file="speeds.txt"/></routes>'
     files[0].write_text(FILE.replace("</routes>", nested))
-    assert {one.vehicle for one in _ego._departures(files)} == {*found, "m"}
+    assert {one.vehicle for one in _ego_choice._departures(files)} == {*found, "m"}
     for vehicle, depart_s in (("f.2", 120.0), ("v", 5.0), ("t", 7.0), ("odd.3", 0.0), ("zero.1", 0.0), ("x", 0.0)):
-        assert _ego._departure_of(vehicle, files) == depart_s
+        assert _ego_choice._departure_of(vehicle, files) == depart_s
 
 
 def test_controlled_vehicle_is_what_ego_names(files):
@@ -134,7 +134,7 @@ def test_controlled_vehicle_is_what_ego_names(files):
         assert (chosen(ego).agent, chosen(ego).setup) == ("f.1", AgentSetup(existing=True, depart_s=110.0))
     assert {chosen(ego).agent for ego in ("route=way", "edges=a", "any", "")} == {"ego"}
     assert all(chosen(ego).arguments == {} for ego in ("route=way", "edges=a", "f.1"))
-    assert chosen("").note == f"{_ego.NOT_GIVEN}{chosen('any').note}"
+    assert chosen("").note == f"{_ego_choice.NOT_GIVEN}{chosen('any').note}"
     assert set(chosen("any", 100.0).arguments["vehicle"].range.split("|")) <= {"f.0", "f.1", "f.2"}
     with pytest.raises(ScenarioError, match="'color=red'") as caught:
         chosen("color=red")
@@ -163,7 +163,7 @@ def bare(**more):
 
 def test_traffic_has_warnings_with_their_times():
     def warned(*runs, **more):
-        return _ego._warnings(bare(**more), runs, departures(("a", runs[0]["entries"][0][1])))
+        return _ego_choice._warnings(bare(**more), runs, departures(("a", runs[0]["entries"][0][1])))
 
     assert warned(surveyed(("a", 300))) == []
     (wait,) = warned(surveyed(("a", 301), begin_s=0.5))
@@ -179,12 +179,12 @@ def test_traffic_has_warnings_with_their_times():
 
 
 def test_resumed_hunt_keeps_its_candidates():
-    kept = _ego.refine(bare(), [surveyed(*((f"t{at}", at) for at in range(200, 400, 50)))])
-    found = _ego.restore(bare(arguments={"scale": 1}, notes=(f"{_ego.NOT_GIVEN}x", "second")), kept)
+    kept = _ego_choice.refine(bare(), [surveyed(*((f"t{at}", at) for at in range(200, 400, 50)))])
+    found = _ego_choice.restore(bare(arguments={"scale": 1}, notes=(f"{_ego_choice.NOT_GIVEN}x", "second")), kept)
     assert found.agents == {"ego": AgentSetup(replaces="vehicle", depart_s=kept.agents["ego"].depart_s)}
     assert found.arguments == {"scale": 1, "vehicle": kept.arguments["vehicle"]}
     count = kept.arguments["vehicle"].range.count("|") + 1
-    assert found.notes[0].startswith(_ego.NOT_GIVEN)
+    assert found.notes[0].startswith(_ego_choice.NOT_GIVEN)
     assert f" {count} candidates" in found.notes[0]
     assert found.notes[1:] == ("second",)
     ego = kept.agents["ego"]
@@ -192,7 +192,7 @@ def test_resumed_hunt_keeps_its_candidates():
         replace(kept, agents={"ego": ego, "b": ego}), replace(kept, agents={"ego": replace(ego, replaces="who")}),
         replace(kept, arguments={}),
     ):  # fmt: skip
-        assert _ego.restore(bare(), other) is None
+        assert _ego_choice.restore(bare(), other) is None
 
 
 # Configurations.

@@ -8,7 +8,7 @@ import pytest
 
 from crashhunt.base.errors import NoValidTrialError, ScenarioError
 from crashhunt.scenario import load_scenario, shipped_folder
-from crashhunt.sumo._ego import _departure_of, _departures, refine
+from crashhunt.sumo._ego_choice import _departure_of, _departures, refine
 
 TRIPS = "".join(f'<trip id="t{at}" depart="{at}" from="south" to="east"/>' for at in range(0, 1000, 50))
 

@@ -30,7 +30,7 @@ from crashhunt.scenario import (
 )
 from crashhunt.scenario._load import check, copy_shipped_scenario, scenario_from_dict
 from crashhunt.scenario._scenario import STEP_LENGTH_S, digest_of_described, with_action
-from crashhunt.sumo import BACKEND as SUMO, SumoSetup, _ego
+from crashhunt.sumo import BACKEND as SUMO, SumoSetup, _ego_choice
 from crashhunt.sumo._files import StagedFiles, filled_in, movable, read_xml, references, written_by
 from crashhunt.sumo._options import HARMLESS
 
@@ -312,8 +312,8 @@ def test_options_of_reset_are_kept_with_a_scenario_and_are_arguments_of_its_envi
 
 
 def test_survey_of_traffic_refines_and_restores_the_scenario_itself(town, monkeypatch):
-    monkeypatch.setattr(_ego, "refine", lambda *given: ("refined", *given))
-    monkeypatch.setattr(_ego, "restore", lambda *given: ("restored", *given))
+    monkeypatch.setattr(_ego_choice, "refine", lambda *given: ("refined", *given))
+    monkeypatch.setattr(_ego_choice, "restore", lambda *given: ("restored", *given))
     assert SUMO.survey.refine(town, {"runs": []}) == ("refined", town, {"runs": []})
     assert SUMO.survey.restore(town, "kept") == ("restored", town, "kept")
 
