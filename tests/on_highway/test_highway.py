@@ -187,12 +187,14 @@ def test_what_is_shown_is_what_highway_env_shows(tmp_path):
         assert (scene.headings[0], scene.speeds[0]) == (-vehicle.heading, vehicle.speed)
 
 
-def test_our_own_layout_is_highway_envs_on_a_straight_road(tmp_path):
+@pytest.mark.parametrize("normalize", [False, True])
+def test_our_own_layout_is_highway_envs_on_a_straight_road(tmp_path, normalize):
     """The same policy sees the same in both, but for its own place, which SUMO cannot know."""
     features = ["presence", "x", "y", "vx", "vy", "cos_h", "sin_h"]
-    theirs = {"type": "Kinematics", "features": features, "normalize": False, "see_behind": True, "vehicles_count": 6}
+    theirs = {"type": "Kinematics", "features": features, "normalize": normalize}
+    theirs |= {"see_behind": True, "vehicles_count": 6}
     one = simulator_of(tmp_path, "highway-fast-v0", config={"observation": theirs})
-    two = simulator_of(tmp_path, "highway-fast-v0", observation=ObservationSetup(vehicles=6))
+    two = simulator_of(tmp_path, "highway-fast-v0", observation=ObservationSetup(vehicles=6, normalize=normalize))
     first, second = (simulator.reset(seed=3)[0]["agent-0"] for simulator in (one, two))
     assert first.shape == second.shape
     for action in (1, 3, 1):
