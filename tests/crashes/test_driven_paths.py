@@ -160,8 +160,7 @@ def rules(case):
 
 
 @pytest.mark.parametrize("left_hand", [False, True])
-@pytest.mark.parametrize("since_s", [-0.0, -0.3, -2.0, -30.0])
-@pytest.mark.parametrize("step_s", [0.1, 0.5])
+@pytest.mark.parametrize(("since_s", "step_s"), [(-0.0, 0.1), (-0.3, 0.5), (-2.0, 0.1), (-30.0, 0.5)])
 def test_vehicle_that_overtakes_on_the_opposite_lane_is_at_fault_in_the_head_on_crash(left_hand, since_s, step_s):
     """Or that drives the wrong way without overtaking: both use the lane of the other direction."""
     y = -1.6 if left_hand else 1.6
@@ -233,7 +232,7 @@ def test_vehicle_behind_another_one_that_overtakes_drives_into_its_back():
     assert in_every_view(case) == ("rear end", "ego", "ego")
 
 
-@pytest.mark.parametrize("radius", [3.0, 6.0, 12.0])
+@pytest.mark.parametrize("radius", [3.0, 12.0])
 def test_head_on_crash_in_a_hairpin_is_one_at_any_angle(radius):
     path = hairpin(radius)
     lanes = Map([borders(path), borders(hairpin(radius + 3.2)[::-1])], (0.0, 0.0))

@@ -32,9 +32,9 @@ class TestSumo(BackendContract):
     def name(self):
         return "sumo"
 
-    @pytest.fixture(params=["merge", "loop"])
-    def scenario(self, request):
-        return shipped_folder() / request.param
+    @pytest.fixture
+    def scenario(self):
+        return shipped_folder() / "merge"
 
 
 class TestHighway(BackendContract):

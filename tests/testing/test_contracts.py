@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import mostly_nightly
 from gymnasium import spaces
 
 from crashhunt.agents import CarFollowing, IntelligentDriver, KeepLaneWithSpeed, LaneChanger, RandomAgent, Recorded
@@ -186,7 +187,8 @@ class TestOracles(OracleContract):
         assert any(make().check(scene, ["ego"]) for scene in drive())
 
 
-@pytest.mark.parametrize("kind", [PoolExecutor, FreshProcessExecutor])
+# By day, tests/executors/test_harms.py has harm in a fresh process.
+@pytest.mark.parametrize("kind", mostly_nightly([PoolExecutor, FreshProcessExecutor], [PoolExecutor]))
 class TestExecutors(ExecutorContract):
     @pytest.fixture
     def make(self, kind):
