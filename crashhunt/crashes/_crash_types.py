@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # The signature of a crash: the properties by which two crashes count as the same crash type.
 
 
-SIGNATURE_VERSION = 6
+SIGNATURE_VERSION = 7
 """Version of these rules. Raise it with each change by which a crash gets another type: types that an earlier version
 has noted in a ledger are then determined again."""
 
@@ -39,7 +39,10 @@ _CALLER_MODULES = (
     ("crashhunt", "episode", "_episode.py"),
     ("crashhunt", "episode", "_blame.py"),
 )
+_REFUSING_MODULES = ("_actions.py", "_any_space.py", "_free_motion.py")  # whose calls are equal for all wrong actions
+_VALUE_OF_ACTION = re.compile(r"(?<=^the action ).* (?=is not )", re.DOTALL)
 _FRAME_LINE = re.compile(r'^\s*File "(?P<file>[^"]+)", line (?P<line>\d+),? in (?P<function>\S+)', re.MULTILINE)
+_FRAME = re.compile(r".+?:[\w<>]+( < |$)")
 _LIBRARY_PATH = re.compile(r"(site|dist)-packages|python3\.\d+")
 
 
@@ -61,12 +64,13 @@ class StackFrame:
 def own_frames(failure: Failure) -> list[StackFrame]:
     """Return the calls in the agent's own code, the innermost first; if there are none, the calls in libraries."""
     frames = _frames(failure.traceback) or _frames(failure.last_output)
-    ours = [
-        number
-        for number, frame in enumerate(frames)
-        if any(frame.file.parts[-len(one) :] == one for one in _CALLER_MODULES)
-    ]  # fmt: skip
-    inner = frames[: min(ours)] if ours else frames  # what the episode has called
+    ours = [number for number, frame in enumerate(frames) if frame.file.parts[-3:] in _CALLER_MODULES]
+    called = frames[: min(ours)] if ours else frames  # what the episode has called
+    inner = [
+        frame
+        for frame in called
+        if frame.file.name not in _REFUSING_MODULES or frame.file.parts[-3:-2] != ("crashhunt",)
+    ]
     return [frame for frame in inner if not _is_of_a_library(frame.file)] or inner
 
 
@@ -110,7 +114,8 @@ class Signature(Serializable):
         lane_change: which of the two actors were changing lanes: ``agent``, ``other``, ``both`` or empty.
         place: the text ``crossing`` where lanes of different directions overlap, ``road`` elsewhere; empty if the map
             is unknown, or if the place does not matter.
-        where: for a software fault, the innermost functions of the agent's code; without any, the text of the message.
+        where: for a software fault, the innermost functions of the agent's code; without any, the text of the message
+            without its numbers and its fix.
         disturbed: whether the agent was disturbed before the crash; a crash in undisturbed traffic is a different crash
             type.
     """
@@ -128,7 +133,7 @@ class Signature(Serializable):
         words += {"collider": ", the agent into the other", "victim": ", the other into the agent"}.get(self.role, "")
         words += f", {_LANE_CHANGE_WORDS[self.lane_change]}" if self.lane_change else ""
         words += ", where lanes cross" if self.place == "crossing" else ""
-        words += f" in {self.where}" if self.where else ""
+        words += f"{' in ' if _FRAME.match(self.where) else ': '}{self.where}" if self.where else ""
         return f"{words}, disturbed" if self.disturbed else words
 
 
@@ -194,9 +199,9 @@ def _innermost_frames(failure: Failure) -> str:
     chosen = own_frames(failure)
     if chosen:
         return " < ".join(f"{frame.file.name}:{frame.function}" for frame in chosen[:_MAX_FRAMES])
-    # Behind the type of an unusable value, its message has the value itself.
+    # Behind the type of an unusable value, its message has the value itself; that of an action has it in its middle.
     message = failure.message.partition(": ")[0] if failure.kind == UNUSABLE_VALUE else failure.message
-    return _NUMBERS.sub("#", message)
+    return _NUMBERS.sub("#", _VALUE_OF_ACTION.sub("", message).partition("; ")[0])
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,6 +89,22 @@ def test_without_a_stack_what_is_said_counts_but_for_its_numbers():
     assert signature_of(bundle(0, failure=said[0])) != signature_of(bundle(0, failure=Failure("bad action", "nan")))
 
 
+def test_type_of_a_wrong_action_is_its_message_without_values():
+    trace = '  File "/h/code/crashhunt/episode/_episode.py", line 9, in _act\n' + "".join(
+        f'  File "/h/code/crashhunt/{place}", line 1, in check\n'
+        for place in ("simulators/_actions.py", "sumo/_free_motion.py")
+    )
+    said = (
+        "the trajectory turns the vehicle by -0.39 rad; turn less",
+        "the action [nan, 0] is not (speed, lane); fix it",
+    )
+    found = [str(signature_of(bundle(0, failure=Failure("bad action", text, trace)))) for text in said]
+    assert found == [
+        "bad action: the trajectory turns the vehicle by # rad",
+        "bad action: the action is not (speed, lane)",
+    ]
+
+
 def test_unusable_values_of_one_type_are_one_crash_type():
     texts = ("str: 'a' (allowed: a bool)", "str: 'b' (allowed: a bool)")
     said = [Failure(UNUSABLE_VALUE, f"info['hit'] is of type {text}") for text in texts]

@@ -62,8 +62,8 @@ def test_the_last_new_kind_is_not_the_last_crash(monkeypatch):
     kinds.add(crash(0, "IndexError", steps=2), 8)
     assert kinds.newest_trial == 6
     assert [kind_data(group) for group in kinds.groups()] == [
-        {"words": "IndexError in said", "count": 2, "first": "c0", "shortest": "c0"},
-        {"words": "KeyError in said", "count": 2, "first": "c1", "shortest": "c1"},
+        {"words": "IndexError: said", "count": 2, "first": "c0", "shortest": "c0"},
+        {"words": "KeyError: said", "count": 2, "first": "c1", "shortest": "c1"},
     ]
 
 
