@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 18
+_INTERFACE = 19
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -389,7 +389,7 @@ class Core(Protocol):
         others: int,
         step_s: float,
         lateral: bool,
-        takes_speed: bool,
+        takes: int,
         sight: tuple[_Vehicles, int, float],
         start_m: float,
         /,
@@ -403,7 +403,8 @@ class Core(Protocol):
             others: Number of other actors in an observation.
             step_s: Step length, in s.
             lateral: Whether vehicles may leave the centre line of a lane.
-            takes_speed: Whether actions consist of a speed and a lane change.
+            takes: The first of the two components of actions, before the lane change: 1 for a speed, 2 for an
+                acceleration; 0 for actions of other forms, which Python applies.
             sight: The vehicles around which actors are selected, the steps between two selections, and the squared
                 range (m²).
             start_m: The distance that the agent had driven at the start, in m.

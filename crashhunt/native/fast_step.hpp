@@ -1,12 +1,13 @@
 // Steps of SUMO in which nothing happens, each in one call. A part of core.cpp.
 //
 // An episode with one agent comes to this in most of its steps: it is shown what it was going to be shown, it answers a
-// speed, SUMO simulates, and nobody has come, gone, collided, changed roads, braked hard, stood for long or come within
-// reach. What Episode.step, BlackBox, SumoSimulator.step, Sight.look, SumoEvents.look and the oracles do about such a
+// speed or an acceleration, SUMO simulates, and nobody has come, gone, collided, changed roads, braked hard, stood for
+// long or come within reach. What Episode.step, BlackBox, SumoSimulator.step, Sight.look, SumoEvents.look and the oracles do about such a
 // step is done here, with the same records. Whatever else it turns out to be is handed back as soon as that is seen, and
 // nothing has been done by then that Python would do again.
 
 enum Come { DONE, ASK, REFUSED, ANSWERED, SIMULATED };
+enum Takes { NEITHER, SPEED, ACCELERATION };
 enum Phase { ACTING = 1, SIMULATING = 2 }; // as BlackBoxHeader has them
 
 const double LOOK_M = 60.0, LOOK_S = 6.0; // as in _surroundings.py
@@ -14,7 +15,7 @@ const int LANES_EVERY = 10, DIRECTION_EVERY = 10; // steps
 const double STANDING = 0.1;                      // m/s, as Standstill.SPEED
 const double LOOKED_INTO = 2.0, TOLERANCE = 0.01; // m/s², as of HardBraking
 const double ALONG = -0.4; // a cosine; what comes nearer to the -0.5 of SumoEvents is Python's to judge
-const double MOST_SPEED = 100.0;
+const double MOST_SPEED = 100.0, MOST_ACCELERATION = 10.0; // as in _actions.py
 const double RADIANS = 3.141592653589793 / 180.0;
 
 struct Moment {
@@ -40,7 +41,7 @@ struct Steps {
     Vehicles *eyes = nullptr;
     size_t others = 0;
     double step_s = 0, start_m = 0, hardest = 0, within = 0;
-    int lateral = 0, takes_speed = 0;
+    int lateral = 0, takes = NEITHER;
     long every = 1;
     PyObject *limits = nullptr, *stood = nullptr; // of HardBraking, and of Standstill
     double limit = 0;
@@ -95,6 +96,20 @@ struct Steps {
             Py_DECREF(step.first);
         }
         trail.clear();
+    }
+
+    // Whether an answer is one that `command` carries out; anything else is Python's.
+    bool takes_answer(double value) const {
+        return takes == SPEED ? value >= 0.0 && value <= MOST_SPEED : fabs(value) <= MOST_ACCELERATION;
+    }
+
+    // As _apply_speed and _apply_acceleration of sumo/_driving.py, without a lane change.
+    void command(double value) const {
+        if (takes == ACCELERATION) {
+            value = sumo.speed(agent) + value * step_s;
+            value = value > 0.0 ? value : 0.0;
+        }
+        sumo.set_speed(agent, value);
     }
 
     bool able() const { return ready && !stopped && tape && sight.roster; }
@@ -608,15 +623,15 @@ struct UsualSteps {
 
 Steps &steps_of(PyObject *object) { return *reinterpret_cast<UsualSteps *>(object)->steps; }
 
-// UsualSteps(agent, libsumo, (array, shape, dtype), others, step_s, lateral, takes_speed, (eyes, every, within), start_m)
+// UsualSteps(agent, libsumo, (array, shape, dtype), others, step_s, lateral, takes, (eyes, every, within), start_m)
 PyObject *usual_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
     PyObject *name, *libsumo, *array, *shape, *dtype, *eyes;
     Py_ssize_t others;
     double step_s, within, start_m;
-    int lateral, takes_speed;
+    int lateral, takes;
     long every;
-    if (!PyArg_ParseTuple(arguments, "UO(OOO)ndpp(Old)d", &name, &libsumo, &array, &shape, &dtype, &others, &step_s,
-                          &lateral, &takes_speed, &eyes, &every, &within, &start_m) ||
+    if (!PyArg_ParseTuple(arguments, "UO(OOO)ndpi(Old)d", &name, &libsumo, &array, &shape, &dtype, &others, &step_s,
+                          &lateral, &takes, &eyes, &every, &within, &start_m) ||
         !vehicles_of(eyes)) {
         return nullptr;
     }
@@ -640,7 +655,7 @@ PyObject *usual_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
     steps.others = static_cast<size_t>(others);
     steps.step_s = step_s;
     steps.lateral = lateral;
-    steps.takes_speed = takes_speed;
+    steps.takes = takes;
     steps.every = every;
     steps.within = within;
     steps.start_m = start_m;
@@ -849,22 +864,22 @@ PyObject *usual_take(PyObject *object, PyObject *agents) {
         return nullptr;
     }
     Py_XSETREF(steps.answer, answer);
-    if (!steps.able() || !steps.takes_speed || !PyTuple_CheckExact(answer) || PyTuple_GET_SIZE(answer) != 2) {
+    if (!steps.able() || steps.takes == NEITHER || !PyTuple_CheckExact(answer) || PyTuple_GET_SIZE(answer) != 2) {
         return PyLong_FromLong(ANSWERED);
     }
-    PyObject *speed = PyTuple_GET_ITEM(answer, 0), *change = PyTuple_GET_ITEM(answer, 1);
+    PyObject *value = PyTuple_GET_ITEM(answer, 0), *change = PyTuple_GET_ITEM(answer, 1);
     int overflow = 0;
-    if (!PyFloat_CheckExact(speed) || !PyLong_CheckExact(change) ||
+    if (!PyFloat_CheckExact(value) || !PyLong_CheckExact(change) ||
         PyLong_AsLongAndOverflow(change, &overflow) != 0 || overflow) {
         return PyLong_FromLong(ANSWERED);
     }
-    const double action[2] = {PyFloat_AS_DOUBLE(speed), 0.0};
+    const double action[2] = {PyFloat_AS_DOUBLE(value), 0.0};
     const size_t end = steps.offset;
-    if (!(action[0] >= 0.0 && action[0] <= MOST_SPEED) || !steps.record(1, action, sizeof action, SIMULATING)) {
+    if (!steps.takes_answer(action[0]) || !steps.record(1, action, sizeof action, SIMULATING)) {
         return PyLong_FromLong(ANSWERED);
     }
     try {
-        sumo.set_speed(steps.agent, action[0]);
+        steps.command(action[0]);
     } catch (...) { // Python's own way of saying it
         steps.forget(end);
         return PyLong_FromLong(ANSWERED);

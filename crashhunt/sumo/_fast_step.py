@@ -69,7 +69,7 @@ class UsualSteps:
         start_m: The distance that the agent had driven at the start, in m.
         step_length_s: Step length, in s.
         lateral: Whether vehicles may leave the centre line of a lane.
-        takes_speed: Whether actions are `SpeedAndLaneChange`.
+        takes: The kind of actions: 1 for `SpeedAndLaneChange`, 2 for `AccelerationAndLaneChange`, 0 for others.
         perceive: Function that makes an observation that consists of parts; None for the default observation.
         draft: What the core writes observations that consist of parts into; None if it does not write them.
         enter_parts: Function called with the vehicles in sight, the row of the agent and the roster; None without a
@@ -98,7 +98,7 @@ class UsualSteps:
         start_m: float,
         step_length_s: float,
         lateral: bool,
-        takes_speed: bool,
+        takes: int,
         perceive: Callable[[Scene, int, str], NDArray[np.generic]] | None,
         draft: Draft | None,
         enter_parts: Callable[[Vehicles, int, Roster], None] | None,
@@ -115,7 +115,7 @@ class UsualSteps:
         array = np.ndarray, shape, _FLOAT32 if draft is None else _FLOAT64
         self.core = core.UsualSteps(
             agent, SimpleNamespace(simulationStep=simulate), array, kinematics.shape[0] - 1,
-            step_length_s, lateral, takes_speed, sight.around, start_m,
+            step_length_s, lateral, takes, sight.around, start_m,
         )  # fmt: skip
         self._perceive, self._enter_parts = perceive, enter_parts
         if perceive is not None:

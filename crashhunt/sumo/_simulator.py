@@ -81,6 +81,7 @@ _FORMS: dict[str, Callable[[], ActionForm]] = {
     "target_pose": partial(NumbersAction, "target_pose"),
     "sumo": SimulatorDrives,
 }
+_APPLIED_IN_CORE: Mapping[type, int] = {SpeedAndLaneChange: 1, AccelerationAndLaneChange: 2}
 _DECELERATION_LIMIT_BIT = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
 _CORE_DISABLED_NOTICE = "the compiled core is disabled: its values differ from those of libsumo's getters"
 P = ParamSpec("P")
@@ -502,7 +503,7 @@ class SumoSimulator:
             start_m=self._start[agent],
             step_length_s=self.step_length_s,
             lateral=self._lateral,
-            takes_speed=type(self.actions[agent]) is SpeedAndLaneChange,
+            takes=_APPLIED_IN_CORE.get(type(self.actions[agent]), 0),
             perceive=self._perceive if has_parts else None,
             draft=draft,
             enter_parts=None if draft is None else partial(self._parts.enter, agent),

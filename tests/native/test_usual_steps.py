@@ -129,6 +129,27 @@ def test_an_episode_is_the_same_bit_by_bit(street, how):
     assert street.comes[DONE] + street.comes[ANSWERED] > 20 or how == "raises at once"
 
 
+ACCELERATIONS = {
+    "within its limits": lambda _, seen: (max(-4.0, min(2.0, 8.0 - float(seen[0, 3]))), 0),
+    "to a stand and on": lambda step, _: (-3.0 if 20 < step < 60 else 1.5, 0),
+    "none": lambda step, _: (-0.0 if step % 2 else 0.0, 0),
+    "the least and the most": lambda step, _: (-10.0 if step % 2 else 10.0, 0),
+    "too much": lambda step, _: (1.0 if step < 30 else 10.5, 0),
+    "not a number": lambda step, _: (1.0 if step < 30 else float("nan"), 0),
+    "a lane that is not there": lambda step, _: (0.5, 1 if step == 40 else 0),
+}
+
+
+@pytest.mark.parametrize("how", ACCELERATIONS)
+def test_accelerations_are_the_same_bit_by_bit(tmp_path, how):
+    street = Street(tmp_path, 'action = "acceleration"')
+    street.both(ACCELERATIONS[how])
+    street.box.close()
+    street.simulator.close()
+    assert street.comes[DONE] > 10
+    assert street.comes[ANSWERED] == (how in ("too much", "not a number", "a lane that is not there"))
+
+
 def test_call_that_an_agent_must_not_make_is_its_error_even_if_it_hides_the_refusal(street):
     import libsumo
 

@@ -286,7 +286,7 @@ def test_core_runs_steps_of_one_usual_agent(running, monkeypatch, change, fast):
             0.5,
             change.get("_lateral", False),
         )
-        assert named["takes_speed"] is True
+        assert named["takes"] == 1
         assert named["instead_of"].keys() == {"actions", "reset", "step", "scene", "restore_observation"}
         assert named["apply"]("a", "off") is False
         assert running._off_road == ["a"]
