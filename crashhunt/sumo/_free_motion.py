@@ -69,7 +69,7 @@ class FreeMotion:
         self._is_relative = settings.get("frame") == "ego"
         self._is_overruled = False
         self._target: tuple[float, float] | None = None  # the position of the target pose that was computed last
-        self._aim = self._target  # the same of the last step
+        self._aim: tuple[float, float] | None = None  # the same of the last step
         self._backwards_m = 0.0  # since the vehicle has last moved ahead by as much
         self._pursues = settings.get("tracker") == "pure_pursuit"
         self._half, self._half_width = sumo.vehicle_getLength(vehicle) / 2, sumo.vehicle_getWidth(vehicle) / 2
