@@ -17,7 +17,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 
 from pydantic_core import from_json, to_json
 
-from crashhunt.agents._program_processes import MAX_FILE_BYTES, AttachedProgram, launch, read_format
+from crashhunt.agents._program_processes import MAX_FILE_BYTES, AttachedProgram, ProgramProcess, launch, read_format
 from crashhunt.base import forks
 from crashhunt.base.errors import ProgramError
 from crashhunt.base.processes import descendants_of, kill
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from crashhunt.agents._program_processes import ProgramProcess
     from crashhunt.base.program_message_types import ProgramRequest
 
 _ANSWERS: Final = {"hello": "ready", "reset": "ok", "observe": "act"}

@@ -21,14 +21,12 @@ from crashhunt.agents._car_following import (
     idm_acceleration,
     off_path,
 )
-from crashhunt.agents._reference_models import REFERENCE_MODELS, Situation
+from crashhunt.agents._reference_models import REFERENCE_MODELS, ReferenceModel, Situation
 from crashhunt.trial import Argument
 
 if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
-
-    from crashhunt.agents._reference_models import ReferenceModel
 
 _HEADWAY_S = 2.0  # time gap of the careful human driver of R157
 _COMFORT_MPS2 = 1.0  # acceleration of a follower. Source: the comparison of the models, see _reference_models.py

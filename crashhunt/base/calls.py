@@ -6,17 +6,14 @@ import functools
 import inspect
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import MISSING, fields
-from typing import TYPE_CHECKING, Any, Final, ParamSpec, Protocol, TypeVar
+from typing import Any, Final, ParamSpec, Protocol, TypeVar
 
 from crashhunt.base.errors import CallError
 from crashhunt.base.foreign_code import describe_value
 from crashhunt.base.older_versions import removed_fix
 from crashhunt.base.text import one_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
 
 P = ParamSpec("P")
 R = TypeVar("R")

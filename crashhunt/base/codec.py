@@ -17,7 +17,7 @@ msgspec 2 us and this module 10 us. `json.loads` takes 15 us before that.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence, Set as AbstractSet
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set as AbstractSet
 from contextlib import suppress
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
@@ -44,8 +44,6 @@ from crashhunt.base.integrity import typed
 from crashhunt.base.text import did_you_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from crashhunt.base.json_types import Plain
 
 

@@ -7,14 +7,10 @@ import sys
 import sysconfig
 import traceback
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Final
 
 from crashhunt.base.errors import PluginError
 from crashhunt.base.layout import PACKAGE
-
-if TYPE_CHECKING:
-    from typing import Final
-
 
 MAX_MESSAGE_CHARACTERS: Final = 10_000
 MAX_TRACEBACK_CHARACTERS: Final = 100_000

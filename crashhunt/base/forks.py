@@ -38,7 +38,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, TextIO
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.processes import adopt_orphans, children_of, die_with, end_descendants, has_child, kill
@@ -46,7 +46,6 @@ from crashhunt.base.signals import describe_death, is_sent_from_outside
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
-    from typing import TextIO
 
     from crashhunt.base.json_types import Plain
 

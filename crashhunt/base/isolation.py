@@ -21,7 +21,7 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 from crashhunt.base import errors
 from crashhunt.base.errors import CrashhuntError, PluginError
@@ -31,7 +31,6 @@ from crashhunt.base.processes import die_with, end_descendants
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
-    from typing import TypeAlias
 
     from crashhunt.base.json_types import ErrorData, Plain
 

@@ -20,11 +20,10 @@ import stat
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from collections.abc import Collection
-    from typing import Final
 
 _MAX_COPIED_BYTES: Final = 16 << 20  # of a file without a name, or of a mapping; a copy of it is made in every fork
 _MAP_FIXED: Final = 0x10

@@ -6,7 +6,7 @@ worker's start.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from enum import EnumType
 from functools import cache
@@ -18,8 +18,6 @@ from crashhunt.base.older_versions import removed_fix
 from crashhunt.base.text import any_of, did_you_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     from pydantic import ConfigDict, TypeAdapter
     from pydantic_core import ErrorDetails
 

@@ -20,7 +20,7 @@ from crashhunt.plans import read_settings, with_settings, write_settings
 from crashhunt.scenario import load_order_change, with_recorded_load_order
 from crashhunt.snapshots import Snapshot, environment_changes, take_snapshot
 from crashhunt.trial import Outcome
-from crashhunt.trial_reruns import StoppedError, call_in_threads, run_alone
+from crashhunt.trial_reruns import EndedRun, StoppedError, call_in_threads, run_alone
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Signature
     from crashhunt.plans import HuntSettings
     from crashhunt.scenario import Scenario
-    from crashhunt.trial_reruns import EndedRun
 
 Got = Literal["still", "fixed", "changed", "cannot_run"]
 _HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
-from crashhunt.base.codec import known_part
+from crashhunt.base.codec import JsonObject, known_part
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.files import cannot_write, sync_folder, sync_tree, whole_file
 from crashhunt.base.integrity import read_bounded
@@ -42,7 +42,6 @@ from crashhunt.trial import Outcome
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Group, Signature
     from crashhunt.recording import Recording
     from crashhunt.trial import TrialSpec, Value

@@ -16,13 +16,12 @@ from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.text import one_of
-from crashhunt.disturbances._protocol import Closes, Drawn
+from crashhunt.disturbances._protocol import Closes, DisturbanceModel, Drawn
 from crashhunt.trial import CELLS, KINDS, SENSOR_KINDS, Disturbance, in_turn, is_signal, why_not
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from crashhunt.disturbances._protocol import DisturbanceModel
     from crashhunt.trial import TrialResult
 
 

@@ -13,13 +13,12 @@ from crashhunt.base.errors import CrashhuntError, PluginError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.isolation import ServerApart
 from crashhunt.disturbances._disturbance_rates import draw_checked, locate_model
-from crashhunt.disturbances._protocol import Drawn
+from crashhunt.disturbances._protocol import DisturbanceModel, Drawn
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from crashhunt.base.json_types import Plain
-    from crashhunt.disturbances._protocol import DisturbanceModel
 
 
 # Random draws with weights.

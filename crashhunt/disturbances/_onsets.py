@@ -43,7 +43,7 @@ in each step of the root, one check of every place around the agent at which a m
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -54,8 +54,6 @@ from crashhunt.disturbances._protocol import Drawn, Enumerates
 from crashhunt.trial import KINDS, SENSOR_KINDS, Disturbance, Forcing, in_turn
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from crashhunt.disturbances._disturbance_rates import DisturbanceSampler
 
 HasTarget = Callable[[Disturbance], bool]

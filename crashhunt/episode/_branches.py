@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING, Final, cast
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.foreign_code import supports
-from crashhunt.base.forks import NoAnswer, NoProcessError
-from crashhunt.base.json_types import finite
+from crashhunt.base.forks import NoAnswer, NoProcessError, SuspendedFork
+from crashhunt.base.json_types import Plain, finite
 from crashhunt.base.resources import FREE, free_memory
 from crashhunt.base.text import format_percent
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates
 from crashhunt.episode._forks import ForkRunner
-from crashhunt.episode._observers import Observer
+from crashhunt.episode._observers import ObservedEpisode, Observer
 from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import SENSOR_KINDS, Branch, Branches, Disturbance, Outcome, in_turn, steps_of
 from crashhunt.world import approaches, dangers
@@ -35,11 +35,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.base.forks import SuspendedFork
-    from crashhunt.base.json_types import Plain
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.episode._episode import Episode
-    from crashhunt.episode._observers import ObservedEpisode
     from crashhunt.trial import TrialResult
     from crashhunt.world import Frame, Scene
 

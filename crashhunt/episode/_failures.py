@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain, islice
 from types import FunctionType, ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from crashhunt.agents import Closes
 from crashhunt.base.errors import (
@@ -31,7 +31,6 @@ from crashhunt.trial import UNUSABLE_VALUE, Failure, Outcome, TrialResult
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from types import FrameType
-    from typing import Final
 
     from crashhunt.agents import Agent
     from crashhunt.episode._observers import Observer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol, cast
 
 import numpy as np
@@ -23,8 +23,6 @@ from crashhunt.simulators import (
 from crashhunt.world import EVENT_WORDS, approaches
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from crashhunt.simulators import Info, Observations, Simulator
     from crashhunt.world import Lane, Neighbor, Scene
 

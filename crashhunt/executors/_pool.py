@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.executors._fork_server_link import ForkServerLink
 from crashhunt.executors._postmortem import TrialAttempt, result_of_death, where_it_is
-from crashhunt.executors._protocol import Notes
+from crashhunt.executors._protocol import Answer, Notes
 from crashhunt.trial import TrialResult
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from crashhunt.episode import WorkerSettings
-    from crashhunt.executors._protocol import Answer
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialSpec
 

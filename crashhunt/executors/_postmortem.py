@@ -19,7 +19,7 @@ from crashhunt.base.signals import is_sent_from_outside, signal_name
 from crashhunt.base.text import unescape_letters
 from crashhunt.episode import scratch_of
 from crashhunt.executors._native_stack import split_native_calls
-from crashhunt.executors._protocol import CHECKSUM_BYTES, checksum_of
+from crashhunt.executors._protocol import CHECKSUM_BYTES, Report, checksum_of
 from crashhunt.recording import (
     BlackBoxHeader,
     Phase,
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.json_types import ErrorData
-    from crashhunt.executors._protocol import Report
     from crashhunt.trial import TrialSpec
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol, TypeGuard
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Protocol, TypeGuard
 
 import gymnasium
 import numpy as np
 
 from crashhunt.base.foreign_code import members, supports, truth_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
 
 _STEP_PARTS = ("observations", "rewards", "terminations", "truncations", "infos")
 _FIX = "return a bool for each agent"

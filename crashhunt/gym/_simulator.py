@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,7 @@ from crashhunt.base.text import (
     listed,
     one_of,
 )
-from crashhunt.gym._descriptor import GymSetup
+from crashhunt.gym._descriptor import CrashRule, GymSetup
 from crashhunt.gym._pettingzoo import OneLearner, generates_agents, is_parallel, takes_turns
 from crashhunt.scenario import argument_values
 from crashhunt.simulators import (
@@ -49,12 +49,10 @@ from crashhunt.trial import fold_signals
 from crashhunt.world import Contact, Roster, Scene
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from crashhunt.gym._descriptor import CrashRule
     from crashhunt.scenario import Scenario
     from crashhunt.simulators import ActionForm, Info, Observations, Options, StepResult
     from crashhunt.trial import Value

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.hunts._reports import BranchReport, ProbeReport, RareReport
-from crashhunt.hunts._verification import Found
+from crashhunt.hunts._verification import Found, VerificationRuns
 from crashhunt.results import BRANCHES, PROBES, sums_of_branches, sums_of_probes
 from crashhunt.statistics import crashed_copies, rare_watch
 from crashhunt.trial import Branches, Stress, in_turn
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from crashhunt.hunts._next_trials import Trials
-    from crashhunt.hunts._verification import VerificationRuns
     from crashhunt.trial import Branch, Disturbance, ForcedCopy, TrialResult
 
 

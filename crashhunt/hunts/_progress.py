@@ -16,7 +16,7 @@ from crashhunt.crashes import (
     Group,
 )
 from crashhunt.executors import HasNodes
-from crashhunt.hunts._reports import kind_data
+from crashhunt.hunts._reports import AuditReport, StoppedBecause, kind_data
 from crashhunt.results import CrashTally, Kinds, sums_of_branches, sums_of_probes
 from crashhunt.trial import Outcome
 from crashhunt.trial_reruns import call_in_threads
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle
     from crashhunt.executors import Executor, NodeFigures
-    from crashhunt.hunts._reports import AuditReport, StoppedBecause
     from crashhunt.ledger import Facts, Ledger, Noted, RunningRate
     from crashhunt.plans import RunSettings
     from crashhunt.recording import BlackBoxHeader

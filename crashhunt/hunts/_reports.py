@@ -6,7 +6,7 @@ import statistics
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from crashhunt.base.codec import Serializable
+from crashhunt.base.codec import JsonObject, Serializable
 from crashhunt.base.text import format_number, format_percent
 from crashhunt.results import CrashTally
 from crashhunt.statistics import TRIALS_PER_ROOT
@@ -14,7 +14,6 @@ from crashhunt.statistics import TRIALS_PER_ROOT
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, Group
     from crashhunt.ledger import KindData
     from crashhunt.plans import HuntSettings

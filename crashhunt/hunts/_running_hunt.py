@@ -20,8 +20,8 @@ from crashhunt.hunts._audits import Audit, PendingAudits
 from crashhunt.hunts._fork_results import ForkCrashes, verify_fork_results, verify_rare
 from crashhunt.hunts._next_trials import Trials, Unanswered, result_lag, trials_under_way
 from crashhunt.hunts._preflight import Preflight, WorkerNotices, is_hopeless, unusable_value, why_invalid
-from crashhunt.hunts._progress import PhaseClock, Progress, RemainingTime
-from crashhunt.hunts._reports import HuntReport
+from crashhunt.hunts._progress import HuntStatus, PhaseClock, PhaseStatus, Progress, RemainingTime
+from crashhunt.hunts._reports import HuntReport, StoppedBecause
 from crashhunt.hunts._verification import Confirmation, TrialReruns, VerificationRuns, is_settled, keep_near_misses
 from crashhunt.plans import core_of, disturber_apart, sampler_of
 from crashhunt.results import (
@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.hunts._hunt_setup import HuntSetup
-    from crashhunt.hunts._progress import HuntStatus, PhaseStatus
-    from crashhunt.hunts._reports import StoppedBecause
     from crashhunt.ledger import Ledger, Noted
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialResult

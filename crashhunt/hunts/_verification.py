@@ -16,11 +16,11 @@ from crashhunt.base.temporary import remove_at_once, remove_scratch
 from crashhunt.base.text import command_line
 from crashhunt.crashes import changing, is_bundle_made_here, is_snapshot_trusted, list_near_misses, write_bundle
 from crashhunt.executors import PoolExecutor
-from crashhunt.hunts._hunt_setup import settings_again
+from crashhunt.hunts._hunt_setup import HuntSetup, settings_again
 from crashhunt.replays import ReplayOptions, confirm
 from crashhunt.results import Judged
 from crashhunt.snapshots import Snapshot
-from crashhunt.trial_reruns import Reruns, StoppedError
+from crashhunt.trial_reruns import EndedRun, Reruns, SharedReruns, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -29,11 +29,9 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.executors import Executor
-    from crashhunt.hunts._hunt_setup import HuntSetup
     from crashhunt.hunts._progress import PhaseClock, PhaseName, Progress
     from crashhunt.ledger import Ledger
     from crashhunt.trial import TrialResult, TrialSpec
-    from crashhunt.trial_reruns import EndedRun, SharedReruns
 
 
 class Confirmation:

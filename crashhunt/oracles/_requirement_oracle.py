@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from crashhunt.base.errors import CrashhuntError, FormulaError, UnusableValueError, UsageError
 from crashhunt.base.text import did_you_mean, format_time
-from crashhunt.oracles._protocol import REQUIREMENT, Finding
+from crashhunt.oracles._protocol import REQUIREMENT, Finding, SignalSource
 from crashhunt.requirements import TRAFFIC_RULES, Monitor, parse
 from crashhunt.trial import MAX_ROBUSTNESS, Argument, Outcome
 from crashhunt.world import Event
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from crashhunt.oracles._protocol import SignalSource
     from crashhunt.requirements import Violation
     from crashhunt.trial import Category, TrialResult
     from crashhunt.world import Scene

@@ -16,7 +16,7 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, TypedDict, cast, final
+from typing import TYPE_CHECKING, NoReturn, TextIO, TypedDict, cast, final
 
 import numpy as np
 
@@ -40,7 +40,6 @@ from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from typing import TextIO
 
     from numpy.typing import NDArray
 

@@ -18,7 +18,7 @@ from crashhunt.replays._edits import edited_spec
 from crashhunt.scenario import argument_values, load_order_change, load_scenario, with_recorded_load_order
 from crashhunt.snapshots import Snapshot, code_differences, environment_changes, processor, program_warnings
 from crashhunt.trial import SENSOR_KINDS
-from crashhunt.trial_reruns import Reruns
+from crashhunt.trial_reruns import Reruns, Where
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialSpec, Value
-    from crashhunt.trial_reruns import Where
 
 
 Code = Literal["snapshot", "current", "log"]

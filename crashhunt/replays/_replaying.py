@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -11,20 +11,16 @@ from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError, UntrustedError, UsageError
 from crashhunt.crashes import with_lights
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, values_around
-from crashhunt.replays._prepare import ReplayOptions, Rerun, prepare
+from crashhunt.replays._prepare import Code, Look, ReplayOptions, Rerun, prepare
 from crashhunt.scenario import load_order_change
 from crashhunt.snapshots import environment_changes
 from crashhunt.trial import Outcome, TrialResult
-from crashhunt.trial_reruns import StoppedError, run_alone
+from crashhunt.trial_reruns import SharedReruns, StoppedError, run_alone
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from crashhunt.base.binaries import BinaryFacts
     from crashhunt.crashes import Bundle
     from crashhunt.recording import AgentChannel, Prologue
-    from crashhunt.replays._prepare import Code, Look
-    from crashhunt.trial_reruns import SharedReruns
 
 
 # Whether a replay is the same as what was recorded, and where it first is not.

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.base.errors import UsageError
-from crashhunt.samplers._protocol import HuntFacts, Proposal
+from crashhunt.samplers._protocol import HuntFacts, Proposal, Space
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from crashhunt.samplers._protocol import Space
     from crashhunt.trial import TrialResult
 
 SAMPLE, BOUNDARY = "sample", "boundary"

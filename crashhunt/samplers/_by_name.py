@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -19,15 +19,14 @@ from crashhunt.samplers._protocol import (
     PlainStream,
     Proposal,
     ReceivesHuntFacts,
+    Sampler,
+    Space,
     Versioned,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     import numpy as np
 
-    from crashhunt.samplers._protocol import Sampler, Space
     from crashhunt.trial import TrialResult
 
 

@@ -35,8 +35,8 @@ import numpy as np
 
 from crashhunt.samplers._model import TRIALS, Model
 from crashhunt.samplers._signal_shapes import SignalShapes
-from crashhunt.samplers._space_filling import HaltonSampler
-from crashhunt.samplers._strategies import CRASHED, NEAREST, Draft, Elites
+from crashhunt.samplers._space_filling import Cube, HaltonSampler
+from crashhunt.samplers._strategies import CRASHED, NEAREST, Conjunct, Draft, Elites, ScoredTrial
 from crashhunt.trial import MAX_ROBUSTNESS
 
 if TYPE_CHECKING:
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.samplers._protocol import HuntFacts, Space
-    from crashhunt.samplers._space_filling import Cube
-    from crashhunt.samplers._strategies import Conjunct, ScoredTrial
 
     Floats = NDArray[np.float64]
     Seeds = NDArray[np.int64]

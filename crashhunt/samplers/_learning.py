@@ -6,15 +6,13 @@ from typing import TYPE_CHECKING, ClassVar
 
 from threadpoolctl import ThreadpoolController
 
-from crashhunt.samplers._protocol import HuntFacts, Proposal
+from crashhunt.samplers._protocol import HuntFacts, Proposal, Space
 from crashhunt.samplers._space_filling import Cube, RandomSampler
-from crashhunt.samplers._strategies import PLAIN_EVERY, CmaEs, CrossEntropy, Mutation, scored_trial
+from crashhunt.samplers._strategies import PLAIN_EVERY, CmaEs, CrossEntropy, Mutation, Strategy, scored_trial
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from crashhunt.samplers._protocol import Space
-    from crashhunt.samplers._strategies import Strategy
     from crashhunt.trial import TrialResult
 
 _PLAIN, _START = "random", "start"

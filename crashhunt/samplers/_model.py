@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from crashhunt.samplers._signal_shapes import SignalShapes
-from crashhunt.samplers._strategies import Draft, reflected
+from crashhunt.samplers._strategies import Draft, ScoredTrial, reflected
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.samplers._space_filling import Cube
-    from crashhunt.samplers._strategies import ScoredTrial
 
     Floats = NDArray[np.float64]
     Excluded = Callable[[Floats, NDArray[np.int64]], NDArray[np.bool_]]

@@ -16,14 +16,11 @@ from crashhunt.base.errors import PluginError, UsageError
 from crashhunt.base.extras import install_command
 from crashhunt.base.text import one_of
 from crashhunt.samplers._learning import Learning
-from crashhunt.samplers._protocol import HuntFacts
-from crashhunt.samplers._strategies import Draft
+from crashhunt.samplers._protocol import HuntFacts, Space
+from crashhunt.samplers._strategies import Draft, ScoredTrial, Strategy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from crashhunt.samplers._protocol import Space
-    from crashhunt.samplers._strategies import ScoredTrial, Strategy
 
 
 PREFIX = "optuna:"

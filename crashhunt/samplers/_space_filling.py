@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from crashhunt.base.errors import UsageError
-from crashhunt.samplers._protocol import HuntFacts, Proposal
+from crashhunt.samplers._protocol import HuntFacts, Key, Proposal, Space
 from crashhunt.trial import Choice, point_of_signal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from crashhunt.samplers._protocol import Key, Space
     from crashhunt.trial import TrialResult, TrialSpec, Value
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,8 +17,6 @@ from crashhunt.recording import OPAQUE_SHAPE, decode_value, encode_value
 from crashhunt.simulators._actions import SpaceAction, cast
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
     from crashhunt.base.json_types import Plain

@@ -11,10 +11,11 @@ import numpy as np
 
 from crashhunt.simulators._bicycle_model import WHEELBASE_SHARE
 from crashhunt.simulators._kinematics_observation import kind_number
-from crashhunt.simulators._observation_layout import History, layouts_of
+from crashhunt.simulators._observation_layout import History, RequestedPart, layouts_of
 from crashhunt.simulators._observation_parts import REACH_M, SCENE_PARTS
 from crashhunt.simulators._scene_parts import (
     ActorNumbers,
+    NearActor,
     RayCaster,
     center_of,
     covariances_of,
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import AgentSetup
-    from crashhunt.simulators._observation_layout import RequestedPart
-    from crashhunt.simulators._scene_parts import NearActor
     from crashhunt.world import Scene
 
 _MAX_BEND = 2.0  # of the wheelbase times the curvature, with the front wheels across

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import libsumo
 from libsumo import _libsumo as sumo
 
-from crashhunt.sumo._driving import VehicleCommand
+from crashhunt.sumo._driving import Driving, VehicleCommand
 from crashhunt.trial import steps_of
 from crashhunt.world import PERSON, is_person, place_words
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
     from crashhunt.simulators import ActiveDisturbance
-    from crashhunt.sumo._driving import Driving
     from crashhunt.trial import Disturbance
     from crashhunt.world import Scene
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import libsumo
 import numpy as np
@@ -12,7 +12,6 @@ from libsumo import _libsumo as sumo  # without the Python wrappers of the gette
 
 if TYPE_CHECKING:
     from types import TracebackType
-    from typing import Self
 
     from numpy.typing import NDArray
 

@@ -31,13 +31,11 @@ from libsumo import _libsumo as sumo
 from crashhunt.sumo._agent_calls import commanded_elsewhere
 from crashhunt.sumo._bent_vehicles import height_at
 from crashhunt.sumo._driving import VehicleCommand
-from crashhunt.sumo._lane_graph import VEHICLE_CLASSES, is_open
+from crashhunt.sumo._lane_graph import VEHICLE_CLASSES, LaneGraph, LaneLink, is_open
 from crashhunt.world import LEVEL_M
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
-
-    from crashhunt.sumo._lane_graph import LaneGraph, LaneLink
 
     Polygon = Sequence[tuple[float, float]]
 

@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from crashhunt.sumo._lane_graph import MAX_PREPARING_S, TURNS, is_open
+from crashhunt.sumo._lane_graph import MAX_PREPARING_S, TURNS, GraphLane, LaneGraph, is_open
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from numpy.typing import NDArray
-
-    from crashhunt.sumo._lane_graph import GraphLane, LaneGraph
 
     NearLanesOf = dict[tuple["Sampling", str], "NearLanes"]
 

@@ -21,15 +21,12 @@ from crashhunt.simulators import (
     predictions_of,
     with_range_noise,
 )
-from crashhunt.sumo._lane_paths import NearLanes, Sampling
-from crashhunt.sumo._reader_protocol import Reader
+from crashhunt.sumo._lane_paths import LanePath, NearLanes, Sampling
+from crashhunt.sumo._reader_protocol import Moment, Reader, ReaderSetup
 from crashhunt.world import is_person
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from crashhunt.sumo._lane_paths import LanePath
-    from crashhunt.sumo._reader_protocol import Moment, ReaderSetup
 
 _MAX_SPEED_MPS, _MAX_PREDICTED_M = 60.0, 1000.0  # longer paths along lanes are straight at their end
 _SPACING_M = 1.0  # of the points of these paths

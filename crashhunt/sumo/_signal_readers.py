@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from libsumo import _libsumo as sumo
 
-from crashhunt.sumo._reader_protocol import NEVER_S, Reader, RowsReader
+from crashhunt.sumo._reader_protocol import NEVER_S, Moment, Reader, ReaderSetup, RowsReader
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from crashhunt.native import Draft
     from crashhunt.sumo._lane_graph import Signal
-    from crashhunt.sumo._reader_protocol import Moment, ReaderSetup
 
     Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import libsumo
 # some two hundred values.
 from libsumo import _libsumo as sumo
 
-from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
+from crashhunt.base.errors import EpisodeError, InvalidEpisodeError, SimulatorError
 from crashhunt.base.foreign_code import Party
 from crashhunt.native import core_for, reseed_generators, why_no_reseeding
 from crashhunt.scenario import ObservationSetup
@@ -60,7 +60,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from crashhunt.base.errors import EpisodeError
     from crashhunt.scenario import Scenario
     from crashhunt.simulators import ActionForm, ActiveDisturbance, Info, Lights, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value

@@ -8,12 +8,13 @@ from __future__ import annotations
 import errno
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
 from crashhunt.base.codec import (
     OMIT_DEFAULT,
+    JsonObject,
     Serializable,
     from_plain,
     null_is,
@@ -28,12 +29,6 @@ from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._outcome import Outcome, outcome_of
 from crashhunt.trial._specification import TrialSpec
 from crashhunt.world import ClosestApproach, Event
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from crashhunt.base.codec import JsonObject
-
 
 KILLED: Final = "killed from outside"
 """Kind of the failure of a trial whose processes were killed from outside until no attempt was left."""

@@ -18,14 +18,12 @@ import numpy as np
 
 from crashhunt.base.codec import Serializable, null_is
 from crashhunt.world._geometry import LEVEL_M, levels, outlines, rectangle_gap, time_to_contact
-from crashhunt.world._scene import core_of, part_of
+from crashhunt.world._scene import Frame, Scene, core_of, part_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
-
-    from crashhunt.world._scene import Frame, Scene
 
 
 # The closest approach.

@@ -16,14 +16,11 @@ from dataclasses import dataclass
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Literal
 
-from crashhunt.world._geometry import center, levels, outlines, same_level, separation
-from crashhunt.world._scene import is_person
+from crashhunt.world._geometry import Level, Rectangle, center, levels, outlines, same_level, separation
+from crashhunt.world._scene import Scene, is_person
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from crashhunt.world._geometry import Level, Rectangle
-    from crashhunt.world._scene import Scene
 
 STANDS_MPS = 0.1
 """An actor that moves more slowly than this stands, in m/s."""

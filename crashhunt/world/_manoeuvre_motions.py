@@ -7,15 +7,12 @@ and the next lane are given by their middles. The controlled vehicle begins with
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from crashhunt.world._scene import PERSON, Actor
 from crashhunt.world._tracks import ActorState
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 START_M = 300.0
 """Front of the controlled vehicle along the road at the beginning, in m."""

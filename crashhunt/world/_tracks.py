@@ -13,14 +13,12 @@ import numpy as np
 
 from crashhunt.base.codec import JsonObject, Serializable
 from crashhunt.world._geometry import levels, outlines
-from crashhunt.world._scene import Actor, core_of, part_of
+from crashhunt.world._scene import Actor, Frame, Scene, Spine, core_of, part_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
-
-    from crashhunt.world._scene import Frame, Scene, Spine
 
     Array = NDArray[np.float64]
 

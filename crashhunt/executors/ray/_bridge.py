@@ -25,14 +25,13 @@ from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.base.exceptions import in_words
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors._postmortem import killed_from_outside
-from crashhunt.executors.ray._cluster import Cluster, Lost, TokenError, UnreachableError
+from crashhunt.executors.ray._cluster import Cluster, Found, Lost, TokenError, UnreachableError
 from crashhunt.executors.ray._code_archive import CodeArchive
 from crashhunt.executors.ray._node_scheduler import Node, NodeScheduler, Trial, shares
 from crashhunt.executors.ray._node_worker import unpacked
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
-    from crashhunt.executors.ray._cluster import Found
     from crashhunt.executors.ray._messages import (
         BridgeJob,
         EndedTrial,

@@ -17,7 +17,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors._pool import PoolExecutor
 from crashhunt.executors.ray._code_archive import Place, Store, settings_in
-from crashhunt.executors.ray._messages import EndedTrial, News
+from crashhunt.executors.ray._messages import EndedTrial, Header, News, NodeJob, Submitted
 from crashhunt.recording import read_header
 from crashhunt.trial import TrialSpec
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from crashhunt.base.json_types import ErrorData
-    from crashhunt.executors.ray._messages import Header, NodeJob, Submitted
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialResult
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from highway_env.vehicle.objects import Landmark
 
-from crashhunt.highway.accelerator._supported import kinds_of
+from crashhunt.highway.accelerator._supported import VehicleClass, kinds_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.highway.accelerator._lane_network import Network
-    from crashhunt.highway.accelerator._supported import VehicleClass
 
 
 class TrafficFrame:

@@ -10,8 +10,8 @@ import numpy as np
 from highway_env.vehicle.objects import Landmark, Obstacle
 
 from crashhunt.highway.accelerator._frames import are_plain
-from crashhunt.highway.accelerator._kernel import kernel
-from crashhunt.highway.accelerator._supported import NUMBERS_OF, are_numbers, kinds_of
+from crashhunt.highway.accelerator._kernel import Traffic, kernel
+from crashhunt.highway.accelerator._supported import NUMBERS_OF, VehicleClass, are_numbers, kinds_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,9 +20,7 @@ if TYPE_CHECKING:
     from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
 
-    from crashhunt.highway.accelerator._kernel import Traffic
     from crashhunt.highway.accelerator._lane_network import Network
-    from crashhunt.highway.accelerator._supported import VehicleClass
 
     Row = tuple[object, ...]
 

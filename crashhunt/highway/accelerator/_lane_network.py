@@ -10,13 +10,11 @@ import numpy as np
 from highway_env.road.lane import AbstractLane, CircularLane, SineLane, StraightLane
 from highway_env.road.road import RoadNetwork
 
-from crashhunt.highway.accelerator._kernel import kernel
+from crashhunt.highway.accelerator._kernel import CompiledNetwork, Contents, kernel
 from crashhunt.highway.accelerator._supported import are_numbers, is_plain
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from crashhunt.highway.accelerator._kernel import CompiledNetwork, Contents
 
 
 _ON_LANE_MARGIN_M = 1  # highway-env's lateral margin for neighbours on a lane

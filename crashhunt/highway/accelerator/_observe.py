@@ -12,7 +12,7 @@ from highway_env import utils
 from highway_env.road.lane import AbstractLane
 from highway_env.vehicle.kinematics import Vehicle
 
-from crashhunt.highway.accelerator._frames import are_plain
+from crashhunt.highway.accelerator._frames import TrafficFrame, are_plain
 from crashhunt.highway.accelerator._supported import are_numbers, kind_of
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
 
-    from crashhunt.highway.accelerator._frames import TrafficFrame
     from crashhunt.highway.accelerator._lane_network import Network
     from crashhunt.highway.accelerator._roads import RoadState
 

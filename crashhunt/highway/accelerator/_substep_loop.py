@@ -28,7 +28,7 @@ from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 
-from crashhunt.highway.accelerator._roads import cached, is_known, look, methods_of, prepared, watches
+from crashhunt.highway.accelerator._roads import Prepared, cached, is_known, look, methods_of, prepared, watches
 from crashhunt.highway.accelerator._supported import Own, is_genuine, kinds_of, originals
 
 if TYPE_CHECKING:
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from highway_env.envs.highway_env import HighwayEnv
 
     from crashhunt.highway.accelerator._kernel import Traffic
-    from crashhunt.highway.accelerator._roads import Prepared
 
 
 # The parts of a sub-step that stay in Python: checks of pairs by highway-env, and right of way at intersections.

@@ -20,14 +20,12 @@ from highway_env.envs.common import abstract, action, finite_mdp, observation
 from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, dynamics, kinematics, objects
 
-from crashhunt.highway.accelerator._kernel import kernel, why_not
+from crashhunt.highway.accelerator._kernel import Snapshot, kernel, why_not
 from crashhunt.highway.accelerator._known_versions import ACCELERATED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
     from types import ModuleType
-
-    from crashhunt.highway.accelerator._kernel import Snapshot
 
     Space = dict[str, Any] | type  # the dictionary of a module, or a class
 

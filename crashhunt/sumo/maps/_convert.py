@@ -12,15 +12,12 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import ScenarioError
 from crashhunt.base.extras import install_command
 from crashhunt.sumo.maps._road_network import BICYCLE, CAR, PERSON, RoadNetwork, read_network
-from crashhunt.sumo.maps._source import fix_of_bbox
-from crashhunt.sumo.maps._tools import first_error
+from crashhunt.sumo.maps._source import BBox, MapSource, fix_of_bbox
+from crashhunt.sumo.maps._tools import Tools, first_error
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-
-    from crashhunt.sumo.maps._source import BBox, MapSource
-    from crashhunt.sumo.maps._tools import Tools
 
 NET = "map.net.xml"
 _RAIL = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})

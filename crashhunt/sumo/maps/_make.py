@@ -35,16 +35,14 @@ from crashhunt.sumo.maps._folder import (
 )
 from crashhunt.sumo.maps._picture import draw_map
 from crashhunt.sumo.maps._road_network import CAR, RoadNetwork
-from crashhunt.sumo.maps._source import MapSource, check_source, kind_of_file
-from crashhunt.sumo.maps._tools import find_tools
+from crashhunt.sumo.maps._source import BBox, MapSource, check_source, kind_of_file
+from crashhunt.sumo.maps._tools import Tools, find_tools
 from crashhunt.sumo.maps._traffic import ROUTES, RUN_S, Demand, PlainRun, calibrate, find_demand, route_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from crashhunt.scenario import Scenario
-    from crashhunt.sumo.maps._source import BBox
-    from crashhunt.sumo.maps._tools import Tools
 
 
 # Cache of scenarios of maps that hunts name: a scenario is made once, and stored by the map's contents.

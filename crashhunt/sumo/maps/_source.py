@@ -7,14 +7,13 @@ import math
 import xml.etree.ElementTree as ET
 import zlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, BinaryIO, Literal, TypeAlias
 
 from crashhunt.base.errors import ScenarioError, UsageError
 from crashhunt.base.text import any_of, near_path
 
 if TYPE_CHECKING:
     from pathlib import Path
-    from typing import BinaryIO
 
 BBox: TypeAlias = tuple[float, float, float, float]
 """West, south, east, north, in degrees."""

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import string
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import ScenarioError
-from crashhunt.sumo.maps._road_network import BICYCLE, CAR, TRUCK
-from crashhunt.sumo.maps._tools import first_error
+from crashhunt.sumo.maps._road_network import BICYCLE, CAR, TRUCK, RoadNetwork
+from crashhunt.sumo.maps._tools import Tools, first_error
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
     from pathlib import Path
-
-    from crashhunt.sumo.maps._road_network import RoadNetwork
-    from crashhunt.sumo.maps._tools import Tools
 
 
 ROUTES = "traffic.rou.xml"
