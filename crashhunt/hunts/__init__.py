@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._disk_check import Checked as Checked, check as check
     from ._hunt import Hunt as Hunt
+    from ._hunt_file_check import Checked as Checked, check as check
     from ._next_trials import (
         GREATEST_LAG as GREATEST_LAG,
         Trials as Trials,

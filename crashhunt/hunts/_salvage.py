@@ -10,7 +10,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.files import cannot_write, is_empty_folder, sync_folder, sync_tree
 from crashhunt.base.temporary import new_folder
-from crashhunt.hunts._disk_check import intact_snapshots
+from crashhunt.hunts._hunt_file_check import intact_snapshots
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings, write_settings
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from crashhunt.hunts._disk_check import Checked
+    from crashhunt.hunts._hunt_file_check import Checked
     from crashhunt.ledger import Noted, Row
     from crashhunt.plans import HuntSettings
 

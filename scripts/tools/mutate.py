@@ -146,7 +146,7 @@ _TESTS_ELSEWHERE = {
         "executors/test_ray_store.py",
     ),
     # What a hunt does is seen by whole hunts.
-    "hunts/_disk_check.py": ("e2e/test_check.py",),
+    "hunts/_hunt_file_check.py": ("e2e/test_check.py",),
     "hunts/_salvage.py": ("e2e/test_check.py",),
     "results/_found_crashes.py": ("hunts/test_whole_hunts.py",),
     "hunts/_fork_results.py": ("hunts/test_whole_hunts.py", "e2e/test_branches.py"),

@@ -18,7 +18,7 @@ from crashhunt.base.temporary import this_process
 from crashhunt.crashes import export_crash, find_bundle
 from crashhunt.errors import BundleError, CrashhuntError, HuntDirectoryError
 from crashhunt.hunts import check, salvage
-from crashhunt.hunts._disk_check import intact_snapshots
+from crashhunt.hunts._hunt_file_check import intact_snapshots
 from crashhunt.ledger import Ledger, Turn
 from crashhunt.results._hunt_state import ledger_owner
 from crashhunt.trial import Outcome
@@ -86,7 +86,7 @@ def test_what_is_whole_is_fine(hunt):
 
 def test_a_low_limit_on_open_files_is_not_taken_for_damage(hunt, monkeypatch):
     error = OSError(errno.EMFILE, "Too many open files")
-    monkeypatch.setattr("crashhunt.hunts._disk_check.error_of_next_files", lambda count: error)
+    monkeypatch.setattr("crashhunt.hunts._hunt_file_check.error_of_next_files", lambda count: error)
     monkeypatch.setattr("resource.getrlimit", lambda which: (5, 5))
     with pytest.raises(CrashhuntError, match="cannot open files: Too many open files; the limit on open files is 5: "):
         check(hunt)
