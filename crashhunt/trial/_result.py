@@ -79,6 +79,9 @@ class Collision(Serializable):
     time_s: float = field(default=math.nan, metadata=null_is(math.nan))
     cell: str = field(default="", metadata=OMIT_DEFAULT)
 
+    def __eq__(self, other: object) -> bool:
+        return self.equals(other)
+
     @property
     def other(self) -> str:
         """The collision partner of the agent; empty if the agent was alone."""

@@ -59,6 +59,9 @@ class Event(Serializable):
     name: str = field(default="", metadata=OMIT_DEFAULT)
     details: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
 
+    def __eq__(self, other: object) -> bool:
+        return self.equals(other)
+
     @property
     def label(self) -> str:
         """The kind of the event, and the name of a violated requirement."""

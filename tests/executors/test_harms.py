@@ -51,7 +51,7 @@ _DAMAGED = dict.fromkeys(harms.MOMENTS[:-2], (ERROR, NAMED))  # the process cann
 SHOWN_IN_STACK = (
     "segfaults",
     "aborts",
-    "overflows_stack",
+    *(("overflows_stack",) if harms.HARMS["overflows_stack"][0] == "dies" else ()),
     "divides_in_c",
     "frees_what_is_not_its_own",
 )
@@ -74,7 +74,6 @@ MESSAGES = {
     ("segfaults", "close"): "the process died of SIGSEGV after the last step",
     ("exits_with_79", "constructor"): "the process exited with 79 in ego's constructor or reset() while the episode was"
     " being set up",
-    ("overflows_stack", "fifth act"): "the process died of SIGSEGV in ego's act() of step 5",
     ("recurses", "fifth act"): "maximum recursion depth exceeded",
     ("raises_error", "signal handler"): "harm",
     ("feigns_full_disk", "signal handler"): "the disk is full; buy one",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import shutil
 import sqlite3
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -57,32 +57,48 @@ def ended(spec):
 class Killed(BaseException):
     """The process of a hunt is gone."""
 
+    ledger: Ledger
+
+
+@contextmanager
+def opened(path):
+    """Open the ledger of a hunt. One that is killed leaves it open, until its files have been copied as they are."""
+    ledger = Ledger(path, writable=True)
+    try:
+        yield ledger
+    except Killed as killed:
+        killed.ledger = ledger
+        raise
+    except BaseException:
+        ledger.close()
+        raise
+    ledger.close()
+
 
 def hunt(path, chosen, chance, *, kill_after=10**9, lag=None, slow=frozenset(), log=None, **more):
     """What a hunt does with its trials, which end in any order, until it is killed; return how many were open then."""
-    ledger = Ledger(path, writable=True)
-    finished = ledger.finished()
-    capacity = 2 * chosen.run.parallel
-    sampler = NamedSampler(chosen.sampler, chosen.space, points=chosen.points)
-    trials = Trials(chosen, sampler, ledger, finished, lag=lag or capacity, **more)
-    running = []
-    while True:
-        for spec in trials.take(capacity - len(running)):
-            running.append(spec)
-            if log is not None:
-                log.append(spec)
-        if kill_after <= 0:
-            raise Killed
-        kill_after -= 1
-        if not running:
-            break
-        ready = [spec for spec in running if spec.number not in slow] or running
-        spec = chance.choice(ready)
-        running.remove(spec)
-        result = ended(spec)
-        trials.ended(result)
-        ledger.record(result, snapshot="")
-    ledger.close()
+    with opened(path) as ledger:
+        finished = ledger.finished()
+        capacity = 2 * chosen.run.parallel
+        sampler = NamedSampler(chosen.sampler, chosen.space, points=chosen.points)
+        trials = Trials(chosen, sampler, ledger, finished, lag=lag or capacity, **more)
+        running = []
+        while True:
+            for spec in trials.take(capacity - len(running)):
+                running.append(spec)
+                if log is not None:
+                    log.append(spec)
+            if kill_after <= 0:
+                raise Killed
+            kill_after -= 1
+            if not running:
+                break
+            ready = [spec for spec in running if spec.number not in slow] or running
+            spec = chance.choice(ready)
+            running.remove(spec)
+            result = ended(spec)
+            trials.ended(result)
+            ledger.record(result, snapshot="")
 
 
 def killed_again_and_again(folder, chosen, chance, kills, *, lag=None, power=False, slow=frozenset()):
@@ -94,9 +110,10 @@ def killed_again_and_again(folder, chosen, chance, kills, *, lag=None, power=Fal
         started.append(log)
         try:
             hunt(path, chosen, chance, kill_after=kill, lag=lag, slow=slow, log=log)
-        except Killed:
+        except Killed as killed:
             # The files as they are now, under another name: whoever had them open plays no part any more.
             shutil.copytree(path.parent, folder / str(number))
+            killed.ledger.close()
             path = folder / str(number) / "ledger.sqlite"
             path.with_name("ledger.sqlite-shm").unlink(missing_ok=True)
             log_file = path.with_name("ledger.sqlite-wal")
@@ -220,9 +237,10 @@ def test_a_trial_that_hangs_keeps_no_one_from_learning(tmp_path):
     assert {8, 20, 40} <= set(told)
     # A deterministic one waits for it.
     log: list = []
-    with pytest.raises(Killed):
+    with pytest.raises(Killed) as killed:
         hunt(tmp_path / "other.sqlite", settings(deterministic=True), random.Random(1), lag=8, slow=slow,
              log=log, kill_after=6)  # fmt: skip
+    killed.value.ledger.close()
     assert max(spec.number for spec in log) <= 7 + 8
 
 
@@ -382,9 +400,10 @@ def test_unanswered_trials_run_first_and_the_sampler_proposes_as_if_they_had_not
     for path in (undisturbed, killed):
         path.parent.mkdir()
     hunt(undisturbed, chosen, random.Random(1), lag=4)
-    with pytest.raises(Killed):
+    with pytest.raises(Killed) as error:
         hunt(killed, chosen, random.Random(1), lag=4, kill_after=9)
     shutil.copytree(killed.parent, resumed.parent)
+    error.value.ledger.close()
     with closing(Ledger(resumed, writable=True)) as ledger, closing(Ledger(undisturbed)) as whole:
         finished = ledger.finished()
         unanswered = [ledger.result(number).spec for number in sorted(finished)[1:4:2]]
