@@ -9,6 +9,7 @@ import re
 import shutil
 import sqlite3
 import subprocess
+from contextlib import closing
 from importlib.util import find_spec
 from typing import ClassVar
 
@@ -270,7 +271,7 @@ TOY = ("--scenario", "toy", "--seed", "5", "--set", "gap_m=5.0:25.0")
 
 
 def results(folder):
-    with sqlite3.connect(f"file:{folder / 'ledger.sqlite'}?mode=ro", uri=True) as database:
+    with closing(sqlite3.connect(f"file:{folder / 'ledger.sqlite'}?mode=ro", uri=True)) as database:
         return [json.loads(row[0]) for row in database.execute("SELECT result FROM trials ORDER BY number")]
 
 
