@@ -68,8 +68,7 @@ class FreeMotion:
         self._vehicle, self._form, self._dt, self._area = vehicle, form, step_length_s, area
         self._is_relative = settings.get("frame") == "ego"
         self._is_overruled = False
-        self._target: tuple[float, float] | None = None  # the position of the target pose that was computed last
-        self._aim: tuple[float, float] | None = None  # the same of the last step
+        self._aim: tuple[float, float] | None = None  # the position of the last target pose
         self._backwards_m = 0.0  # since the vehicle has last moved ahead by as much
         self._pursues = settings.get("tracker") == "pure_pursuit"
         self._half, self._half_width = sumo.vehicle_getLength(vehicle) / 2, sumo.vehicle_getWidth(vehicle) / 2
@@ -104,7 +103,7 @@ class FreeMotion:
         """Move the vehicle by an encoded action; return whether it stays on the road and hits no obstacle."""
         self.events.clear()
         state = self._next(action.tolist())
-        self._aim = self._target
+        self._aim = self._pose(action.tolist())[:2] if self._form == "target_pose" else None
         if self._arrives(state):
             sumo.vehicle_remove(self._vehicle, _ARRIVED)
             return True
@@ -354,7 +353,6 @@ class FreeMotion:
             return after
         if self._form == "target_pose":
             (x, y, heading), time_s = self._pose(values), values[3]
-            self._target = x, y
             after = self._towards(x, y, heading, time_s)
             is_usual = -_MAX_BRAKING_MPS2 <= after.acceleration <= _MAX_ACCELERATION_MPS2
             if self._is_overruled and not (is_usual and self._refusal(after) is None):
