@@ -12,7 +12,6 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -338,6 +337,22 @@ class TrialProcess:
         return made
 
 
+def _late_modules(before: frozenset[str]) -> list[str]:
+    """Return the names of modules that have been imported since then.
+
+    New modules come last. To look at the names of all modules would copy 250 pages of memory in each trial. An earlier
+    module may come last as well, if the agent has removed it and imported it again.
+    """
+    found: list[str] = []
+    more = len(sys.modules) - len(before)
+    for name in reversed(sys.modules):
+        if name not in before:
+            found.append(name)
+        elif len(found) >= more:
+            break
+    return found
+
+
 def notices_of_late_imports(before: frozenset[str], code: Sequence[str]) -> list[str]:
     """Return a notice for each module that a trial has imported from a user's folder and not from the snapshot.
 
@@ -346,9 +361,7 @@ def notices_of_late_imports(before: frozenset[str], code: Sequence[str]) -> list
     """
     found = []
     with suppress(Exception):  # the code of a trial may have put anything into `sys.modules`
-        # New modules come last. To look at the names of all modules would copy 250 pages of memory in each trial.
-        late = takewhile(lambda name: name not in before, reversed(sys.modules))
-        for name in sorted(late) if code else ():
+        for name in sorted(_late_modules(before)) if code else ():
             file = getattr(sys.modules[name], "__file__", None)
             if "." in name or not isinstance(file, str) or not is_users(file):
                 continue

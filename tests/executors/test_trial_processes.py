@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 import json
 import os
 import signal
@@ -404,11 +405,13 @@ def test_folder_that_is_gone_is_a_fault_of_the_machine(process, tmp_path):
 
 def test_module_that_only_a_trial_imports_from_outside_of_the_snapshot_is_reported(tmp_path, monkeypatch):
     code, mine, installed = tmp_path / "code", tmp_path / "my code", tmp_path / "site-packages"
+    monkeypatch.setitem(sys.modules, "colorsys", colorsys)
     before = frozenset(sys.modules)
     places = {"kept": code / "kept.py", "late": mine / "late.py", "big": mine / "big" / "__init__.py"}
     for name, file in {**places, "lib": installed / "lib.py", "big.part": mine / "big" / "part.py"}.items():
         monkeypatch.setitem(sys.modules, name, SimpleNamespace(__file__=str(file)))
     monkeypatch.setitem(sys.modules, "built_in", SimpleNamespace())
+    sys.modules["colorsys"] = sys.modules.pop("colorsys")  # an agent may import a module again
     found = notices_of_late_imports(before, (str(code),))
     assert [notice.split("'")[1] for notice in found] == ["big", "late"]
     assert all(notice.endswith(f"add --snapshot-root '{mine}'") for notice in found)
