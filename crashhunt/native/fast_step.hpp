@@ -1,10 +1,10 @@
 // Steps of SUMO in which nothing happens, each in one call. A part of core.cpp.
 //
-// An episode with one agent comes to this in most of its steps: it is shown what it was going to be shown, it answers a
-// speed or an acceleration, SUMO simulates, and nobody has come, gone, collided, changed roads, braked hard, stood for
-// long or come within reach. What Episode.step, BlackBox, SumoSimulator.step, Sight.look, SumoEvents.look and the oracles do about such a
-// step is done here, with the same records. Whatever else it turns out to be is handed back as soon as that is seen, and
-// nothing has been done by then that Python would do again.
+// Most steps of an episode with one agent are usual: the agent receives its observation and answers a speed or an
+// acceleration, and SUMO simulates. No vehicle comes into sight or leaves it, collides, changes roads, brakes hard,
+// stands for long or comes within reach. What Episode.step, BlackBox, SumoSimulator.step, Sight.look, SumoEvents.look
+// and the oracles do in such a step is done here, with the same records. Any other step is handed back as soon as that
+// is seen, and until then nothing has been done that Python would do again.
 
 enum Come { DONE, ASK, REFUSED, ANSWERED, SIMULATED };
 enum Takes { NEITHER, SPEED, ACCELERATION };

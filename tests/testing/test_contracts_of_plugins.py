@@ -370,7 +370,7 @@ class Loud(ReportedCollision):
     """Finds what no agent does."""
 
     def check(self, scene, agents):
-        return [Finding("red_light", event=Event("red_light", "nobody", ""))]
+        return [Finding("red_light", event=Event("red_light", "another", ""))]
 
 
 class Unnamed(Overlap):
