@@ -27,7 +27,8 @@ def _start(length, width):
     return ReactivePlanner(config)
 
 
-def _act(planner, wanted, seen):
+def _plan(planner, wanted, seen):
+    """Return x, y, heading and speed for now and each 0.1 s from now."""
     x, y, heading, speed, acceleration, yaw_rate, steering, length = seen["ego"][:8]
     turn, back, checker = np.array([np.cos(heading), np.sin(heading)]), 0.3 * length, CollisionChecker()
     route = np.array([row for row in seen["route"] if row[0]])
@@ -44,17 +45,23 @@ def _act(planner, wanted, seen):
     planner.set_desired_velocity(wanted, max(speed, 0.01))
     found = planner.plan()
     if found is None:  # brake
-        return [[0.1, *((x, y) + turn * max(0.0, 0.1 * speed - 0.04)), heading, max(0.0, speed - 0.8)]]
+        return [
+            [x, y, heading, speed],
+            [*((x, y) + turn * max(0.0, 0.1 * speed - 0.04)), heading, max(0.0, speed - 0.8)],
+        ]
     plan = [(one.position, one.orientation, max(0.0, one.velocity)) for one in found[0].state_list]
-    return [[0.1 * k, *(at + back * np.array([np.cos(h), np.sin(h)])), h, v] for k, (at, h, v) in enumerate(plan)]
+    return [[*(at + back * np.array([np.cos(h), np.sin(h)])), h, v] for at, h, v in plan]
 
 
 for message in map(json.loads, sys.stdin):
     answer = {"type": "ok"}
     if message["type"] == "hello":
-        planner, wanted = None, float(message["arguments"].get("desired_speed", 14))
+        planner, plan, age, wanted = None, [], 0, float(message["arguments"].get("desired_speed", 14))
         answer = {"type": "ready", "action": "trajectory", "observation": PARTS, "arguments": SPEED}
     elif message["type"] == "observe":
         planner = planner or _start(*message["observation"]["ego"][7:9])
-        answer = {"type": "act", "action": _act(planner, wanted, message["observation"])}
+        plan, age = plan[1:], age + 1
+        if age == planner.config.planning.replanning_frequency or len(plan) < 2:
+            plan, age = _plan(planner, wanted, message["observation"]), 0
+        answer = {"type": "act", "action": [[0.1 * k, *pose] for k, pose in enumerate(plan)]}
     print(json.dumps(answer), file=answers, flush=True)
