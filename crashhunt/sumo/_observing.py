@@ -23,15 +23,8 @@ from crashhunt.sumo._ego_and_actors import ActorsReader, EgoReader
 from crashhunt.sumo._free_motion import obstacle_outlines
 from crashhunt.sumo._lane_graph import USUAL_CLASS, lane_graph
 from crashhunt.sumo._reader_protocol import Places, ReaderSetup
-from crashhunt.sumo._road_readers import (
-    CrossingsReader,
-    LanesReader,
-    RightOfWayReader,
-    RouteReader,
-    RouteStateReader,
-    SpeedLimitReader,
-    StopLineReader,
-)
+from crashhunt.sumo._right_of_way_readers import CrossingsReader, RightOfWayReader, StopLineReader
+from crashhunt.sumo._road_readers import LanesReader, RouteReader, RouteStateReader, SpeedLimitReader
 from crashhunt.sumo._scene_readers import (
     ActorIdsReader,
     CovarianceReader,

@@ -138,6 +138,7 @@ _TESTS_ELSEWHERE = {
     "executors/_supervisor.py": ("executors/test_killed_trials.py", "executors/test_warm_traffics.py"),
     "executors/_trial_folder.py": ("executors/test_supervisors.py", "executors/test_killed_trials.py"),
     "executors/_time_limits.py": ("executors/test_last_words.py",),
+    "executors/_worker_environment.py": ("executors/test_new_processes.py",),
     "executors/_trial_process.py": ("executors/test_harms.py", "executors/test_warm_traffics.py"),
     "executors/ray": (
         "executors/test_ray_address.py",
@@ -205,6 +206,7 @@ _TESTS_ELSEWHERE = {
     "sumo/_observing.py": ("on_sumo/test_observed_parts.py",),
     "sumo/_reader_protocol.py": ("on_sumo/test_observed_parts.py",),
     "sumo/_lane_paths.py": ("on_sumo/test_observed_parts.py", "on_sumo/test_road_readers.py"),
+    "sumo/_right_of_way_readers.py": ("on_sumo/test_observed_parts.py", "on_sumo/test_road_readers.py"),
     "sumo/_scene_readers.py": ("on_sumo/test_observed_parts.py", "on_sumo/test_road_readers.py"),
     "sumo/_scripted.py": ("on_sumo/test_manoeuvres.py", "on_sumo/test_scripted.py"),
     "sumo/_fast_step.py": ("native/test_usual_steps.py",),

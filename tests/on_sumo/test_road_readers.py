@@ -16,7 +16,7 @@ libsumo = pytest.importorskip("libsumo")
 sumolib = pytest.importorskip("sumolib")
 
 from crashhunt.simulators import parse_parts  # noqa: E402
-from crashhunt.sumo import _road_readers as readers, _signal_readers  # noqa: E402
+from crashhunt.sumo import _right_of_way_readers, _road_readers as readers, _signal_readers  # noqa: E402
 from crashhunt.sumo._conflicts import Conflicts  # noqa: E402
 from crashhunt.sumo._lane_graph import LaneGraph  # noqa: E402
 from crashhunt.sumo._reader_protocol import Moment, Places, ReaderSetup  # noqa: E402
@@ -43,7 +43,7 @@ READERS = {
     "route_state": readers.RouteStateReader,
     "signals": _signal_readers.SignalsReader,
     "speed_limit": readers.SpeedLimitReader,
-    "stop_line": readers.StopLineReader,
+    "stop_line": _right_of_way_readers.StopLineReader,
     "time_to_switch": _signal_readers.SwitchTimesReader,
 }
 
