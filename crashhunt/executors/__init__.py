@@ -16,10 +16,12 @@ if TYPE_CHECKING:
         HasNodes as HasNodes,
         NodeFigures as NodeFigures,
         make_executor as make_executor,
-        snapshot_environment as snapshot_environment,
-        worker_environment as worker_environment,
     )
     from ._supervisor import Supervisor as Supervisor
     from ._trial_process import EXCLUDED_WORDS as EXCLUDED_WORDS
+    from ._worker_environment import (
+        snapshot_environment as snapshot_environment,
+        worker_environment as worker_environment,
+    )
 
 offer_lazily(__name__)

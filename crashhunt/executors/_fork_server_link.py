@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import describe_death
-from crashhunt.executors._protocol import ForkServerJob, FromForkServer, snapshot_environment, worker_environment
 from crashhunt.executors._time_limits import import_died
+from crashhunt.executors._worker_environment import snapshot_environment, worker_environment
 
 if TYPE_CHECKING:
     from crashhunt.episode import WorkerSettings
+    from crashhunt.executors._protocol import ForkServerJob, FromForkServer
 
 
 _MAX_MESSAGE_BYTES = 1 << 16  # bytes, as in _fork_server

@@ -29,7 +29,7 @@ from crashhunt.executors._fork_server import be_zygote
 from crashhunt.executors._host_conditions import HostConditions
 from crashhunt.executors._postmortem import TrialAttempt, hung, result_of_death, where_it_is
 from crashhunt.executors._preparation import import_nothing, import_parts
-from crashhunt.executors._protocol import Answer, FreshJob, Notes, snapshot_environment
+from crashhunt.executors._protocol import Answer, FreshJob, Notes
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError, with_escape
 from crashhunt.executors._time_limits import (
     START_UP_S,
@@ -39,6 +39,7 @@ from crashhunt.executors._time_limits import (
     has_hung,
     import_died,
 )
+from crashhunt.executors._worker_environment import snapshot_environment
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import WorkerSettings, answer_file, scratch_of
-from crashhunt.executors import PoolExecutor, _fork_server_link, _fresh, _pool, _protocol
+from crashhunt.executors import PoolExecutor, _fork_server_link, _fresh, _pool, _worker_environment
 from crashhunt.executors._fresh import FreshProcessExecutor
 from crashhunt.executors._postmortem import TrialAttempt
 from crashhunt.executors._supervisor import EndedTrial, LostTrialError, UnfitZygoteError
@@ -285,7 +285,7 @@ def test_code_below_a_folder_with_a_colon_is_imported_through_a_link(settings, m
     code.mkdir(parents=True)
     (code / "twelve_thirty.py").write_text("print('imported')")
     for _ in range(2):  # in the second process, the link exists
-        found = _protocol.snapshot_environment(replace(settings, code=(str(code),)))
+        found = _worker_environment.snapshot_environment(replace(settings, code=(str(code),)))
         ran = subprocess.run([sys.executable, "-m", "twelve_thirty"], env=found, capture_output=True, text=True)
         assert (ran.stdout, ran.stderr) == ("imported\n", "")
 
@@ -293,7 +293,7 @@ def test_code_below_a_folder_with_a_colon_is_imported_through_a_link(settings, m
 def test_code_of_a_snapshot_is_compiled_outside_of_it_and_few_are_kept(settings, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", "/mine")
-    plain = _protocol.snapshot_environment(settings)
+    plain = _worker_environment.snapshot_environment(settings)
     assert plain["PYTHONPATH"] == "/mine"
     assert plain["PYTHONHASHSEED"] == "0"
     assert {plain[f"{name}_NUM_THREADS"] for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")} == {"1"}
@@ -302,13 +302,13 @@ def test_code_of_a_snapshot_is_compiled_outside_of_it_and_few_are_kept(settings,
         (compiled / f"{number}").mkdir(parents=True)
         os.utime(compiled / f"{number}", (number, number))
     ours = replace(settings, code=("/hunt/snapshots/abc/snapshots/0f/code", "/more"))
-    found = _protocol.snapshot_environment(ours)
+    found = _worker_environment.snapshot_environment(ours)
     assert found["PYTHONPATH"] == os.pathsep.join((*ours.code, "/mine"))
     assert found["PYTHONPYCACHEPREFIX"] == str(compiled / "0f")
     assert found["PYTHONDONTWRITEBYTECODE"] == ""
     assert {path.name for path in compiled.iterdir()} == {"0f", *(str(number) for number in range(5, 20))}
     for other in (replace(ours, code=("/elsewhere/code",)), replace(ours, sealed=())):
-        found = _protocol.snapshot_environment(other)
+        found = _worker_environment.snapshot_environment(other)
         assert found["PYTHONDONTWRITEBYTECODE"] == "1"
         assert found.get("PYTHONPYCACHEPREFIX") == os.environ.get("PYTHONPYCACHEPREFIX")
 
