@@ -6,7 +6,7 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._comparison_text import comparison_page as comparison_page, describe_comparison as describe_comparison
-    from ._crash_text import Story as Story
+    from ._crash_text import Story as Story, describe_note as describe_note
     from ._findings import (
         corpus_annotations as corpus_annotations,
         corpus_summary as corpus_summary,
@@ -71,8 +71,7 @@ if TYPE_CHECKING:
         describe_hunt as describe_hunt,
         describe_replay as describe_replay,
     )
-    from ._words import (
-        describe_note as describe_note,
+    from ._version_words import (
         describe_types_by_version as describe_types_by_version,
         describe_versions as describe_versions,
     )

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.text import aligned, count_of, format_number, format_time, in_lines
+from crashhunt.base.text import aligned, count_of, format_number, format_time, in_lines, one_line
 from crashhunt.crashes import (
     Encounter,
     contact_record,
@@ -23,37 +23,38 @@ from crashhunt.crashes import (
     subject_of,
 )
 from crashhunt.recording import describe_value, is_opaque
-from crashhunt.report._headline import verdict_of
-from crashhunt.report._live_screen import draw_signals, format_inputs, input_signals
-from crashhunt.report._step_table import NEAREST, TableCell, stacked, steps_table
-from crashhunt.report._words import (
+from crashhunt.report._cause_words import about_why
+from crashhunt.report._disturbance_words import about_disturbances
+from crashhunt.report._encounter_words import (
     COLUMNS,
     MAX_STANDING_SPEED_MPS,
-    NOT_DECIDED,
-    about_changes,
     about_danger,
-    about_disturbances,
-    about_drivers,
     about_events,
     about_gap,
-    about_judgement,
     about_nearest,
     about_place,
-    about_reference,
-    about_why,
     danger_cells,
     danger_to_json,
-    describe_note,
     nearest_to_json,
     window_of,
 )
+from crashhunt.report._headline import verdict_of
+from crashhunt.report._judgement_words import (
+    NOT_DECIDED,
+    about_changes,
+    about_drivers,
+    about_judgement,
+    about_reference,
+)
+from crashhunt.report._live_screen import draw_signals, format_inputs, input_signals
+from crashhunt.report._step_table import NEAREST, TableCell, stacked, steps_table
 from crashhunt.simulators import TRAJECTORY_SHAPE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from crashhunt.base.binaries import BinaryFacts
-    from crashhunt.crashes import Bundle, Moment
+    from crashhunt.crashes import Bundle, Moment, Note
     from crashhunt.recording import StepRecord
 
 _MAX_ACTION_CHARACTERS = 60  # of an action that is no array of numbers
@@ -512,3 +513,17 @@ def _steps_around(steps: list[StepRecord], rows: int, middle: int) -> list[StepR
     """Return about `rows` evenly spaced steps that include the step in the middle."""
     every = math.ceil(len(steps) / rows)
     return [step for step in steps if (step.step - middle) % every == 0]
+
+
+_MAX_NOTE_CHARACTERS = 200  # of a note in one line
+
+
+def describe_note(note: Note, *, whole: bool = True) -> str:
+    """Return a note as one line; unless the whole note is wanted, the middle of a long text is omitted."""
+    about = f" on {note.crash}" if note.crash else ""
+    tags = "".join(f" #{tag}" for tag in note.tags)
+    text = one_line(note.text)
+    if not whole and len(text) > _MAX_NOTE_CHARACTERS:
+        half = _MAX_NOTE_CHARACTERS // 2
+        text = f"{text[:half]} … {text[-half:]}"
+    return one_line(f"note {note.number}{about} ({note.by}, {note.at}):{' ' if text else ''}{text}{tags}")

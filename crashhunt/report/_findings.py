@@ -18,7 +18,7 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.text import command_line, count_of, one_line
 from crashhunt.base.version import __version__
 from crashhunt.crashes import own_frames
-from crashhunt.report._words import fault_words, list_preventing
+from crashhunt.report._judgement_words import fault_words, list_preventing
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:

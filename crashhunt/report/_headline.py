@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from crashhunt.report._words import describe_instead
+from crashhunt.report._judgement_words import describe_instead
 from crashhunt.world import is_person, lane_jump
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.text import aligned, command_line, count_of
 from crashhunt.crashes import COMPETENT_DRIVERS
+from crashhunt.report._judgement_words import DRIVER_NAMES
 from crashhunt.report._page import player_parts
-from crashhunt.report._words import DRIVER_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -9,18 +9,17 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.text import aligned, command_line, count_of, in_lines, out_of
 from crashhunt.crashes import count_causes, join_causes
-from crashhunt.report._live_screen import describe_types, format_arguments, format_inputs, format_seconds
-from crashhunt.report._rate_text import describe_rates
-from crashhunt.report._words import (
+from crashhunt.report._disturbance_words import (
     by_likelihood,
     describe_branches,
     describe_disturbances,
     describe_probes,
-    describe_versions,
-    fault_words,
     list_disturbances,
-    list_preventing,
 )
+from crashhunt.report._judgement_words import fault_words, list_preventing
+from crashhunt.report._live_screen import describe_types, format_arguments, format_inputs, format_seconds
+from crashhunt.report._rate_text import describe_rates
+from crashhunt.report._version_words import describe_versions
 from crashhunt.world import event_counts
 
 if TYPE_CHECKING:

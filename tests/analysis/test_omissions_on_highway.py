@@ -16,7 +16,7 @@ from crashhunt.highway import HighwaySimulator
 from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.oracles import OffRoad, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, read_black_box
-from crashhunt.report._words import about_reference
+from crashhunt.report._judgement_words import about_reference
 from crashhunt.scenario import AgentSetup, ObservationSetup, Scenario
 from crashhunt.trial import Outcome, Overruled, TrialSpec
 from crashhunt.trial_reruns import EndedRun

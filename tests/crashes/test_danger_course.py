@@ -11,7 +11,7 @@ import pytest
 
 from crashhunt.crashes import closest_actors, danger_course, most_dangerous
 from crashhunt.recording import Prologue, StepRecord
-from crashhunt.report._words import about_danger
+from crashhunt.report._encounter_words import about_danger
 from crashhunt.world import Actor, Roster, Scene
 
 CARS = tuple(Actor(name, "car", 5.0, 2.0) for name in ("ego", "ahead"))

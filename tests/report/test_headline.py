@@ -23,7 +23,7 @@ from crashhunt.crashes import (
 from crashhunt.crashes._contact_record import record_in
 from crashhunt.report._crash_text import _cells
 from crashhunt.report._headline import describe_contact, last_avoidable, verdict_of
-from crashhunt.report._words import about_drivers, about_reference
+from crashhunt.report._judgement_words import about_drivers, about_reference
 from crashhunt.trial import Collision, Escape
 from crashhunt.world import Actor, Roster, Scene
 

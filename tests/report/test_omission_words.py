@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from crashhunt.crashes import Omission, Reference, ReferenceRun
-from crashhunt.report._words import about_reference
+from crashhunt.report._judgement_words import about_reference
 
 
 def said(faculty="longitudinal", endings=("none", "none", "none"), changed=(), **more):

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 from crashhunt.hunts._reports import BranchReport, ProbeReport
 from crashhunt.ledger import Ledger
+from crashhunt.report._disturbance_words import describe_branches, describe_probes
 from crashhunt.report._page import _trials
-from crashhunt.report._words import describe_branches, describe_probes
 from crashhunt.trial import Outcome, Stress, TrialResult, TrialSpec
 
 WHY = "a copy was killed by SIGKILL"

@@ -15,9 +15,11 @@ from crashhunt.hunts import AuditReport, HuntReport
 from crashhunt.plans import HuntSettings, RunSettings
 from crashhunt.recording import Phase
 from crashhunt.report import describe_hunt, describe_replay, describe_versions
+from crashhunt.report._disturbance_words import about_disturbances
+from crashhunt.report._encounter_words import about_events
+from crashhunt.report._judgement_words import fault_words
 from crashhunt.report._listing import describe
 from crashhunt.report._live_screen import _workers
-from crashhunt.report._words import about_disturbances, about_events, fault_words
 from crashhunt.trial import Collision, Disturbance, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Event
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from crashhunt.crashes import Attempt, Factor, Judgement, LeftOut, Why
-from crashhunt.report._words import about_judgement, about_why
+from crashhunt.report._cause_words import about_why
+from crashhunt.report._judgement_words import about_judgement
 
 
 @pytest.mark.parametrize("drawn", [(), ("unclear", "unclear")])
