@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.process_owners import this_process
 from crashhunt.base.processes import die_with
 from crashhunt.base.signals import describe_death
-from crashhunt.base.temporary import temporary_beside, temporary_folder, this_process
+from crashhunt.base.temporary import temporary_beside, temporary_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -15,7 +15,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.foreign_code import Boundary, Party, is_ours, supports
 from crashhunt.base.plugins import add_current_folder, import_module, locate
 from crashhunt.base.sandbox import confine
-from crashhunt.base.temporary import record_shared_memory
+from crashhunt.base.shared_memory import record_shared_memory
 from crashhunt.episode._blame import internal_error
 from crashhunt.episode._episode import seed_everything
 from crashhunt.episode._failures import record_originals

@@ -37,8 +37,8 @@ from crashhunt.base.forks import ended
 from crashhunt.base.plugins import locate
 from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill, resume
 from crashhunt.base.resources import limit_behind
+from crashhunt.base.shared_memory import SharedMemoryWatch
 from crashhunt.base.signals import is_sent_from_outside
-from crashhunt.base.temporary import SharedMemoryWatch
 from crashhunt.episode import WorkerSettings, require_origin, seal, stage_of
 from crashhunt.executors._host_conditions import HostConditions
 from crashhunt.executors._preparation import Imported, import_nothing, import_parts

@@ -22,9 +22,9 @@ from crashhunt.base.exceptions import INSTALLED_FOLDERS, is_users
 from crashhunt.base.foreign_code import supports
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.opened_files import OpenedFiles
+from crashhunt.base.shared_memory import begin_records, end_records
 from crashhunt.base.shared_state import SharedState
 from crashhunt.base.signals import block_signals
-from crashhunt.base.temporary import begin_records, end_records
 from crashhunt.base.text import command_line
 from crashhunt.episode import (
     BUDGET,

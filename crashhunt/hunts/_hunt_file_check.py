@@ -12,8 +12,8 @@ from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError, remedy
 from crashhunt.base.older_versions import HOW_TO_READ
+from crashhunt.base.process_owners import has_ended, owner_in
 from crashhunt.base.resources import error_of_next_files, limit_behind
-from crashhunt.base.temporary import has_ended, owner_in
 from crashhunt.crashes import Bundle, read_bundle, read_params, unreadable_notes
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import HuntSettings, read_settings

@@ -12,12 +12,8 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError
 from crashhunt.base.files import whole_file
-from crashhunt.base.temporary import (
-    remove_ended,
-    remove_scratch,
-    temporary_beside,
-    this_process,
-)
+from crashhunt.base.process_owners import this_process
+from crashhunt.base.temporary import remove_ended, remove_scratch, temporary_beside
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import HuntSettings, read_settings, write_settings
 from crashhunt.results._hunt_state import is_hunt

@@ -15,11 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 from crashhunt.base import layout
 from crashhunt.base.codec import OMIT_DEFAULT, JsonObject, Serializable, written_if
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.base.temporary import (
-    owner_in,
-    start_time,
-    this_process,
-)
+from crashhunt.base.process_owners import owner_in, start_time, this_process
 from crashhunt.base.text import command_line, near_path
 from crashhunt.crashes import Note, crash_folders, read_notes
 from crashhunt.ledger import KindData, Ledger, RunningRate, damaged, has_begun

@@ -32,7 +32,8 @@ from crashhunt.base.files import put_in_place, sync_folder, sync_tree
 from crashhunt.base.git import query
 from crashhunt.base.integrity import FileEntry, describe_files, digest_of_content, digest_of_data, digest_of_file
 from crashhunt.base.opened_files import output_files
-from crashhunt.base.temporary import remove_ended, temporary_beside, this_process
+from crashhunt.base.process_owners import this_process
+from crashhunt.base.temporary import remove_ended, temporary_beside
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, load_order_of
 from crashhunt.snapshots._environment import Environment, differing_versions, environment

@@ -50,6 +50,8 @@ _TESTS_ELSEWHERE = {
     "base/doors.py": ("test_public_face.py",),
     "base/errors.py": ("base/test_exception_text.py", "requirements/test_language.py"),
     "base/library_probe.py": ("agents/test_library_agents.py", "base/test_binaries.py"),
+    "base/process_owners.py": ("base/test_temporary.py",),
+    "base/shared_memory.py": ("base/test_temporary.py",),
     "base/text.py": ("base/test_text.py", "report/test_table.py"),
     "base/foreign_code.py": ("base/test_scalars.py", "episode/test_blame.py", "episode/test_probes_of_a_trial.py"),
     "base/exceptions.py": ("base/test_exception_text.py", "episode/test_episode_cases.py"),

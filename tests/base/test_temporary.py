@@ -22,24 +22,20 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.base import temporary, temporary as segments
+from crashhunt.base import process_owners, shared_memory as segments, temporary
 from crashhunt.base.files import exchange, put_in_place, whole_file
+from crashhunt.base.process_owners import OwnerProcess, has_ended, owner_in, start_time, this_process
 from crashhunt.base.temporary import (
-    OwnerProcess,
     TemporaryFolder,
-    has_ended,
     new_folder,
-    owner_in,
     remove_at_once,
     remove_ended,
     remove_leftovers,
     remove_scratch,
     remove_tree,
-    start_time,
     temporary_beside,
     temporary_folder,
     temporary_name,
-    this_process,
 )
 
 KEPT: list[object] = []  # what is lost is removed
@@ -237,7 +233,7 @@ def test_a_process_id_that_was_given_to_another_process_is_not_taken_for_the_own
 def test_a_process_that_proc_does_not_show_counts_as_alive(monkeypatch):
     other = OwnerProcess(os.getppid(), 5, this_process().boot, this_process().namespace)
     assert has_ended(other)
-    monkeypatch.setattr(temporary, "start_time", lambda pid: -1)
+    monkeypatch.setattr(process_owners, "start_time", lambda pid: -1)
     assert not has_ended(other)
 
 
@@ -259,7 +255,7 @@ def test_what_another_host_boot_or_container_has_stays(place, field):
 def test_where_a_process_does_not_know_itself_it_removes_nothing_of_others(place, monkeypatch):
     here = this_process()
     with monkeypatch.context() as patched, fresh():
-        patched.setattr(temporary, "_BOOT_ID", "/nowhere")
+        patched.setattr(process_owners, "_BOOT_ID", "/nowhere")
         assert this_process().boot == "0" * 12
         folder = owned(place, OwnerProcess(here.pid, 1, here.boot, here.namespace))
         unknown = owned(place, OwnerProcess(here.pid + 1, 0, "0" * 12, "0" * 8))
@@ -275,13 +271,13 @@ def test_where_a_process_does_not_know_itself_it_removes_nothing_of_others(place
 @contextmanager
 def fresh():
     """Nothing is remembered of this process, before and after."""
-    temporary._owner.cache_clear()
-    temporary._boot.cache_clear()
+    process_owners.owner_of.cache_clear()
+    process_owners.boot_id.cache_clear()
     try:
         yield
     finally:
-        temporary._owner.cache_clear()
-        temporary._boot.cache_clear()
+        process_owners.owner_of.cache_clear()
+        process_owners.boot_id.cache_clear()
 
 
 def ended() -> OwnerProcess:
@@ -378,7 +374,7 @@ def test_a_kernel_without_time_namespaces_has_owners_too(tmp_path, monkeypatch):
     before = this_process()
     (tmp_path / "pid").symlink_to(os.readlink("/proc/self/ns/pid"))  # noqa: PTH115 - it is no path
     with monkeypatch.context() as patched, fresh():
-        patched.setattr(temporary, "_NAMESPACE_FOLDER", str(tmp_path))
+        patched.setattr(process_owners, "_NAMESPACE_FOLDER", str(tmp_path))
         here = this_process()
         assert (here.pid, here.started, here.boot) == (before.pid, before.started, before.boot)
         assert here.namespace not in (before.namespace, "0" * 8)
@@ -696,7 +692,7 @@ def test_shared_memory_of_programs_that_a_trial_started_goes_and_that_of_others_
         ours = start(f"/{name}-before", f"/{name}-ours", f"/{name}-both")
         other = start(f"/{name}-theirs", f"/{name}-both")
         below = [program.pid for program in programs if program is not other]
-        monkeypatch.setattr(temporary, "descendants_of", lambda pid: below if pid == os.getpid() else [])
+        monkeypatch.setattr(segments, "descendants_of", lambda pid: below if pid == os.getpid() else [])
         watch.look()
         ours.kill()
         ours.wait()
@@ -806,10 +802,10 @@ def test_existing_folder_stays_itself_and_receives_the_contents(tmp_path, monkey
 
 def test_owner_of_records_is_known_before_a_fork_that_may_outlive_it(monkeypatch):
     with monkeypatch.context() as patched, fresh():
-        patched.setattr(temporary, "_recording_process", [os.getpid()])
-        temporary._know_owner()
-        patched.setattr(temporary, "start_time", lambda _: 0)  # the process of the trial has ended
-        assert temporary._owner(os.getpid()).started > 0
+        patched.setattr(segments, "_recording_process", [os.getpid()])
+        segments._know_owner()
+        patched.setattr(process_owners, "start_time", lambda _: 0)  # the process of the trial has ended
+        assert process_owners.owner_of(os.getpid()).started > 0
 
 
 def test_folder_that_is_lost_while_another_is_made_is_removed():

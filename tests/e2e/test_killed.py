@@ -23,7 +23,8 @@ from conftest import keeps_going, mostly_nightly, wait_for
 from repositories import git
 
 from crashhunt.base.git import run_to_end
-from crashhunt.base.temporary import OwnerProcess, owner_in, remove_leftovers, remove_tree, start_time, this_process
+from crashhunt.base.process_owners import OwnerProcess, owner_in, start_time, this_process
+from crashhunt.base.temporary import remove_leftovers, remove_tree
 from crashhunt.corpus import _bisection as _bisect
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError

@@ -32,8 +32,9 @@ from repositories import git
 from test_corpus import DRIVER, MENDED
 from test_killed import processes_of
 
+from crashhunt.base.process_owners import owner_in
 from crashhunt.base.processes import children_of
-from crashhunt.base.temporary import owner_in, remove_tree
+from crashhunt.base.temporary import remove_tree
 from crashhunt.scenario import shipped_folder
 
 if TYPE_CHECKING:

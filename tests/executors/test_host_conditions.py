@@ -11,7 +11,7 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HostError
-from crashhunt.base.temporary import this_process
+from crashhunt.base.process_owners import this_process
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import HostConditions, _host_conditions
 from crashhunt.scenario import AgentSetup, Scenario

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.integrity import digest_of_data
-from crashhunt.base.temporary import this_process
+from crashhunt.base.process_owners import this_process
 from crashhunt.crashes import export_crash, find_bundle
 from crashhunt.errors import BundleError, CrashhuntError, HuntDirectoryError
 from crashhunt.hunts import check, salvage

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base import layout
-from crashhunt.base.temporary import this_process
+from crashhunt.base.process_owners import this_process
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings
