@@ -183,7 +183,7 @@ class FreeMotion:
             return
         if self._pursues:
             gap = min(math.dist(point[1:3], (state.x, state.y)) for point in self._in_map(action).tolist())
-            reach = _MAX_GAP_M + values[0][0] * values[0][4]  # the vehicle has yet to drive to a first point in future
+            reach = _MAX_GAP_M + values[0][0] * max(state.speed, values[0][4])  # it may have yet to drive to the first
             if gap > reach:
                 message = f"the trajectory is {gap:.1f} m away from the vehicle"
                 raise ActionError(message, fix=f"return a point within {reach:.1f} m")

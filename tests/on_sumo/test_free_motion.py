@@ -547,10 +547,12 @@ def test_pursuit_reaches_the_speed_of_a_later_first_point_at_its_time(start):
 def test_pursued_trajectory_that_is_elsewhere_is_refused(start):
     simulator, _ = start("trajectory:frame=ego:tracker=pure_pursuit", **EMPTY)
     simulator.actions["ego"].encode([[0.1, 4.0, 2.9, 0.0, 5.0]])
-    with pytest.raises(ActionError, match=r"the trajectory is 6\.0 m away from the vehicle") as caught:
-        simulator.actions["ego"].encode([[0.1, 6.0, 0.0, 0.0, 5.0]])
-    assert caught.value.fix == "return a point within 5.5 m"
+    with pytest.raises(ActionError, match=r"the trajectory is 8\.0 m away from the vehicle") as caught:
+        simulator.actions["ego"].encode([[0.1, 8.0, 0.0, 0.0, 5.0]])
+    speed = simulator._driving.moving["ego"].state.speed
+    assert caught.value.fix == f"return a point within {5 + 0.1 * speed:.1f} m"
     simulator.actions["ego"].encode([[0.5, 10.0, 0.0, 0.0, 20.0], [1.0, 20.0, 0.0, 0.0, 20.0]])  # of a coarse planner
+    simulator.actions["ego"].encode([[2.0, speed, 0.0, 0.0, 0.0]])  # which stops in 2 s
 
 
 def drive_to(motion, *pose):
