@@ -61,7 +61,7 @@ def environment(imported: ImportedModules | None = None) -> Environment:
     loaded: set[str] = set()
     for distribution in installed():
         name, version, theirs = _facts_of(distribution)
-        if not name:
+        if not name or name in distributions:  # of two versions, the first is the one that is imported
             continue
         distributions[name] = version
         if name in named or not modules.isdisjoint(theirs):

@@ -12,7 +12,7 @@ def test_distributions_and_those_that_are_loaded_are_what_importlib_states():
     import_module("numpy")  # which other tests have imported, where there are any
     found = environment()
     assert found["distributions"] == {
-        distribution.metadata["Name"]: distribution.version for distribution in metadata.distributions()
+        name: metadata.version(name) for name in {one.metadata["Name"] for one in metadata.distributions()}
     }
     owners = metadata.packages_distributions()
     imported = {owner for name in list(sys.modules) for owner in owners.get(name, ())}
@@ -22,6 +22,19 @@ def test_distributions_and_those_that_are_loaded_are_what_importlib_states():
     assert set(found["loaded"]) == imported | found["versions"].keys() - {"python"}
     for name in ("crashhunt", "numpy", "libsumo"):
         assert versions()[name] == found["distributions"][name] == metadata.version(name)
+
+
+def test_of_two_versions_the_one_that_is_imported_is_recorded(tmp_path, monkeypatch):
+    (tmp_path / "numpy-99.0.dist-info").mkdir()
+    (tmp_path / "numpy-99.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: numpy\nVersion: 99.0\n")
+    recorded = environment()
+    monkeypatch.syspath_prepend(tmp_path)
+    found = environment()
+    assert found["distributions"]["numpy"] == found["versions"]["numpy"] == metadata.version("numpy") == "99.0"
+    assert environment_changes(found) == {}
+    assert environment_changes(recorded) == {"numpy": (recorded["distributions"]["numpy"], "99.0")}
+    monkeypatch.setattr(sys, "path", [*sys.path[1:], sys.path[0]])
+    assert environment() == recorded
 
 
 def test_another_version_than_it_was_is_reported():
