@@ -22,9 +22,10 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Noted, Row
     from crashhunt.plans import HuntSettings
 
-# How the copied trials were drawn, which their rows do not show. Without its sampler's version, a hunt cannot resume.
+# How the copied trials were drawn, and which of them wait for their audit, which their rows do not show. Without its
+# sampler's version, a hunt cannot resume.
 _KEPT_FACTS = frozenset((
-    "code_versions", "crash_on", "disturb", "independent", "lag", "origins", "plain_origin", "replanned",
+    "audits_left", "code_versions", "crash_on", "disturb", "independent", "lag", "origins", "plain_origin", "replanned",
     "sampler_version", "under_way",
 ))  # fmt: skip
 _DROPPED_FACTS = frozenset(("dropped", "dropped_at_fault", "dropped_judged"))  # about crashes without a bundle

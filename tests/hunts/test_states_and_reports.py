@@ -310,8 +310,8 @@ def test_salvaged_hunt_keeps_that_its_number_of_trials_was_changed_or_is_not_kno
         assert ledger.facts()["replanned"] is True
 
 
-def test_salvaged_hunt_keeps_how_its_trials_were_drawn(hunt, tmp_path):
-    drawn = {"sampler_version": 5, "lag": 32, "independent": False, "plain_origin": "random"}
+def test_salvaged_hunt_keeps_how_its_trials_were_drawn_and_which_wait_for_their_audit(hunt, tmp_path):
+    drawn = {"sampler_version": 5, "lag": 32, "independent": False, "plain_origin": "random", "audits_left": [2]}
     drawn |= {"under_way": 4, "code_versions": {"snapshots": [["0f"], ["1f"]], "newest": 1, "first": 2}}
     with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
         ledger.note(**drawn, newest_kind=1.0)
