@@ -302,9 +302,10 @@ def group_crashes(
         try:
             recording = bundle.recording() if bundle.result.collision is not None else None
             record = contact_record(bundle, recording)
-            signed.append((signature_of(bundle, recording, record), bundle))
+            signature = signature_of(bundle, recording, record)
             if faults:
                 verdicts[bundle.path] = fault_of(bundle, recording, record).verdict
+            signed.append((signature, bundle))
         except BundleError as error:
             unsigned.append(str(error))
     groups = groups_of(signed, dropped)

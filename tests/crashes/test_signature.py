@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.crashes import Signature, group_crashes, signature_of
+from crashhunt.crashes import Bundle, Signature, group_crashes, signature_of
 from crashhunt.trial import UNUSABLE_VALUE, Disturbance, Failure, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Event
 
@@ -52,6 +52,14 @@ def test_software_faults_are_the_same_where_exception_and_functions_are():
     assert str(signature_of(other)).startswith("ZeroDivisionError in test_signature.py:divides")
     groups = group_crashes([other, one, again]).groups
     assert [[member.id for member in group.bundles] for group in groups] == [["b0", "b1"], ["b2"]]
+
+
+def test_crash_whose_log_is_lost_has_no_group(tmp_path):
+    event = Event(kind="red_light", agent="ego", what="ran a red light")
+    lost = Bundle(tmp_path, TrialResult(SPEC, Outcome("red_light"), 50, event=event), 1, "abc")
+    found = group_crashes([lost, bundle(1, outcome=Outcome.HANG)])
+    assert [group.bundles[0].id for group in found.groups] == ["b1"]
+    assert str(tmp_path) in found.left_out[0]
 
 
 def test_the_stack_of_a_stuck_process_begins_with_the_innermost_function():
