@@ -206,12 +206,17 @@ class LaneMap:
         return False
 
     def is_over_side(self, pose: tuple[NDArray[np.float64], float], half_width: float) -> bool:
-        """Return whether an actor reaches over the side of the lane on which it drives.
+        """Return whether an actor reaches over the side of the lane on which it drives, or into which it reaches.
 
         The pose is the centre, in m, and the heading, in rad. The half width is in m.
         """
+        point, heading = pose
         lane = self._driven(pose)
-        return lane is not None and abs(lane.place(pose[0]).aside_m) + half_width - lane.half_width >= _OVER_M
+        if lane is None:  # its centre is next to its lane
+            places = ((near.place(point), near.half_width) for near in self._lanes)
+            over = (abs(place.aside_m) - own for place, own in places if place.inside and _is_along(place, heading))
+            return min(over, default=half_width) < half_width
+        return abs(lane.place(point).aside_m) + half_width - lane.half_width >= _OVER_M
 
     def reached_since(self, scenes: Sequence[Scene], actor: str, pose: tuple[NDArray[np.float64], float]) -> int | None:
         """Return the index of the scene since which the outline of an actor has always reached into a lane.
