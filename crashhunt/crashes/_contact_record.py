@@ -52,6 +52,7 @@ _BEFORE_S = 1.0  # as long as the first half of a lane change takes
 _SIDEWAYS_M = 0.3  # less is drifting
 _MAX_STRAIGHT_TURN_RAD = math.radians(10)
 _DRIFTS_M = 0.1
+_OVER_M = 0.1  # less is a rounding error of the map
 _ACROSS_M = 50.0  # from the line of a junction to where it ends; there are larger ones
 _BEND_M = 0.4  # with it, an actor on the neighbouring lane is still not in the way: its centre is more than 2 m away
 _MAX_ASIDE_M, _MIN_OVERLAP_M = 1.5, 0.3  # across the lane, of a follower that does not drive in its middle
@@ -498,14 +499,44 @@ class ContactRecord:
 
         ``back`` is the index of a time before the contact; None for the time of the contact.
         """
-        way = self.way(actor)
-        x, y, heading = (
-            (*self._at_contact(actor)[0], self._at_contact(actor)[1])
-            if back is None
-            else (*way.centers[back], way.headings[back])
+        center, heading = self._pose(actor, back)
+        return self._is_against(actor, center, heading)
+
+    def reaches_oncoming_lane(self, actor: str, back: int | None = None) -> bool:
+        """Return whether an actor reached more than 0.1 m into lanes that only lead in the opposite direction."""
+        _, heading = self._pose(actor, back)
+        return any(self._is_against(actor, point, heading) for point in self._outline(actor, back, _OVER_M))
+
+    def is_inside_its_lanes(self, actor: str) -> bool:
+        """Return whether the outline of an actor was wholly in lanes of its direction at the contact.
+
+        Places where lanes cross do not count.
+        """
+        _, heading = self._pose(actor, None)
+        return all(
+            self._is_against(actor, point, heading) is False
+            and not self.lanes.cross((float(point[0]), float(point[1])))
+            for point in self._outline(actor, None)
         )
+
+    def _pose(self, actor: str, back: int | None) -> tuple[NDArray[np.float64], float]:
+        """Return the centre of an actor, in m, and its heading, in rad."""
+        way = self.way(actor)
+        return self._at_contact(actor) if back is None else (way.centers[back], float(way.headings[back]))
+
+    def _outline(self, actor: str, back: int | None, inset_m: float = 0.0) -> NDArray[np.float64]:
+        """Return the corners of an actor and the middles of its sides, each nearer to its axis by a distance."""
+        center, heading = self._pose(actor, back)
+        way = self.way(actor)
+        ahead, left = np.array([[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]])
+        return np.array([
+            center + along * way.length * ahead + side * (way.width / 2 - inset_m) * left
+            for along in (-0.5, 0.0, 0.5) for side in (-1, 1)
+        ])  # fmt: skip
+
+    def _is_against(self, actor: str, point: NDArray[np.float64], heading: float) -> bool | None:
         course = heading + math.pi if self.reverses(actor) else heading
-        return self.lanes.is_against((float(x), float(y)), float(course))
+        return self.lanes.is_against((float(point[0]), float(point[1])), float(course))
 
     def reverses(self, actor: str) -> bool:
         """Return whether an actor last moved backwards."""

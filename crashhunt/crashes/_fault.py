@@ -106,7 +106,7 @@ def _red_light(case: ContactRecord) -> FaultFinding | None:
 
 
 def _wrong_way(case: ContactRecord) -> FaultFinding | None:
-    """Blame the vehicle that drove against the direction of its lane, as when it overtakes on the opposite lane."""
+    """Blame the vehicle that drove, wholly or partly, on the oncoming lane, as when it overtakes there."""
     if case.same_way:
         return None
     against = {actor: case.is_against_its_lane(actor) for actor in (case.agent, case.other)}
@@ -115,7 +115,9 @@ def _wrong_way(case: ContactRecord) -> FaultFinding | None:
             if against[event.agent] is False or against[case.partner(event.agent)]:
                 continue  # it has returned to a lane of its direction
             return _blaming(case, event.agent, "wrong way", event.what, _SOURCES["wrong_way"])
-    wrong = [actor for actor, is_wrong in against.items() if is_wrong]
+    wholly = any(against.values())
+    is_wrong = case.is_against_its_lane if wholly else case.reaches_oncoming_lane
+    wrong = [actor for actor in against if is_wrong(actor)]
     if len(wrong) != 1 or not case.is_oncoming:
         return None
     (driver,) = wrong
@@ -125,11 +127,17 @@ def _wrong_way(case: ContactRecord) -> FaultFinding | None:
         return None  # a vehicle that stands may be parked, and a place to park has no direction
     if any(case.is_against_its_lane(other, back) is not False for back in (None, *lately)):
         return None  # it may have come there from another road, or have been on the wrong side as well
+    strays = case.is_over_side(other) if wholly else not case.is_inside_its_lanes(other)
+    if strays or (not wholly and any(case.reaches_oncoming_lane(other, back) for back in lately)):
+        return None
     since = lately[-1]
-    while since >= lately[0] and case.is_against_its_lane(driver, since):
+    while since >= lately[0] and is_wrong(driver, since):
         since -= 1
     since_s = float(case.times[since + 1]) if since < lately[-1] else 0.0
     when = f"for the last {since_s:.1f} s" if since_s else "just before the contact"
+    if not wholly:
+        words = f"{driver} was partly in the oncoming lane {when}, and {other} was wholly in its own lane"
+        return _blaming(case, driver, "wrong way", words, "Vienna, articles 10 and 12; StVO § 2")
     words = f"{driver} drove against the direction of its lane {when}, towards {other}, which stayed in its lane"
     return _blaming(case, driver, "wrong way", words, "Vienna, articles 10 and 11; StVO §§ 2 and 5")
 

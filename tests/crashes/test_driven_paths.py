@@ -176,6 +176,38 @@ def test_vehicle_that_overtakes_on_the_opposite_lane_is_at_fault_in_the_head_on_
     assert in_every_view(case) == ("head-on", "", "the other")
 
 
+@pytest.mark.parametrize("left_hand", [False, True])
+def test_vehicle_that_is_partly_in_the_oncoming_lane_is_at_fault(left_hand):
+    side = -1.0 if left_hand else 1.0
+    lanes = road(left_hand=left_hand)
+
+    def crash(aside, its_aside, **more):
+        """Lanes are 3.2 m wide and vehicles 2 m: beyond 0.6 m towards the middle, a vehicle is over the line."""
+        own, its = side * (-1.6 + aside), side * (1.6 - its_aside)
+        return record(lane(own, 15.0), lane(its, 12.0, x=5.0 - LENGTH_M, west=True), lanes=lanes, step_s=0.1, **more)
+
+    straddles = crash(1.3, 0.1)
+    assert in_every_view(straddles) == ("head-on", "", "ego")
+    (found,) = fault_in(straddles).findings
+    assert found.words == (
+        "ego was partly in the oncoming lane for the last 3.0 s, and other was wholly in its own lane"
+    )
+    assert in_every_view(crash(0.1, 1.3))[2] == "the other"
+    for aside, its_aside in ((1.0, 0.8), (0.8, 0.8), (0.69, 0.6), (1.7, 0.8)):  # both over the line, or by too little
+        assert in_every_view(crash(aside, its_aside))[2] == "nobody can tell", (aside, its_aside)
+
+    # The other had been over the line until 1 s before, so that ego may have made room for it.
+    returns = lane(side * 1.6, 12.0, x=5.0 - LENGTH_M, west=True, before=side * 0.4, until_s=-1.0)
+    case = record(lane(-0.3 * side, 15.0), returns, lanes=lanes, step_s=0.1)
+    assert in_every_view(case)[2] == "nobody can tell"
+
+
+def test_vehicle_over_the_line_where_lanes_cross_has_no_verdict():
+    crossed = Map([*road().borders, borders([(1.0, -90), (1.0, 90)])], (0.0, 0.0))
+    case = record(lane(-0.3, 15.0), oncoming(), lanes=crossed, step_s=0.1)
+    assert in_every_view(case)[2] == "nobody can tell"
+
+
 def test_head_on_crash_without_one_vehicle_on_the_wrong_side_has_no_verdict():
     crash = (lane(1.6, 15.0), oncoming())
     narrow = road(between=0.3)  # both lanes hold both vehicles
