@@ -155,7 +155,7 @@ def _arguments(parsed_args: Options, *, of_agents: bool) -> list[str]:
             said = tomllib.loads(file.read_text(encoding="utf-8"))
             tables = [agent.get("arguments", {}) for agent in said.get("agents", {}).values()]
             return list(dict.fromkeys(key for table in tables for key in table)) if of_agents else [*said["arguments"]]
-        except (OSError, ValueError, KeyError, AttributeError):
+        except (OSError, ValueError, KeyError, AttributeError, TypeError):
             continue
     found = (known.arguments for known in configurations() if name.endswith(known.endings))
     return [] if of_agents else list(next(found, ()))
@@ -177,10 +177,10 @@ def _paths(*endings: str) -> Completer:
 
     def inside(prefix: str, **_: object) -> list[str]:
         folder, _slash, start = prefix.rpartition("/")
-        place = Path(folder or ("/" if prefix.startswith("/") else ".")).expanduser()
+        place = Path(folder or ("/" if prefix.startswith("/") else "."))
         try:
-            found = sorted(path for path in place.iterdir() if path.name.startswith(start))
-        except OSError:
+            found = sorted(path for path in place.expanduser().iterdir() if path.name.startswith(start))
+        except (OSError, RuntimeError):  # the latter of a user without a home, as in ~NAME/
             return []
         hidden = start.startswith(".")
         names = [(path.name, path.is_dir()) for path in found if hidden or not path.name.startswith(".")]

@@ -67,8 +67,9 @@ def test_arguments_are_those_of_the_scenario_file(offer, tmp_path):
         assert offer("run", "--set", scenario=name) == ["a=", "b="]
         assert offer("run", "--arg", scenario=name) == ["c="]
     assert "vehicles=" in offer("run", "--set", scenario=None)
-    file.write_text("[[")
-    assert offer("run", "--set", scenario=str(tmp_path)) == []
+    for text in ("[[", "arguments = 5"):
+        file.write_text(text)
+        assert offer("run", "--set", scenario=str(tmp_path)) == []
     assert offer("run", "--arg", scenario=str(tmp_path / "x.sumocfg")) == []
 
 
@@ -84,7 +85,7 @@ def test_paths_are_folders_and_files_of_the_right_kind(tmp_path, monkeypatch):
     assert inside("hunts/") == ["hunts/c.zip", "hunts/deep/"]
     assert inside("hunts/d") == ["hunts/deep/"]
     assert inside(".") == [".b.zip", ".hidden/"]
-    assert inside("nowhere/") == []
+    assert inside("nowhere/") == inside("~no such user/") == []
     assert inside(f"{tmp_path}/h") == [f"{tmp_path}/hunts/"]
     assert "tmp/" in [name.lstrip("/") for name in inside("/t")]
     assert _completion._paths("")("a") == ["a.txt", "a.zip"]
