@@ -6,8 +6,7 @@ Every analysis that runs a recorded trial again uses this module. The parts of a
   at a step (`overruled`, `disturbances`, `handover`, `reseeding`) leaves the steps before as recorded. They are
   simulated again. The caller chooses which specifications run next.
 - **Where** (`Where`): ``current`` forks processes that have imported the current crashhunt. ``snapshot`` does the same
-  with the crashhunt of a snapshot. ``alone`` starts a new Python process for each run. `SharedReruns` serves several
-  threads.
+  with the crashhunt of a snapshot, in a new Python process. `SharedReruns` serves several threads.
 - **Limits**: `Budget` decides about a stop of the user and the wall time. The caller limits the number of runs,
   because only the caller knows which of the runs count.
 - **Comparison**: an `EndedRun` has the outcome, the recording and the files of a run. Bit-identical runs have the same
@@ -18,7 +17,7 @@ Invariant: a run is identified by the index of its specification. The order in w
 a time, change no result. If the caller stops the iteration, the unfinished runs are cancelled.
 
 Cost: with the current crashhunt, each run is a fork of a process that has imported the agents. If the traffic stays the
-same, a run is a fork of a simulator that has already been set up. A run in a new Python process takes 0.3 s longer.
+same, a run is a fork of a simulator that has already been set up. A new Python process takes 0.3 s to start.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.episode import scratch_of
-from crashhunt.executors import FreshProcessExecutor, PoolExecutor, read_map
+from crashhunt.executors import PoolExecutor, read_map
 from crashhunt.recording import Recording, read_black_box
 
 if TYPE_CHECKING:
@@ -48,14 +47,13 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.episode import WorkerSettings
-    from crashhunt.executors import Executor
     from crashhunt.trial import TrialResult, TrialSpec
     from crashhunt.world import Lane
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-Where = Literal["current", "snapshot", "alone"]
+Where = Literal["current", "snapshot"]
 """The processes that run trials again; see the text of this module."""
 
 _STOP_CHECK_INTERVAL_S = 0.1  # how late a request to stop may be
@@ -162,7 +160,7 @@ class Reruns:
         if self._folder is not None:
             worker = replace(worker, scratch=self._folder.path)
         self._worker, self._stopped, self._shared = worker, stopped, shared
-        self._executor = _executor(worker, where, parallel)
+        self._executor = PoolExecutor(worker, parallel=parallel, snapshot=where == "snapshot")
         self._numbers = itertools.count(1) if numbered else None
         self._lock = threading.Lock()
         self._ended: dict[int, TrialResult] = {}
@@ -281,12 +279,6 @@ class Reruns:
         )
 
 
-def _executor(worker: WorkerSettings, where: Where, parallel: int) -> Executor:
-    if where == "alone":
-        return FreshProcessExecutor(worker, parallel=parallel)
-    return PoolExecutor(worker, parallel=parallel, snapshot=where == "snapshot")
-
-
 def _require_same_trial(asked: TrialSpec, run: TrialSpec) -> None:
     """Check that the specification of a trial came back unchanged, because an earlier crashhunt ignores unknown keys.
 
@@ -312,7 +304,7 @@ def run_alone(
         StoppedError: the user has stopped the run.
         CrashhuntError: the trial could not be run.
     """
-    with closing(Reruns(worker, "alone", stopped=stopped)) as runs:
+    with closing(Reruns(worker, "snapshot", stopped=stopped)) as runs:
         yield from runs.run([spec])
 
 

@@ -67,7 +67,7 @@ def runs(worker, monkeypatch):
 
     def make(*ends, **more):
         executor = Executor(*ends)
-        monkeypatch.setattr(trial_reruns, "_executor", lambda *given: executor)
+        monkeypatch.setattr(trial_reruns, "PoolExecutor", lambda *given, **_: executor)
         return Reruns(worker, "current", **more), executor
 
     return make
@@ -135,7 +135,7 @@ def test_trial_that_ran_without_a_part_of_its_specification_is_refused(runs):
 
 def test_one_trial_that_is_run_alone_ends_with_its_process(worker, monkeypatch):
     made, executor = [], Executor()
-    monkeypatch.setattr(trial_reruns, "FreshProcessExecutor", lambda given, *, parallel: made.append(given) or executor)
+    monkeypatch.setattr(trial_reruns, "PoolExecutor", lambda given, **_: made.append(given) or executor)
     unplaced = replace(worker, scratch=Path())
     for ended in run_alone(unplaced, spec(3)):
         assert (ended.result, ended.folder) == (survived(3), scratch_of(made[0].scratch, 3))
@@ -147,23 +147,18 @@ def test_one_trial_that_is_run_alone_ends_with_its_process(worker, monkeypatch):
     assert executor.closed == 2
 
 
-def test_only_reruns_that_are_alone_run_without_a_pool(worker, monkeypatch):
+def test_reruns_with_the_code_of_a_snapshot_are_new_processes(worker, monkeypatch):
     made = []
-    monkeypatch.setattr(trial_reruns, "PoolExecutor", lambda given, **more: made.append(("pool", more)))
-    monkeypatch.setattr(trial_reruns, "FreshProcessExecutor", lambda given, **more: made.append(("fresh", more)))
-    for where in ("snapshot", "current", "alone"):
+    monkeypatch.setattr(trial_reruns, "PoolExecutor", lambda given, **more: made.append(more))
+    for where in ("snapshot", "current"):
         Reruns(worker, where, parallel=2)
-    assert made == [
-        ("pool", {"parallel": 2, "snapshot": True}),
-        ("pool", {"parallel": 2, "snapshot": False}),
-        ("fresh", {"parallel": 2}),
-    ]
+    assert made == [{"parallel": 2, "snapshot": True}, {"parallel": 2, "snapshot": False}]
 
 
 class Failing:
     """Reports once that it can run no trial, as a pool does, and no trial ends."""
 
-    def __init__(self, *given):
+    def __init__(self, *given, **_):
         self.errors, self.submitted = queue.SimpleQueue(), []
 
     def submit(self, given):
@@ -182,7 +177,7 @@ class Failing:
 
 
 def test_executor_that_fails_once_fails_every_thread(worker, monkeypatch, tmp_path):
-    monkeypatch.setattr(trial_reruns, "_executor", Failing)
+    monkeypatch.setattr(trial_reruns, "PoolExecutor", Failing)
     shared, looks = SharedReruns(tmp_path / "shared", parallel=2), iter(range(200))
     with ThreadPoolExecutor(2) as threads:
         begun = [threads.submit(shared.run, worker, spec(3), lambda: next(looks, None) is None) for _ in range(4)]
@@ -195,17 +190,17 @@ def test_executor_that_fails_once_fails_every_thread(worker, monkeypatch, tmp_pa
 def test_threads_share_the_processes_of_equal_settings(worker, monkeypatch, tmp_path):
     made = []
 
-    def executor(given, where, parallel):
-        made.append((given.scratch.name, where, parallel, found := Executor()))
+    def executor(given, *, parallel, snapshot):
+        made.append((given.scratch.name, snapshot, parallel, found := Executor()))
         return found
 
-    monkeypatch.setattr(trial_reruns, "_executor", executor)
+    monkeypatch.setattr(trial_reruns, "PoolExecutor", executor)
     shared = SharedReruns(tmp_path / "shared", parallel=2)
     for scratch in ("a", "b"):  # which is not the folder of the runs
         ended = shared.run(replace(worker, scratch=tmp_path / scratch), spec(3))
         assert ended.result == survived(3)
     shared.run(replace(worker, timeout_s=3.0), spec(4))
-    assert [one[:3] for one in made] == [("shared-0", "snapshot", 2), ("shared-1", "snapshot", 2)]
+    assert [one[:3] for one in made] == [("shared-0", True, 2), ("shared-1", True, 2)]
     with pytest.raises(StoppedError):
         shared.run(worker, spec(3), lambda: True)
     assert made[0][3].cancelled == []  # which would cancel the runs of other threads

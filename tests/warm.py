@@ -65,7 +65,7 @@ _made: dict[str, tuple[types.CodeType, bytes]] = {}  # what a module of crashhun
 _imported: dict[str, dict[str, tuple[types.ModuleType, types.CodeType, dict[str, bytes]]]] = {}
 # What crashhunt records of each module before a trial, by the address of the module's dictionary.
 _contents: dict[int, _Contents] = {}
-_BEGIN_WITH = ("crashhunt.executors._fork_server", "crashhunt.executors._fresh")
+_BEGIN_WITH = ("crashhunt.executors._fork_server",)
 # What these import as soon as they have read what is to be done.
 _ALL = ("crashhunt.scenario._load", "crashhunt.crashes._last_avoidable_step", "crashhunt.recording._foxglove")
 _GO_ON_WITH = {
@@ -604,7 +604,6 @@ if __name__ == "__main__":
     _import_ours()
     _import(
         "crashhunt.executors._fork_server",
-        "crashhunt.executors._fresh",
         "crashhunt.simulators.toy",
         "crashhunt.recording._log",
         "gymnasium",

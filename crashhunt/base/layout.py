@@ -81,9 +81,3 @@ REPLACED: Final = ".replaced-"
 def crash_folder(number: int, outcome: str) -> str:
     """Return the name of a crash's folder, which is the id of the crash, such as ``000012-collision``."""
     return f"{number:06d}-{outcome}"
-
-
-def numbered(number: int, name: str) -> str:
-    """Return the name of a file that belongs to a trial, such as ``job-000012.json``."""
-    stem, dot, ending = name.partition(".")
-    return f"{stem}-{number:06d}{dot}{ending}"

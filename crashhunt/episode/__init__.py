@@ -37,6 +37,6 @@ if TYPE_CHECKING:
     from ._parts import Parts as Parts, require_origin as require_origin, seal as seal, stage_of as stage_of
     from ._probes import BUDGET as BUDGET, BUDGET_BESIDE as BUDGET_BESIDE, Prober as Prober
     from ._trial_signals import INFO_KEY as INFO_KEY, SIGNALS as SIGNALS, TrialSignals as TrialSignals
-    from ._worker_settings import WorkerSettings as WorkerSettings, answer_file as answer_file, scratch_of as scratch_of
+    from ._worker_settings import WorkerSettings as WorkerSettings, scratch_of as scratch_of
 
 offer_lazily(__name__)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from crashhunt.base import layout
 from crashhunt.base.codec import (
     ESSENTIAL,
     OMIT_DEFAULT,
@@ -154,8 +153,3 @@ def _asked(value: object) -> Any:
 def scratch_of(scratch: Path, number: int) -> Path:
     """Return the scratch folder of a trial, which remains if the trial is kept."""
     return scratch / f"trial-{number:06d}"
-
-
-def answer_file(scratch: Path, number: int) -> Path:
-    """Return the path of the file for the result of a trial whose process cannot report it otherwise."""
-    return scratch / layout.numbered(number, layout.ANSWER)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._fresh import FreshProcessExecutor as FreshProcessExecutor, fork_zygote as fork_zygote
+    from ._fresh import FreshProcessExecutor as FreshProcessExecutor
     from ._host_conditions import HostConditions as HostConditions
     from ._pool import PoolExecutor as PoolExecutor
     from ._postmortem import read_map as read_map

@@ -226,7 +226,7 @@ def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool)
     adopt_orphans()
     try:
         report = lambda importing: _send(orders, {"importing": importing})  # noqa: E731
-        imported = import_nothing(settings) if late else import_parts(settings, report, rehearses=True)
+        imported = import_nothing(settings) if late else import_parts(settings, report)
     except CrashhuntError as error:
         _send(orders, error.to_json())
         return

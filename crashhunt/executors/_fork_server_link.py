@@ -12,7 +12,7 @@ import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.errors import WorkerError
 from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import describe_death
 from crashhunt.executors._time_limits import import_died
@@ -59,11 +59,11 @@ class ForkServerLink:
         self._importing = ""  # what its template could not import when it was killed, in words
         self.unfit = False
         number = next(_numbers)
-        job = settings.scratch / f"fork-server-{number}.json"
+        self._job = settings.scratch / f"fork-server-{number}.json"
         path = [] if snapshot else sys.path
         content: ForkServerJob = {"settings": settings.to_json(), "sys_path": path, "late": late}
         environment = snapshot_environment(settings) if snapshot else {**os.environ, **worker_environment()}
-        job.write_text(json.dumps(content), encoding="utf-8")
+        self._job.write_text(json.dumps(content), encoding="utf-8")
         self._log = settings.scratch / f"fork-server-{number}.log"
         # Messages stay apart from each other, and file descriptors with theirs.
         self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -71,7 +71,7 @@ class ForkServerLink:
             try:
                 self._kept = Kept(
                     "crashhunt.executors._fork_server",
-                    [str(theirs.fileno()), str(job)],
+                    [str(theirs.fileno()), str(self._job)],
                     environment=environment,
                     inherited=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
@@ -97,7 +97,7 @@ class ForkServerLink:
         """Return messages on supervisors that have ended, and how they ended; None if the fork server itself has ended.
 
         Raises:
-            CrashhuntError: a module that trials need cannot be imported.
+            WorkerError: a module that trials need cannot be imported.
         """
         ended: list[FromForkServer] = []
         while True:
@@ -111,7 +111,7 @@ class ForkServerLink:
                 return None
             message: FromForkServer = json.loads(data)
             if "error" in message:
-                raise CrashhuntError.from_json({"error": message["error"]})
+                raise WorkerError.from_json({"error": message["error"]})
             if "slot" in message:
                 ended.append(message)
             self.ready = self.ready or "ready" in message
@@ -122,23 +122,23 @@ class ForkServerLink:
         """Start a new fork server after the previous one has ended.
 
         Raises:
-            CrashhuntError: the fork server ended without a kill, or was killed too often.
+            WorkerError: the fork server ended without a kill, or was killed too often.
         """
         try:
             code = self._kept.process.wait(_END_S)
         except subprocess.TimeoutExpired:
             code = -signal.SIGKILL
+        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         self.end()
         if self.unfit:
             return ForkServerLink(self._settings, late=True, deaths=self.deaths, snapshot=self._snapshot)
         if -code not in _OUTSIDE_SIGNALS or self.deaths + 1 >= _MAX_CONSECUTIVE_DEATHS:
             if self._importing:
                 raise import_died(self._importing, code, times=self.deaths + 1)
-            lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             how = describe_death(code)
             said = f": {lines[-1]}" if lines else ""
             again = f", {_MAX_CONSECUTIVE_DEATHS} times" if -code in _OUTSIDE_SIGNALS else ""
-            raise CrashhuntError(
+            raise WorkerError(
                 f"the process that starts the workers {how}{again}{said}",
                 fix="raise the limits on memory (ulimit -v) and processes (ulimit -u), and run the same command again",
             )
@@ -148,3 +148,5 @@ class ForkServerLink:
         """Kill the fork server and all processes that it has started."""
         self._kept.end()
         self.control.close()
+        for file in (self._job, self._log):
+            file.unlink(missing_ok=True)  # a hunt with a new process for each trial has a million

@@ -10,17 +10,18 @@ import socket
 import threading
 from collections import deque
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.errors import WorkerError
+from crashhunt.base.signals import describe_death
 from crashhunt.executors._fork_server_link import ForkServerLink
 from crashhunt.executors._postmortem import TrialAttempt, result_of_death, where_it_is
 from crashhunt.executors._protocol import Answer, Notes
 from crashhunt.trial import TrialResult
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from crashhunt.episode import WorkerSettings
     from crashhunt.recording import BlackBoxHeader
@@ -51,13 +52,22 @@ class PoolExecutor:
         settings: settings of the hunt.
         parallel: number of slots.
         snapshot: whether the trials use the crashhunt of the settings' snapshot, in new Python processes.
+        may_repeat: function that returns whether a trial may run again, alone on the machine; called repeatedly.
 
     Attributes:
         held_back: number of slots that receive no further trial for now.
     """
 
-    def __init__(self, settings: WorkerSettings, *, parallel: int = 1, snapshot: bool = False) -> None:
+    def __init__(
+        self,
+        settings: WorkerSettings,
+        *,
+        parallel: int = 1,
+        snapshot: bool = False,
+        may_repeat: Callable[[], bool] = lambda: True,
+    ) -> None:
         self.held_back = 0
+        self._may_repeat = may_repeat
         self._snapshot = snapshot
         self._settings = settings
         self._parallel = parallel
@@ -78,6 +88,17 @@ class PoolExecutor:
     def capacity(self) -> int:
         """The number of trials that run at a time."""
         return self._parallel
+
+    @property
+    def runs(self) -> bool:
+        """Whether a trial runs."""
+        return any(worker.attempt is not None for worker in list(self._workers.values()))
+
+    @property
+    def repeats(self) -> bool:
+        """Whether a trial runs again, or waits for it."""
+        attempts = [*self._waiting, *(worker.attempt for worker in list(self._workers.values()))]
+        return any(attempt is not None and attempt.alone for attempt in attempts)
 
     def submit(self, spec: TrialSpec) -> None:
         """Queue a trial."""
@@ -174,7 +195,9 @@ class PoolExecutor:
         """Assign trials to free slots, in the order of the queue."""
         while self._waiting:
             running = [worker.attempt for worker in self._workers.values() if worker.attempt is not None]
-            if any(attempt.alone for attempt in running) or (running and self._waiting[0].alone):
+            if any(attempt.alone for attempt in running):
+                return
+            if self._waiting[0].alone and (running or not self._may_repeat()):
                 return
             if len(running) >= self._parallel - self.held_back:
                 return
@@ -235,15 +258,20 @@ class PoolExecutor:
             return  # it was cancelled meanwhile
         answer: Answer = json.loads(line)
         if "error" in answer:
-            raise CrashhuntError.from_json(answer)
-        worker.attempt = None
+            raise WorkerError.from_json(answer)  # or an InternalError
         if "lost" in answer:
+            worker.attempt = None
             self._end_attempt(attempt, answer["lost"])
             self._stop_worker(worker)
             return
+        result = TrialResult.from_json(answer["result"])
+        if answer.get("searches"):
+            attempt.result = result
+            return
+        worker.attempt = None
         for notice in answer.get("notices", ()):
             self._notes.add(notice)
-        self._done.put(TrialResult.from_json(answer["result"]))
+        self._done.put(result)
         if self._link is not None:
             self._link.deaths = 0
         if answer.get("retires"):
@@ -290,7 +318,10 @@ class PoolExecutor:
     def _end_attempt(self, attempt: TrialAttempt, exit_code: int) -> None:
         """Determine the result of a trial whose process has ended, or run the trial again."""
         scratch = self._settings.scratch
-        if why := attempt.again(scratch, exit_code):
+        if attempt.result is not None:
+            why = f"the process that searched {describe_death(exit_code)}"
+            self._done.put(replace(attempt.result, why_no_escape=why))
+        elif why := attempt.again(scratch, exit_code):
             self._notes.add(why)
             self._waiting.appendleft(attempt)
         else:

@@ -59,10 +59,12 @@ class TrialAttempt:
     Args:
         spec: the trial to run.
         ends: the signal and the step at which each process of the trial ended.
+        result: result of the trial, while further trials search for its last avoidable step.
     """
 
     spec: TrialSpec
     ends: list[tuple[int, int]] = field(default_factory=list)
+    result: TrialResult | None = None
 
     @property
     def alone(self) -> bool:

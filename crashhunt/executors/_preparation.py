@@ -95,13 +95,10 @@ class Imported:
 _NOTHING_IMPORTED: Final = Imported(None, makes_simulator=False)
 
 
-def import_parts(
-    settings: WorkerSettings, report: Callable[[str], None], *, rehearses: bool = False
-) -> Imported | None:
-    """Import the modules that trials need, and check whether a zygote may create the simulator.
+def import_parts(settings: WorkerSettings, report: Callable[[str], None]) -> Imported | None:
+    """Rehearse a trial, import the modules that trials need, and check whether a zygote may create the simulator.
 
-    ``report`` is called before each import, as in `Parts.load`, and with an empty text at the end. A rehearsal is worth
-    its 20 ms if many trials follow.
+    ``report`` is called before each import, as in `Parts.load`, and with an empty text at the end.
 
     Returns:
         The result; None if this process can no longer be forked.
@@ -110,8 +107,7 @@ def import_parts(
         CrashhuntError: a module cannot be imported.
     """
     parts = Parts(settings)
-    if rehearses:
-        rehearse_trial(settings.scratch, report)
+    rehearse_trial(settings.scratch, report)
     parts.load(report)
     if not _can_be_forked():
         return None

@@ -118,31 +118,26 @@ class ExecutorFactory(Protocol):
 
 @final
 class Done(TypedDict):
-    """The message with the result of a trial; ``retires`` means that the supervisor can run no further trial."""
+    """The message with the result of a trial; ``retires`` means that the supervisor can run no further trial.
+
+    ``searches`` means that another message with the result and its last avoidable step follows.
+    """
 
     result: JsonObject
     notices: NotRequired[list[str]]
     retires: NotRequired[bool]
+    searches: NotRequired[bool]
 
 
 @final
 class Lost(TypedDict):
-    """The message that a trial was killed from outside: the exit code, and the failed import if it was importing."""
+    """The message that a trial was killed from outside, with the exit code."""
 
     lost: int
-    importing: NotRequired[str]
 
 
 Answer: TypeAlias = Done | Lost | ErrorData
 """What a supervisor says at the end of a trial."""
-
-
-class FreshJob(TypedDict):
-    """The job file of a new process, with the path of the file for its result."""
-
-    settings: JsonObject
-    spec: JsonObject
-    answer: str
 
 
 class ForkServerJob(TypedDict):

@@ -34,7 +34,7 @@ from crashhunt.trial import Escape, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     from crashhunt.crashes import Borders
@@ -57,10 +57,6 @@ class LostTrialError(Exception):
     def __init__(self, exit_code: int) -> None:
         super().__init__(exit_code)
         self.exit_code = exit_code
-
-
-class UnfitZygoteError(Exception):
-    """A process with imported agents cannot be forked, so each trial must import the agents itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +105,6 @@ class Supervisor:
 
         Raises:
             LostTrialError: the process of the trial was killed from outside, or its zygote has ended.
-            UnfitZygoteError: the zygote cannot fork.
             HostError: the trial failed, and a folder that it needs was deleted, or the disk is full.
             CrashhuntError: the disk is full, or the simulator cannot be created.
         """
@@ -256,8 +251,6 @@ class Supervisor:
             message = self._next(_LOOK_EVERY_S)
             if message is not None and "error" in message:
                 raise CrashhuntError.from_json({"error": message["error"]})
-            if message is not None and message.get("unfit"):
-                raise UnfitZygoteError
             self._zygote_pid = message.get("ready", 0) if message is not None else 0
             if not self._zygote_pid and time.monotonic() > deadline + pauses.paused_s():
                 raise CrashhuntError(
@@ -310,8 +303,9 @@ def be_supervisor(
         supervisor = Supervisor(settings, zygote, conditions)
         with pool.makefile("rb") as specs:
             for line in specs:
-                answer = _answer(supervisor, settings, TrialSpec.from_json(json.loads(line)))
-                pool.sendall(json.dumps(answer).encode() + b"\n")
+                answer: Answer = {"lost": 0}
+                for answer in _answers(supervisor, settings, TrialSpec.from_json(json.loads(line))):
+                    pool.sendall(json.dumps(answer).encode() + b"\n")
                 if supervisor.retires or "result" not in answer:
                     break
         code = 0
@@ -319,29 +313,31 @@ def be_supervisor(
         os._exit(code)
 
 
-def _answer(supervisor: Supervisor, settings: WorkerSettings, spec: TrialSpec) -> Answer:
+def _answers(supervisor: Supervisor, settings: WorkerSettings, spec: TrialSpec) -> Iterator[Answer]:
+    """Run a trial, and yield what the pool receives; the last answer counts."""
     try:
         ended = supervisor.run(spec)
+        result = ended.result
+        if settings.find_escapes and result.collision is not None and not supervisor.retires:
+            yield {"result": result.to_json(), "searches": True}  # whatever becomes of the search
+            result = with_escape(supervisor, settings, ended)
+        answer: Done = {"result": result.to_json(), "retires": supervisor.retires}
+        if ended.notices:
+            answer["notices"] = list(ended.notices)
+        yield answer
     except LostTrialError as error:
-        return {"lost": error.exit_code}
+        yield {"lost": error.exit_code}
     except CrashhuntError as error:
-        return error.to_json()
+        yield error.to_json()
     except FileNotFoundError:  # another trial has removed the scratch folder meanwhile
-        return {"lost": -signal.SIGKILL}
+        yield {"lost": -signal.SIGKILL}
     except OSError as error:
         limit, fix = limit_behind(error), remedy(error)
-        if not (limit or fix):
-            return internal_error(error, spec.number).to_json()
-        return RecorderError(
+        said = RecorderError(
             f"the trial cannot be kept: {limit or error.strerror}", fix="" if limit else fix,
             where=str(error.filename or ""),
-        ).to_json()  # fmt: skip
-
-    result = with_escape(supervisor, settings, ended)
-    answer: Done = {"result": result.to_json(), "retires": supervisor.retires}
-    if ended.notices:
-        answer["notices"] = list(ended.notices)
-    return answer
+        )  # fmt: skip
+        yield (said if limit or fix else internal_error(error, spec.number)).to_json()
 
 
 # Until when braking would have avoided a crash, found out by further trials in the same slot.
@@ -350,10 +346,8 @@ _FIRST_EXTRA_NUMBER = 1 << 40  # beyond the numbers of a hunt's trials: each tri
 
 
 def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: EndedTrial) -> TrialResult:
-    """Return the result of a trial, with the last step at which braking avoids the crash if the settings request it."""
+    """Return the result of a trial with a collision, with the last step at which braking avoids the collision."""
     result = ended.result
-    if not settings.find_escapes or result.collision is None or supervisor.retires:
-        return result
     from crashhunt.crashes import find_escape
 
     braking = None

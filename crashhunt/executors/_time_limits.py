@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import os
-import select
 import time
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.forks import ended
-from crashhunt.base.processes import kill, resume
-from crashhunt.base.signals import describe_death, is_sent_from_outside
+from crashhunt.base.signals import describe_death
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Callable
 
     from crashhunt.recording import BlackBoxHeader
@@ -75,22 +68,7 @@ def has_hung(
 # an `ImportWatch`, as only that one is left to report when a module hangs or ends its process.
 
 _MAX_MESSAGE_CHARACTERS = 200  # characters of a message; foreign code may write its own
-_MAX_MESSAGE_BYTES = 1 << 12  # bytes
-_LOOK_EVERY_S = 0.02  # whether the process has died
 _IMPORT_FIX = "see what the module does when it is imported"
-
-
-class ImportKilledError(Exception):
-    """A process was killed by a signal, possibly from outside, while it imported the modules that trials need.
-
-    Args:
-        exit_code: exit code of the process; negative for a signal.
-        importing: description of the failed import.
-    """
-
-    def __init__(self, exit_code: int, importing: str) -> None:
-        super().__init__(exit_code, importing)
-        self.exit_code, self.importing = exit_code, importing
 
 
 class ImportWatch:
@@ -137,31 +115,3 @@ def import_died(importing: str, exit_code: int, *, times: int = 1) -> CrashhuntE
         f"{importing}: its process {describe_death(exit_code)} meanwhile{again}",
         fix=f"{_IMPORT_FIX}, or raise the limits on memory (ulimit -v) and processes (ulimit -u)",
     )
-
-
-def await_imports(reports: socket.socket, pid: int, timeout_s: float) -> None:
-    """Wait until a child process has imported the modules that trials need.
-
-    The child sends a message before each import, and an empty message at the end. The time limit is that of
-    `ImportWatch`.
-
-    Raises:
-        ImportKilledError: the child was killed by a signal that may come from outside.
-        CrashhuntError: an import takes too long, or has ended the child.
-    """
-    watch = ImportWatch(timeout_s)
-    while watch.importing:
-        if select.select([reports], [], [], _LOOK_EVERY_S)[0] and (data := reports.recv(_MAX_MESSAGE_BYTES)):
-            with suppress(ValueError):  # foreign code may write there as well
-                watch.begin(json.loads(data))
-        elif os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:
-            code = ended(pid)
-            if is_sent_from_outside(code):
-                raise ImportKilledError(code, watch.importing)
-            raise import_died(watch.importing, code)
-        elif watch.has_hung:
-            kill(pid)
-            ended(pid)
-            raise watch.hung()
-        else:
-            resume(pid)  # which a module may have stopped

@@ -300,5 +300,5 @@ def reruns_of(
         todays: whether trials run with the current crashhunt and not with the snapshot's; None to determine it.
     """
     worker = replace(rerun.worker, keep_trials=keep_all, warm_copies=warm_copies)
-    where: Where = "current" if (is_current_code(rerun) if todays is None else todays) else "alone"
+    where: Where = "current" if (is_current_code(rerun) if todays is None else todays) else "snapshot"
     return Reruns(worker, where, parallel=parallel, stopped=stopped, numbered=True)

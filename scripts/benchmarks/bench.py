@@ -8,6 +8,7 @@ import json
 import math
 import os
 import shutil
+import socket
 import statistics
 import subprocess
 import sys
@@ -99,13 +100,20 @@ class Slot:
     """
 
     def __init__(self, settings: WorkerSettings) -> None:
-        from crashhunt.base.processes import children_of
-        from crashhunt.executors import Supervisor, fork_zygote, worker_environment
+        from crashhunt.executors import Supervisor, worker_environment
+        from crashhunt.executors._fork_server import be_zygote
+        from crashhunt.executors._preparation import import_parts
 
         os.environ.update(worker_environment())
-        before = set(children_of(os.getpid()))
-        self._supervisor = Supervisor(settings, fork_zygote(settings, rehearses=True))
-        (self.zygote,) = set(children_of(os.getpid())) - before
+        ours, theirs = socket.socketpair()
+        self.zygote = os.fork()
+        if self.zygote == 0:
+            ours.close()
+            imported = import_parts(settings, lambda _: None)
+            assert imported is not None
+            be_zygote(theirs, settings, imported)
+        theirs.close()
+        self._supervisor = Supervisor(settings, ours)
 
     def run(self, spec: TrialSpec) -> TrialResult:
         """Run a trial, which has to get as far as its first step."""

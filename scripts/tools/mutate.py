@@ -133,7 +133,7 @@ _TESTS_ELSEWHERE = {
         "executors/test_lost_processes.py",
         "executors/test_warm_traffics.py",
     ),
-    "executors/_fresh.py": ("executors/test_harms.py",),
+    "executors/_fresh.py": ("executors/test_harms.py", "executors/test_new_processes.py"),
     "executors/_pool.py": ("executors/test_lost_processes.py",),
     "executors/_postmortem.py": ("executors/test_evidence.py",),
     "executors/_protocol.py": ("executors/test_pool_of_trials.py",),

@@ -32,7 +32,7 @@ class Agent(Raises):
         again = "-again" * ("/snapshots/" in ours["crashhunt"].__file__)
         pathlib.Path(f"{sys.argv[0]}{again}.json").write_text(json.dumps([files, code, said]))
 """
-FORK_SERVER, FRESH = "crashhunt.executors._fork_server", "crashhunt.executors._fresh"
+FORK_SERVER = "crashhunt.executors._fork_server"
 
 
 def told(shell, hunt: str, run) -> tuple:
@@ -46,7 +46,7 @@ def told(shell, hunt: str, run) -> tuple:
     err = re.sub(r"\d+:\d\d \(", "M:SS (", done.err.replace(hunt, "h"))  # how long it took
     err = re.sub(r"^(running: |confirming ).*\n", "", err, flags=re.MULTILINE)  # progress, which depends on the time
     run("replay", hunt)
-    processes = (FORK_SERVER, f"{FORK_SERVER}-again", f"{FRESH}-again")
+    processes = (FORK_SERVER, f"{FORK_SERVER}-again")
     imported = [imported_by(shell, process, hunt) for process in processes]
     return manifest["files"], manifest["paths"], environment, crash | {"path": ""}, err, imported
 
@@ -77,7 +77,7 @@ def test_its_snapshot_output_and_digests_are_the_same(toy):
     (file,) = (toy.folder / "forked" / "snapshots").glob("*/code/crashhunt/world/__init__.py")
     file.write_text(file.read_text(encoding="utf-8").replace('"""', '"""Not here. ', 1), encoding="utf-8")
     toy.crashhunt("replay", "forked", "--force", "--trust", expect=None)
-    *_, said = imported_by(toy, f"{FRESH}-again", "forked")
+    *_, said = imported_by(toy, f"{FORK_SERVER}-again", "forked")
     assert said.startswith("Not here. ")
 
 

@@ -253,13 +253,9 @@ def processes_in(command: int) -> dict[str, list[int]]:
     def below_keeper(keeper: int) -> None:
         for server in children_of(keeper):
             found["fork server"].append(server)
-            fresh = "_fresh" in described(keeper)
             for child in children_of(server):
                 below = children_of(child)
-                if fresh:
-                    found["zygote"].append(child)
-                    found["trial"] += below
-                elif below:
+                if below:
                     found["template"].append(child)
                     found["zygote"] += below
                     found["trial"] += [trial for zygote in below for trial in children_of(zygote)]

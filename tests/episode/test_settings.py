@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.episode import WorkerSettings, answer_file, scratch_of
+from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.scenario import load_scenario
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
@@ -118,4 +118,3 @@ def test_the_audit_is_a_share_of_the_trials_without_a_crash(scenario, tmp_path):
 
 def test_names_in_the_scratch_folder():
     assert scratch_of(Path("/s"), 12) == Path("/s/trial-000012")
-    assert answer_file(Path("/s"), 3) == Path("/s/answer-000003.json")

@@ -83,15 +83,6 @@ def test_the_search_brakes_with_the_deceleration_of_the_simulator(search, decele
     assert search.asked.braking is None
 
 
-@pytest.mark.parametrize(
-    "given",
-    [{"find_escapes": False}, {"retires": True}, {"result": TrialResult(CRASH.spec, Outcome.SURVIVED, steps=90)}],
-)
-def test_where_there_is_nothing_to_search_no_trial_runs(search, given):
-    assert search(**given).escape is None
-    assert search.asked.numbers == []
-
-
 def test_whatever_lies_in_the_way_is_removed_and_what_a_link_leads_to_is_not(tmp_path):
     (tmp_path / "kept").mkdir()
     (tmp_path / "kept" / "inner").write_text("x")

@@ -9,21 +9,17 @@ import socket
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.episode import WorkerSettings, answer_file, scratch_of
+from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor, _fork_server_link, _fresh, _pool, _worker_environment
 from crashhunt.executors._fresh import FreshProcessExecutor
 from crashhunt.executors._postmortem import TrialAttempt
-from crashhunt.executors._supervisor import EndedTrial, LostTrialError, UnfitZygoteError
-from crashhunt.executors._time_limits import ImportKilledError
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.trial import Escape, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 KILL = -signal.SIGKILL
 
@@ -43,239 +39,84 @@ def settings(tmp_path):
 
 
 @pytest.fixture
-def started(monkeypatch):
-    """The processes that were started; each runs until `code` is set."""
-    found = []
+def pools(monkeypatch):
+    """The pools that were made, one for each trial; a trial runs until its result is in `found`."""
+    made = []
 
-    class Kept:
-        def __init__(self, module, words, *, environment, stdin, stdout, stderr):
-            self.job = json.loads(Path(words[0]).read_text())
-            self.words, self.code, self.ended, self.pid = words, None, 0, 4321
-            self.process = self
-            stderr.write(b"first\nlast words\n" if module == "crashhunt.executors._fresh" else b"")
-            found.append(self)
+    class Pool:
+        def __init__(self, settings, *, snapshot, may_repeat):
+            assert snapshot
+            self.settings, self.may_repeat, self.found, self.told = settings, may_repeat, [], []
+            self.runs, self.repeats, self.closed = True, False, 0
+            made.append(self)
 
-        def poll(self):
-            return self.code
+        def submit(self, given):
+            self.number = given.number
 
-        def end(self):
-            self.ended += 1
+        def completed(self, timeout_s):
+            assert timeout_s == 0.0
+            while self.found:
+                yield self.found.pop()
 
-        def answers(self, content, code=0):
-            with open(self.job["answer"], "w") as file:
-                json.dump(content, file)
-            self.code = code
+        def where(self):
+            return {self.number: "step 3"}
 
-    monkeypatch.setattr(_fresh, "Kept", Kept)
+        def notes(self):
+            return self.told
+
+        def close(self):
+            self.closed += 1
+
+    monkeypatch.setattr(_fresh, "PoolExecutor", Pool)
     monkeypatch.setattr(_fresh, "_LOOK_EVERY_S", 0.001)
-    return found
+    return made
 
 
-def numbers(started):
-    return [kept.job["spec"]["number"] for kept in started]
-
-
-def test_as_many_new_processes_run_as_asked(settings, started):
+def test_as_many_new_processes_run_as_asked(settings, pools):
     executor = FreshProcessExecutor(settings, parallel=2)
     assert executor.capacity == 2
-    stale = answer_file(settings.scratch, 0)
-    stale.write_text("stale")
     for number in range(4):
         executor.submit(spec(number))
-    assert numbers(started) == [0, 1]
-    assert not stale.exists()
-    assert started[0].job["settings"] == settings.to_json()
+    assert [(pool.number, pool.settings) for pool in pools] == [(0, settings), (1, settings)]
+    assert executor.where() == {0: "step 3", 1: "step 3"}
     assert list(executor.completed(0.01)) == []
-    started[1].answers({"result": survived(1).to_json()})
+    pools[0].told = ["a"]
+    pools[1].found, pools[1].told = [survived(1)], ["a", "b"]
     assert list(executor.completed(5)) == [survived(1)]
-    assert (numbers(started), started[1].ended) == ([0, 1, 2], 1)
-    names = {path.name for path in settings.scratch.iterdir()}
-    assert {layout.numbered(0, layout.JOB), "start-000000.log"} <= names
-    assert not {layout.numbered(1, layout.JOB), "start-000001.log", answer_file(settings.scratch, 1).name} & names
+    assert [(pool.number, pool.closed) for pool in pools] == [(0, 0), (1, 1), (2, 0)]
+    assert sorted(executor.notes()) == ["a", "b"]
+    assert executor.notes() == []
     executor.cancel(above=0)
-    assert [kept.ended for kept in started] == [0, 1, 1]
-    started[0].answers({"result": survived(0).to_json()})
+    assert [pool.closed for pool in pools] == [0, 1, 1]
+    pools[0].found = [survived(0)]
     assert list(executor.completed(5)) == [survived(0)]
     executor.submit(spec(5))
     executor.close()
-    assert started[-1].ended == 1
+    assert pools[-1].closed == 1
     assert list(executor.completed(0)) == []
-    assert executor.notes() == []
 
 
-def test_trial_that_was_killed_runs_again_and_alone(settings, started):
+def test_trial_that_was_killed_runs_again_and_alone(settings, pools):
     executor = FreshProcessExecutor(settings, parallel=3)
-    for number in range(3):
+    for number in range(4):
         executor.submit(spec(number))
-    started[1].answers({"lost": -signal.SIGTERM})
-    assert list(executor.completed(0)) == []
-    assert numbers(started) == [0, 1, 2]  # it waits for the others
-    started[0].answers({"result": survived(0).to_json()})
-    started[2].code = KILL
+    first, second, third = pools
+    second.repeats, second.runs = True, False
+    assert not second.may_repeat()
+    third.repeats, third.runs = True, False
+    first.found = [survived(0)]
     assert list(executor.completed(0)) == [survived(0)]
-    assert numbers(started) == [0, 1, 2, 2]
-    executor.submit(spec(4))
-    assert numbers(started) == [0, 1, 2, 2]  # it runs alone
-    started[3].answers({"result": survived(2).to_json()})
+    assert len(pools) == 3  # nothing begins while a trial waits for others to end
+    assert second.may_repeat()
+    assert not third.may_repeat()  # it is the next one
+    second.found = [survived(1)]
+    assert list(executor.completed(0)) == [survived(1)]
+    assert third.may_repeat()
+    third.runs = True
+    third.found = [survived(2)]
     assert list(executor.completed(0)) == [survived(2)]
-    assert numbers(started) == [0, 1, 2, 2, 1]
-    assert executor.notes() == [
-        "trial 1 was ended by SIGTERM from outside, and is run again",
-        "trial 2 was ended by SIGKILL from outside, and is run again",
-    ]
+    assert [pool.number for pool in pools] == [0, 1, 2, 3]
     executor.close()
-
-
-def test_process_that_cannot_start_or_fails_is_an_error(settings, started):
-    executor = FreshProcessExecutor(settings)
-    executor.submit(spec(0))
-    started[0].code = 1
-    with pytest.raises(CrashhuntError, match="the process of trial 0 could not start: last words") as caught:
-        list(executor.completed(0))
-    assert caught.value.where.endswith("start-000000.log")
-    executor.submit(spec(1))
-    started[1].answers(CrashhuntError("no map", fix="draw one").to_json())
-    with pytest.raises(CrashhuntError, match="no map"):
-        list(executor.completed(0))
-    executor.submit(spec(2))
-    started[2].code = 0
-    (died,) = executor.completed(0)
-    assert died.failure.message == "the process exited with 0 while the episode was being set up"
-    executor.submit(spec(3))
-    for _ in range(3):
-        started[-1].answers({"lost": KILL, "importing": "the module planner"})
-        if len(started) == 6:
-            break
-        assert list(executor.completed(0)) == []
-    with pytest.raises(
-        CrashhuntError, match="the module planner: its process was killed by SIGKILL meanwhile, 3 times"
-    ):
-        list(executor.completed(0))
-
-
-def test_process_that_hangs_is_ended(settings, started, monkeypatch):
-    asked = []
-    header = SimpleNamespace(pid=55, step=3)
-    looked = []
-    monkeypatch.setattr(_fresh, "where_it_is", lambda *given: looked.append(given) or header)
-    monkeypatch.setattr(_fresh, "children_of", lambda pid: [55] if pid == 4321 else [])
-    monkeypatch.setattr(_fresh, "hung", lambda *given: given)
-    monkeypatch.setattr(_fresh, "has_hung", lambda found, **given: asked.append((found, given)) or given["limit_s"] < 0)
-    executor = FreshProcessExecutor(settings)
-    executor.submit(spec(0))
-    assert executor.where() == {0: header}
-    assert looked == [(settings.scratch, 0)]
-    ((found, given),) = asked if list(executor.completed(0)) == [] else ()
-    assert found is header
-    assert (given["begun"], given["limit_s"]) == (False, 9 + _fresh.START_UP_S)  # its supervisor has begun it
-    header.pid = 56
-    answer_file(settings.scratch, 0).write_text("{")
-    list(executor.completed(0))
-    assert (asked[-1][1]["begun"], asked[-1][1]["limit_s"]) == (True, 60 + 2 * 9)
-    answer_file(settings.scratch, 0).unlink()
-    stack = scratch_of(settings.scratch, 0) / layout.STACK
-    assert not asked[-1][1]["has_words"]()
-    stack.parent.mkdir(parents=True)
-    stack.write_text("")
-    assert not asked[-1][1]["has_words"]()
-    stack.write_text("File")
-    assert asked[-1][1]["has_words"]()
-    monkeypatch.setattr(_fresh, "has_hung", lambda found, **given: True)
-    assert list(executor.completed(0)) == []
-    assert started[0].ended == 1
-    started[0].code = KILL
-    assert list(executor.completed(0)) == [(spec(0), settings.scratch, 9.0)]
-
-
-def test_search_for_an_escape_that_was_killed_is_done_again(settings, started):
-    executor = FreshProcessExecutor(replace(settings, find_escapes=True))
-    executor.submit(spec(0))
-    for count in range(3):
-        started[count].answers({"result": survived(0).to_json()}, KILL)
-        found = list(executor.completed(0))
-        if found:
-            break
-    assert executor.notes() == ["trial 0 was ended by SIGKILL from outside, and is run again"]
-    why = "the process that searched was killed by SIGKILL, 3 times"
-    assert (numbers(started), found) == ([0, 0, 0], [replace(survived(0), why_no_escape=why)])
-    escaped = replace(survived(1), escape=Escape(why_not="it was too late"))
-    executor.submit(spec(1))
-    started[-1].answers({"result": escaped.to_json()}, 0)
-    assert list(executor.completed(0)) == [escaped]
-    plain = FreshProcessExecutor(settings)
-    plain.submit(spec(2))
-    started[-1].answers({"result": survived(2).to_json()}, KILL)
-    assert list(plain.completed(0)) == [survived(2)]
-
-
-@pytest.mark.parametrize("late", [False, True])
-def test_new_process_answers_before_it_searches_for_an_escape(settings, monkeypatch, late):
-    forked, answers, sealed = [], [], []
-    escaped = replace(survived(0), escape=Escape(why_not="it was too late"))
-
-    def run(given):
-        assert given == spec(0)
-        if late and len(forked) == 1:
-            raise UnfitZygoteError
-        return EndedTrial(survived(0))
-
-    def fork(given, *, late=False):
-        forked.append(late)
-        return "zygote"
-
-    monkeypatch.setattr(_fresh, "require_origin", lambda name, code: sealed.append((name, code)))
-    monkeypatch.setattr(_fresh, "seal", lambda given: sealed.append(given.scratch == settings.scratch))
-    monkeypatch.setattr(_fresh, "fork_zygote", fork)
-    monkeypatch.setattr(_fresh, "Supervisor", lambda given, zygote, conditions: SimpleNamespace(run=run, zygote=zygote))
-    monkeypatch.setattr(_fresh, "with_escape", lambda supervisor, given, ended: escaped)
-    job = {"settings": settings.to_json(), "spec": spec(0).to_json()}
-    assert _fresh._run(job, answers.append) == 0
-    assert answers == [{"result": survived(0).to_json()}, {"result": escaped.to_json()}]
-    assert (forked, sealed) == ([False, True][: 1 + late], [("crashhunt", ()), True])
-    monkeypatch.setattr(_fresh, "with_escape", lambda supervisor, given, ended: ended.result)
-    _fresh._run(job, answers.append)
-    assert len(answers) == 3
-    for error, said in (
-        (LostTrialError(-15), {"lost": -15}),
-        (ImportKilledError(-9, "a module"), {"lost": -9, "importing": "a module"}),
-        (CrashhuntError("no map", fix="x"), CrashhuntError("no map", fix="x").to_json()),
-    ):
-
-        def fails(given, failure=error, **_):
-            raise failure
-
-        monkeypatch.setattr(_fresh, "fork_zygote", fails)
-        assert _fresh._run(job, answers.append) == 0
-        assert answers[-1] == said
-
-
-def test_new_process_writes_its_answer_at_once_and_exits(monkeypatch, tmp_path):
-    class Left(BaseException):
-        pass
-
-    def leave(code):
-        raise Left(code)
-
-    def run(job, answer):
-        assert json.loads(path.read_text()) == job
-        answer({"lost": -9})
-        assert not (tmp_path / "answer.part").exists()
-        return 0
-
-    signals = []
-    path = tmp_path / "job"
-    path.write_text(json.dumps({"answer": str(tmp_path / "answer")}))
-    monkeypatch.setattr(_fresh.sys, "argv", ["it", str(path)])
-    monkeypatch.setattr(_fresh.signal, "signal", lambda *given: signals.append(given))
-    monkeypatch.setattr(os, "_exit", leave)
-    monkeypatch.setattr(_fresh, "_run", run)
-    with pytest.raises(Left, match="0"):
-        _fresh.main()
-    assert json.loads((tmp_path / "answer").read_text()) == {"lost": -9}
-    assert signals == [(signal.SIGINT, signal.SIG_DFL)]
-    monkeypatch.setattr(_fresh, "_run", None)  # it fails
-    with pytest.raises(Left, match="1"):
-        _fresh.main()
 
 
 def test_code_below_a_folder_with_a_colon_is_imported_through_a_link(settings, monkeypatch, tmp_path):
@@ -370,6 +211,31 @@ def test_trial_that_a_supervisor_lost_runs_again(pool, worker):
         pool._end_attempt(pool._waiting.popleft(), KILL)
     (result,) = pool.completed(0)
     assert result.failure.exit_code == KILL
+
+
+def test_result_of_a_trial_counts_if_the_search_for_its_escape_dies(pool, worker):
+    worker.end.sendall(json.dumps({"result": survived(3).to_json(), "searches": True}).encode() + b"\n")
+    pool._read_messages(worker.worker)
+    assert list(pool.completed(0)) == []
+    pool._ended(worker.worker.slot, KILL)
+    why = "the process that searched was killed by SIGKILL"
+    assert list(pool.completed(0)) == [replace(survived(3), why_no_escape=why)]
+    assert not pool._waiting
+
+
+def test_trial_waits_until_it_may_run_again(pool):
+    forked, may = [], []
+    pool._link = SimpleNamespace(
+        ready=True, fork=lambda slot, end: forked.append(slot), kill=lambda slot: None, end=lambda: None
+    )
+    pool._may_repeat = lambda: bool(may)
+    pool._waiting.append(TrialAttempt(spec(3), [(KILL, 2)]))
+    assert (pool.repeats, pool.runs) == (True, False)
+    pool._assign_trials()
+    assert forked == []
+    may.append(True)
+    pool._assign_trials()
+    assert (forked, pool.repeats, pool.runs) == ([1], True, True)
 
 
 def test_error_of_a_supervisor_is_one_of_the_pool(pool, worker):
@@ -485,6 +351,8 @@ def test_fork_server_is_started_with_its_job(settings, monkeypatch, snapshot):
     assert link.restart() == "next"
     assert made == [(settings, {"late": True, "deaths": 1, "snapshot": snapshot})]
     assert started[-1] == "ended"
+    assert list(settings.scratch.iterdir()) == []
+    link._log.touch()
     link.unfit, link._importing = False, "a module"
     with pytest.raises(CrashhuntError, match="a module: its process exited with 1 meanwhile, 2 times"):
         link.restart()
@@ -554,17 +422,3 @@ def test_pool_starts_no_more_supervisors_than_it_has_slots(pool):
     pool._link.ready = True
     pool._assign_trials()
     assert forked == [1, 2, 3, 4]  # those that have retired hold no slot
-
-
-@pytest.mark.parametrize(
-    ("free", "said"),
-    [
-        (1000, "could not start: the disk is full; free some space there, or set TMPDIR to a folder on another disk"),
-        (1 << 30, "could not start: it exited with 1 without output; run the same command again"),
-    ],
-)
-def test_process_that_could_write_nothing_is_explained_without_its_log(tmp_path, monkeypatch, free, said):
-    log = tmp_path / "start.log"
-    log.touch()
-    monkeypatch.setattr(_fresh.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
-    assert str(_fresh._not_started(3, log, 1)) == f"{tmp_path}: the process of trial 3 {said}"

@@ -97,7 +97,7 @@ def test_fork_server_that_is_killed_starts_again_twice(tmp_path, monkeypatch, co
     link = _fork_server_link.ForkServerLink.__new__(_fork_server_link.ForkServerLink)
     link._settings, link._late, link._snapshot, link._importing = "settings", False, True, ""
     link.deaths, link.unfit = deaths, False
-    link._log = tmp_path / "log"
+    link._job, link._log = tmp_path / "job", tmp_path / "log"
     link._log.write_text("first\nno memory\n")
     link._kept = SimpleNamespace(process=SimpleNamespace(wait=wait), end=lambda: ended.append(True))
     link.control = SimpleNamespace(close=lambda: None)

@@ -20,7 +20,7 @@ from crashhunt.base.errors import CrashhuntError, HostError
 from crashhunt.episode import Parts, WorkerSettings, run_episode, scratch_of
 from crashhunt.executors import _supervisor, _time_limits
 from crashhunt.executors._protocol import encode_report
-from crashhunt.executors._supervisor import EndedTrial, LostTrialError, Supervisor, UnfitZygoteError
+from crashhunt.executors._supervisor import EndedTrial, LostTrialError, Supervisor
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import CRASHES, Collision, Outcome, TrialResult, TrialSpec
@@ -209,9 +209,6 @@ def test_trial_whose_process_was_killed_is_lost(zygote, settings):
 
 def test_zygote_that_does_not_get_ready_is_an_error(zygote, settings, monkeypatch):
     theirs = zygote.theirs
-    theirs.sendall(b'{"unfit": true}\n')
-    with pytest.raises(UnfitZygoteError):
-        Supervisor(settings, zygote.ours).run(spec())
     theirs.sendall(json.dumps(CrashhuntError("no map", fix="draw one").to_json()).encode() + b"\n")
     with pytest.raises(CrashhuntError, match="no map"):
         Supervisor(settings, zygote.ours).run(spec())
@@ -315,7 +312,8 @@ CRASH = replace(FINE, outcome=Outcome.COLLISION, collision=HIT)
 
 def test_answer_of_a_supervisor_has_the_result_or_why_there_is_none(settings):
     def answer(end):
-        return _supervisor._answer(Running(end), settings, spec())
+        (found,) = _supervisor._answers(Running(end), settings, spec())
+        return found
 
     assert answer(EndedTrial(FINE)) == {"result": FINE.to_json(), "retires": False}
     assert answer(EndedTrial(FINE, ("a", "b")))["notices"] == ["a", "b"]
@@ -329,6 +327,22 @@ def test_answer_of_a_supervisor_has_the_result_or_why_there_is_none(settings):
     assert full["fix"]
     assert "where" in answer(OSError(22, "odd"))["error"]
     assert not answer(OSError(22, "odd"))["error"]["message"].startswith("the trial cannot be kept")
+
+
+def test_supervisor_answers_before_it_searches_for_an_escape(settings, monkeypatch):
+    asked, escaped = replace(settings, find_escapes=True), replace(CRASH, why_no_escape="it was killed")
+    monkeypatch.setattr(_supervisor, "with_escape", lambda *_: escaped)
+
+    def answers(end, given=asked, *, retires=False):
+        supervisor = Running(EndedTrial(end))
+        supervisor.retires = retires
+        return list(_supervisor._answers(supervisor, given, spec()))
+
+    found = {"result": escaped.to_json(), "retires": False}
+    assert answers(CRASH) == [{"result": CRASH.to_json(), "searches": True}, found]
+    for unchanged in (answers(FINE), answers(CRASH, settings), answers(CRASH, retires=True)):
+        assert len(unchanged) == 1
+        assert unchanged[0]["result"] != escaped.to_json()
 
 
 def test_escape_is_searched_in_trials_of_their_own(settings, monkeypatch, tmp_path):
@@ -367,11 +381,6 @@ def test_escape_is_searched_in_trials_of_their_own(settings, monkeypatch, tmp_pa
         times = ", 3 times" if len(supervisor.specs) == 3 else ""
         assert result.why_no_escape == f"the process that searched was killed by SIGKILL{times}"
         assert supervisor.ends == []
-    for given, end in ((settings, CRASH), (asked, FINE)):
-        assert _supervisor.with_escape(Running(), given, EndedTrial(end)) is end
-    retired = Running()
-    retired.retires = True
-    assert _supervisor.with_escape(retired, asked, EndedTrial(CRASH)) is CRASH
     assert len(found) == 5
 
 
@@ -392,14 +401,14 @@ def test_supervisor_serves_until_it_retires_or_has_no_result(settings, monkeypat
         assert (supervisor, given) == (found, settings)
         said.append(trial.number)
         found.retires = last == "retires" and len(said) == 2
-        return answers[(len(said) - 1) % 2]
+        yield answers[(len(said) - 1) % 2]
 
     said = []
     monkeypatch.setattr(os, "_exit", leave)
     monkeypatch.setattr(os, "setsid", lambda: died.append("own session"))
     monkeypatch.setattr(_supervisor, "die_with", died.append)
     monkeypatch.setattr(_supervisor, "Supervisor", lambda given, zygote, conditions: found)
-    monkeypatch.setattr(_supervisor, "_answer", answer)
+    monkeypatch.setattr(_supervisor, "_answers", answer)
     with ours, theirs:
         for number in range(3):
             ours.sendall(json.dumps(spec(number).to_json()).encode() + b"\n")

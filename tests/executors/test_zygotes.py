@@ -15,9 +15,8 @@ import pytest
 from crashhunt.base import forks
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import stage_of
-from crashhunt.executors import _fork_server, _fresh, _preparation, _time_limits, _warm_traffics
+from crashhunt.executors import _fork_server, _preparation, _warm_traffics
 from crashhunt.executors._preparation import Imported
-from crashhunt.executors._time_limits import ImportKilledError
 from crashhunt.executors._warm_traffics import WarmTraffics
 from crashhunt.trial import TrialSpec
 
@@ -495,58 +494,9 @@ def test_server_whose_template_is_gone_gives_no_supervisor(server):
 
 
 @pytest.fixture
-def imports(monkeypatch):
-    """A child that imports; `reported` is its end of the connection, and `ends` how it ended, if it has."""
-    reports, reported = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    found = SimpleNamespace(reports=reports, reported=reported, ends=[], resumed=[], killed=[], waited=[])
-
-    def waitid(how, pid, options):
-        assert (how, pid, options) == (os.P_PID, PID, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-        return found.ends.pop(0) if found.ends else None
-
-    monkeypatch.setattr(_time_limits, "_LOOK_EVERY_S", 0.005)
-    monkeypatch.setattr(os, "waitid", waitid)
-    monkeypatch.setattr(_time_limits, "resume", found.resumed.append)
-    monkeypatch.setattr(_time_limits, "kill", found.killed.append)
-    monkeypatch.setattr(_time_limits, "ended", lambda pid: found.waited.append(pid) or found.code)
-    with reports, reported:
-        yield found
-
-
-def test_imports_are_awaited_up_to_the_last(imports):
-    imports.ends = [None, None]
-    for text in (b'"a module"', b"[", b'""'):
-        imports.reported.send(text)
-    _time_limits.await_imports(imports.reports, PID, 5.0)
-    assert (imports.killed, imports.waited) == ([], [])
-
-
-def test_import_that_ends_its_process_or_hangs_is_named(imports, monkeypatch):
-    imports.reported.send(b'"a module"')
-    imports.ends, imports.code = [None, "ended"], 3
-    with pytest.raises(CrashhuntError, match="a module: its process exited with 3 meanwhile") as caught:
-        _time_limits.await_imports(imports.reports, PID, 5.0)
-    assert "meanwhile," not in caught.value.message
-    assert (imports.resumed, imports.waited) == ([PID], [PID])
-    imports.reported.send(b'"a module"')
-    imports.ends, imports.code = ["ended"], -signal.SIGKILL
-    with pytest.raises(ImportKilledError) as killed:
-        _time_limits.await_imports(imports.reports, PID, 5.0)
-    assert killed.value.args == (-signal.SIGKILL, "a module")
-    imports.reported.send(b'"a module"')
-    monkeypatch.setattr(_time_limits, "START_UP_S", 0.01)
-    with pytest.raises(CrashhuntError, match=r"a module: it takes more than 0.02 s"):
-        _time_limits.await_imports(imports.reports, PID, 0.01)
-    assert imports.killed == [PID]
-    assert imports.waited == [PID] * 3
-    again = _time_limits.import_died("a module", -signal.SIGKILL, times=2).message
-    assert again == "a module: its process was killed by SIGKILL meanwhile, 2 times"
-
-
-@pytest.fixture
 def template(monkeypatch):
     """What a template or a fork server is made of: `imported` is the result of its imports, or its error."""
-    found = SimpleNamespace(imported="imported", late=[], rehearsed=0, forked=0, called=[], orphans=[], signals=[])
+    found = SimpleNamespace(imported="imported", late=[], forked=0, called=[], orphans=[], signals=[])
     made = []
 
     class Tracked(socket.socket):
@@ -559,8 +509,7 @@ def template(monkeypatch):
     monkeypatch.setattr(socket, "socket", Tracked)
     found.pool, found.orders = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
-    def imports(settings, report=None, *, rehearses=False):
-        found.rehearsed += rehearses
+    def imports(settings, report=None):
         if report:
             report("a module")
         found.late.append(report is None)
@@ -572,13 +521,12 @@ def template(monkeypatch):
         found.called.append(("zygote", control.fileno() >= 0, settings, imported))
         leave("zygote")
 
-    for module in (_fork_server, _fresh):
-        monkeypatch.setattr(module, "import_parts", imports)
-        monkeypatch.setattr(module, "import_nothing", lambda settings: imports(settings))
-        monkeypatch.setattr(module, "be_zygote", zygote)
-        monkeypatch.setattr(module, "die_with", lambda pid: found.called.append(("dies with", pid)))
-        monkeypatch.setattr(module, "prepare", lambda what: found.called.append("prepared"))
-        monkeypatch.setattr(module, "gc", SimpleNamespace(freeze=lambda: None, collect=lambda: None))
+    monkeypatch.setattr(_fork_server, "import_parts", imports)
+    monkeypatch.setattr(_fork_server, "import_nothing", lambda settings: imports(settings))
+    monkeypatch.setattr(_fork_server, "be_zygote", zygote)
+    monkeypatch.setattr(_fork_server, "die_with", lambda pid: found.called.append(("dies with", pid)))
+    monkeypatch.setattr(_fork_server, "prepare", lambda what: found.called.append("prepared"))
+    monkeypatch.setattr(_fork_server, "gc", SimpleNamespace(freeze=lambda: None, collect=lambda: None))
     monkeypatch.setattr(_fork_server, "adopt_orphans", lambda: found.called.append("adopts"))
     monkeypatch.setattr(_fork_server, "end_descendants", found.orphans.append)
     monkeypatch.setattr(_fork_server, "_ORPHANS_EVERY_S", 0.01)
@@ -620,7 +568,6 @@ def test_template_reports_imports_and_readiness(template, monkeypatch):
     template.imported = None
     _fork_server._be_template(template.orders, "settings", late=False)
     assert sent(template.pool) == [{"importing": "a module"}, {"unfit": True}]
-    assert template.rehearsed == 1
     template.imported = CrashhuntError("no planner", fix="write one")
     _fork_server._be_template(template.orders, "settings", late=True)
     assert sent(template.pool) == [template.imported.to_json()]
@@ -637,56 +584,6 @@ def test_template_reports_imports_and_readiness(template, monkeypatch):
     assert template.signals == [(number, signal.SIG_DFL) for number in _fork_server._IGNORED_SIGNALS]
     assert {signal.SIGINT, signal.SIGTERM} <= {number for number, _ in template.signals}
     assert template.orders.fileno() == -1
-
-
-@pytest.mark.parametrize("late", [False, True])
-def test_zygote_of_a_new_process_is_awaited(template, monkeypatch, late):
-    awaited = []
-
-    def wait(reports, pid, timeout_s):
-        awaited.append((pid, timeout_s))
-        assert reports.recv(10) == b""  # the end of the child is closed here
-
-    settings = SimpleNamespace(timeout_s=9.0)
-    template.forked = PID
-    monkeypatch.setattr(_fresh, "await_imports", wait)
-    with _fresh.fork_zygote(settings) as control:
-        assert awaited == [(PID, 9.0)]
-        assert control.recv(10) == b""
-    template.forked = 0
-    heard = []
-
-    def zygote(control, given, imported):
-        heard.append((given, imported))
-        leave("zygote")
-
-    monkeypatch.setattr(_fresh, "be_zygote", zygote)
-    with pytest.raises(Left, match="1"):
-        _fresh.fork_zygote(settings, late=late)
-    assert heard == [(settings, "imported")]
-    assert ("dies with", os.getpid()) in template.called
-    assert template.late == [late]
-
-
-def test_fork_zygote_imports_early_by_default(template):
-    with pytest.raises(Left):
-        _fresh.fork_zygote(SimpleNamespace(timeout_s=9.0))
-    assert template.late == [False]
-    assert template.rehearsed == 0  # a replay runs one trial, and would wait for ten
-
-
-def test_imports_of_a_new_process_are_reported_with_their_error(template):
-    control, theirs = socket.socketpair()
-    with control, theirs:
-        for imported, said in ((None, {"unfit": True}), (CrashhuntError("no planner", fix="write one"), None)):
-            reports, reported = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            with reports, reported:
-                template.imported = imported
-                _fresh._import_for_zygote(theirs, reported, "settings", late=False, rehearses=False)
-                assert sent(control) == [said or imported.to_json()]
-                assert sent(reports) == ["a module", ""]
-                assert reported.fileno() == -1
-        assert template.called == []
 
 
 @pytest.mark.parametrize("sys_path", [[], ["/mine"]])
@@ -829,7 +726,7 @@ def test_rehearsal_comes_before_the_imports_and_leaves_nothing(tmp_path, monkeyp
     monkeypatch.setattr(_preparation, "run_episode", run_episode)
     monkeypatch.setattr(_preparation, "Parts", lambda _: parts)
     monkeypatch.setattr(_preparation, "_can_be_forked", lambda: True)
-    assert _preparation.import_parts(settings, said.append, rehearses=True) is not None
+    assert _preparation.import_parts(settings, said.append) is not None
     assert said[:2] == ["Gymnasium cannot be imported", f"a module, {1 if fails else 10} rehearsals"]
     assert not list(tmp_path.iterdir())
 
@@ -840,9 +737,10 @@ def test_rehearsal_comes_before_the_imports_and_leaves_nothing(tmp_path, monkeyp
 def test_imports_decide_who_makes_the_simulator(monkeypatch, forkable, forks_well, makes):
     said = []
     backend = SimpleNamespace(forkable=forkable)
-    settings = SimpleNamespace(scenario=SimpleNamespace(backend=backend, simulator="toy"))
+    settings = SimpleNamespace(scenario=SimpleNamespace(backend=backend, simulator="toy"), scratch=None)
     parts = SimpleNamespace(load=lambda report: report("a module"))
     monkeypatch.setattr(_preparation, "Parts", lambda given: parts if given is settings else None)
+    monkeypatch.setattr(_preparation, "rehearse_trial", lambda *_: None)
     monkeypatch.setattr(_preparation, "_is_forkable_with", lambda given: forks_well if given is parts else None)
     monkeypatch.setattr(_preparation, "_can_be_forked", lambda: True)
     assert _preparation.import_parts(settings, said.append) == Imported(parts, makes_simulator=makes)
