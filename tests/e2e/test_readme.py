@@ -32,7 +32,7 @@ VARIES = re.compile(
     r"|\d+(\.\d+)?(/s\b| s/trial\b)?"  # a loaded machine runs less than one trial per second
 )
 NOW_AND_THEN = re.compile(
-    r"running:|done:|saving:|confirming:|.*: (running|finished|crashed)$|\.+ +\[|(.* )?\d+ passed"
+    r"the compiled core is |running:|done:|saving:|confirming:|.*: (running|finished|crashed)$|\.+ +\[|(.* )?\d+ passed"
 )
 
 
