@@ -114,17 +114,16 @@ class Owners:
             raise ArgumentError(f"{option} {word}: {who}", fix=f"write {fix}")
         return (takers[0], word) if takers else None
 
-    def of_record(self, word: str, ask: Callable[[str], Takes] | None, *, option: str) -> tuple[str, str] | None:
-        """Return the owner and the name of an argument of a recorded crash; None if no owner has it.
+    def of_record(self, word: str, ask: Callable[[str], Takes] | None) -> tuple[str, str] | None:
+        """Return the owner and the name of an argument that ``--set`` names; None if no owner has it.
 
-        The record lacks arguments whose default is not a number, a string or a Boolean; for these, `ask` is called.
-        ``ask`` returns the arguments of an agent from its code, or None if the code may not run; it is called only if
-        the record does not contain the name.
+        The record lacks arguments whose default is not a number, a string or a Boolean. Therefore, if it does not
+        contain the name, ``ask`` returns the arguments of an agent from its code. It is None if no code may run.
 
         Raises:
             ArgumentError: several owners have an argument with this name.
         """
-        owner = self.of(word, option=option)
+        owner = self.of(word, option="--set")
         if owner is not None or ask is None or word.startswith(f"{SCENARIO}."):
             return owner
         agent = agent_of(word, self.agents)
@@ -132,7 +131,7 @@ class Owners:
         for name in [agent] if agent else self.agents:
             asked = ask(name)
             agents[name] = Takes((*agents[name].names, *asked.names), asked.open)
-        return Owners(agents, self.scenario).of(word, option=option)
+        return Owners(agents, self.scenario).of(word, option="--set")
 
     def unknown(self, word: str, *, option: str, whose: str) -> ArgumentError:
         """Return the error for an unknown argument, with the most similar known name."""

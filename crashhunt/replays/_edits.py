@@ -224,7 +224,7 @@ def edited_spec(
     """Return the trial to replay, and its differences from the recorded trial.
 
     ``original`` is the ``hunt.toml`` with which the trial ran. The changes, by ``NAME`` or ``AGENT.NAME``, are applied
-    last. The code of the agents, without which no code may run, is inspected for arguments that are not recorded.
+    last. Arguments that are not recorded are looked up in the agents' ``code``, unless no code may run.
 
     Raises:
         ArgumentError: an argument does not exist, or a range is given instead of one value.
@@ -307,7 +307,7 @@ def _find(name: str, recorded: TrialSpec, settings: HuntSettings, code: Sequence
     scenario = [*(known for owner, known in specs if not owner), *recorded.scenario_arguments]
     owners = Owners(agents, tuple(dict.fromkeys(scenario)))
     ask = None if code is None else lambda agent: takes_of(settings.agents[agent].agent, code)
-    owner = owners.of_record(name, ask, option="--set")
+    owner = owners.of_record(name, ask)
     if owner is None:
         raise owners.unknown(name, option="--set", whose="the crash")
     return owner

@@ -202,7 +202,7 @@ class _Names:
         self._ask = cache(lambda agent: takes_of(drivers[agent], folder=Path(asked.folder)))
 
     def find(self, word: str) -> tuple[str, str] | None:
-        return self._owners.of_record(word, self._ask, option="--set")
+        return self._owners.of_record(word, self._ask)
 
     def owner(self, word: str) -> tuple[str, str]:
         owner = self.find(word)

@@ -447,16 +447,16 @@ def test_of_a_record_the_code_is_asked_only_where_it_does_not_know():
         calls.append(agent)
         return Takes(("weights",) if agent == "b" else ())
 
-    assert owners.of_record("speed", ask, option="--set") == ("a", "speed")
-    assert owners.of_record("scenario.x", ask, option="--set") is None
-    assert owners.of_record("weights", None, option="--set") is None
+    assert owners.of_record("speed", ask) == ("a", "speed")
+    assert owners.of_record("scenario.x", ask) is None
+    assert owners.of_record("weights", None) is None
     assert calls == []
-    assert owners.of_record("weights", ask, option="--set") == ("b", "weights")
+    assert owners.of_record("weights", ask) == ("b", "weights")
     assert calls == ["a", "b"]
-    assert owners.of_record("b.weights", ask, option="--set") == ("b", "weights")
+    assert owners.of_record("b.weights", ask) == ("b", "weights")
     assert calls == ["a", "b", "b"]
-    assert owners.of_record("a.weights", ask, option="--set") is None
-    assert owners.of_record("a.weights", lambda _: Takes((), open=True), option="--set") == ("a", "weights")
+    assert owners.of_record("a.weights", ask) is None
+    assert owners.of_record("a.weights", lambda _: Takes((), open=True)) == ("a", "weights")
 
 
 def test_code_states_what_an_agent_takes(folder):
