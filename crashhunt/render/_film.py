@@ -105,25 +105,22 @@ class Layout:
     Args:
         frame: width and height of the scene, in pixels.
         labels: labels of all panels.
-        panel: width and height of one panel, in pixels.
     """
 
-    def __init__(self, frame: tuple[int, int], labels: Sequence[str], panel: tuple[int, int] = _PANEL_PIXELS) -> None:
-        width, height = frame
-        count = len(labels)
-        rows = max(1, height // panel[1])
-        columns = max(1, width // panel[0])
-        next_to = width + math.ceil(count / rows) * panel[0], max(height, min(rows, count) * panel[1])
-        below = max(width, min(columns, count) * panel[0]), height + math.ceil(count / columns) * panel[1]
+    def __init__(self, frame: tuple[int, int], labels: Sequence[str]) -> None:
+        (width, height), (across, down), count = frame, _PANEL_PIXELS, len(labels)
+        rows, columns = max(1, height // down), max(1, width // across)
+        next_to = width + math.ceil(count / rows) * across, max(height, min(rows, count) * down)
+        below = max(width, min(columns, count) * across), height + math.ceil(count / columns) * down
         self.places: dict[str, tuple[int, int]] = {}
         if next_to[0] * next_to[1] < below[0] * below[1]:  # of two equal sizes, the narrow one is legible on a page
             self.size = next_to
             for number, label in enumerate(labels):
-                self.places[label] = width + number // rows * panel[0], number % rows * panel[1]
+                self.places[label] = width + number // rows * across, number % rows * down
         else:
             self.size = below
             for number, label in enumerate(labels):
-                self.places[label] = number % columns * panel[0], height + number // columns * panel[1]
+                self.places[label] = number % columns * across, height + number // columns * down
         # What players expect: an even number of pixels each way.
         self.size = self.size[0] + self.size[0] % 2, self.size[1] + self.size[1] % 2
 
