@@ -276,10 +276,7 @@ class Sample:
         self._take(ledger, sorted(numbers))
 
     def add(self, ledger: Ledger, trials: Iterable[tuple[int, str]]) -> None:
-        """Read those of the new trials that belong to the sample.
-
-        Each trial has its number and its outcome.
-        """
+        """Read those of the new trials, given by number and outcome, that belong to the sample."""
         self._take(
             ledger,
             [

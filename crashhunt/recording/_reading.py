@@ -120,12 +120,11 @@ class StepRecord:
 
     Args:
         step: number of the step; 0 is the start of the episode, before the first action.
-        scene: scene after the step.
+        scene: scene after the step; None if the process ended inside the step.
         rewards: reward of each agent, by agent id.
         observations: the observation of each agent before this step; empty at step 0.
         actions: the action of each agent.
         more: data of further record types, by the name of the type.
-        whole: whether the step was completed; False if the process ended inside the step, so that no scene follows.
     """
 
     step: int

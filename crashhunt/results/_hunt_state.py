@@ -359,8 +359,8 @@ def state_of_facts(directory: Path, facts: Facts, outcomes: dict[str, int], last
 def _duration_s(facts: Facts, until: float | None) -> float:
     """Return how long the last run of a hunt lasted up to a time, in s; 0 if that is unknown.
 
-    If the system's clock was set or the machine was suspended, the hunt's own measurement counts. The time is in s
-    since the epoch; None if no trial has ended.
+    If the system's clock was set or the machine was suspended, the hunt's own measurement counts. ``until`` is in s
+    since the epoch.
     """
     began, measured = facts.get("began"), facts.get("elapsed_s")
     if began is None or until is None:  # such as in a copy that `check --salvage` has made

@@ -74,8 +74,7 @@ def difference_of_rates(
     """Return the interval of the difference, second minus first agent, or the reason why there is none.
 
     The probability that the interval ever excludes the true difference, after any number of pairs, is at most `alpha`.
-    The pairs are in the order of their numbers. The interval excludes the difference with at most the probability
-    ``alpha``.
+    The pairs are in the order of their numbers.
     """
     trials = [one for pair in pairs for both in pair for one in both]
     step_length_s = next((one.step_length_s for one in trials if one.step_length_s), None)

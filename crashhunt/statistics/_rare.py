@@ -173,7 +173,7 @@ class RareEstimate:
         plain_steps: number of simulated steps of plain trials.
         plain_equivalent_steps: number of steps that plain trials would need for the same standard error. None if there
             is no standard error, or if the estimate is 1.
-        relative_error: half the width of ``estimated``, divided by the estimate; infinite if there is no interval.
+        confidence: confidence of all intervals, in (0, 1).
     """
 
     roots: int

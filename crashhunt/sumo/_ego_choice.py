@@ -129,9 +129,9 @@ def draw_among(
 ) -> Ego:
     """Return a controlled vehicle that replaces another vehicle in each trial, drawn from those entering amid traffic.
 
-    There is at least one vehicle, and they are ordered by time. The note begins with ``why``, and its ``verb`` says
-    what they do then, such as "depart". If the time window has fewer than ``few``, all are candidates. The controlled
-    vehicle keeps the id ``keep_agent`` if possible.
+    The vehicles are in the order of their times, at which they enter or depart, as ``verb`` says. If fewer than ``few``
+    vehicles do so in the time window, all are candidates. The note begins with ``why``. The controlled vehicle keeps
+    the id ``keep_agent`` if possible.
     """
     first, last = known[0].depart_s, known[-1].depart_s
     since = first + min(_BUSY_AFTER_S, (last - first) / 3)

@@ -80,7 +80,7 @@ def _along(
 ) -> NDArray[np.float64] | None:
     """Return the positions and the heading of an actor that drives some distances along a path, shape (N, 3).
 
-    The result is None for an actor that drives across the path or against it. Behind its end, the path is straight. The
+    The result is None for an actor that drives across the path or against it. Beyond its end, the path is straight. The
     heading is in rad, and all distances are in m. The reference point is ``ahead`` of the centre.
     """
     points = path.rows[path.begin :, 1:3]
