@@ -290,7 +290,7 @@ def add_replay(commands: Commands) -> None:
         "--print", metavar="FIELD,…", action=WordsWithCommas, default="", dest="fields",
         help="print a table with these values of each step: x, y, heading, speed, reward, time_to_collision_s, gap_m "
         "and required_deceleration (to the nearest actor), gap_to_other_m, time_to_other_s, closing_speed, action or "
-        "its parts, observation[ROW,NAME]",
+        "its parts, action[ROW,COLUMN], observation[ROW,NAME] and other names that a divergence contains",
     )  # fmt: skip
     look.add_argument(
         "--gui", action="store_true",

@@ -63,6 +63,23 @@ class AgentChannel(Serializable):
     observation_names: tuple[str, ...] = ()
     observation_parts: tuple[ObservedPart, ...] = field(default=(), metadata=OMIT_DEFAULT)
 
+    def value_name(self, array: str, where: tuple[int, ...]) -> str:
+        """Return the name of a value of an array: ``action[target_speed]``, or ``observation[actors, 0, x]``.
+
+        ``array`` is ``observation`` or ``action``, and ``where`` the index of the value in it.
+        """
+        columns = self.action_names if array == "action" else self.observation_names
+        words: list[object] = [*where[:-1], columns[where[-1]] if columns else where[-1]] if where else []
+        if array == "observation" and self.observation_parts:
+            (place,) = where
+            for part in self.observation_parts:
+                if place < part.size:
+                    *rows, last = np.unravel_index(place, part.shape)
+                    words = [part.name, *rows, part.columns[last] if part.columns else last]
+                    break
+                place -= part.size
+        return f"{array}[{', '.join(map(str, words))}]" if words else array
+
     def part(self, name: str, observation: NDArray[Any]) -> NDArray[Any] | None:
         """Return a part of a recorded observation; None if the observation has no such part."""
         begin = 0

@@ -47,8 +47,7 @@ from crashhunt.report._judgement_words import (
     about_reference,
 )
 from crashhunt.report._live_screen import draw_signals, format_inputs, input_signals
-from crashhunt.report._step_table import NEAREST, TableCell, stacked, steps_table
-from crashhunt.simulators import TRAJECTORY_SHAPE
+from crashhunt.report._step_table import NEAREST, TableCell, describe_action, is_wide, stacked, steps_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -57,7 +56,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, Moment, Note
     from crashhunt.recording import StepRecord
 
-_MAX_ACTION_CHARACTERS = 60  # of an action that is no array of numbers
 _MAX_TABLE_ROWS = 20  # of the table; of more steps, the table shows a selection
 _BUILD_ID_DIGITS = 12
 _WIDTH = 80  # characters of a line of the table, as on an ordinary terminal
@@ -385,24 +383,17 @@ class Story:
         channel = next((agent for agent in self.recording.prologue.agents if agent.id == self.agent), None)
         if channel is None:
             return ()
-        if is_opaque(channel.action_shape) or channel.action_shape == TRAJECTORY_SHAPE:
+        if is_wide(channel):
             return ("action",)
         return channel.action_names or tuple(f"action[{n}]" for n in range(math.prod(channel.action_shape)))
 
     def _opaque_action(self, step: int) -> str:
-        """Return the text of an action that is a trajectory, or no array of numbers; empty for other actions."""
+        """Return the text of an action with too many numbers for a table; empty for other actions."""
         channel = next((agent for agent in self.recording.prologue.agents if agent.id == self.agent), None)
         if channel is None or not 0 <= step < len(self.recording.all_steps):
             return ""
         array = self.recording.all_steps[step].actions.get(self.agent)
-        if array is not None and channel.action_shape == TRAJECTORY_SHAPE:
-            time, x, y, _, speed = array[-1].tolist()
-            return f"to ({x:.1f}, {y:.1f}) at {speed:.1f} m/s in {time:.1f} s"
-        return (
-            describe_value(array, _MAX_ACTION_CHARACTERS)
-            if array is not None and is_opaque(channel.action_shape)
-            else ""
-        )
+        return describe_action(array, channel) if array is not None and is_wide(channel) else ""
 
     def _action(self, step: int) -> list[float] | None:
         """Return the action of the agent in a step as text."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from contextlib import suppress
-from itertools import product
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -15,6 +14,7 @@ from crashhunt.base.plugins import locate
 from crashhunt.base.text import aligned, did_you_mean
 from crashhunt.crashes import Encounter
 from crashhunt.recording import describe_value, is_opaque
+from crashhunt.simulators import TRAJECTORY_SHAPE
 from crashhunt.snapshots import latest_snapshot
 from crashhunt.trial import signature_of
 from crashhunt.world import approaches, join_frames
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.plans import HuntSettings
@@ -32,6 +31,8 @@ if TYPE_CHECKING:
 
 TableCell: TypeAlias = "bool | int | float | str | None"
 TableRow: TypeAlias = dict[str, TableCell]
+_MAX_COLUMNS = 12  # of an action in a table
+_MAX_TEXT = 60  # of an action that is no array of numbers
 _SCENE_FIELDS = ("x", "y", "heading", "speed")
 NEAREST = ("time_to_collision_s", "gap_m", "required_deceleration")
 """Measures relative to the nearest actor, as in every trial."""
@@ -51,6 +52,7 @@ def check_fields(recording: Recording, fields: Sequence[str], agent: str) -> lis
     """
     channel = next(found for found in recording.prologue.agents if found.id == agent)
     actions, observed = _actions(channel), _observed(channel)
+    parts = list(actions)[: max(1, math.prod(channel.action_shape))]
     known = [*_SCENE_FIELDS, "reward", *NEAREST, *_PARTNER_FIELDS, *actions, *observed]
     names: list[str] = []
     for field in fields:
@@ -58,10 +60,10 @@ def check_fields(recording: Recording, fields: Sequence[str], agent: str) -> lis
         if name != "action" and name not in known:
             hint = did_you_mean(name, known)
             shown = ", ".join(
-                [*_SCENE_FIELDS, "reward", *NEAREST, *_PARTNER_FIELDS, "action", *actions, *list(observed)[:3]]
+                [*_SCENE_FIELDS, "reward", *NEAREST, *_PARTNER_FIELDS, "action", *parts[:9], *list(observed)[:3]]
             )
             raise UsageError(f"--print: there is no field {field!r}", fix=f"{hint} there are {shown}, …".lstrip())
-        names += actions if name == "action" else (name,)
+        names += parts if name == "action" and not is_wide(channel) else (name,)
     return names
 
 
@@ -73,7 +75,7 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
         fields: names of the columns: ``x``, ``y``, ``heading``, ``speed``, ``reward``, ``time_to_collision_s``,
             ``gap_m``, ``required_deceleration`` (relative to the nearest actor), ``gap_to_other_m``,
             ``time_to_other_s``, ``closing_speed`` (relative to the collision partner), ``observation[ROW,NAME]``, the
-            components of the action by name, or ``action`` for all components.
+            components of the action by name, or ``action`` for all components; for a wide action, its text.
         agent: identifier of the agent whose values are listed.
         other: identifier of the collision partner.
 
@@ -96,9 +98,9 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
                 row[name] = getattr(moments.get(step.step), _PARTNER_FIELDS[name], None)
             elif name in NEAREST:
                 row[name] = float(measured[name][number]) if step.scene is not None else None
-            elif name in actions:
+            elif name in actions or name == "action":
                 array = step.actions.get(agent)
-                row[name] = None if array is None else _item(array, (actions.index(name),), channel.action_shape)
+                row[name] = None if array is None else _action_cell(array, actions.get(name), channel)
             elif name in observed:
                 array = step.observations.get(agent)
                 row[name] = None if array is None else _item(array, observed[name], channel.observation_shape)
@@ -127,45 +129,46 @@ def stacked(heading: Sequence[str]) -> list[list[str]]:
 
 
 def _item(array: NDArray[np.generic], place: tuple[int, ...], shape: tuple[int, ...]) -> Any:
-    """Return one number of an action, flattened, or of an observation; for a value of any length, its text."""
-    if is_opaque(shape):
-        return describe_value(array)
-    return (array.reshape(-1) if len(place) == 1 else array)[place].item()
+    """Return one number of an observation; for a value of any length, its text."""
+    return describe_value(array) if is_opaque(shape) else array[place].item()
 
 
-def _actions(channel: AgentChannel) -> tuple[str, ...]:
+def _action_cell(array: NDArray[np.generic], place: tuple[int, ...] | None, channel: AgentChannel) -> Any:
+    """Return one number of an action; for a whole action, its text."""
+    return describe_action(array, channel) if place is None else array[place].item()
+
+
+def describe_action(array: NDArray[np.generic], channel: AgentChannel) -> str:
+    """Return a wide action as text: the end of a trajectory, or the first numbers."""
     if is_opaque(channel.action_shape):
-        return ("action",)
-    return tuple(channel.action_names) or tuple(f"action[{n}]" for n in range(math.prod(channel.action_shape)))
+        return describe_value(array, _MAX_TEXT)
+    if channel.action_shape == TRAJECTORY_SHAPE:
+        time, x, y, _, speed = array[-1].tolist()
+        return f"to ({x:.1f}, {y:.1f}) at {speed:.1f} m/s in {time:.1f} s"
+    return f"{', '.join(f'{value:.6g}' for value in array.reshape(-1)[:4].tolist())}, … ({array.size} numbers)"
+
+
+def is_wide(channel: AgentChannel) -> bool:
+    """Return whether an action of an agent has too many numbers for a table, or is no array of numbers."""
+    return is_opaque(channel.action_shape) or math.prod(channel.action_shape) > _MAX_COLUMNS
+
+
+def _actions(channel: AgentChannel) -> dict[str, tuple[int, ...]]:
+    """Return the index of each number of an action by its names, first the names of the columns of a table."""
+    if is_opaque(channel.action_shape):
+        return {}
+    places = list(np.ndindex(*channel.action_shape))
+    named = {channel.value_name("action", place).replace(" ", ""): place for place in places}
+    flat = {f"action[{number}]": place for number, place in enumerate(places)}
+    return dict(zip(channel.action_names, places, strict=False)) | named | flat
 
 
 def _observed(channel: AgentChannel) -> dict[str, tuple[int, ...]]:
-    shape = tuple(channel.observation_shape)
-    if is_opaque(shape):
+    """Return the index of each number of an observation by its name, such as ``observation[PART,ROW,COLUMN]``."""
+    if is_opaque(channel.observation_shape):
         return {"observation": ()}
-    if channel.observation_parts:
-        return _observed_in_parts(channel)
-    if len(shape) == 2:
-        names = channel.observation_names or tuple(map(str, range(shape[1])))
-        return {
-            f"observation[{row},{name}]": (row, column) for row in range(shape[0]) for column, name in enumerate(names)
-        }
-    if len(shape) == 1:
-        return {f"observation[{place}]": (place,) for place in range(shape[0])}
-    return {}
-
-
-def _observed_in_parts(channel: AgentChannel) -> dict[str, tuple[int, ...]]:
-    """Return the place of each value of an observation with parts, by ``observation[PART,ROW,COLUMN]``."""
-    found: dict[str, tuple[int, ...]] = {}
-    begin = 0
-    for part in channel.observation_parts:
-        for number, place in enumerate(product(*map(range, part.shape))):
-            *rows, last = place
-            words = [part.name, *map(str, rows), part.columns[last] if part.columns else str(last)]
-            found[f"observation[{','.join(words)}]"] = (begin + number,)
-        begin += part.size
-    return found
+    places = np.ndindex(*channel.observation_shape)
+    return {channel.value_name("observation", place).replace(" ", ""): place for place in places}
 
 
 def _of_scene(step: StepRecord, agent: str, name: str) -> float | None:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from crashhunt.base.text import aligned
 from crashhunt.crashes import find_bundle
 from crashhunt.errors import UsageError
+from crashhunt.recording._reading import AgentChannel, ObservedPart, Prologue, StepRecord
+from crashhunt.recording.records._agent_records import array_difference
 from crashhunt.report._step_table import NEAREST, check_fields, format_table, stacked, steps_table
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1" / "hunt"
@@ -68,3 +72,35 @@ def test_unknown_field_is_refused_with_the_known_ones(rear_end):
     known = ("speed", "gap_to_other_m", "target_speed", "observation[0,presence]")
     assert all(name in caught.value.fix for name in known)
     assert check_fields(rear_end, ["action", "x"], "ego") == ["target_speed", "lane_change", "x"]
+
+
+def test_names_that_a_divergence_contains_are_fields():
+    parts = (ObservedPart("ego", (2,), ("x", "speed")), ObservedPart("lidar2d", (3,)), ObservedPart("actors", (2, 2)))
+    planner = AgentChannel("ego", "<f8", (9,), "<f8", (64, 5), observation_parts=parts)
+    pedals = AgentChannel("ego", "<f8", (2, 2, 3), "<f8", (2,), ("throttle", "brake"))
+    named = []
+    for channel in (planner, pedals):
+        was = StepRecord(4)
+        for kind in ("observation", "action"):
+            shape = getattr(channel, f"{kind}_shape")
+            values = getattr(was, f"{kind}s")["ego"] = np.arange(1.0, 1 + np.prod(shape)).reshape(shape)
+            for place in np.ndindex(*shape):
+                now = values.copy()
+                now[place] = 0.0
+                found = array_difference(4, channel, kind, values, now)
+                recording = SimpleNamespace(prologue=Prologue((channel,), 0.1), all_steps=[was])
+                (row,) = steps_table(recording, [found.field], "ego")
+                assert list(row.values())[2:] == [values[place]]
+                named.append(found.field)
+    assert {"observation[ego, speed]", "observation[lidar2d, 2]", "observation[actors, 1, 0]"} <= {*named}
+    assert {"action[0, 4]", "action[63, 0]", "action[throttle]", "observation[1, 0, 2]"} <= {*named}
+
+
+@pytest.mark.parametrize(("shape", "said"), [((64, 5), "to (317.0, 318.0) at 320.0 m/s in 316.0 s"),
+                                             ((13,), "1, 2, 3, 4, … (13 numbers)"), ((2,), None)])  # fmt: skip
+def test_wide_action_is_one_column(shape, said):
+    channel = AgentChannel("ego", "<f8", (1,), "<f8", shape)
+    step = StepRecord(4, actions={"ego": np.arange(1.0, 1 + np.prod(shape)).reshape(shape)})
+    recording = SimpleNamespace(prologue=Prologue((channel,), 0.1), all_steps=[step])
+    (row,) = steps_table(recording, ["action"], "ego")
+    assert list(row.items())[2:] == ([("action", said)] if said else [("action[0]", 1.0), ("action[1]", 2.0)])

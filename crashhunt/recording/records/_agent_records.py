@@ -68,37 +68,30 @@ def message_of(dtype: str) -> str:
 
 
 def array_difference(
-    step: int,
-    agent: str,
-    kind: str,
-    columns: tuple[str, ...],
-    was: NDArray[np.generic] | None,
-    now: NDArray[np.generic] | None,
-    *,
-    opaque: bool = False,
+    step: int, agent: AgentChannel, kind: str, was: NDArray[np.generic] | None, now: NDArray[np.generic] | None
 ) -> Divergence | None:
     """Return the first difference between two arrays of an agent; either array may be missing.
 
-    ``kind`` is ``observation`` or ``action``. With ``opaque``, the arrays contain values as text.
+    ``kind`` is ``observation`` or ``action``.
     """
+    opaque = is_opaque(getattr(agent, f"{kind}_shape"))
     if was is None and now is None:
         return None
     if was is None or now is None:
         recorded, replayed = (
             None if array is None else describe_value(array) if opaque else array.tolist() for array in (was, now)
         )
-        return Divergence(step=step, agent=agent, field=kind, recorded=recorded, replayed=replayed)
+        return Divergence(step=step, agent=agent.id, field=kind, recorded=recorded, replayed=replayed)
     if was.tobytes() == now.tobytes():
         return None
     if was.shape != now.shape or opaque:  # texts of values
         recorded, replayed = (describe_value(array) for array in (was, now))
-        return Divergence(step=step, agent=agent, field=kind, recorded=recorded, replayed=replayed)
+        return Divergence(step=step, agent=agent.id, field=kind, recorded=recorded, replayed=replayed)
     where = first_difference(was, now)
-    name = ", ".join((*map(str, where[:-1]), columns[where[-1]] if columns else str(where[-1]))) if where else ""
-    field = f"{kind}[{name}]" if name else kind
     return Divergence(
-        step=step, agent=agent, field=field, recorded=was[where].item(), replayed=now[where].item(), place=(kind, where)
-    )
+        step=step, agent=agent.id, field=agent.value_name(kind, where), recorded=was[where].item(),
+        replayed=now[where].item(), place=(kind, where),
+    )  # fmt: skip
 
 
 def _array_record(tag: int, what: str) -> RecordType:
@@ -116,8 +109,7 @@ def _array_record(tag: int, what: str) -> RecordType:
         if agent is None:
             return None
         was, now = (getattr(step, f"{what}s").get(agent.id) for step in (left, right))
-        opaque = is_opaque(getattr(agent, f"{what}_shape"))
-        return array_difference(left.step, agent.id, what, getattr(agent, f"{what}_names"), was, now, opaque=opaque)
+        return array_difference(left.step, agent, what, was, now)
 
     def value(step: StepRecord, agent: str, index: tuple[int, ...]) -> object:
         array = getattr(step, f"{what}s").get(agent)
