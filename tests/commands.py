@@ -34,6 +34,7 @@ from warm import (
     path_of,
     pid_of,
     prepare_ours,
+    use_huge_pages,
 )
 
 if TYPE_CHECKING:
@@ -348,4 +349,5 @@ if __name__ == "__main__":
     prepare_ours()
     gc.collect()
     gc.freeze()
+    use_huge_pages()
     _serve(Clients(socket.socket(fileno=int(sys.argv[1])), sys.argv[4]))
