@@ -45,9 +45,11 @@ def lane_place(network: RoadNetwork, vehicle: RoadObject, other: RoadObject) -> 
     front = other.position + other.LENGTH / 2 * np.array([math.cos(other.heading), math.sin(other.heading)])
     _, right = other.lane.local_coordinates(front)
     same = vehicle.lane_index == other.lane_index or any(
-        network.is_connected_road(one.lane_index, two.lane_index, one.route, same_lane=True, depth=_MAX_ROADS)
+        network.is_connected_road(
+            one.lane_index, two.lane_index, getattr(one, "route", None), same_lane=True, depth=_MAX_ROADS
+        )
         for one, two in ((vehicle, other), (other, vehicle))
-        if isinstance(one, Vehicle)
+        if isinstance(one, Vehicle)  # with continuous actions, a vehicle that has no route
     )
     # highway-env counts lanes from the left, and its lateral coordinate points to the right.
     index = len(network.graph[start][end]) - 1 - (number or 0)

@@ -11,6 +11,7 @@ import pytest
 from gymnasium.spaces import flatten, unflatten
 
 from crashhunt.highway import HighwaySimulator
+from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
 from crashhunt.simulators import PARTS
 from crashhunt.simulators.toy import ToySimulator
@@ -75,6 +76,15 @@ def test_ego_and_actors_are_the_objects_of_highway_env(name, is_straight):
                     assert bool(row[ACTORS["same_lane"]]) == is_on_lane
                     assert (row[ACTORS["ahead"]] > 0) == (thing is front)
         assert leaders > 3 or not is_straight
+
+
+def test_vehicle_without_a_route_observes_actors():
+    setup = AgentSetup(observation=("actors:rows=20",))
+    scenario = Scenario(simulator="highway", tables={"highway": HighwaySetup(id="racetrack-v1")}, agents={"ego": setup})
+    with closing(HighwaySimulator(scenario, None)) as simulator:
+        observations, _ = simulator.reset(seed=2)
+        rows = simulator.observation_layouts["ego"].restore(observations["ego"])["actors"]
+        assert rows[:, ACTORS["present"]].sum() == len(simulator._objects()) - 1 == 1
 
 
 def test_hidden_vehicle_is_not_shown_to_an_agent_that_observes_parts():
