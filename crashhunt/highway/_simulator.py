@@ -11,7 +11,7 @@ import math
 import random
 import warnings
 from collections import Counter
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.highway._fast_import import highway_env  # before anything else imports it
@@ -38,7 +38,8 @@ from crashhunt.highway._lanes_and_contacts import Hidden, HighwayEvents, Vehicle
 from crashhunt.highway._scripted import Puppet, Puppets
 from crashhunt.highway._steering import action_with, is_steered, motion_of
 from crashhunt.highway._surroundings import surroundings_of
-from crashhunt.highway.accelerator import Onlooker, SkippedObservation, kernel, switch_off, switch_on
+from crashhunt.highway.accelerator import Onlooker, kernel
+from crashhunt.highway.accelerator._known_versions import ACCELERATED
 from crashhunt.scenario import argument_values
 from crashhunt.simulators import (
     FullBraking,
@@ -102,12 +103,8 @@ class HighwaySimulator:
         self._possible = tuple(scenario.agents)
         self._parts = SceneObserver(scenario.agents, LANE_PARTS)
         self.observation_layouts = self._parts.layouts
-        reason = ""
-        if not self._setup.accelerate:
-            switch_off()
-        elif reason := switch_on():
-            logging.getLogger(__name__).warning("the accelerator is disabled: %s", reason)
-        self._compiled = kernel() if self._setup.accelerate and not reason else None
+        self._is_accelerated = _switch_accelerator(is_wanted=self._setup.accelerate)
+        self._compiled = kernel() if self._is_accelerated else None
         self.agents: list[str] = []
         self.notices: dict[str, None] = {}
         self._lane_names: dict[tuple[str, str, int], str] = {}
@@ -376,7 +373,11 @@ class HighwaySimulator:
         self._env = env
         self._lane_parts = LaneParts(env.road.network)
         is_unused = self._kinematics is not None or len(self.observation_layouts) == len(self._possible)
-        self._skipping = SkippedObservation(env) if is_unused else nullcontext()
+        self._skipping: AbstractContextManager[None] = nullcontext()
+        if is_unused and self._is_accelerated:
+            from crashhunt.highway.accelerator import SkippedObservation
+
+            self._skipping = SkippedObservation(env)
         rate = env.config["simulation_frequency"]
         self.step_length_s = int(rate // env.config["policy_frequency"]) / rate  # highway-env rounds sub-steps down
         chosen = self._setup.off_road
@@ -554,6 +555,20 @@ class HighwaySimulator:
         if found is None:
             found = self._lane_names[index] = "_".join(map(str, index))
         return found
+
+
+def _switch_accelerator(*, is_wanted: bool) -> bool:
+    """Switch the accelerator on or off, and return whether highway-env is accelerated."""
+    if highway_env.__version__ not in ACCELERATED:  # it may lack names that the accelerator imports
+        return False
+    from crashhunt.highway.accelerator import switch_off, switch_on
+
+    if not is_wanted:
+        switch_off()
+        return False
+    if reason := switch_on():
+        logging.getLogger(__name__).warning("the accelerator is disabled: %s", reason)
+    return not reason
 
 
 def _is_highway_envs_own(kind: type) -> bool:

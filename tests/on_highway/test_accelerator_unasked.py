@@ -164,6 +164,6 @@ def test_a_scenario_that_shows_something_else_is_not_distinguished(tmp_path, mon
     trace, times = run(other)
     assert times == 0
     switch_off()
-    monkeypatch.setattr("crashhunt.highway._simulator.switch_on", lambda: "")
+    monkeypatch.setattr("crashhunt.highway.accelerator.switch_on", lambda: "")
     assert run(other)[0] == trace
     assert run(None)[1] == 3

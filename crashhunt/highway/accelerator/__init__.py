@@ -8,7 +8,8 @@ if TYPE_CHECKING:
     from ._frames import TrafficFrame as TrafficFrame
     from ._kernel import Poses as Poses, kernel as kernel
     from ._lane_network import Network as Network
-    from ._substep_loop import Onlooker as Onlooker, SkippedObservation as SkippedObservation
+    from ._onlooker import Onlooker as Onlooker
+    from ._substep_loop import SkippedObservation as SkippedObservation
     from ._supported import kind_of as kind_of, reason_against as reason_against
     from ._switch import (
         Acceleration as Acceleration,

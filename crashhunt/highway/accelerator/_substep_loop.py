@@ -28,6 +28,7 @@ from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 
+from crashhunt.highway.accelerator._onlooker import Onlooker
 from crashhunt.highway.accelerator._roads import Prepared, cached, is_known, look, methods_of, prepared, watches
 from crashhunt.highway.accelerator._supported import Own, is_genuine, kinds_of, originals
 
@@ -171,57 +172,6 @@ def _clip_to_unit(value: float) -> float:
         clipped: float = np.clip(value, 0, 1)  # decides about the sign of zero, and about NaN
         return clipped
     return value if value < 1 else _ONE
-
-
-# A wrapper of a road's `step` that declares whether it changes the road.
-
-
-class Onlooker:
-    """Replaces the ``step`` of a road object by a function that calls observers before and after each sub-step.
-
-    The kept state of the road stays valid as long as the observers do not change the road.
-
-    Args:
-        advance: The original ``step`` of the road.
-        before: Function called before each sub-step with the length of the sub-step, in s.
-        after: Function called after each sub-step.
-        interferes: Function that returns whether the two observers may change the road; called before and after each
-            sub-step. By default, the observers never change the road.
-        waits: Function that returns whether the observers act only in sub-steps in which a vehicle crashes. If so,
-            ``after`` is called only after these sub-steps, and ``before`` is never called. By default, both observers
-            are always called.
-    """
-
-    def __init__(
-        self,
-        advance: Callable[[float], None],
-        *,
-        before: Callable[[float], None] | None = None,
-        after: Callable[[], None] | None = None,
-        interferes: Callable[[], bool] = bool,
-        waits: Callable[[], bool] = bool,
-    ) -> None:
-        self._advance = advance
-        self._before = before
-        self._after = after
-        self.interferes = interferes
-        self.waits = waits
-
-    def look(self) -> None:
-        """Call the observer that follows a sub-step."""
-        if self._after is not None:
-            self._after()
-
-    def __deepcopy__(self, memo: dict[int, object]) -> Onlooker:
-        """Return the same object for a copy of the road, as for a function."""
-        return self
-
-    def __call__(self, dt: float) -> None:
-        """Run a sub-step of the road with its observers."""
-        if self._before is not None:
-            self._before(dt)
-        self._advance(dt)
-        self.look()
 
 
 _CALLED_METHODS = ("step", "_simulate", "_automatic_rendering")

@@ -398,10 +398,7 @@ def reason_against() -> str:
     version = highway_env.__version__
     if version not in ACCELERATED:
         return f"highway-env {version} is not supported (supported: {', '.join(ACCELERATED)})"
-    digest = hashlib.blake2b(digest_size=8)
-    for module in _SOURCES:
-        digest.update(Path(str(module.__file__)).read_bytes())
-    if digest.hexdigest() != ACCELERATED[version]:
+    if installed_digest() != ACCELERATED[version]:
         return f"the installed highway-env {version} is not the published one"
     for name, function in _functions():
         place = getattr(getattr(function, "__code__", None), "co_filename", "something else")
@@ -410,6 +407,14 @@ def reason_against() -> str:
         if function.__qualname__ != name:  # such as another method of highway-env
             return f"{name} has been replaced by {function.__qualname__}"
     return f"the compiled kernel is not used: {why_not()}" if kernel() is None else ""
+
+
+def installed_digest() -> str:
+    """Return the digest of the modules of the installed highway-env in which the accelerator replaces something."""
+    digest = hashlib.blake2b(digest_size=8)
+    for module in _SOURCES:
+        digest.update(Path(str(module.__file__)).read_bytes())
+    return digest.hexdigest()
 
 
 _FILES = {str(module.__file__) for module in _SOURCES}
