@@ -101,7 +101,8 @@ def test_seed_that_is_not_kept_is_refused(imitate):
         reseed_generators("libsumo.so", 3)
 
 
-def test_reason_names_the_version_or_the_missing_symbol():
+def test_reason_names_the_version_or_the_missing_symbol(monkeypatch):
+    monkeypatch.setattr(_generators, "_CHECKED_VERSIONS", ("1.28.0",))  # a nightly job adds the newest one
     assert why_no_reseeding("1.0.0", "none") == "libsumo 1.0.0 was not checked for re-seeding (checked: 1.28.0)"
     assert why_no_reseeding("1.28.0", "/nowhere.so").startswith("libsumo's generators cannot be re-seeded: /nowhere.so")
     python = ctypes.pythonapi._name or ""
