@@ -207,8 +207,9 @@ class HandOver:
         return replace(rerun, spec=spec, worker=worker)
 
     def __str__(self) -> str:
+        given = " and ".join(f"{name}={value}" for name, value in self.arguments.items())
         who = f"{self.driver or 'the recorded agent'} takes over after step {self.from_step}"
-        return ", ".join([who, *(f"{name}={value}" for name, value in self.arguments.items())])
+        return f"{who}, with {given}" if given else who
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -121,10 +121,9 @@ def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: What
             if rerun.code == "snapshot" and not is_current_code(rerun):
                 raise _too_old(error.message) from error
             raise
-    edits = [] if not rerun.edits else [", ".join(rerun.edits)]
     return Counts(
         crash=bundle.id,
-        interventions=(*edits, *(str(one) for one in interventions if not isinstance(one, SetArguments))),
+        interventions=(*rerun.edits, *(str(one) for one in interventions if not isinstance(one, SetArguments))),
         from_step=runs.from_step,
         code=rerun.code,
         recorded_outcome=bundle.result.outcome,

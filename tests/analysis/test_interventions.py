@@ -209,11 +209,12 @@ def test_what_the_engine_changes_itself_leaves_the_run_as_it_is():
 def test_interventions_are_described_in_words():
     brake, late = (Disturbance(9, "ahead", what, 1.0, 1.0, "ego") for what in ("brake", "late_observation"))
     assert [str(one) for one in (
-        HandOver(from_step=4, arguments={"speed": "7"}), HandOver(from_step=4, driver="a:B"), Overrule(from_step=4),
-        Overrule(from_step=4, manoeuvre="left", agent="bus"), SetArguments(changes={"speed": "7", "gap_m": "9"}),
-        LeaveOut(actors=("a", "b")), Disturb(disturbances=(brake, late)),
+        HandOver(from_step=4, arguments={"speed": "7", "gap": "2"}), HandOver(from_step=4, driver="a:B"),
+        Overrule(from_step=4), Overrule(from_step=4, manoeuvre="left", agent="bus"),
+        SetArguments(changes={"speed": "7", "gap_m": "9"}), LeaveOut(actors=("a", "b")),
+        Disturb(disturbances=(brake, late)),
     )] == [
-        "the recorded agent takes over after step 4, speed=7", "a:B takes over after step 4",
+        "the recorded agent takes over after step 4, with speed=7 and gap=2", "a:B takes over after step 4",
         "the agent is overruled after step 4: brake", "bus is overruled after step 4: left", "speed=7, gap_m=9",
         "without a, b", "ego: brake in step 9, ego: late_observation in step 9",
     ]  # fmt: skip

@@ -68,6 +68,12 @@ def test_another_agent_takes_over_after_the_recorded_actions(crash):
     assert "matched the recording up to step 33" in braking
 
 
+def test_each_change_is_a_line_of_its_own(crash):
+    said = crash.crashhunt("whatif", "h", "--set", "speed=8", "--set", "gap_m=50").out.splitlines()
+    changed = [line for line in said if line.startswith("  changed: ")]
+    assert [line.split(" was ")[0] for line in changed] == ["  changed: ego.speed", "  changed: gap_m"]
+
+
 def test_agent_of_today_is_found_in_the_working_directory(crash):
     (crash.folder / "newcomer.py").write_text(
         "class Late:\n"
