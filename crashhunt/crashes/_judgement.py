@@ -404,6 +404,12 @@ class Judgement(Serializable):
         """Number of trials that were run."""
         return sum(len(attempt.endings) for attempt in self.attempts)
 
+    def others_from(self, step: int) -> int:
+        """Return the number of runs from this step and from later steps in which another crash happened."""
+        return sum(
+            ending == "other" for attempt in self.attempts for after, ending in attempt.endings.items() if after >= step
+        )
+
     @property
     def best(self) -> Attempt | None:
         """The manoeuvre that avoids the crash from the latest step; the first of several that are equally good."""

@@ -215,15 +215,17 @@ def _avoided(story: CrashFacts, omission: Omission | None) -> str:
             f"{_omitted(story.agent, omission, had_to_yield=blamed)}with a reference driver this crash does not happen"
         )
     if judgement is not None and judgement.runs:
+        none = "no run ends without a crash" if judgement.others_from(0) else "no run avoids it"
         if judgement.verdict == "invalid":
-            return "no run avoids it: the trial starts in an unavoidable situation"
+            return f"{none}: the trial starts in an unavoidable situation"
         if judgement.verdict == "too late when visible":
-            return f"when {story.agent} first observed {story.other}, no run avoided it any more"
+            avoided = "ended without a crash" if judgement.others_from(judgement.visible_step or 0) else "avoided it"
+            return f"when {story.agent} first observed {story.other}, no run {avoided} any more"
         best = judgement.best
         if best is not None and best.last_step is not None:
             how = _MANOEUVRE_WORDS.get(best.manoeuvre, best.manoeuvre)
             return _if_it(story, how, best.last_step, best.changed)
-        return "no run avoids it" if judgement.avoidable is False else ""
+        return none if judgement.avoidable is False else ""
     if tried is None or tried.why_not or tried.step is None:
         return ""
     is_changing = story.contact is not None and story.agent in story.contact.lane_changers(_CHANGE_S)

@@ -39,23 +39,27 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
         sentences = [_until(best, ago)]
         rest = (attempt for attempt in judgement.attempts if attempt is not best and attempt.last_step is not None)
         sentences += [_until(attempt, ago) for attempt in rest]
-    elif judgement.avoidable is False:
-        tried = " nor ".join(_ESCAPE_WORDS.get(attempt.manoeuvre, attempt.manoeuvre) for attempt in judgement.attempts)
-        sentences = [f"None of {runs} avoided it, from the first step on: neither {tried}."]
-        if len(judgement.attempts) == 1:
-            sentences = [f"None of {runs} avoided it {tried}, from the first step on."]
-        if others := sum(end == "other" for attempt in judgement.attempts for end in attempt.endings.values()):
-            sentences.append(f"In {others} of them, another crash happened instead.")
     elif judgement.runs:
-        sentences = [f"None of {runs} avoided it, but they do not prove that it was unavoidable."]
+        others = judgement.others_from(0)
+        none = f"None of {runs} {'ended without a crash' if others else 'avoided it'}"
+        tried = " nor ".join(_ESCAPE_WORDS.get(attempt.manoeuvre, attempt.manoeuvre) for attempt in judgement.attempts)
+        if judgement.avoidable is not False:
+            sentences = [f"{none}, but they do not prove that it was unavoidable."]
+        elif len(judgement.attempts) == 1:
+            sentences = [f"{none} {tried}, from the first step on."]
+        else:
+            sentences = [f"{none}, from the first step on: neither {tried}."]
+        sentences += [f"In {others} of them, another crash happened instead."] * bool(others)
     visible = judgement.visible_step
     if judgement.verdict == "invalid":
         sentences.append(f"{agent} started in an unavoidable situation: the trial is invalid.")
     elif visible is not None and judgement.verdict == "too late when visible":
-        sentences.append(
-            f"When {agent} first observed {other}, {ago(visible)}, the crash was already unavoidable: runs from every "
-            "later step crashed."
-        )
+        seen = f"When {agent} first observed {other}, {ago(visible)},"
+        if others := judgement.others_from(visible):
+            late = f"no later run ended without a crash; in {others} of them, another crash happened instead"
+        else:
+            late = "the crash was already unavoidable: runs from every later step crashed"
+        sentences.append(f"{seen} {late}.")
     elif visible is not None and judgement.runs:
         when = "at the start" if visible == 0 else ago(visible)  # other actors may hide it later
         sentences.append(f"{agent} first observed {other} {when}.")

@@ -218,6 +218,10 @@ def omitted(**more):
             {"judgement": Judgement((attempt(-1),))},
             f"{TOUCHED}; no run avoids it: the trial starts in an unavoidable situation.",
         ),
+        (
+            {"judgement": Judgement((Attempt("brake", 40, dict.fromkeys(range(40), "other")),))},
+            f"{TOUCHED}; no run ends without a crash.",
+        ),
         ({"judgement": Judgement((), why_not="interrupted")}, f"{TOUCHED}."),
         (
             {"judgement": omitted()},

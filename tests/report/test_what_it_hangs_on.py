@@ -28,7 +28,16 @@ def test_that_braking_helped_from_the_first_step_on_is_reported_next_to_what_hel
 def test_other_crashes_in_place_of_this_one_are_reported(others):
     endings = {0: "other" if others else "hit", 1: "hit", 2: "other" if others else "hit"}
     told = about_judgement(Judgement((Attempt("brake", 3, endings),)), str, "ego", "other")
-    assert told[0] == "None of 3 runs avoided it by braking, from the first step on."
+    what = "ended without a crash" if others else "avoided it"
+    assert told[0] == f"None of 3 runs {what} by braking, from the first step on."
+    unsettled = Judgement((Attempt("brake", 3, endings),), why_not="it took too long")
+    doubt = about_judgement(unsettled, str, "ego", "other")
+    assert doubt[0] == f"None of 3 runs {what}, but they do not prove that it was unavoidable."
+    assert ("In 2 of them, another crash happened instead." in doubt) == bool(others)
+    late = Judgement((Attempt("brake", 3, {0: "unclear", **{k: endings[k] for k in (1, 2)}}),), visible_step=1)
+    seen = about_judgement(late, str, "ego", "other")[-1]
+    assert ("the crash was already unavoidable" in seen) != bool(others)
+    assert ("no later run ended without a crash; in 1 of them, another crash" in seen) == bool(others)
     assert ("In 2 of them, another crash happened instead." in told) == bool(others)
 
 
