@@ -294,7 +294,7 @@ def _readers(kind: Any) -> list[tuple[str, _Convert | None, bool]]:
         if (null := item.metadata.get("null")) is not None:
             convert = _null_as(null)
         elif (convert := _reader(hint)) is not None and type(None) in get_args(hint):
-            convert = _optional(convert, falsy=issubclass(_kind_of(hint)[0], Serializable))
+            convert = _optional(convert)
         found.append((item.name, convert, item.default is MISSING and item.default_factory is MISSING))
     return found
 
@@ -303,9 +303,8 @@ def _null_as(null: float) -> _Convert:
     return lambda held: null if held is None else held
 
 
-def _optional(convert: _Convert, *, falsy: bool) -> _Convert:
-    # Early versions wrote {} for a part that a trial has not.
-    return lambda held: None if held is None or (falsy and not held) else convert(held)
+def _optional(convert: _Convert) -> _Convert:
+    return lambda held: None if held is None else convert(held)
 
 
 def _reader(hint: object) -> _Convert | None:

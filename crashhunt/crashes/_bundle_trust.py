@@ -249,7 +249,7 @@ def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> U
     elif bundle.authentication_code:
         proof = "you did not make it on this machine, or it has changed since"
     else:
-        proof = "nothing proves that you made it on this machine (earlier versions of crashhunt wrote no proof)"
+        proof = "nothing proves that you made it on this machine"
     return UntrustedError(
         f"{proof}, and this would run its code: {runs}",
         fix=f"{fix}; crashhunt replay --from-log runs none of it",

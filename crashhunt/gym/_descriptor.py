@@ -113,7 +113,6 @@ BACKEND: Backend = Backend(
     shows_itself=True,
     check=_check,
     modules=_modules,
-    implied={"time_limit": "none"},
     notes=_notes,
     versions=("gymnasium",),
     reported_events=(),

@@ -107,7 +107,6 @@ BACKEND: Backend = Backend(
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "ignore_priority", "unseen"),
     varying_disturbances=("brake", "stop"),
     observations=(*SCENE_PARTS, "lanes", "route", "speed_limit"),
-    implied={"time_limit": "none"},
     accelerator=Accelerator(switched_off=_as_it_is, note=_not_accelerated),
     side_effect=_side_effect,
     plays_paths=True,

@@ -271,9 +271,7 @@ def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool 
         keys=_keys_of_a_file,
     )
     tables: dict[str, object] = {
-        name: validate(kind, data[name], where=where, error=ScenarioError, under=name)
-        for name, kind in kinds.items()
-        if data[name] is not None  # as an older crashhunt sends it to a worker
+        name: validate(kind, data[name], where=where, error=ScenarioError, under=name) for name, kind in kinds.items()
     }
     own = _table_kind(scenario.simulator)
     if own is not None and scenario.simulator not in tables and _is_optional(own):
@@ -362,10 +360,6 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
     for key in _INTERNAL_FIELDS:
         if key in data:
             raise ScenarioError(f"unknown key {key!r}", fix="remove it", where=str(path))
-    if kept:  # a snapshot of an earlier version means what this version did
-        for name, table in data.items():
-            if isinstance(table, dict) and (backend := backend_of(name)) is not None:
-                data[name] = {**backend.implied, **table}
     if not kept:
         _join_commands(data, str(path), path.resolve().parent)
     scenario = scenario_from_dict(data, where=str(path), folder=path.resolve().parent, tolerant=kept)

@@ -518,7 +518,6 @@ class Backend:
             moves; None if the contents are already valid everywhere.
         modules: function that yields the user's modules that the simulator imports in addition to the agents, as
             ``module:attribute``. Names without a colon are ignored, so the id of an environment is allowed.
-        implied: values of keys of the table in snapshots of earlier versions, which lack these keys.
         notes: function that yields texts for the user about decisions of crashhunt.
         versions: the Python distributions on whose versions the simulator's results depend.
         variables: names of environment variables on which results depend; their values are recorded together with the
@@ -567,7 +566,6 @@ class Backend:
     texts: Callable[[Scenario], Iterable[str]] = _no_notes
     relocated: Callable[[Path], bytes | None] | None = None
     modules: Callable[[Scenario], Iterable[str]] = _no_notes
-    implied: Mapping[str, object] = field(default_factory=dict)
     notes: Callable[[Scenario], Iterable[str]] = _no_notes
     versions: tuple[str, ...] = ()
     variables: tuple[str, ...] = ()

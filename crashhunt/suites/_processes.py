@@ -357,8 +357,7 @@ def refuse_untrusted_hunt(hunt: Path) -> None:
     except CrashhuntError as error:
         runs = f"what cannot be described: {error.message}"
     raise UntrustedError(
-        "nothing proves that you began this hunt on this machine (earlier versions of crashhunt wrote no proof), and "
-        f"running it again would run code: {runs}",
+        f"nothing proves that you began this hunt on this machine, and running it again would run code: {runs}",
         fix=f"if you trust that code, run {command_line('crashhunt', 'trust', hunt)} once, or add --trust",
         where=str(hunt),
     )

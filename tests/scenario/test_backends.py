@@ -16,7 +16,6 @@ from crashhunt.scenario import (
     Backend,
     Scenario,
     _load,
-    as_plain_data,
     backend_of,
     load_scenario,
     scenario_from_dict,
@@ -165,29 +164,8 @@ def test_a_table_of_no_one_is_refused(tmp_path, changes, says):
     assert "notes" not in str(caught.value)  # nor what is no key of a file
 
 
-def test_a_table_that_an_older_crashhunt_sends_as_nothing_is_none():
-    sent = {"simulator": "toy", "sumo": None, "highway": None}
-    assert scenario_from_dict(sent, where="worker settings", folder=Path()).tables == {}
-
-
 def test_what_ran_before_with_a_table_that_no_one_used_still_runs(tmp_path):
     shutil.copytree(shipped_folder() / "highway", tmp_path / "s")
     file = tmp_path / "s" / "scenario.toml"
     file.write_text('schema = 1\nsimulator = "toy"\n[agents.ego]\n[sumo]\nnet = "gone.net.xml"\n')
     assert list(load_scenario(file, kept=True).files()) == []
-
-
-@pytest.mark.parametrize(("simulator", "key"), [("gym", "CartPole-v1"), ("highway", "highway-fast-v0")])
-def test_snapshot_of_an_earlier_version_keeps_the_time_limit_lifted(tmp_path, simulator, key):
-    """Its trials ran without the registered limit, and a replay repeats them."""
-    text = f'schema = 1\nsimulator = "{simulator}"\n[{simulator}]\nid = "{key}"\n'
-    file = tmp_path / "scenario.toml"
-    for written, kept, expected in (
-        ("", True, "none"),
-        ("", False, "registered"),
-        ('"registered"', True, "registered"),
-    ):
-        file.write_text(text + (f"time_limit = {written}\n" if written else ""))
-        scenario = load_scenario(file, kept=kept)
-        assert scenario.tables[simulator].time_limit == expected
-        assert as_plain_data(scenario)[simulator]["time_limit"] == expected
