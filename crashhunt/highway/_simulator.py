@@ -22,7 +22,7 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 from highway_env.envs.common.abstract import AbstractEnv
-from highway_env.envs.common.action import DiscreteMetaAction, MultiAgentAction
+from highway_env.envs.common.action import ContinuousAction, DiscreteMetaAction, MultiAgentAction
 from highway_env.envs.common.observation import MultiAgentObservation
 from highway_env.envs.parking_env import ParkingEnv
 from highway_env.vehicle.objects import Obstacle, RoadObject
@@ -265,7 +265,8 @@ class HighwaySimulator:
         """Return what a careful driver of an agent's vehicle would consider."""
         vehicle = self._controlled[agent]
         others = (thing for thing in self._objects() if thing is not vehicle)
-        limits = tuple(self._kinds[agent].acceleration_range) if self.is_steered(agent) else None
+        kind = self._kinds[agent]
+        limits = tuple(kind.acceleration_range) if isinstance(kind, ContinuousAction) else None
         return surroundings_of(self._env.road.network, vehicle, others, lambda thing: self._actor(thing).id, limits)
 
     def is_steered(self, agent: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,9 @@ from crashhunt.highway import HighwaySimulator
 
 # isort: split
 
+from highway_env.envs.common.action import ContinuousAction, DiscreteAction
 from highway_env.vehicle.controller import MDPVehicle
+from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle
 from test_parts_on_highway import planned, put, straight
 
@@ -59,12 +62,18 @@ def test_actors_are_numbered_as_they_are_met_and_agents_have_their_names(simulat
     assert simulator._actor(late).id == "vehicle.2"
 
 
-@pytest.mark.parametrize("steered", [False, True])
-def test_surroundings_of_an_agent_are_all_others(simulator, monkeypatch, steered):
-    monkeypatch.setattr(_simulator, "is_steered", lambda kind: steered)
+@pytest.mark.parametrize(
+    "action", [None, ContinuousAction, DiscreteAction, partial(ContinuousAction, longitudinal=False)]
+)
+def test_surroundings_of_an_agent_are_all_others_whatever_its_actions_are(simulator, action):
+    if action is not None:  # whose vehicle has no target lane
+        simulator._kinds["ego"] = action(None)
+        simulator._env.road.vehicles.remove(simulator._controlled["ego"])
+        simulator._controlled["ego"] = put(simulator._env.road, 100.0, 1, kind=Vehicle)
     found = simulator.surroundings("ego")
     assert [leader.actor for leader in found.ahead] == ["vehicle.1"]
-    assert (found.braking_mps2 == 5.0) is steered
+    assert found.ahead[0].gap_m == pytest.approx(25.0)
+    assert (found.braking_mps2 == 5.0) is (action is not None)
 
 
 def test_disturbances_and_holds_find_the_vehicle_by_its_identifier(simulator):
