@@ -135,17 +135,18 @@ class FreeMotion:
 
         At the start of a road, the rear of a vehicle that has just entered may be off the road.
         """
-        half, half_width, over = self._half - _KERB_M, self._half_width - _KERB_M, ""
-        self.inside = self._area.lane_around(self.state, half, half_width, self._kind)
+        half, half_width = self._half - _KERB_M, self._half_width - _KERB_M
+        self.inside, is_over = self._area.lane_around(self.state, half, half_width, self._kind), False
         if not self.inside:
             if not self._area.contains(self.state.x, self.state.y, self._kind):
                 return False
             points = zip(_ALONG_OUTLINE, self._outline(_ALONG_OUTLINE, _KERB_M), strict=True)
             outside = (place for place, point in points if not self._area.contains(*point, self._kind))
-            over = next((_words_of(*place) for place in outside), "")
-        if over and self._is_over_kerb is False:
-            self.events.append(("kerb", f"drove over the kerb with {over}"))
-        self._is_over_kerb = bool(over)
+            first = next(outside, None)
+            is_over = first is not None
+            if first is not None and self._is_over_kerb is False:
+                self.events.append(("kerb", f"drove over the kerb with {_words_of([first, *outside])}"))
+        self._is_over_kerb = is_over
         return True
 
     def _outline(self, places: Sequence[tuple[float, float]], inset_m: float = 0.0) -> list[tuple[float, float]]:
@@ -585,10 +586,17 @@ class DrivableArea:
         return found
 
 
-def _words_of(ahead: float, left: float) -> str:
-    """Return a place of the outline in words."""
-    side = "left" if left > 0 else "right"
-    return f"its {'front' if ahead > 0 else 'rear'} {side} corner" if abs(ahead) == 1.0 else f"its {side} side"
+def _words_of(places: Sequence[tuple[float, float]]) -> str:
+    """Return places of the outline in words: all corners among them, and each side without a corner among them."""
+    corners = [f"{'front' if ahead > 0 else 'rear'} {_side_of(left)}" for ahead, left in places if abs(ahead) == 1.0]
+    sides = dict.fromkeys(_side_of(left) for _, left in places)
+    words = [f"its {' and '.join(corners)} corner{'s' * (len(corners) > 1)}"] if corners else []
+    words += [f"its {side} side" for side in sides if not any(corner.endswith(side) for corner in corners)]
+    return " and ".join(words)
+
+
+def _side_of(left: float) -> str:
+    return "left" if left > 0 else "right"
 
 
 def offset_from(path: Sequence[tuple[float, float]], x: float, y: float) -> tuple[float, float]:

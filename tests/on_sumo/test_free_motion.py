@@ -18,7 +18,7 @@ from crashhunt.oracles import Overlap
 from crashhunt.scenario import AgentSetup, argument_values, load_scenario
 from crashhunt.simulators import BicycleModel, MotionState
 from crashhunt.sumo import SumoSimulator
-from crashhunt.sumo._free_motion import DrivableArea, FreeMotion, _is_inside, _overlap
+from crashhunt.sumo._free_motion import DrivableArea, FreeMotion, _is_inside, _overlap, _words_of
 from crashhunt.world import Contact, describe_road_map
 
 EMPTY = {"priority_demand": 1, "minor_demand": 1}
@@ -655,6 +655,25 @@ def test_kerb_is_driven_over_where_a_side_leaves_the_road_while_the_centre_stays
     assert len(over) >= 2
     assert all("drove over the kerb with its" in what and "right" in what for _, what in said)
     assert simulator.agents == ["ego"]
+
+
+def test_kerb_event_names_every_corner_that_is_over_the_kerb():
+    front, rear = (1.0, -1.0), (-1.0, -1.0)
+    assert _words_of([front]) == "its front right corner"
+    assert _words_of([front, rear, (0.0, -1.0)]) == "its front right and rear right corners"
+    assert _words_of([(1.0, 1.0), (0.5, 1.0), (0.0, -1.0)]) == "its front left corner and its right side"
+    assert _words_of([(0.5, -1.0), (0.0, -1.0)]) == "its right side"
+
+
+def test_vehicle_beside_its_lane_is_over_the_kerb_with_two_corners(start):
+    simulator, step = start("target_pose", **EMPTY)
+    _, y0, _ = centre()
+    said = []
+    for number in range(30):
+        x, _, _ = centre()
+        step((x + 1.2, y0 - 0.05 * number, 0.0, 0.1))  # it slides to the right, parallel to the kerb
+        said += [event.what for event in simulator.scene().events if event.kind == "kerb"]
+    assert said == ["ego drove over the kerb with its front right and rear right corners"]
 
 
 TOWN = """schema = 1
