@@ -33,6 +33,20 @@ def test_what_goes_into_a_wheel_is_all_there_is(tmp_path):
     assert {entry["name"] for entry in installed(site)("scenarios")["scenarios"]} == shipped
 
 
+def test_readme_of_a_distribution_links_to_the_files_of_its_tag():
+    """PyPI shows it without the files beside it."""
+    core = pytest.importorskip("hatchling.builders.wheel").WheelBuilder(str(ROOT)).metadata.core
+    links = re.findall(r"(!?)\[[^\[\]]*\]\(([^)]*)\)", core.readme)
+    assert all(link.startswith("https://") for _, link in links)
+    source = f"{core.urls['Source']}/"
+    ours = [(mark, link.removeprefix(source)) for mark, link in links if link.startswith(source)]
+    assert len(ours) > 30
+    for mark, link in ours:
+        way, tag, file = link.partition("#")[0].split("/", 2)
+        assert (way, tag) == ("raw" if mark else "blob", f"v{core.version}")
+        assert (ROOT / file).exists()
+
+
 def installed(site):
     """Runs commands of what is in a folder, before the editable installation of this environment."""
     program = f"import sys; sys.path.insert(0, {str(site)!r}); from crashhunt.cli import main; sys.exit(main())"
