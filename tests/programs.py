@@ -131,7 +131,7 @@ while True:
         data = {"garbage": bytes([0xc1]), "number": bytes([5])}.get(kind, data)
     frame = struct.pack("<I", len(data)) + data
     if message.get("step") == 3 and kind:
-        frame = {"long": struct.pack("<I", 1 << 30), "half": frame[:9]}.get(kind, frame)
+        frame = {"long": struct.pack("<I", 1 << 30), "empty": bytes(4), "half": frame[:9]}.get(kind, frame)
     sys.stdout.buffer.write(frame)
     sys.stdout.buffer.flush()
     if message.get("step") == 3 and kind == "half":

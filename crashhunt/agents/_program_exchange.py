@@ -40,7 +40,7 @@ _CLOSING_S: Final = 1.0  # from `close` to the end of the program
 _TERMINATION_S: Final = 0.2  # from SIGTERM to SIGKILL
 _MAX_REPORT_BYTES: Final = 1 << 20  # of the end of the log, which may have the report of a sanitizer
 _MAX_REASON_CHARACTERS: Final = 300
-_LOGS_FIX = "write only messages to standard output, each in one line, and logs to standard error"
+_LOGS_FIX = "write only messages to standard output, {}, and logs to standard error"
 _REASONS: Final = tuple(
     re.compile(pattern, re.MULTILINE)
     for pattern in (
@@ -51,9 +51,15 @@ _REASONS: Final = tuple(
         r"^(terminate called .+)$",
         r"^(\*\*\* .+ \*\*\*: terminated)$",  # of glibc, as the next one
         r"^(double free or corruption.*|(?:free|malloc|realloc|munmap_chunk)\(\): .+|corrupted size vs\. .+)$",
+        # Uncaught exceptions and panics. Programs may log those that they catch, so Python's must be the log's end.
+        r"^thread '.*' (?:\(\d+\) )?panicked at (.+?):?\n(.+)$",  # of Rust
+        r"^((?:panic|fatal error): .+)$",  # of Go
+        r"^Exception in thread \".*\" (.+)$",  # of Java
+        r"\A[\s\S]*^(\w*Error\b.*)\n {4}at [\s\S]*\nNode\.js v.+\s*\Z",
+        r"^Traceback \(most recent call last\):\n(?:[ \t].*\n)+(\w.*)\s*\Z",
     )
 )
-"""What the log of a program names as the reason of its end: sanitizers, assert, exceptions of C++, a damaged heap."""
+"""What the log of a program names as the reason of its end: sanitizers, assert, exceptions, a damaged heap."""
 
 _inherited: list[ProgramProcess] = []
 """Programs of the process of which this one is a fork. Their pipes are closed here, so nothing may close them again."""
@@ -173,6 +179,10 @@ class ProgramExchange:
             self._keep(data, answer.get("action"))
         return answer
 
+    @property
+    def _logs_fix(self) -> str:
+        return _LOGS_FIX.format("each in one line" if self._packer is None else "each after its length in 4 bytes")
+
     def _use_msgpack(self) -> None:
         import msgpack
 
@@ -181,7 +191,9 @@ class ProgramExchange:
     def exchange(self, data: bytes, expected: str, shown: str, limit_s: float | None) -> dict[str, Any]:
         """Send an encoded message, and return the answer, which must be of the expected type; see `ask`."""
         if self._received:
-            raise ProgramError(f"it has sent something before {shown}: {excerpt_of(self._received)}", fix=_LOGS_FIX)
+            raise ProgramError(
+                f"it has sent something before {shown}: {excerpt_of(self._received)}", fix=self._logs_fix
+            )
         deadline = None if limit_s is None else time.monotonic() + limit_s
         self._is_idle = False
         try:
@@ -253,7 +265,8 @@ class ProgramExchange:
             return from_json(data)
         except ValueError:
             form = "JSON" if self._unpack is None else "MessagePack"
-            raise ProgramError(f"its answer to {shown} is not {form}: {excerpt_of(data)}", fix=_LOGS_FIX) from None
+            said = excerpt_of(data) or "an empty message"
+            raise ProgramError(f"its answer to {shown} is not {form}: {said}", fix=self._logs_fix) from None
 
     def _write(self, data: bytes, shown: str, deadline: float | None) -> None:
         """Write a message, as fast as the program reads it."""
@@ -279,8 +292,8 @@ class ProgramExchange:
             else:
                 begin, end = _LENGTH_BYTES, _LENGTH_BYTES + int.from_bytes(received[:_LENGTH_BYTES], "little")
             if max(len(received), end) > _MAX_MESSAGE_BYTES:
-                fix = "end each message with a line break" if self._packer is None else "send the length first"
-                raise ProgramError(f"its answer to {shown} is longer than {_MAX_MESSAGE_BYTES >> 20} MB", fix=fix)
+                said = f"longer than {_MAX_MESSAGE_BYTES >> 20} MB: {excerpt_of(received)}"
+                raise ProgramError(f"its answer to {shown} is {said}", fix=self._logs_fix)
             if begin <= end <= len(received) and len(received) >= begin:
                 data = bytes(received[begin:end])
                 del received[: end + (self._packer is None)]

@@ -309,6 +309,8 @@ def _argument(name: str, facts: object) -> Argument:
     default, unit, text = facts.get("default"), facts.get("unit") or "", facts.get("range")
     if not (default is None or isinstance(default, bool | int | float | str)) or not isinstance(unit, str):
         raise ProgramError(f"its argument {name} has the default {excerpt_of(default)} and the unit {excerpt_of(unit)}")
+    if not (text is None or isinstance(text, bool | int | float | str)):
+        raise ProgramError(f"its argument {name} has the range {excerpt_of(text)}", fix='write it as "5:40" or "a|b|c"')
     # JSON does not tell 12 from 12.0, so whether an argument takes whole numbers follows from the texts of its values.
     kind: Kind | None = None if default is None or type(default) is int else kind_of(default)
     try:

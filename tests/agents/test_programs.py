@@ -83,12 +83,17 @@ def agent_of(locator, folder, *, form=None, limit_s=None, is_forked=False, **arg
     )
 
 
+CAUGHT = 'Traceback (most recent call last):\n  File "a.py", line 1, in f\n    g()\nValueError: it was caught\n'
+
+
 @pytest.mark.parametrize(
     ("kind", "message"),
     {
         "garbage": "its answer to observe of step 3 is not MessagePack",
         "number": "its answer to observe of step 3 is not of type 'act'",
-        "long": "its answer to observe of step 3 is longer than 16 MB; send the length first",
+        "long": "its answer to observe of step 3 is longer than 16 MB: ",
+        "empty": "its answer to observe of step 3 is not MessagePack: an empty message; write only messages to "
+        "standard output, each after its length in 4 bytes, and logs to standard error",
         "half": "exited with 0 instead of answering observe of step 3, in the middle of a message",
     }.items(),
 )
@@ -115,9 +120,35 @@ def test_harm_in_binary_messages_is_an_error_of_the_agent(tmp_path, kind, messag
         ),
         ("ready\n*** stack smashing detected ***: terminated", ": *** stack smashing detected ***: terminated"),
         ("ready\nfree(): invalid pointer", ": free(): invalid pointer"),
+        (
+            "ready\nthread 'main' (7) panicked at a.rs:1:88:\nindex out of bounds\nstack:",
+            ": a.rs:1:88: index out of bounds",
+        ),
+        ("panic: no lane\n\ngoroutine 1 [running]:\n", ": panic: no lane"),
+        ('Exception in thread "main" P: no lane\n\tat P.main(P.java:1)\n', ": P: no lane"),
+        (
+            "Error: it was caught\n    at b\n\na.js:1\n\nTypeError: no lane\n    at b\n\nNode.js v20.20.2\n",
+            ": TypeError: no lane",
+        ),
+        (f"{CAUGHT}{CAUGHT.replace('was caught', 'ends')}", ": ValueError: it ends"),
+        (f"{CAUGHT}goodbye", "answering hello"),
         ("goodbye", "answering hello"),
     ],
-    ids=["address", "undefined", "assert", "exception", "stack", "heap", "none"],
+    ids=[
+        "address",
+        "undefined",
+        "assert",
+        "exception",
+        "stack",
+        "heap",
+        "rust",
+        "go",
+        "java",
+        "node",
+        "python",
+        "caught",
+        "none",
+    ],
 )
 def test_the_reason_in_the_log_of_a_program_that_ends_is_part_of_the_error(tmp_path, capfd, log, reason):
     program = tmp_path / "ends"
@@ -506,6 +537,10 @@ print(json.dumps({"type": "ready", "observation": ["ego"], "arguments": {"observ
         (
             '{"type": "ready", "arguments": {"speed": {"range": "a:b"}}}',
             'its argument speed: "a:b" is not a range; write',
+        ),
+        (
+            '{"type": "ready", "arguments": {"speed": {"range": [5, 25]}}}',
+            "its argument speed has the range [5,25]; write",
         ),
         ('{"type": "ready", "arguments": {"speed": {"unit": 5}}}', "its argument speed has the default null and the"),
         ('{"type": "ready", "arguments": {"speed": {"low": 5}}}', "speed has low (allowed: range, unit, default)"),
