@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 19
+_INTERFACE = 20
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -103,11 +103,12 @@ class UsualSteps(Protocol):
         """Set the functions that are called when the visible vehicles change.
 
         Args:
-            meet: function that receives the id of a vehicle that was not in sight. It returns the id, the actor, its
-                length, width and reach (m), and whether it is controlled. It returns None if the core cannot continue
-                with this vehicle.
+            meet: function that receives the id of a vehicle that has not been in sight since `resume`. It returns
+                the id, the actor, its length, width and reach (m), and whether it is controlled. It returns None if the
+                core cannot continue with this vehicle.
             adopt: function that receives the vehicles in sight, their ids and actors, and the row of the agent; it
-                returns their roster.
+                returns their roster. If the core makes the observations, it calls this function later: before
+                it passes a step or a report to Python.
             introduce: function that receives actors, and returns the payloads of two records: of those actors that are
                 not recorded yet, and of a roster of all of them.
             record_roster: function that writes such records for the actors in sight if the buffer is full; it provides
@@ -191,10 +192,10 @@ class UsualSteps(Protocol):
             numbers: The payload of the record of this roster.
         """
 
-    def give_back(self) -> tuple[int, int, Any, list[tuple[Any, list[int]]]]:
+    def give_back(self) -> tuple[int, int, Any, list[tuple[Any, bytes]]]:
         """Stop recording; return the end of the records, the last complete step, the last roster, and all steps.
 
-        Consecutive steps with the same roster are given as this roster and the offsets of their numbers.
+        Consecutive steps with the same roster are given as this roster and the offsets of their numbers, as uint64.
         """
 
     def pause(self) -> None:

@@ -56,9 +56,10 @@ struct Steps {
     long long made = 0; // by SUMO so far when they were, vehicles of this and other runs
     struct Sight {
         Vehicles *vehicles = nullptr;
-        PyObject *ids = nullptr, *actors = nullptr, *roster = nullptr; // the last as the black box has it
+        PyObject *ids = nullptr, *actors = nullptr;
         std::vector<char> controlled;
         size_t row = 0;
+        bool recorded = false;
     } sight, entered;
     Vehicles *before_vehicles = nullptr;
     Earlier earlier;
@@ -73,9 +74,15 @@ struct Steps {
     PyObject *tape = nullptr;
     size_t offset = 0, reserved = 0;
     long tags[6] = {}; // of an observation, an action, a step, lanes, a roster, actors
-    PyObject *recorded = nullptr; // the last roster
     std::unordered_map<PyObject *, uint32_t> numbers; // of the actors that are recorded, which the recorder keeps
-    std::vector<std::pair<PyObject *, size_t>> trail; // the roster of each step, and where its numbers begin
+    // Steps with the same actors, whose roster Python makes when it asks for it: many at a time take less.
+    struct Run {
+        PyObject *vehicles, *ids, *actors, *roster;
+        size_t row;
+        std::vector<uint64_t> places; // where the numbers of each step begin
+    };
+    std::vector<Run> runs;
+    std::unordered_map<std::string, PyObject *> met; // what `meet` has returned since Python took a step
 
     Steps() = default;
     Steps(const Steps &) = delete;
@@ -83,19 +90,57 @@ struct Steps {
         for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, perceive, restore, draft, whole_type,
                               part_names, perceived, reinterpret_cast<PyObject *>(eyes),
                               limits, stood, reinterpret_cast<PyObject *>(sight.vehicles), sight.ids, sight.actors,
-                              sight.roster, reinterpret_cast<PyObject *>(entered.vehicles), entered.ids, entered.actors,
-                              entered.roster, reinterpret_cast<PyObject *>(before_vehicles), meet, adopt, introduce,
-                              record_roster, observation, answer, tape, recorded}) {
+                              reinterpret_cast<PyObject *>(entered.vehicles), entered.ids, entered.actors,
+                              reinterpret_cast<PyObject *>(before_vehicles), meet, adopt, introduce, record_roster,
+                              observation, answer, tape}) {
             Py_XDECREF(one);
         }
-        clear_trail();
+        clear_runs();
+        forget_met();
     }
 
-    void clear_trail() {
-        for (const auto &step : trail) {
-            Py_DECREF(step.first);
+    void clear_runs() {
+        for (const Run &run : runs) {
+            for (PyObject *one : {run.vehicles, run.ids, run.actors, run.roster}) {
+                Py_XDECREF(one);
+            }
         }
-        trail.clear();
+        runs.clear();
+    }
+
+    void forget_met() {
+        for (const auto &known : met) {
+            Py_DECREF(known.second);
+        }
+        met.clear();
+    }
+
+    // The next steps have these actors, whose roster may be null yet.
+    void begin_run(Sight &seen, PyObject *roster) {
+        runs.push_back({Py_NewRef(reinterpret_cast<PyObject *>(seen.vehicles)), Py_NewRef(seen.ids),
+                        Py_NewRef(seen.actors), Py_XNewRef(roster), seen.row, {}});
+        seen.recorded = true;
+    }
+
+    // Tells Python who was in sight since it asked last; false with an exception.
+    bool adopt_all() {
+        for (Run &run : runs) {
+            if (!run.roster && !(run.roster = roster_of(run.vehicles, run.ids, run.actors, run.row))) {
+                return false;
+            }
+        }
+        return true;
+    }
+
+    PyObject *roster_of(PyObject *vehicles, PyObject *ids, PyObject *actors, size_t row) const {
+        return PyObject_CallFunction(adopt, "OOOn", vehicles, ids, actors, static_cast<Py_ssize_t>(row));
+    }
+
+    // The same of those who are in sight next, whom Python is told of at once; null with an exception.
+    PyObject *adopt_entered() {
+        return adopt_all() ? roster_of(reinterpret_cast<PyObject *>(entered.vehicles), entered.ids, entered.actors,
+                                       entered.row)
+                           : nullptr;
     }
 
     // Whether an answer is one that `command` carries out; anything else is Python's.
@@ -112,7 +157,7 @@ struct Steps {
         sumo.set_speed(agent, value);
     }
 
-    bool able() const { return ready && !stopped && tape && sight.roster; }
+    bool able() const { return ready && !stopped && tape && sight.recorded; }
 
     // Writes a record and where the process is; false where that is Python's to do.
     bool record(int kind, const void *data, size_t length, Phase phase) {
@@ -346,7 +391,7 @@ struct Steps {
         keep(place.vehicles, vehicles);
         keep(place.ids, ids);
         keep(place.actors, actors);
-        Py_CLEAR(place.roster);
+        place.recorded = false;
         place.row = static_cast<size_t>(row);
         return true;
     }
@@ -372,13 +417,28 @@ struct Steps {
         return known;
     }
 
+    // What Python says of a vehicle that was not in sight, borrowed; null where it is none that can be read here.
+    PyObject *meet_one(const std::string &id) {
+        const auto known = met.find(id);
+        if (known != met.end()) {
+            return known->second;
+        }
+        PyObject *name = text_of(id), *found = name ? PyObject_CallOneArg(meet, name) : nullptr;
+        Py_XDECREF(name);
+        if (!found || !PyTuple_CheckExact(found)) {
+            Py_XDECREF(found);
+            return nullptr;
+        }
+        return met[id] = found;
+    }
+
     // Fills in who is in sight now: as before, who was, and otherwise as Python has met them.
     bool meet_all() {
         const size_t count = earlier.size();
         Py_XSETREF(entered.vehicles, reinterpret_cast<Vehicles *>(vehicles_type->tp_alloc(vehicles_type, 0)));
         Py_XSETREF(entered.ids, PyTuple_New(static_cast<Py_ssize_t>(count)));
         Py_XSETREF(entered.actors, PyTuple_New(static_cast<Py_ssize_t>(count)));
-        Py_CLEAR(entered.roster);
+        entered.recorded = false;
         entered.controlled.clear();
         if (!entered.vehicles || !entered.ids || !entered.actors) {
             return false;
@@ -389,25 +449,20 @@ struct Steps {
         for (size_t row = 0; row < count; row++) {
             const long was = earlier[row];
             double length, width, reach;
-            PyObject *id, *actor, *met = nullptr;
+            PyObject *id, *actor;
             int controlled;
             if (was >= 0) {
                 length = were.lengths[was], width = were.widths[was], reach = were.reaches[was];
                 id = PyTuple_GET_ITEM(sight.ids, was), actor = PyTuple_GET_ITEM(sight.actors, was);
                 controlled = sight.controlled[was];
             } else {
-                PyObject *name = text_of(around.names[around.near[row]]);
-                met = name ? PyObject_CallOneArg(meet, name) : nullptr;
-                Py_XDECREF(name);
-                if (!met || !PyTuple_CheckExact(met) ||
-                    !PyArg_ParseTuple(met, "OOdddp", &id, &actor, &length, &width, &reach, &controlled)) {
-                    Py_XDECREF(met);
+                PyObject *found = meet_one(around.names[around.near[row]]);
+                if (!found || !PyArg_ParseTuple(found, "OOdddp", &id, &actor, &length, &width, &reach, &controlled)) {
                     return false;
                 }
             }
             PyTuple_SET_ITEM(entered.ids, static_cast<Py_ssize_t>(row), Py_NewRef(id));
             PyTuple_SET_ITEM(entered.actors, static_cast<Py_ssize_t>(row), Py_NewRef(actor));
-            Py_XDECREF(met);
             roster.ids.push_back(around.names[around.near[row]]);
             roster.lengths.push_back(length);
             roster.widths.push_back(width);
@@ -421,16 +476,15 @@ struct Steps {
         return present;
     }
 
-    // Tells Python who is in sight now, and records it; REFUSED where it is Python's to say why not, and negative with an
-    // exception, such as of a disk that is full.
+    // Records who is in sight now; negative with an exception, such as of a disk that is full, and REFUSED where it is
+    // Python's to go on.
     int note_roster() {
-        PyObject *roster = PyObject_CallFunction(adopt, "OOOn", entered.vehicles, entered.ids, entered.actors,
-                                                 static_cast<Py_ssize_t>(entered.row));
-        if (!roster) {
+        // Only where it makes a part of the observation, Python has to know them in this step.
+        PyObject *roster = perceive ? adopt_entered() : nullptr;
+        if (perceive && !roster) {
             PyErr_Clear();
             return REFUSED;
         }
-        Py_XSETREF(entered.roster, roster);
         PyObject *fresh = PyList_New(0);
         bool good = fresh;
         for (Py_ssize_t row = 0; good && row < PyTuple_GET_SIZE(entered.actors); row++) {
@@ -445,23 +499,27 @@ struct Steps {
             good = records && PyArg_ParseTuple(records, "y#y#", &actors, &length, &places, &size) &&
                    number(fresh, places, size);
         }
-        const int noted = good ? note_sight(actors, length) : -1;
+        const int noted = good ? note_sight(actors, length, roster) : -1;
         Py_XDECREF(records);
         Py_XDECREF(fresh);
+        Py_XDECREF(roster);
         return noted;
     }
 
     // Records those who are in sight now, and before them the actors that have been numbered; as `note_roster`.
-    int note_sight(const char *actors, Py_ssize_t length) {
+    int note_sight(const char *actors, Py_ssize_t length, PyObject *roster) {
         std::vector<uint32_t> present;
         for (Py_ssize_t row = 0; row < PyTuple_GET_SIZE(entered.actors); row++) {
             present.push_back(numbers.at(PyTuple_GET_ITEM(entered.actors, row)));
         }
         const size_t size = 4 * present.size();
         if (offset + static_cast<size_t>(length) + size + 64 > reserved) {
-            PyObject *done = PyObject_CallFunction(record_roster, "((y#y#))", actors, length,
-                                                   reinterpret_cast<const char *>(present.data()),
-                                                   static_cast<Py_ssize_t>(size));
+            PyObject *known = roster ? Py_NewRef(roster) : adopt_entered();
+            PyObject *done = known ? PyObject_CallFunction(record_roster, "((y#y#))", actors, length,
+                                                           reinterpret_cast<const char *>(present.data()),
+                                                           static_cast<Py_ssize_t>(size))
+                                   : nullptr;
+            Py_XDECREF(known);
             Py_XDECREF(done);
             return !done ? -1 : able() ? DONE : REFUSED;
         }
@@ -469,7 +527,7 @@ struct Steps {
             record(5, actors, static_cast<size_t>(length), SIMULATING);
         }
         record(4, present.data(), size, SIMULATING);
-        keep(recorded, entered.roster);
+        begin_run(entered, roster);
         return DONE;
     }
 
@@ -492,7 +550,7 @@ struct Steps {
         earlier.clear();
         const int come = look_around();
         earlier.clear();
-        return come;
+        return come == SIMULATED && !adopt_all() ? -1 : come;
     }
 
     int look_around() {
@@ -547,8 +605,9 @@ struct Steps {
             if (offset + records > reserved) {
                 return SIMULATED;
             }
-            if (trail.size() == trail.capacity()) {
-                trail.reserve(2 * trail.size() + 64); // where there is no memory, the step is Python's
+            std::vector<uint64_t> &places = runs.back().places;
+            if (places.size() == places.capacity()) {
+                places.reserve(2 * places.size() + 16); // where there is no memory, the step is Python's
             }
             seen = shown(present, who);
             if (!seen) {
@@ -594,7 +653,7 @@ struct Steps {
         char *start = static_cast<char *>(buffer.buf);
         char *rewards = put_step(start + offset, tags[2], step, now.time_s, 1, now.values);
         memcpy(rewards, &reward, 8);
-        trail.emplace_back(Py_NewRef(sight.roster), offset + 32);
+        runs.back().places.push_back(offset + 32);
         offset += 32 + 8 * now.values.size();
         say_where(start, offset, step, SIMULATING, 0);
         PyBuffer_Release(&buffer);
@@ -778,6 +837,7 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     steps.follower = follower;
     steps.step = step;
     steps.known = false;
+    steps.forget_met(); // such as of a vehicle that has parked since
     steps.ready = true;
     Py_RETURN_NONE;
 }
@@ -804,43 +864,39 @@ PyObject *usual_borrow(PyObject *object, PyObject *arguments) {
         PyErr_SetString(PyExc_ValueError, "nothing can be written there");
         return nullptr;
     }
-    steps.clear_trail();
+    Steps::Sight &seen = steps.earlier.empty() ? steps.sight : steps.entered;
+    if (!seen.vehicles || !steps.number(seen.actors, numbers, length)) {
+        return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_ValueError, "nobody is in sight");
+    }
     keep(steps.tape, tape);
     steps.offset = static_cast<size_t>(offset);
-    keep(steps.recorded, roster);
-    Steps::Sight &seen = steps.earlier.empty() ? steps.sight : steps.entered;
-    keep(seen.roster, roster);
-    if (seen.actors && !steps.number(seen.actors, numbers, length)) {
-        return nullptr;
-    }
+    steps.clear_runs();
+    steps.begin_run(seen, roster);
     Py_RETURN_NONE;
 }
 
-// give_back() -> (offset, step, the last roster, [(roster, [where the numbers begin of each of its steps])])
+// give_back() -> (offset, step, the last roster, [(roster, where the numbers begin of each of its steps)])
 PyObject *usual_give_back(PyObject *object, PyObject *) {
     Steps &steps = steps_of(object);
-    PyObject *runs = PyList_New(0), *places = nullptr; // borrowed
+    PyObject *runs = steps.adopt_all() ? PyList_New(0) : nullptr;
     bool good = runs;
-    for (size_t number = 0; good && number < steps.trail.size(); number++) {
-        const auto &[roster, begin] = steps.trail[number];
-        if (!number || roster != steps.trail[number - 1].first) {
-            places = PyList_New(0);
-            PyObject *run = places ? Py_BuildValue("(ON)", roster, places) : nullptr;
-            good = run && PyList_Append(runs, run) == 0;
-            Py_XDECREF(run);
+    for (const Steps::Run &run : steps.runs) {
+        if (good && !run.places.empty()) {
+            PyObject *pair = Py_BuildValue("(Oy#)", run.roster, reinterpret_cast<const char *>(run.places.data()),
+                                           static_cast<Py_ssize_t>(8 * run.places.size()));
+            good = pair && PyList_Append(runs, pair) == 0;
+            Py_XDECREF(pair);
         }
-        PyObject *place = good ? PyLong_FromSize_t(begin) : nullptr;
-        good = place && PyList_Append(places, place) == 0;
-        Py_XDECREF(place);
     }
-    if (!good) {
-        Py_XDECREF(runs);
-        return nullptr;
+    PyObject *last = steps.runs.empty() ? Py_None : steps.runs.back().roster;
+    PyObject *given = good ? Py_BuildValue("(nLOO)", static_cast<Py_ssize_t>(steps.offset), steps.step, last, runs)
+                           : nullptr;
+    Py_XDECREF(runs);
+    if (given) {
+        steps.clear_runs();
+        Py_CLEAR(steps.tape);
     }
-    steps.clear_trail();
-    Py_CLEAR(steps.tape);
-    return Py_BuildValue("(nLON)", static_cast<Py_ssize_t>(steps.offset), steps.step,
-                         steps.recorded ? steps.recorded : Py_None, runs);
+    return given;
 }
 
 // take(agents) -> what has come of it
@@ -912,7 +968,7 @@ PyObject *usual_told(PyObject *object, PyObject *) {
     if (!steps.ready) {
         Py_RETURN_NONE;
     }
-    if (!steps.show_array(steps.observation)) {
+    if (!steps.adopt_all() || !steps.show_array(steps.observation)) {
         return nullptr;
     }
     return Py_BuildValue("(LOdN(OdN)(OdN))", steps.step, steps.observation, steps.reward, text_of(steps.follower),

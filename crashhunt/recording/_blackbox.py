@@ -204,7 +204,8 @@ class BlackBox:
             self._lent = None
             if runs:
                 self._step = step
-                self._trail += [(roster, places, [None] * len(places)) for roster, places in runs]
+                lists = [(roster, memoryview(places).cast("Q").tolist()) for roster, places in runs]
+                self._trail += [(roster, places, [None] * len(places)) for roster, places in lists]
 
     def _raw(self, tag: int, agent: int, array: NDArray[np.generic], phase: int) -> None:
         if self._lent is not None:
