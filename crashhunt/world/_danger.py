@@ -229,8 +229,7 @@ class _Way:
         Behind the agent, only actors that drive in another direction count.
         """
         spacing = float(np.clip(1.6 * self._track.half_length.min(), 1.0, 4.0))
-        ahead = self._first(others, spacing, AHEAD_M)
-        behind = self._first(others, -spacing, _BEHIND_M)
+        ahead, behind = self._first(others, spacing)
         there = np.isfinite(behind)
         heading = np.interp(self.along[others.sample[there]] + behind[there], self._at, self._heading)
         behind[there] = np.where(
@@ -247,42 +246,50 @@ class _Way:
         ahead[there] = np.where(np.cos(others.heading[there] - heading) >= _SAME_DIRECTION_COSINE, ahead[there], np.inf)
         return ahead, np.full(len(ahead), np.inf)
 
-    def _first(self, others: Others, spacing: float, far: float) -> Array:
-        """Return the first position of contact with each actor, found by a search at fixed distances and bisection."""
-        found = np.full(len(others.sample), np.inf)
-        base = self.along[others.sample]
+    def _first(self, others: Others, spacing: float) -> tuple[Array, Array]:
+        """Return the first positions of contact with each actor ahead and behind, found at fixed distances and refined.
+
+        One search for both sides costs less, because half of its time is the overhead of calls.
+        """
+        count, base = len(others.sample), self.along[others.sample]
+        found = np.full(2 * count, np.inf)  # all positions ahead, then all behind
         reach = (
             np.hypot(others.half_length, others.half_width)
             + np.hypot(self._track.half_length, self._track.half_width)[others.sample]
         )
         # Test several places at a time; all actors of one instant share the places of the agent.
         stretch = _PLACES_PER_CALL * spacing
-        middles = stretch * (np.arange(int(far / abs(stretch)) + 1) + 0.5) - spacing / 2
+        ahead, behind = (
+            stretch * (np.arange(int(far / stretch) + 1) + 0.5) - spacing / 2 for far in (AHEAD_M, _BEHIND_M)
+        )
+        far = np.repeat((AHEAD_M, _BEHIND_M), (len(ahead), len(behind)))
         samples, of = np.unique(others.sample, return_inverse=True)
-        at = self.along[samples, None] + middles
+        at = self.along[samples, None] + np.append(ahead, -behind)
         at[(at < self._at[0] - far) | (at > self._at[-1] + far)] = np.nan
         x, y = np.interp(at, self._at, self._x)[of], np.interp(at, self._at, self._y)[of]
         x -= others.x[:, None]
         y -= others.y[:, None]
-        around = reach + abs(stretch) / 2
+        around = reach + stretch / 2
         pair, place = np.nonzero(x * x + y * y < (around * around)[:, None])
-        number = (place[:, None] * _PLACES_PER_CALL + np.arange(_PLACES_PER_CALL)).ravel()
-        pair = np.repeat(pair, _PLACES_PER_CALL)
-        known = (along := base[pair] + spacing * number) <= self._at[-1]
+        side = place >= len(ahead)
+        number = ((place - len(ahead) * side)[:, None] * _PLACES_PER_CALL + np.arange(_PLACES_PER_CALL)).ravel()
+        pair, side = np.repeat(pair, _PLACES_PER_CALL), np.repeat(side, _PLACES_PER_CALL)
+        known = (along := base[pair] + np.where(side, -spacing, spacing) * number) <= self._at[-1]
         known &= along >= self._at[0]
-        pair, number, along = pair[known], number[known], along[known]
+        pair, side, number, along = pair[known], side[known], number[known], along[known]
         hit = self._apart(others, pair, along, reach[pair]) < 0
         first = np.full(len(found), _NO_INDEX)
-        np.minimum.at(first, pair[hit], number[hit])
-        pair = np.flatnonzero(first < _NO_INDEX)
-        inside = spacing * first[pair]
-        outside = spacing * np.maximum(first[pair] - 1, 0)
+        np.minimum.at(first, (pair + count * side)[hit], number[hit])
+        row = np.flatnonzero(first < _NO_INDEX)
+        pair, way = row % max(count, 1), np.where(row < count, spacing, -spacing)
+        inside = way * first[row]
+        outside = way * np.maximum(first[row] - 1, 0)
         for _ in range(_BISECTIONS):
             middle = (inside + outside) / 2
             touches = self._apart(others, pair, base[pair] + middle) < 0
             inside, outside = np.where(touches, middle, inside), np.where(touches, outside, middle)
-        found[pair] = inside
-        return found
+        found[row] = inside
+        return found[:count], found[count:]
 
     def _apart(self, others: Others, pair: NDArray[np.intp], along: Array, reach: Array | None = None) -> Array:
         """Return the distance between the agent at positions on its path and other actors; negative if they overlap.
