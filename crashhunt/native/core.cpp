@@ -1260,6 +1260,9 @@ PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
 // The way of an agent as _Way of crashhunt/world/_danger.py has it, up to what NumPy rounds otherwise: enough to rule out
 // that others touch it.
 struct Way {
+    struct Outline { // of another actor: the middle, the direction, half sizes, and how far the corners are
+        double x, y, c, s, length, width, reach;
+    };
     std::vector<double> x, y, heading, along, half_length, half_width, reach;
     double end = 0, spacing = 0;
     bool known = true;
@@ -1296,23 +1299,22 @@ struct Way {
     }
 
     // How far two outlines are apart, on the axis where that is most.
-    double apart(size_t sample, double dx, double dy, double angle, double length, double width, double turned) const {
-        const double c = cos(angle), s = sin(angle), turn_c = cos(turned - angle), turn_s = sin(turned - angle);
+    double apart(size_t sample, double angle, double dx, double dy, const Outline &other) const {
+        double c, s;
+        sincos(angle, &s, &c);
+        const double turn_c = other.c * c + other.s * s, turn_s = other.s * c - other.c * s;
         const double along_x = dx * c + dy * s, across = dy * c - dx * s, far = fabs(turn_c), wide = fabs(turn_s);
-        const double own_l = half_length[sample], own_w = half_width[sample];
+        const double own_l = half_length[sample], own_w = half_width[sample], length = other.length, width = other.width;
         double found = fabs(along_x) - own_l - length * far - width * wide;
         found = std::max(found, fabs(across) - own_w - length * wide - width * far);
         found = std::max(found, fabs(along_x * turn_c + across * turn_s) - length - own_l * far - own_w * wide);
         return std::max(found, fabs(across * turn_c - along_x * turn_s) - width - own_l * wide - own_w * far);
     }
 
-    // Whether an actor, whose front and half sizes are given, may be touched on one of the places that are looked
-    // at, ahead of a sample (or behind it, with a negative spacing). What is not a number may.
-    bool touches(size_t sample, double gap, double far, double fx, double fy, double angle, double length,
-                 double width) const {
-        // From the front, until that is near: the middle is as far from it as half the length.
-        const double around = reach[sample] + sqrt(length * length + width * width) + length;
-        const double slack = SLACK * (1 + fabs(fx) + fabs(fy) + end);
+    // Whether an actor may be touched on one of the places that are looked at, ahead of a sample (or behind it, with a
+    // negative spacing). What is not a number may.
+    bool touches(size_t sample, double gap, double far, const Outline &other) const {
+        const double around = reach[sample] + other.reach, slack = SLACK * (1 + fabs(other.x) + fabs(other.y) + end);
         const long places = 3 * (static_cast<long>(far / (3 * fabs(gap))) + 1);
         size_t segment = std::min(sample, along.size() - 2);
         for (long place = 0; place < places;) {
@@ -1327,8 +1329,8 @@ struct Way {
                 segment--;
             }
             const double share = (at - along[segment]) / (along[segment + 1] - along[segment]);
-            double dx = fx - (x[segment] + share * (x[segment + 1] - x[segment]));
-            double dy = fy - (y[segment] + share * (y[segment + 1] - y[segment]));
+            const double dx = other.x - (x[segment] + share * (x[segment + 1] - x[segment]));
+            const double dy = other.y - (y[segment] + share * (y[segment + 1] - y[segment]));
             const double room = sqrt(dx * dx + dy * dy) - around;
             if (room > 2 * far + 100) {
                 return false;
@@ -1337,12 +1339,8 @@ struct Way {
                 place += std::max(1L, static_cast<long>((room - slack) / fabs(gap)));
                 continue;
             }
-            double c, s;
-            sincos(angle, &s, &c);
-            dx -= length * c;
-            dy -= length * s;
             const double own = heading[segment] + share * (heading[segment + 1] - heading[segment]);
-            if (!(apart(sample, dx, dy, own, length, width, angle) > slack)) {
+            if (!(apart(sample, own, dx, dy, other) > slack)) {
                 return true;
             }
             place++;
@@ -1408,10 +1406,13 @@ PyObject *tracks(PyObject *, PyObject *const *given, Py_ssize_t count) {
                 if (actor != row && dx * dx + dy * dy < reach * reach) {
                     if (chosen) {
                         const size_t number = static_cast<size_t>(sample);
-                        const double x = line[2 * actor], y = line[2 * actor + 1], angle = line[2 * actors + actor];
                         const double half = part.lengths[actor] / 2, wide = part.widths[actor] / 2;
-                        if (!way.touches(number, way.spacing, ahead, x, y, angle, half, wide) &&
-                            !way.touches(number, -way.spacing, behind, x, y, angle, half, wide)) {
+                        double c, s;
+                        sincos(line[2 * actors + actor], &s, &c);
+                        const Way::Outline other = {line[2 * actor] - half * c, line[2 * actor + 1] - half * s, c, s,
+                                                    half, wide, sqrt(half * half + wide * wide)};
+                        if (!way.touches(number, way.spacing, ahead, other) &&
+                            !way.touches(number, -way.spacing, behind, other)) {
                             continue;
                         }
                     }
