@@ -85,8 +85,9 @@ class BicycleModel:
             distance = (state.speed + a * step_s / 2) * step_s
         slip = math.atan(math.tan(delta) / 2)
         turned = distance * math.cos(slip) * math.tan(delta) / self.wheelbase
-        chord = distance if turned == 0.0 else distance * math.sin(turned / 2) / (turned / 2)
-        course = state.heading + slip + turned / 2
+        half = turned / 2  # which is 0 for the smallest number as well
+        chord = distance if half == 0.0 else distance * math.sin(half) / half
+        course = state.heading + slip + half
         return MotionState(
             x=state.x + chord * math.cos(course), y=state.y + chord * math.sin(course),
             heading=state.heading + turned, speed=speed, acceleration=a, steering=delta,

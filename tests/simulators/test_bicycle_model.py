@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import example, given, strategies as st
 
 from crashhunt.simulators import MAX_STEERING_RAD, BicycleModel, MotionState
 from crashhunt.simulators._bicycle_model import MAX_JERK_MPS3, MAX_STEERING_RATE_RADPS
@@ -30,6 +30,7 @@ def integrated(state, acceleration, steering, seconds, parts=20_000):
     speed=st.floats(0, 35), heading=st.floats(-7, 7), acceleration=st.floats(-5, 3),
     steering=st.floats(-MAX_STEERING_RAD, MAX_STEERING_RAD), step_s=st.sampled_from([0.05, 0.1, 1.0]),
 )  # fmt: skip
+@example(speed=15.0, heading=0.0, acceleration=0.0, steering=5e-324, step_s=0.1)  # half of it is 0
 def test_step_equals_a_fine_integration_of_the_equations(speed, heading, acceleration, steering, step_s):
     state = MotionState(x=4.0, y=-7.0, heading=heading, speed=speed, acceleration=acceleration, steering=steering)
     found = MODEL.step(state, acceleration, steering, step_s)
