@@ -56,7 +56,7 @@ def check_layout(space: Space[object] | None) -> None:
         raise UsageError(
             "the agent needs the default features (presence, x, y, vx, vy, cos_h, sin_h), but the observation has "
             f"{columns} columns",
-            fix="omit features in [observation]",
+            fix="give the observation these features in the scenario file",
         )
 
 
