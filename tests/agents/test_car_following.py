@@ -162,7 +162,7 @@ def test_an_observation_of_other_columns_is_refused():
     for space in (None, spaces.Box(-1, 1, (8, 7), np.float32)):
         check_layout(space)
     for space in (spaces.Box(-1, 1, (8, 6), np.float32), spaces.Discrete(3)):
-        with pytest.raises(UsageError, match="default features.*; give the observation these features"):
+        with pytest.raises(UsageError, match=r"default features.*; give the observation these features"):
             check_layout(space)
 
 
