@@ -196,6 +196,11 @@ class Driving:
     def _move_freely(self, agent: str, action: NDArray[np.generic]) -> bool:
         return self.moving[agent].apply(action)
 
+    def settle(self) -> None:
+        """Complete a step that SUMO has simulated."""
+        for motion in self.moving.values():
+            motion.settle()
+
     def is_inside_lane(self, agent: str) -> bool:
         """Return whether an agent's whole vehicle is inside a straight part of the lane of a road that SUMO assigns."""
         lane = sumo.vehicle_getLaneID(agent)

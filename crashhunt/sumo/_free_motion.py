@@ -43,6 +43,7 @@ _STANDING_M = 0.01  # a vehicle that moves by less in a step does not turn
 _KERB_M = 0.1  # an outline that is less off the road drives over no kerb
 _CORNERS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))  # counter-clockwise, as shares of half the size
 _ALONG_OUTLINE = tuple((ahead, left) for ahead in (1.0, -1.0, 0.5, 0.0, -0.5) for left in (1.0, -1.0))
+_MAX_SPEED_ERROR_MPS = 0.01  # far more than a rounding error
 _MAX_SLIDE_M, _MAX_TURN_RAD = 0.2, 0.05  # distance of a trajectory's start from the vehicle, as plans predict
 
 
@@ -122,6 +123,12 @@ class FreeMotion:
             self.events.append(("off_road", f"drove into the {hit}"))
             return False
         return self._stays_on_road()
+
+    def settle(self) -> None:
+        """Set the speed again where SUMO reports another one after a step: it stops a vehicle beside its route."""
+        with suppress(libsumo.TraCIException):  # it has left the road
+            if abs(sumo.vehicle_getSpeed(self._vehicle) - self.state.speed) > _MAX_SPEED_ERROR_MPS:
+                sumo.vehicle_setPreviousSpeed(self._vehicle, self.state.speed)
 
     def _return_to_route(self) -> None:
         """Give the vehicle its own route again after it has left the route, for example to overtake."""

@@ -284,6 +284,7 @@ class SumoSimulator:
             is_simulating = True
             libsumo.simulationStep()
             is_simulating = False
+            self._driving.settle()
             return self._finish(actions)
         except _TRACI_ERRORS as error:
             raise _failure_of(error, is_simulating=is_simulating) from error
@@ -492,7 +493,7 @@ class SumoSimulator:
             self._sight,
             self._events,
             self._kinematics,
-            simulate=_simulating(),
+            simulate=_simulating(self._driving),
             part=_part,
             present=lambda: PresentVehicles(self._scene, self._shown, self._steps),
             arrive=self._arrive,
@@ -621,7 +622,7 @@ def _part(do: Callable[P, T]) -> Callable[P, T]:
     return step
 
 
-def _simulating() -> Callable[[], None]:
+def _simulating(driving: Driving) -> Callable[[], None]:
     # The wrappers of libsumo and of `guard_against_agents` around it take 4 of the 75 µs of a step in the core.
     listening = libsumo._stepManager
     step_alone = getattr(sumo.simulation_step, "__wrapped__", sumo.simulation_step)
@@ -632,6 +633,8 @@ def _simulating() -> Callable[[], None]:
                 libsumo.simulationStep()
             else:
                 step_alone(0.0)
+            if driving.moving:
+                driving.settle()
         except _TRACI_ERRORS as error:
             raise _failure_of(error, is_simulating=True) from error
 

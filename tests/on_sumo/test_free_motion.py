@@ -76,6 +76,17 @@ def test_sumo_places_the_vehicle_on_the_course_of_the_bicycle_model(start):
         assert simulator._driving.moving["ego"].steering() == state.steering
 
 
+def test_speed_is_that_of_the_motion_where_a_vehicle_beside_its_lane_enters_a_junction(start):
+    simulator, step = start("target_pose", **EMPTY)
+    _, y0, _ = centre()
+    for number in range(210):
+        x, _, _ = centre()
+        step((x + 1.2, y0 + min(number / 50, 1.0) * (-1.58 - y0), 0.0, 0.1))
+        scene = simulator.scene()
+        assert scene.speed(scene.roster.index["ego"]) == pytest.approx(simulator._driving.moving["ego"].state.speed)
+    assert centre()[0] > 0.0  # the middle of the junction
+
+
 def test_pedals_are_shares_of_the_accelerations_of_the_type(start):
     _, step = start("throttle_brake_steering", **EMPTY)
     speed, limits = libsumo.vehicle.getSpeed("ego"), (libsumo.vehicle.getAccel("ego"), libsumo.vehicle.getDecel("ego"))
