@@ -922,7 +922,7 @@ struct RightOfWay : Written {
 
     bool write(const Here &here, double *out) override {
         typedef std::tuple<double, double, std::string, bool, double, double> Row;
-        const double NEVER_S = 1000.0, STANDING_MPS = 0.1; // as in _road_readers.py
+        const double NEVER_S = 1000.0, STANDING_MPS = 0.1; // as in _right_of_way_readers.py
         const Scene &scene = here.scene;
         const std::vector<double> &lengths = scene.roster->lengths;
         if (here.along < 0 || scene.roster->ids.size() != scene.size) {

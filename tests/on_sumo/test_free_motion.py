@@ -76,7 +76,7 @@ def test_sumo_places_the_vehicle_on_the_course_of_the_bicycle_model(start):
         assert simulator._driving.moving["ego"].steering() == state.steering
 
 
-def test_speed_is_that_of_the_motion_where_a_vehicle_beside_its_lane_enters_a_junction(start):
+def test_speed_is_that_of_the_motion_where_a_vehicle_next_to_its_lane_enters_a_junction(start):
     simulator, step = start("target_pose", **EMPTY)
     _, y0, _ = centre()
     for number in range(210):
@@ -676,7 +676,7 @@ def test_kerb_event_names_every_corner_that_is_over_the_kerb():
     assert _words_of([(0.5, -1.0), (0.0, -1.0)]) == "its right side"
 
 
-def test_vehicle_beside_its_lane_is_over_the_kerb_with_two_corners(start):
+def test_vehicle_next_to_its_lane_is_over_the_kerb_with_two_corners(start):
     simulator, step = start("target_pose", **EMPTY)
     _, y0, _ = centre()
     said = []
