@@ -118,8 +118,8 @@ def test_errors_of_sumo_are_one_line_and_those_outside_its_step_are_not_its_fail
     assert _simulator._one_line(KeyError()) == "KeyError"
     monkeypatch.setattr(_simulator.libsumo, "simulationStep", fails)
     with pytest.raises(SimulatorError, match="SUMO gave up: "):
-        _simulator._simulating()()
-    assert {_simulator._part(fails).__name__, _simulator._simulating().__name__} == {"step"}
+        _simulator._simulating(SimpleNamespace(moving={}))()
+    assert {_simulator._part(fails).__name__, _simulator._simulating(SimpleNamespace()).__name__} == {"step"}
 
 
 def test_another_simulator_of_the_process_ends_the_episode(make, monkeypatch):
@@ -193,7 +193,7 @@ def running(make, sumo, monkeypatch):
     sumo.answers |= {"vehicle_getRoadID": "e", "vehicle_getLaneIndex": 1, "vehicle_getDistance": 130.0}
     made._driving = SimpleNamespace(
         apply=lambda agent, action: made.applied.append((agent, action)) or action != "off", lanes=lambda edge: 3,
-        from_left=lambda edge, lane: 3.5, aside=lambda agent: (0.25, -0.5), moving={},
+        from_left=lambda edge, lane: 3.5, aside=lambda agent: (0.25, -0.5), moving={}, settle=lambda: None,
     )  # fmt: skip
 
     def look(steps, off_road):
