@@ -55,7 +55,7 @@ _REASONS: Final = tuple(
         r"^thread '.*' (?:\(\d+\) )?panicked at (.+?):?\n(.+)$",  # of Rust
         r"^((?:panic|fatal error): .+)$",  # of Go
         r"^Exception in thread \".*\" (.+)$",  # of Java
-        r"\A[\s\S]*^(\w*Error\b.*)\n {4}at [\s\S]*\nNode\.js v.+\s*\Z",
+        r"^(\w*Error\b.*)\n(?: {4}at .*\n)+(?:(?:[ }].*)?\n)*Node\.js v.+\s*\Z",
         r"^Traceback \(most recent call last\):\n(?:[ \t].*\n)+(\w.*)\s*\Z",
     )
 )

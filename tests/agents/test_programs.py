@@ -130,6 +130,11 @@ def test_harm_in_binary_messages_is_an_error_of_the_agent(tmp_path, kind, messag
             "Error: it was caught\n    at b\n\na.js:1\n\nTypeError: no lane\n    at b\n\nNode.js v20.20.2\n",
             ": TypeError: no lane",
         ),
+        (
+            "RangeError: no way\n    at f (a.js:2:5) {\n  code: 'E',\n  [cause]: Error: deep\n      at f\n}\n\n"
+            "Node.js v20.20.2\n",
+            ": RangeError: no way",
+        ),
         (f"{CAUGHT}{CAUGHT.replace('was caught', 'ends')}", ": ValueError: it ends"),
         (f"{CAUGHT}goodbye", "answering hello"),
         ("goodbye", "answering hello"),
@@ -145,6 +150,7 @@ def test_harm_in_binary_messages_is_an_error_of_the_agent(tmp_path, kind, messag
         "go",
         "java",
         "node",
+        "node with a cause",
         "python",
         "caught",
         "none",
