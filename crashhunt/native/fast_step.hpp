@@ -122,7 +122,7 @@ struct Steps {
         seen.recorded = true;
     }
 
-    // Tells Python who was in sight since it asked last; false with an exception.
+    // Has Python make each roster that is still missing; false with an exception.
     bool adopt_all() {
         for (Run &run : runs) {
             if (!run.roster && !(run.roster = roster_of(run.vehicles, run.ids, run.actors, run.row))) {
@@ -136,7 +136,7 @@ struct Steps {
         return PyObject_CallFunction(adopt, "OOOn", vehicles, ids, actors, static_cast<Py_ssize_t>(row));
     }
 
-    // The same of those who are in sight next, whom Python is told of at once; null with an exception.
+    // Returns the roster of the actors in sight from now on, which Python makes at once; null with an exception.
     PyObject *adopt_entered() {
         return adopt_all() ? roster_of(reinterpret_cast<PyObject *>(entered.vehicles), entered.ids, entered.actors,
                                        entered.row)
@@ -866,7 +866,7 @@ PyObject *usual_borrow(PyObject *object, PyObject *arguments) {
     }
     Steps::Sight &seen = steps.earlier.empty() ? steps.sight : steps.entered;
     if (!seen.vehicles || !steps.number(seen.actors, numbers, length)) {
-        return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_ValueError, "nobody is in sight");
+        return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_ValueError, "no vehicle is in sight");
     }
     keep(steps.tape, tape);
     steps.offset = static_cast<size_t>(offset);

@@ -125,7 +125,7 @@ class FreeMotion:
         return self._stays_on_road()
 
     def settle(self) -> None:
-        """Set the speed again where SUMO reports another one after a step: it stops a vehicle next to its route."""
+        """Restore the speed if SUMO has changed it in the step, as it does where the lane does not lead on."""
         with suppress(libsumo.TraCIException):  # it has left the road
             if abs(sumo.vehicle_getSpeed(self._vehicle) - self.state.speed) > _MAX_SPEED_ERROR_MPS:
                 sumo.vehicle_setPreviousSpeed(self._vehicle, self.state.speed)
