@@ -131,8 +131,7 @@ def test_harm_in_binary_messages_is_an_error_of_the_agent(tmp_path, kind, messag
             ": TypeError: no lane",
         ),
         (
-            "RangeError: no way\n    at f (a.js:2:5) {\n  code: 'E',\n  [cause]: Error: deep\n      at f\n}\n\n"
-            "Node.js v20.20.2\n",
+            "RangeError: no way\n    at f (a.js:2) {\n  code: 1,\n  [cause]: Error: deep\n      at f\n}\n\nNode.js v20.1\n",
             ": RangeError: no way",
         ),
         (f"{CAUGHT}{CAUGHT.replace('was caught', 'ends')}", ": ValueError: it ends"),
