@@ -131,8 +131,8 @@ def test_harm_in_binary_messages_is_an_error_of_the_agent(tmp_path, kind, messag
             ": TypeError: no lane",
         ),
         (
-            "RangeError: no way\n    at f (a.js:2) {\n  code: 1,\n  [cause]: Error: deep\n      at f\n}\n\nNode.js v20.1\n",
-            ": RangeError: no way",
+            "RangeError: no\n    at f (a.js:2) {\n code: 1,\n  [cause]: Error: a\n      at f\n}\n\nNode.js v20.1\n",
+            ": RangeError: no",
         ),
         (f"{CAUGHT}{CAUGHT.replace('was caught', 'ends')}", ": ValueError: it ends"),
         (f"{CAUGHT}goodbye", "answering hello"),
