@@ -11,7 +11,8 @@ from libsumo import _libsumo as sumo
 
 from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import META_ACTIONS
-from crashhunt.sumo._free_motion import DrivableArea, FreeMotion
+from crashhunt.sumo._drivable_area import DrivableArea
+from crashhunt.sumo._free_motion import FreeMotion
 from crashhunt.sumo.maps import is_left_hand
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from crashhunt.simulators import (
     with_reference_point,
 )
 from crashhunt.sumo._conflicts import Conflicts
+from crashhunt.sumo._drivable_area import obstacle_outlines
 from crashhunt.sumo._ego_and_actors import ActorsReader, EgoReader
-from crashhunt.sumo._free_motion import obstacle_outlines
 from crashhunt.sumo._lane_graph import USUAL_CLASS, lane_graph
 from crashhunt.sumo._reader_protocol import Places, ReaderSetup
 from crashhunt.sumo._right_of_way_readers import CrossingsReader, RightOfWayReader, StopLineReader

@@ -10,7 +10,7 @@ import numpy as np
 from libsumo import _libsumo as sumo
 
 from crashhunt.simulators import center_of, nearest_actors
-from crashhunt.sumo._free_motion import obstacle_outlines
+from crashhunt.sumo._drivable_area import obstacle_outlines
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

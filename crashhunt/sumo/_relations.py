@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from libsumo import _libsumo as sumo
 
-from crashhunt.sumo._free_motion import offset_from
+from crashhunt.sumo._drivable_area import offset_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

@@ -33,12 +33,12 @@ from crashhunt.simulators import (
 from crashhunt.sumo._agent_calls import forget_calls, guard_against_agents, refused_calls
 from crashhunt.sumo._descriptor import BACKEND
 from crashhunt.sumo._disturbances import SumoDisturbances
+from crashhunt.sumo._drivable_area import obstacle_outlines
 from crashhunt.sumo._driving import FREE_FORMS, Driving, VehicleCommand, hold_vehicle
 from crashhunt.sumo._ego_and_actors import vehicle_data_of
 from crashhunt.sumo._fast_step import PresentVehicles, UsualSteps
 from crashhunt.sumo._files import StagedFiles
 from crashhunt.sumo._followers import Followers
-from crashhunt.sumo._free_motion import obstacle_outlines
 from crashhunt.sumo._insertion import VehicleFilter, enter, replaced_by, steps_counted
 from crashhunt.sumo._lane_graph import USUAL_CLASS
 from crashhunt.sumo._lights_for_pictures import LightReader

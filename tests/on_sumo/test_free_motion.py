@@ -18,7 +18,8 @@ from crashhunt.oracles import Overlap
 from crashhunt.scenario import AgentSetup, argument_values, load_scenario
 from crashhunt.simulators import BicycleModel, MotionState
 from crashhunt.sumo import SumoSimulator
-from crashhunt.sumo._free_motion import DrivableArea, FreeMotion, _is_inside, _overlap, _words_of
+from crashhunt.sumo._drivable_area import DrivableArea, _is_inside, _overlap
+from crashhunt.sumo._free_motion import FreeMotion, _words_of
 from crashhunt.world import Contact, describe_road_map
 
 EMPTY = {"priority_demand": 1, "minor_demand": 1}
