@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from crashhunt.base import library_probe
-from crashhunt.base.binaries import is_of_system, machine_of, own_libraries
+from crashhunt.base.binaries import is_of_system, length_by_headers, machine_of, own_libraries
 from crashhunt.base.errors import PluginError
 from crashhunt.base.signals import describe_death
 from crashhunt.base.text import one_line
@@ -296,6 +296,9 @@ def describe_library(locator: str, path: Path) -> Library:
     if machine != own:
         what = f"is built for {machine} (allowed: {own})" if machine else "is not a shared library (an ELF file)"
         raise PluginError(f"{locator!r}: it {what}", fix="build the library on this machine, with -shared")
+    if status.st_size < (length := length_by_headers(path)):
+        what = f"it is cut: it has {status.st_size} bytes, and its headers say {length} or more"
+        raise PluginError(f"{locator!r}: {what}", fix="copy or build the library again")
     try:
         return _probed(path, status.st_mtime_ns, status.st_size, status.st_ino)
     except PluginError as error:

@@ -104,6 +104,12 @@ def machine_of(file: Path) -> str:
     return "" if head is None else head[0]
 
 
+def length_by_headers(file: Path) -> int:
+    """Return where the last segment of a binary file of 64 bits ends; 0 for another file. A cut file is shorter."""
+    head = _head_of(file)
+    return 0 if head is None else head[2]
+
+
 def is_of_system(library: Path) -> bool:
     """Return whether a library belongs to the operating system or to the environment of Python."""
     homes = (*_SYSTEM_FOLDERS, f"{sys.prefix}/lib", f"{sys.base_prefix}/lib")
@@ -145,8 +151,8 @@ def _loaded_by(file: Path, variables: Mapping[str, str]) -> tuple[dict[str, str]
     return dict(_LOADED.findall(text)), sorted(_MISSING.findall(text))
 
 
-def _head_of(file: Path) -> tuple[str, str] | None:
-    """Return the architecture and the build id of an ELF file; None for any other file."""
+def _head_of(file: Path) -> tuple[str, str, int] | None:
+    """Return the architecture, the build id and the end of the last segment of an ELF file; None for any other file."""
     try:
         with file.open("rb") as opened:
             head = opened.read(64)
@@ -156,19 +162,20 @@ def _head_of(file: Path) -> tuple[str, str] | None:
             (machine,) = struct.unpack_from(f"{order}H", head, 18)
             name = _MACHINES.get(machine, f"ELF machine {machine}")
             if head[4] != 2:  # 32 bits
-                return name, ""
+                return name, "", 0
             (table,) = struct.unpack_from(f"{order}Q", head, 32)
             size, count = struct.unpack_from(f"{order}2H", head, 54)
             opened.seek(table)
             segments = opened.read(size * count)
+            build_id, end = "", 0
             for start in range(0, len(segments) - 55, max(size, 56)):
                 kind, _, offset, _, _, length = struct.unpack_from(f"{order}2I4Q", segments, start)
-                if kind == _NOTES_TYPE and length <= _MAX_NOTES_BYTES:
+                end = max(end, offset + length)
+                if not build_id and kind == _NOTES_TYPE and length <= _MAX_NOTES_BYTES:
                     opened.seek(offset)
-                    if found := _build_id_in(opened.read(length), order):
-                        return name, found
-            return name, ""
-    except (OSError, ValueError, struct.error):  # the file is cut, or its offsets are nonsense
+                    build_id = _build_id_in(opened.read(length), order)
+            return name, build_id, end
+    except (OSError, OverflowError, ValueError, struct.error):  # the file is cut, or its offsets are nonsense
         return None
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import platform
 import re
 import shutil
@@ -353,6 +354,7 @@ def test_a_replay_runs_the_saved_library_and_reports_that_the_current_one_differ
             lambda file: file.write_bytes(b"\x7fELF\2\1\1" + bytes(11) + b"\xb7\0" + bytes(99)),
             "it is built for aarch64",
         ),
+        (lambda file: os.truncate(compile_library(file.parent), 5000), "it is cut: it has 5000 bytes, and its headers"),
         (
             lambda file: compile_library(file.parent, source=IN_C.replace("crashhunt_reset", "crashhunt_rest")),
             "it does not export crashhunt_reset; include crashhunt_agent.h",
