@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.agent_locators import can_fork, is_program
-from crashhunt.base.errors import ProgramError
+from crashhunt.base.errors import PluginError, ProgramError
 from crashhunt.base.isolation import files_read_apart, work_apart
 from crashhunt.base.plugins import Group, ImportedModules, is_foreign, is_foreign_module, locate
 from crashhunt.base.temporary import temporary_folder
@@ -109,6 +109,9 @@ def _declared(locators: Sequence[str], scenario: Scenario, limit_s: float) -> tu
 
     A program that fails takes any argument. The trials report the failure, each as an error of the agent. The
     simulator, whose spaces a program receives, is created in a fork of its own, because its files are not the agent's.
+
+    Raises:
+        PluginError: a declared default is outside of its range.
     """
 
     def described(report: Report) -> Plain:
@@ -123,11 +126,27 @@ def _declared(locators: Sequence[str], scenario: Scenario, limit_s: float) -> tu
                 except ProgramError as error:
                     found["notes"].append(f"{locator} has not declared its arguments: {error}")
                     signature = Signature({}, open=True, given=())
+                _check_defaults(locator, signature)
                 found["signatures"][locator] = signature.to_json()
         return found
 
     data: Any = work_apart(described, task="the programs cannot be described", timeout_s=IMPORT_S + limit_s)
     return {locator: Signature.from_json(found) for locator, found in data["signatures"].items()}, data["notes"]
+
+
+def _check_defaults(locator: str, signature: Signature) -> None:
+    """Refuse defaults outside of their range.
+
+    Raises:
+        PluginError: a default is outside of its range.
+    """
+    for name, one in signature.arguments.items():
+        if one.default is not None and one.distribution is not None and not one.distribution.contains(one.default):
+            raise PluginError(
+                f"{locator!r}: the default of its argument {name}, {one.default}, is outside its range "
+                f"{str(one.distribution)!r}",
+                fix="declare a default within it, or widen the range",
+            )
 
 
 def imported_by(scenario: Scenario, settings: HuntSettings) -> ImportedModules:

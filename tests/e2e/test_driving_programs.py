@@ -58,6 +58,12 @@ def test_a_program_that_fails_at_once_is_an_error_of_the_agent_and_one_that_is_m
     assert f"exec:./fails has not declared its arguments: {failed} (its last output: no planner.yaml)" in done.err
     assert f"ego: {failed}" in done.err
     assert "last output: no planner.yaml" in done.err
+    declared = '{"type": "ready", "arguments": {"v": {"default": 30, "range": "5:25"}}}'
+    program.write_text(f"#!/bin/sh\nread -r line\necho '{declared}'\n")
+    assert toy.crashhunt("run", "g", "1", "1", "20", "--agent", "exec:./fails", *RUN, expect=2).err == (
+        "crashhunt: 'exec:./fails': the default of its argument v, 30, is outside its range '5:25'; declare a default "
+        "within it, or widen the range\n"
+    )
     program.write_text('#!/bin/sh\nread -r line\necho \'{"type": "ready", "arguments": {"speed": {"default": 12}}}\'\n')
     words = ("run", "g", "1", "1", "20", "--agent", "exec:./fails", *RUN, "--arg", "speed=fast")
     assert (
