@@ -21,14 +21,8 @@ from crashhunt.plans import HuntOptions, Request, fields_of, hunt_options
 from crashhunt.results import HuntState, find_hunts, hunt_state, is_hunt
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.snapshots import code_differences, latest_snapshot
-from crashhunt.suites._processes import (
-    REQUEST,
-    RunRequest,
-    check_machine,
-    refuse_untrusted_hunt,
-    run_all,
-    write_request,
-)
+from crashhunt.suites._processes import check_machine, run_all
+from crashhunt.suites._run_requests import REQUEST, RunRequest, refuse_untrusted_hunt, write_request
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

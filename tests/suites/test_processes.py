@@ -19,7 +19,8 @@ from crashhunt.ledger import Ledger
 from crashhunt.plans import Request, plan
 from crashhunt.results import hunt_state
 from crashhunt.suites import RunRequest, Suite, SuiteEntry, _hunt_reruns, _processes, rerun
-from crashhunt.suites._processes import REQUEST, check_machine, run_all, set_aside, write_request
+from crashhunt.suites._processes import check_machine, run_all, set_aside
+from crashhunt.suites._run_requests import REQUEST, write_request
 
 ASKED = RunRequest(
     Request(
