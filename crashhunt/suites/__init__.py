@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._gate_runs import Gate as Gate, GateProgress as GateProgress, GateVersion as GateVersion
+    from ._gate_runs import Gate as Gate, GateProgress as GateProgress
+    from ._gate_versions import GateVersion as GateVersion
     from ._hunt_reruns import rerun as rerun
     from ._run_requests import RunRequest as RunRequest, trust_hunt as trust_hunt
     from ._scorecard_cases import run_scorecard as run_scorecard

@@ -13,10 +13,7 @@ from __future__ import annotations
 import fcntl
 import json
 import math
-import os
 import secrets
-import shutil
-import sys
 import time
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -30,25 +27,18 @@ from crashhunt.base.agent_locators import is_program
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, NoValidTrialError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.git import (
-    checked_out,
-    commit_of,
-    copy_built,
     files_outside,
     git,
-    import_environment,
-    run_build,
-    run_to_end,
-    top_of,
-    track_built,
 )
 from crashhunt.base.plugins import registered
-from crashhunt.base.temporary import temporary_beside, temporary_folder
-from crashhunt.corpus import find_cases
+from crashhunt.base.temporary import temporary_folder
 from crashhunt.ledger import Ledger
 from crashhunt.plans import read_settings
 from crashhunt.results import HuntDirectory, hunt_state, is_hunt
 from crashhunt.scenario import load_scenario
 from crashhunt.statistics import GateCase, GateReport, PairedHunts, PairWatch, check_confidence, measure_rates
+from crashhunt.suites._gate_corpus import run_corpus
+from crashhunt.suites._gate_versions import GateVersion, WorkTrees
 from crashhunt.suites._preventable_crashes import PreventableCrashes
 from crashhunt.suites._processes import run_all, slots_of
 from crashhunt.suites._run_requests import REQUEST, RunRequest, refuse_untrusted_hunt, write_request
@@ -63,53 +53,10 @@ if TYPE_CHECKING:
 GATE: Final = "gate.json"
 """What a gate compares, in the folder with its hunts."""
 _LOCK = ".lock"
-_BUILT: Final = "built"
-"""The files that --build has made for each version, in the folder of a kept gate."""
 BASE, HEAD = "base", "head"
 _BUNDLES_PER_TYPE = 3  # kept of each crash type: a gate counts crashes, and shows some
-_DEFAULT_CORPUS = "crashes"  # as in the action `corpus`
 _BUSY_S, _LOOK_EVERY_S = 15.0, 0.1
 _MIN_SLOTS = 2  # trials at a time: BASE and HEAD run side by side
-_ORIGIN_SCRIPT = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"
-
-
-@dataclass(frozen=True, slots=True)
-class GateVersion:
-    """One of the two versions that a gate compares: BASE or HEAD.
-
-    Args:
-        word: the version as the user named it.
-        agents: target of the agent of each vehicle, as in ``--agent``; empty if the version is a commit.
-        commit: hexadecimal digits of the commit; empty if the version is an agent.
-    """
-
-    word: str
-    agents: Mapping[str, str]
-    commit: str = ""
-
-    @classmethod
-    def of(cls, word: str, folder: Path) -> GateVersion:
-        """Return the version that a word names: an agent, or else a commit of the folder's repository.
-
-        Raises:
-            UsageError: the word names neither an agent nor a commit.
-        """
-        vehicle, equals, locator = ("", "", word) if is_program(word) else word.rpartition("=")
-        if ":" in locator or locator in registered("agents"):
-            return cls(word, {vehicle: locator})
-        if equals or not word:
-            raise UsageError(f"{word!r} is neither an agent nor a commit", fix="give [ID=]MODULE:ATTR, or a revision")
-        try:
-            return cls(word, {}, commit_of(top_of(folder), word))
-        except CrashhuntError as error:
-            fix = "give a revision of the repository around this folder, or an agent as module:attribute"
-            raise UsageError(f"{word!r} is neither an agent nor a commit: {error.message}", fix=fix) from None
-
-    def __str__(self) -> str:
-        """Return the name of the agent, or the revision with the first digits of its commit."""
-        if not self.commit:
-            return self.word
-        return self.word if self.commit.startswith(self.word) else f"{self.word} ({self.commit[:10]})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,17 +230,10 @@ class _Run:
         self._preventable = PreventableCrashes(place, slots_of(gate.parallel)) if gate.only_preventable else None
         self._seed = self._begin()
         self._wait_for_hunts()
-        self._trees: dict[str, Path] = {}
-        if gate.base.commit:
-            top = top_of(gate.folder)
-            for side, version in self._versions.items():
-                tree = checked_out(top, version.commit, purpose="gate", name=side)
-                self._trees[side] = stack.enter_context(tree)
-            self._top = top.resolve()
-            if gate.build:
-                for side in self._trees:
-                    self._build(side)
-            self._check_origins()
+        self._trees = WorkTrees(gate.folder, self._versions, stack)
+        if gate.build:
+            self._trees.build(gate.build, place, limit_s=gate.build_limit_s, is_kept=is_kept, tell=tell)
+        self._trees.check_origins({module for run in gate.hunts.values() for module in _modules_of(run)})
         self._hunts = list(self._planned())
         self._corpus: tuple[GateCase, ...] | None = None
         self._why = ""
@@ -386,16 +326,8 @@ class _Run:
             seed = int(np.random.SeedSequence(self._seed, spawn_key=(number,)).generate_state(1)[0])
         agents = {**asked.locators, **self._versions[side].agents}
         request = replace(asked, agents=agents, seed=seed, trials=most, keep_going=True, keep=kept, parallel=1)
-        folder = self._folder_of(side, Path(run.folder))
+        folder = self._trees.folder_of(side, Path(run.folder))
         return replace(run, request=request, folder=str(folder))
-
-    def _folder_of(self, side: str, folder: Path) -> Path:
-        """Return the folder from which a version is imported: a work tree, or the user's folder."""
-        tree = self._trees.get(side)
-        if tree is None:
-            return folder
-        resolved = folder.resolve()
-        return tree / resolved.relative_to(self._top) if resolved.is_relative_to(self._top) else tree
 
     def _plan(self, place: Path, request: RunRequest) -> None:
         """Write the request of a hunt, or check that the existing request is the same; its folder may have moved."""
@@ -417,37 +349,11 @@ class _Run:
                 f"cannot be created: {error.strerror}", fix="choose another directory", where=str(place)
             ) from error
 
-    def _build(self, side: str) -> None:
-        """Build the commit of a version, or copy the files of an earlier build of the same gate.
-
-        A second build may differ in single bytes, and a hunt continues only with the code with which it began.
-        """
-        gate, tree, kept = self._gate, self._trees[side], self._place / _BUILT / side
-        if kept.is_dir():
-            shutil.copytree(kept, tree, symlinks=True, dirs_exist_ok=True)
-        else:
-            name = f"{side.upper()} ({self._versions[side]})"
-            log = self._place / f"build-{side}.log" if self._is_kept else None
-            run_build(
-                gate.build,
-                self._folder_of(side, gate.folder),
-                log,
-                limit_s=gate.build_limit_s,
-                name=name,
-                tell=self._tell,
-            )
-            if self._is_kept:
-                kept.parent.mkdir(exist_ok=True)
-                with temporary_beside(kept) as building:
-                    copy_built(tree, building)
-                    building.rename(kept)
-        track_built(tree)
-
     def _find_same_files(self, paired: PairedHunts) -> None:
         """Tell which arguments name one file for both commits, as soon as the settings of both hunts are known."""
         if self._cautions is not None or not all((folder / layout.HUNT).exists() for folder in paired.folders):
             return
-        folders = [self._folder_of(side, self._gate.folder) for side in self._trees]
+        folders = self._trees.folders
         self._cautions = tuple(
             f"BASE and HEAD use the same file: {path} ({name}); name it on the command line by a path relative to the "
             "current folder, as a file that each commit contains or builds"
@@ -457,70 +363,12 @@ class _Run:
         for caution in self._cautions:
             self._tell(caution)
 
-    def _check_origins(self) -> None:
-        """Check that the agents are imported from the work trees.
-
-        Raises:
-            UsageError: an agent is imported from elsewhere, so that both versions would be the same.
-        """
-        modules = sorted({module for run in self._gate.hunts.values() for module in _modules_of(run)})
-        for side, tree in self._trees.items():
-            folder = self._folder_of(side, self._gate.folder)
-            places = [_origin_of(module, folder, import_environment(folder, tree)) for module in modules]
-            elsewhere = [
-                (module, place) for module, place in zip(modules, places, strict=True) if not place.is_relative_to(tree)
-            ]
-            if modules and len(elsewhere) == len(modules):
-                module, place = elsewhere[0]
-                raise UsageError(
-                    f"{module!r} is imported from {place}, and not from the commit",
-                    fix="run crashhunt gate in the folder that contains the module, with --agent module:attribute",
-                )
-
-    # The corpus.
-
     def _run_corpus(self) -> tuple[GateCase, ...] | None:
-        """Run the corpus cases of HEAD with HEAD's code, in a separate process; None if there is no corpus."""
-        gate = self._gate
-        given = gate.corpus or Path(_DEFAULT_CORPUS)
-        folder = self._folder_of(HEAD, gate.folder)
-        corpus = folder / given
-        tree = self._trees.get(HEAD)
-        if tree is None and gate.corpus is None:
-            return None
-        if not corpus.is_dir():
-            if gate.corpus is None:
-                return None
-            raise UsageError(f"--corpus {gate.corpus} is not a folder in HEAD", fix="give a folder that HEAD contains")
-        try:
-            cases = find_cases([corpus])
-        except CrashhuntError:
-            if gate.corpus is None:
-                return None
-            raise
-        if tree is None:
-            drivers = set(gate.head.agents.values())
-            cases = [case for case in cases if drivers & _drivers_of(case)]
-            if not cases:
-                message = f"--corpus {gate.corpus} has no case in which the agent {gate.head.word} drives"
-                raise UsageError(message, fix="omit --corpus, or give a corpus with crashes of this agent")
-        command = [sys.executable, "-P", "-m", "crashhunt", "corpus", "run", *map(str, cases), "--json"]
-        command += ["--parallel", str(slots_of(gate.parallel))]
-        if gate.trusted or tree is not None:  # a commit's corpus is trusted as its code is
-            command.append("--trust")
-        environment = dict(os.environ) if tree is None else import_environment(folder, tree)
-        done = run_to_end(command, folder, environment)
-        try:
-            reports = json.loads(done.stdout)["cases"]
-            return tuple(
-                GateCase(name=Path(one["path"]).name, expected=one["expected"], got=one["got"], now=one.get("now", ""))
-                for one in reports
-            )
-        except (ValueError, KeyError, TypeError):
-            said = " ".join(done.stderr.split())[-300:].removeprefix("crashhunt: ")
-            raise CrashhuntError(f"the corpus of HEAD cannot be run: {said}", fix="see crashhunt corpus run") from None
-
-    # The hunts.
+        gate, trees = self._gate, self._trees
+        return run_corpus(
+            gate.corpus, trees.folder_of(HEAD, gate.folder), gate.head, environment=trees.environment_of(HEAD),
+            parallel=slots_of(gate.parallel), trusted=gate.trusted,
+        )  # fmt: skip
 
     def _run_hunts(self) -> None:
         slots = max(_MIN_SLOTS, slots_of(self._gate.parallel))
@@ -530,9 +378,9 @@ class _Run:
             if not self._is_enough(paired):
                 waiting = [folder for folder in paired.folders if not self._is_done(folder, paired.most)]
                 environments = {
-                    folder: import_environment(self._folder_of(side, self._gate.folder), self._trees[side])
+                    folder: environment
                     for side, folder in zip((BASE, HEAD), paired.folders, strict=True)
-                    if side in self._trees
+                    if (environment := self._trees.environment_of(side)) is not None
                 }
                 run_all(
                     waiting, slots, watch=lambda: self._count_pairs(paired, is_last=is_last),  # noqa: B023 - called here
@@ -602,7 +450,7 @@ class _Run:
         side, state, why = failure
         where = f"{side.upper()} ({self._versions[side]})"
         needs = "if the agent needs files that Git does not track, give --build COMMAND"
-        fix = needs if self._trees and not self._gate.build else ""
+        fix = needs if self._trees.folders and not self._gate.build else ""
         if state == "no_valid_trial":
             raise NoValidTrialError(f"no trial can be set up: {why}", fix=fix, where=where)
         raise HuntDirectoryError(f"the hunt cannot run: {why}", fix=fix, where=where)
@@ -729,16 +577,3 @@ def _modules_of(run: RunRequest) -> set[str]:
     points = registered("agents")
     targets = [points[name].value if name in points else name for name in agents.values()]
     return {target.partition(":")[0] for target in targets if not is_program(target)}
-
-
-def _origin_of(module: str, folder: Path, environment: Mapping[str, str]) -> Path:
-    """Return the file from which a module is imported in a work tree; the tree's folder if it cannot be found."""
-    done = run_to_end([sys.executable, "-P", "-c", _ORIGIN_SCRIPT, module], folder, environment)
-    return Path(done.stdout.strip()).resolve() if done.returncode == 0 else folder
-
-
-def _drivers_of(case: Path) -> set[str]:
-    try:
-        return {chosen.agent for chosen in read_settings(case / layout.HUNT).agents.values()}
-    except CrashhuntError:
-        return set()

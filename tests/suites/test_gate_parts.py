@@ -18,7 +18,7 @@ from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, RunSettings, write_settings
 from crashhunt.statistics import SideCounts
 from crashhunt.statistics._hunt_pairs import ScenarioCounts
-from crashhunt.suites import Gate, GateVersion, RunRequest, _gate_runs as _gate
+from crashhunt.suites import Gate, GateVersion, RunRequest, _gate_corpus, _gate_runs as _gate, _gate_versions
 from crashhunt.suites._run_requests import REQUEST, write_request
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
@@ -59,10 +59,13 @@ def work(tmp_path, monkeypatch):
             return SimpleNamespace(stdout=f"{origin}\n", returncode=found.answers["code"])
         return SimpleNamespace(stdout=found.answers["corpus"], stderr="crashhunt: it  does\nnot run", returncode=2)
 
-    monkeypatch.setattr(_gate, "top_of", lambda folder: found.top)
-    monkeypatch.setattr(_gate, "checked_out", checked_out)
-    monkeypatch.setattr(_gate, "run_to_end", run_to_end)
-    monkeypatch.setattr(_gate, "import_environment", lambda folder, tree: {"FOLDER": str(folder), "TREE": str(tree)})
+    monkeypatch.setattr(_gate_versions, "top_of", lambda folder: found.top)
+    monkeypatch.setattr(_gate_versions, "checked_out", checked_out)
+    monkeypatch.setattr(
+        _gate_versions, "import_environment", lambda folder, tree: {"FOLDER": str(folder), "TREE": str(tree)}
+    )
+    for module in (_gate_versions, _gate_corpus):
+        monkeypatch.setattr(module, "run_to_end", run_to_end)
     monkeypatch.setattr(_gate, "git", lambda folder, *words, skipped: found.answers["status"])
     return found
 
@@ -87,7 +90,7 @@ def test_commits_are_imported_from_their_work_trees(work, tmp_path):
     assert work.asked == [(work.top, "aaaa", "gate", "base"), (work.top, "bbbb", "gate", "head")]
     folders = [RunRequest.read(tmp_path / f"g/{side}/{REQUEST}").folder for side in ("base", "head")]
     assert folders == [str(work.trees[side] / "sub") for side in ("base", "head")]
-    assert run._folder_of("head", tmp_path / "elsewhere") == work.trees["head"]
+    assert run._trees.folder_of("head", tmp_path / "elsewhere") == work.trees["head"]
     assert [command[-1] for command, *_ in work.ran] == ["mine", "mine"]
     for (_, folder, environment), side in zip(work.ran, ("base", "head"), strict=True):
         assert folder == work.trees[side] / "sub"
@@ -100,9 +103,9 @@ def test_commits_are_imported_from_their_work_trees(work, tmp_path):
 
 def test_each_commit_is_built_once_in_the_folder_of_the_command(work, tmp_path, monkeypatch):
     built, tracked = [], []
-    monkeypatch.setattr(_gate, "run_build", lambda *words, **more: built.append((*words, more)))
-    monkeypatch.setattr(_gate, "copy_built", lambda tree, place: (place.mkdir(), (place / "planner").touch()))
-    monkeypatch.setattr(_gate, "track_built", tracked.append)
+    monkeypatch.setattr(_gate_versions, "run_build", lambda *words, **more: built.append((*words, more)))
+    monkeypatch.setattr(_gate_versions, "copy_built", lambda tree, place: (place.mkdir(), (place / "planner").touch()))
+    monkeypatch.setattr(_gate_versions, "track_built", tracked.append)
     asked = of_commits(work, build="make", build_limit_s=7.0)
     started(asked, tmp_path / "g")
     log = tmp_path / "g/build-base.log"
@@ -262,8 +265,8 @@ def corpus(work, monkeypatch):
         return work.cases
 
     work.cases, work.places = [Path("x/1"), Path("x/2")], cases
-    monkeypatch.setattr(_gate, "find_cases", find_cases)
-    monkeypatch.setattr(_gate, "_drivers_of", lambda case: {"mine:New"} if case.name == "1" else {"other"})
+    monkeypatch.setattr(_gate_corpus, "find_cases", find_cases)
+    monkeypatch.setattr(_gate_corpus, "_drivers_of", lambda case: {"mine:New"} if case.name == "1" else {"other"})
     work.answers["corpus"] = json.dumps({"cases": [
         {"path": "x/1", "expected": "fixed", "got": "fixed"},
         {"path": "x/2", "expected": "still", "got": "cannot_run", "now": "no map"},
@@ -382,7 +385,7 @@ def test_failed_hunt_is_an_error_of_its_version(tmp_path, monkeypatch):
 )
 def test_commit_that_cannot_run_without_a_build_is_offered_one(work, tmp_path, monkeypatch, build, fix):
     for name in ("run_build", "track_built", "copy_built"):
-        monkeypatch.setattr(_gate, name, lambda *words, **more: words[1].mkdir() if len(words) == 2 else None)
+        monkeypatch.setattr(_gate_versions, name, lambda *words, **more: words[1].mkdir() if len(words) == 2 else None)
     run = started(of_commits(work, build=build), tmp_path / "g")
     for state in ("error", "no_valid_trial"):
         with pytest.raises(CrashhuntError, match="no such file") as caught:
