@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import sys
-import textwrap
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -30,7 +29,7 @@ from crashhunt.cli._common import (
     unwritable_output,
 )
 from crashhunt.cli._rate import exit_code_of
-from crashhunt.plans import hunt_options
+from crashhunt.cli._short_help import GROUPS, ShortHelp
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,54 +38,7 @@ if TYPE_CHECKING:
     from crashhunt.hunts import HuntStatus
 
 _leave = os._exit  # which is refused to samplers, also while they are imported
-_MIN_HELP_COLUMNS = 32  # in a narrower terminal, the terminal breaks the lines
 _LONG_WAIT_S = 3.0  # after which people wonder
-
-
-_GROUPS = {
-    "what": "what is tested",
-    "search": "search",
-    "faults": "faults and probes",
-    "kept": "what is kept",
-    "run": "how it runs",
-    "output": "output",
-}
-
-
-class _ShortHelp(argparse.Action):
-    """Action that prints the most used options, and the names of all other options by group."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
-        """Print the help and exit."""
-        parser._print_message(short_help(parser), sys.stdout)
-        parser.exit()
-
-
-def short_help(parser: argparse.ArgumentParser) -> str:
-    """Return the short help of ``crashhunt run``, for the width of the terminal."""
-    briefs = {option.name: option.about.brief for option in hunt_options() if option.about.brief}
-    short = argparse.ArgumentParser(
-        parser.prog, usage=parser.usage, description=parser.description, add_help=False,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
-    width = max(_MIN_HELP_COLUMNS, short._get_formatter()._width)
-    short.description = textwrap.fill(parser.description or "", width)
-    most_used, others = short.add_argument_group("most used options"), []
-    for group in parser._action_groups:
-        names = []
-        for action in group._group_actions:
-            if not action.option_strings:
-                short.add_argument(action.dest, metavar=action.metavar, help=action.help)
-            elif action.dest in briefs:
-                takes = {"action": "store_true"} if action.nargs == 0 else {"metavar": action.metavar}
-                most_used.add_argument(action.option_strings[-1], help=briefs[action.dest], **takes)
-            else:
-                names.append(action.option_strings[-1])
-        if names and group.title in _GROUPS.values():
-            line = f"  {group.title}: {' '.join(names)}"
-            others.append(textwrap.fill(line, width, subsequent_indent="    ", break_on_hyphens=False))
-    short.epilog = "\n".join(["other options:", *others, "", f"{parser.prog} --help-all describes all options."])
-    return short.format_help()
 
 
 def add_run(commands: Commands) -> None:
@@ -100,7 +52,7 @@ def add_run(commands: Commands) -> None:
         add_help=False,
     )
     hidden: dict[str, Any] = {"nargs": 0, "default": argparse.SUPPRESS}
-    run.add_argument("-h", "--help", action=_ShortHelp, **hidden, help="show the most used options")
+    run.add_argument("-h", "--help", action=ShortHelp, **hidden, help="show the most used options")
     run.add_argument("--help-all", action="help", help="show all options")
     run.add_argument("directory", metavar="DIR", type=Path, help="directory of the hunt; created if it does not exist")
     run.add_argument(
@@ -113,7 +65,7 @@ def add_run(commands: Commands) -> None:
         help="maximum number of trials; 0: no limit, which needs --for or a bar for the rate",
     )
     run.add_argument("max_steps", metavar="MAX_STEPS", type=integer, help="maximum number of steps of a trial")
-    groups = {name: run.add_argument_group(title) for name, title in _GROUPS.items()}
+    groups = {name: run.add_argument_group(title) for name, title in GROUPS.items()}
     add_options(groups)
     groups["kept"].add_argument(
         "--overwrite", action="store_true", help="start a new hunt even if DIR contains another hunt"

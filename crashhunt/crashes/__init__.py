@@ -12,9 +12,6 @@ if TYPE_CHECKING:
         authenticate_bundle as authenticate_bundle,
         is_bundle_made_here as is_bundle_made_here,
         snapshot_of as snapshot_of,
-        with_lights as with_lights,
-        write_bundle as write_bundle,
-        write_trial as write_trial,
     )
     from ._bundle_trust import (
         TrustedOrigin as TrustedOrigin,
@@ -32,6 +29,7 @@ if TYPE_CHECKING:
         trust_repository as trust_repository,
         trust_snapshot as trust_snapshot,
     )
+    from ._bundle_writer import with_lights as with_lights, write_bundle as write_bundle, write_trial as write_trial
     from ._cause_groups import (
         Cause as Cause,
         CauseGroup as CauseGroup,

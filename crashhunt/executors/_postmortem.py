@@ -47,6 +47,34 @@ _FRAME_LINE = re.compile(r'  File "(.*)", line (\d+) in (.*)')  # of a stack tha
 MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside
 
 
+class LostTrialError(Exception):
+    """The process of a trial was killed from outside, or by an agent that attacked its zygote.
+
+    Args:
+        exit_code: exit code of the process; negative for a signal.
+    """
+
+    def __init__(self, exit_code: int) -> None:
+        super().__init__(exit_code)
+        self.exit_code = exit_code
+
+
+@dataclass(frozen=True, slots=True)
+class EndedTrial:
+    """A trial that has ended.
+
+    Args:
+        result: result of the trial.
+        notices: texts for the user.
+        braking: how the vehicle that collided brakes fully, and its deceleration; None if the settings do not request
+            it.
+    """
+
+    result: TrialResult
+    notices: tuple[str, ...] = ()
+    braking: Mapping[str, object] | None = None
+
+
 @dataclass(slots=True)
 class TrialAttempt:
     """A trial to run, and the record of how its processes have ended.

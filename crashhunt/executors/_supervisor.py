@@ -8,71 +8,40 @@ The supervisor owns the socket to the hunt, the black box, the scratch folder of
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import select
-import shutil
 import signal
 import time
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError, CrashhuntError, HostError, RecorderError, remedy
+from crashhunt.base.errors import CrashhuntError, HostError, RecorderError, remedy
 from crashhunt.base.processes import die_with, resume
 from crashhunt.base.resources import limit_behind
-from crashhunt.base.signals import describe_death, is_sent_from_outside
+from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import internal_error, scratch_of
-from crashhunt.executors._postmortem import MAX_ATTEMPTS, check_report, damaged, died, hung, read_ends, read_map
+from crashhunt.executors._escape_search import with_escape
+from crashhunt.executors._postmortem import EndedTrial, LostTrialError, check_report, damaged, died, hung, read_ends
 from crashhunt.executors._time_limits import START_UP_S, PauseMeter, has_hung
 from crashhunt.executors._trial_folder import TrialFolder
-from crashhunt.recording import BlackBoxFile, Recording, read_black_box
-from crashhunt.simulators import FullBraking
-from crashhunt.trial import Escape, TrialResult, TrialSpec
+from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator
     from pathlib import Path
 
-    from crashhunt.crashes import Borders
     from crashhunt.episode import WorkerSettings
     from crashhunt.executors._host_conditions import HostConditions
     from crashhunt.executors._protocol import Answer, Done, FromZygote, Job, KillTrial, Report
+    from crashhunt.recording import BlackBoxFile
 
 
 _LOOK_EVERY_S = 0.1  # whether a trial hangs
 _CHUNK_BYTES = 1 << 16  # bytes at a time
-
-
-class LostTrialError(Exception):
-    """The process of a trial was killed from outside, or by an agent that attacked its zygote.
-
-    Args:
-        exit_code: exit code of the process; negative for a signal.
-    """
-
-    def __init__(self, exit_code: int) -> None:
-        super().__init__(exit_code)
-        self.exit_code = exit_code
-
-
-@dataclass(frozen=True, slots=True)
-class EndedTrial:
-    """A trial that has ended.
-
-    Args:
-        result: result of the trial.
-        notices: texts for the user.
-        braking: how the vehicle that collided brakes fully, and its deceleration; None if the settings do not request
-            it.
-    """
-
-    result: TrialResult
-    notices: tuple[str, ...] = ()
-    braking: Mapping[str, object] | None = None
 
 
 class Supervisor:
@@ -338,52 +307,3 @@ def _answers(supervisor: Supervisor, settings: WorkerSettings, spec: TrialSpec) 
             where=str(error.filename or ""),
         )  # fmt: skip
         yield (said if limit or fix else internal_error(error, spec.number)).to_json()
-
-
-# Until when braking would have avoided a crash, found out by further trials in the same slot.
-
-_FIRST_EXTRA_NUMBER = 1 << 40  # beyond the numbers of a hunt's trials: each trial has a folder by its number
-
-
-def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: EndedTrial) -> TrialResult:
-    """Return the result of a trial with a collision, with the last step at which braking avoids the collision."""
-    result = ended.result
-    from crashhunt.crashes import find_escape
-
-    braking = None
-    if ended.braking is not None:
-        how, deceleration = ended.braking["how"], ended.braking["deceleration"]
-        braking = FullBraking(None, str(how), float(deceleration) if isinstance(deceleration, int | float) else None)
-    numbers = itertools.count(_FIRST_EXTRA_NUMBER + (os.getpid() << 16))
-    kills = 0
-
-    def recording(number: int) -> Recording:
-        return Recording(read_black_box(scratch_of(settings.scratch, number) / layout.BLACK_BOX))
-
-    def run(spec: TrialSpec) -> tuple[TrialResult, Recording]:
-        nonlocal kills
-        kills = 0
-        while True:
-            number = next(numbers)
-            try:
-                done = supervisor.run(replace(spec, number=number)).result
-                return done, recording(number)
-            except LostTrialError:
-                kills += 1
-                if kills == MAX_ATTEMPTS or supervisor.retires:  # without a zygote, no attempt can succeed
-                    raise
-            finally:
-                shutil.rmtree(scratch_of(settings.scratch, number), ignore_errors=True)
-
-    def borders() -> Iterable[Borders]:
-        from crashhunt.recording import lane_borders  # MCAP takes long to import, and few crashes need it
-
-        return lane_borders(read_map(settings.scratch, scratch_of(settings.scratch, result.spec.number)))
-
-    try:
-        return replace(result, escape=find_escape(result, recording(result.spec.number), braking, run, borders))
-    except BundleError as error:
-        return replace(result, escape=Escape(why_not=error.message))
-    except LostTrialError as error:
-        why = f"the process that searched {describe_death(error.exit_code)}{f', {kills} times' if kills > 1 else ''}"
-        return replace(result, why_no_escape=why)

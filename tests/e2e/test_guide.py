@@ -248,8 +248,8 @@ def test_files_of_one_trial_are_those_of_the_stacks_of_its_processes(toy, monkey
     assert found <= listed
     # The supervisor runs no code of a test, the records are written between two calls of agents, and this is the toy.
     assert listed - found == {"executors/_supervisor.py", "recording/_blackbox.py", "sumo/_simulator.py"}
-    assert len(listed) <= 14
-    assert sum(len((Path(top) / file).read_text().splitlines()) for file in listed) <= 5_300
+    assert len(listed) <= 13
+    assert sum(len((Path(top) / file).read_text().splitlines()) for file in listed) <= 5_000
 
 
 def test_table_of_packages_has_all_of_them_in_the_order_of_their_imports():

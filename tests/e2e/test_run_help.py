@@ -8,7 +8,7 @@ import re
 import pytest
 
 from crashhunt.cli import make_parser
-from crashhunt.cli._run import short_help
+from crashhunt.cli._short_help import short_help
 
 GROUPS = ["what is tested", "search", "faults and probes", "what is kept", "how it runs", "output"]
 

@@ -8,8 +8,9 @@ import pytest
 
 from crashhunt import crashes
 from crashhunt.base.errors import BundleError
-from crashhunt.executors import _supervisor, _trial_folder
-from crashhunt.executors._supervisor import LostTrialError, with_escape
+from crashhunt.executors import _escape_search, _trial_folder
+from crashhunt.executors._escape_search import with_escape
+from crashhunt.executors._postmortem import LostTrialError
 from crashhunt.trial import Collision, Escape, Outcome, TrialResult, TrialSpec
 
 HIT = Collision("ego", "collider", "ego", "x", ("overlap",), "overlap", 1.0, 2.0)
@@ -21,8 +22,8 @@ FOUND = Escape(3, 4, 7.5, "with full braking")
 def search(monkeypatch, tmp_path):
     """Calls `with_escape` with a supervisor that loses the first trials."""
     asked = SimpleNamespace(numbers=[], braking=None, ended=[], error=None)
-    monkeypatch.setattr(_supervisor, "read_black_box", lambda path: [])
-    monkeypatch.setattr(_supervisor, "Recording", lambda records: "recording")
+    monkeypatch.setattr(_escape_search, "read_black_box", lambda path: [])
+    monkeypatch.setattr(_escape_search, "Recording", lambda records: "recording")
 
     def find(result, recording, braking, run, borders):
         asked.braking = braking

@@ -18,9 +18,10 @@ import pytest
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HostError
 from crashhunt.episode import Parts, WorkerSettings, run_episode, scratch_of
-from crashhunt.executors import _supervisor, _time_limits
+from crashhunt.executors import _escape_search, _supervisor, _time_limits
+from crashhunt.executors._postmortem import LostTrialError
 from crashhunt.executors._protocol import encode_report
-from crashhunt.executors._supervisor import EndedTrial, LostTrialError, Supervisor
+from crashhunt.executors._supervisor import EndedTrial, Supervisor
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import CRASHES, Collision, Outcome, TrialResult, TrialSpec
@@ -347,8 +348,8 @@ def test_supervisor_answers_before_it_searches_for_an_escape(settings, monkeypat
 
 def test_escape_is_searched_in_trials_of_their_own(settings, monkeypatch, tmp_path):
     asked = replace(settings, find_escapes=True)
-    monkeypatch.setattr(_supervisor, "read_black_box", lambda path: path.parent)
-    monkeypatch.setattr(_supervisor, "Recording", lambda path: path)
+    monkeypatch.setattr(_escape_search, "read_black_box", lambda path: path.parent)
+    monkeypatch.setattr(_escape_search, "Recording", lambda path: path)
     found = []
 
     def find_escape(result, recording, braking, run, borders):
@@ -360,23 +361,23 @@ def test_escape_is_searched_in_trials_of_their_own(settings, monkeypatch, tmp_pa
     monkeypatch.setattr("crashhunt.crashes.find_escape", find_escape)
     supervisor = Running(LostTrialError(-9), LostTrialError(-9), EndedTrial(FINE))
     ended = EndedTrial(CRASH, braking={"how": "emergency", "deceleration": 7})
-    assert _supervisor.with_escape(supervisor, asked, ended).escape == 9
+    assert _escape_search.with_escape(supervisor, asked, ended).escape == 9
     first = (1 << 40) + (os.getpid() << 16)
     assert [(one.number, one.seed) for one in supervisor.specs] == [(first + more, 8) for more in range(3)]
     (_, recording, braking) = found[0]
     assert recording == scratch_of(settings.scratch, 3)
     assert (braking.how, braking.deceleration) == ("emergency", 7.0)
     supervisor = Running(EndedTrial(FINE))
-    _supervisor.with_escape(supervisor, asked, EndedTrial(CRASH, braking={"how": "x", "deceleration": None}))
+    _escape_search.with_escape(supervisor, asked, EndedTrial(CRASH, braking={"how": "x", "deceleration": None}))
     assert found[-1][2].deceleration is None
     supervisor = Running(EndedTrial(FINE))
-    _supervisor.with_escape(supervisor, asked, EndedTrial(CRASH))
+    _escape_search.with_escape(supervisor, asked, EndedTrial(CRASH))
     assert found[-1][2] is None
     for supervisor in (Running(*[LostTrialError(-9)] * 3), Running(LostTrialError(-9))):
         supervisor.retires = False
         if len(supervisor.ends) == 1:
             supervisor.run = lambda given, lost=supervisor: setattr(lost, "retires", True) or Running.run(lost, given)
-        result = _supervisor.with_escape(supervisor, asked, EndedTrial(CRASH))
+        result = _escape_search.with_escape(supervisor, asked, EndedTrial(CRASH))
         assert result.escape is None
         times = ", 3 times" if len(supervisor.specs) == 3 else ""
         assert result.why_no_escape == f"the process that searched was killed by SIGKILL{times}"

@@ -14,7 +14,7 @@ import pytest
 
 import crashhunt
 from crashhunt.errors import CallError, CrashhuntError, HuntDirectoryError, ScenarioError
-from crashhunt.hunts import _hunt as hunt_module, _next_trials, _running_hunt
+from crashhunt.hunts import _hunt, _next_trials
 from crashhunt.hunts._hunt import Hunt
 from crashhunt.hunts._next_trials import GREATEST_LAG, Pace
 from crashhunt.ledger import Ledger
@@ -58,7 +58,7 @@ class Inline:
         self.most = max(self.most, len(self.waiting))
 
     def completed(self, timeout_s):
-        assert timeout_s == _running_hunt._TICK_S
+        assert timeout_s == _hunt._TICK_S
         if self.waiting:
             yield self.ends(self.waiting.pop(self.first))
 
@@ -89,7 +89,7 @@ def run(tmp_path, monkeypatch):
             return found.executor
 
         found = SimpleNamespace(seen=[], path=tmp_path / "h", executor=None)
-        monkeypatch.setattr(_running_hunt, "make_executor", make)
+        monkeypatch.setattr(_hunt, "make_executor", make)
         given = {"scenario": "toy.toml", "seed": 4, "snapshot_code": False, "watch": found.seen.append} | options
         found.report = crashhunt.run(found.path, parallel, trials, 60, **given)
         with closing(Ledger(found.path / "ledger.sqlite")) as ledger:
@@ -166,7 +166,7 @@ def test_hunt_waits_while_it_is_far_ahead_of_its_partner(run, tmp_path, monkeypa
     monkeypatch.setattr("crashhunt.hunts.Hunt", begin)
     monkeypatch.setattr(_next_trials, "trials_of_running", finished)
     monkeypatch.setattr(_next_trials, "_LOOK_EVERY_S", 0.0)
-    monkeypatch.setattr(_running_hunt, "_MAX_LEAD_S", 0.0)
+    monkeypatch.setattr(_hunt, "_MAX_LEAD_S", 0.0)
     found = run(99, ends)
     assert found.numbers == list(range(99))
     assert found.report.stopped_because == "all_trials"
@@ -342,7 +342,7 @@ def test_stopped_hunt_is_interrupted_and_resumes(run, monkeypatch):
 
     def watch(hunt, *words, **options):
         init(hunt, *words, **options)
-        monkeypatch.setattr(hunt_module, "stop_requests", lambda: Stops(stops))
+        monkeypatch.setattr(_hunt, "stop_requests", lambda: Stops(stops))
 
     monkeypatch.setattr(Hunt, "__init__", watch)
     found = run(9, stop)
@@ -395,8 +395,8 @@ def bundles(monkeypatch):
         written.append(result.spec.number)
         return SimpleNamespace(result=result, id=f"{result.spec.number:06d}", confirmed=True, path=folder)
 
-    monkeypatch.setattr(_running_hunt, "write_bundle", write)
-    monkeypatch.setattr(_running_hunt.TrialReruns, "confirm", lambda again, crashes: list(crashes))
+    monkeypatch.setattr(_hunt, "write_bundle", write)
+    monkeypatch.setattr(_hunt.TrialReruns, "confirm", lambda again, crashes: list(crashes))
     return written
 
 
@@ -429,7 +429,7 @@ def test_hunt_that_has_found_its_crash_ends_with_any_version_of_its_sampler(run,
     bundle = SimpleNamespace(
         result=crashes_from(3)(TrialSpec(3, 1, {}, {}, 60)), id="000003-collision", confirmed=True, snapshot=""
     )
-    monkeypatch.setattr(_running_hunt, "list_bundles", lambda directory: [bundle])
+    monkeypatch.setattr(_hunt, "list_bundles", lambda directory: [bundle])
     assert run(30, sampler="mutation").report.stopped_because == "crash"
 
 
@@ -446,7 +446,7 @@ def test_deterministic_hunt_waits_for_trials_below_its_crash(run, bundles, monke
 
 
 def test_hunt_that_keeps_going_reports_its_shortest_crash_first(run, bundles, monkeypatch):
-    monkeypatch.setattr(_running_hunt, "prune_bundles", lambda ledger, kinds, crashes, keep, *, final=True: crashes)
+    monkeypatch.setattr(_hunt, "prune_bundles", lambda ledger, kinds, crashes, keep, *, final=True: crashes)
     kinds = SimpleNamespace(
         until=None, added=[], types_by_cause=None, at_fault=(2, 4), newest=None, newest_trial=None,
         groups=lambda **_: (), refresh=lambda crashes: None, next_to_judge=lambda: None, count_to_judge=lambda: 0,
@@ -508,11 +508,11 @@ def test_parts_of_a_hunt_are_closed_at_its_end(run, monkeypatch):
 
         monkeypatch.setattr(kind, "close", close)
 
-    for kind in (_running_hunt.Audit, _running_hunt.Confirmation, _running_hunt.SharedReruns):
+    for kind in (_hunt.Audit, _hunt.Confirmation, _hunt.SharedReruns):
         note(kind, kind.__name__)
     released = []
     monkeypatch.setattr(
-        _running_hunt, "release_shared_memory", lambda scratch, *, of_ended: released.append((scratch, of_ended))
+        _hunt, "release_shared_memory", lambda scratch, *, of_ended: released.append((scratch, of_ended))
     )
     found = run(3)
     assert closed == ["Audit", "Confirmation", "SharedReruns"]
@@ -550,8 +550,8 @@ def test_bundle_whose_row_is_missing_is_recorded_when_a_hunt_resumes(run, monkey
         result=replace(survives(SimpleNamespace(number=2)), spec=TrialSpec(2, 99, {"ego": {"speed": 7.0}}, {}, 60)),
         id="000002-collision", snapshot="0f", confirmed=True,
     )  # fmt: skip
-    monkeypatch.setattr(_running_hunt, "list_bundles", lambda directory: [bundle])
-    monkeypatch.setattr(_running_hunt.TrialReruns, "confirm", lambda again, crashes: list(crashes))
+    monkeypatch.setattr(_hunt, "list_bundles", lambda directory: [bundle])
+    monkeypatch.setattr(_hunt.TrialReruns, "confirm", lambda again, crashes: list(crashes))
     found = run(4, keep_going=False)
     assert 2 in found.numbers
     assert found.executor is None or 2 not in [spec.number for spec in found.executor.submitted]

@@ -25,14 +25,12 @@ from crashhunt.hunts import (
     _next_trials,
     _preflight,
     _progress,
-    _running_hunt,
     _verification,
 )
-from crashhunt.hunts._hunt import Hunt
+from crashhunt.hunts._hunt import Hunt, RunningHunt, TrialLoop
 from crashhunt.hunts._next_trials import result_lag
 from crashhunt.hunts._progress import PhaseClock, Progress
 from crashhunt.hunts._reports import BranchReport, Difference, ProbeReport, RareReport, kind_data
-from crashhunt.hunts._running_hunt import RunningHunt, TrialLoop
 from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReruns, is_settled
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
@@ -202,7 +200,7 @@ def test_rest_of_an_audit_is_a_phase_of_its_own(running, loop):
     )  # fmt: skip
 
     def receive(*, wait_s):
-        assert wait_s == _running_hunt._TICK_S
+        assert wait_s == _hunt._TICK_S
         audit.waiting -= 2 if audit.waiting == 3 else 1
 
     found._receive_notices = receive
@@ -273,7 +271,7 @@ def test_error_of_a_hunt_is_in_its_ledger(hunt, monkeypatch, error, raised, why)
 
     ledger = SimpleNamespace(note=lambda **facts: noted.append(facts), close=lambda: noted.append("closed"))
     found._place = SimpleNamespace(
-        locked=locked, claim=lambda *given, **more: SETTINGS, scratch="scratch", has_begun=True
+        locked=locked, claim=lambda *given, **more: SETTINGS, settings_before=None, scratch="scratch", has_begun=True
     )
     monkeypatch.setattr(_hunt, "stop_requests", stops)
     monkeypatch.setattr(_hunt, "Ledger", lambda path, *, writable, wait: ledger if writable else None)
@@ -330,14 +328,14 @@ def test_trial_is_written_recorded_and_counted(running, loop, monkeypatch):
         save=lambda bundle: calls.append(("saved", bundle)),
     )  # fmt: skip
     found = loop()
-    monkeypatch.setattr(_running_hunt, "write_trial", lambda _, given, scratch: calls.append(("files", scratch.name)))
-    monkeypatch.setattr(_running_hunt, "read_map", lambda scratch, trial: "lanes")
+    monkeypatch.setattr(_hunt, "write_trial", lambda _, given, scratch: calls.append(("files", scratch.name)))
+    monkeypatch.setattr(_hunt, "read_map", lambda scratch, trial: "lanes")
 
     def write(folder, given, trial, **more):
         calls.append(("bundle", folder == running.setup.place.path, trial.name, more))
         return "bundle"
 
-    monkeypatch.setattr(_running_hunt, "write_bundle", write)
+    monkeypatch.setattr(_hunt, "write_bundle", write)
 
     def record(given):
         calls.clear()
@@ -363,7 +361,7 @@ def test_trial_is_written_recorded_and_counted(running, loop, monkeypatch):
 
 def test_phases_after_the_last_trial_are_shown_and_noted_now_and_then(running, monkeypatch):
     clock = SimpleNamespace(now=100.0)
-    monkeypatch.setattr(_running_hunt.time, "monotonic", lambda: clock.now)
+    monkeypatch.setattr(_hunt.time, "monotonic", lambda: clock.now)
     running.progress = progress = SimpleNamespace(
         phase=None, ends_at=5.0, noted=lambda: {"done": progress.phase.done}, notes=[],
         status=lambda phase, planned, workers, **more: (phase, progress.phase.done),

@@ -19,7 +19,7 @@ import crashhunt
 from crashhunt.base import layout
 from crashhunt.episode import WorkerSettings
 from crashhunt.errors import CrashhuntError, HuntDirectoryError
-from crashhunt.hunts import _running_hunt, check, salvage
+from crashhunt.hunts import _hunt, check, salvage
 from crashhunt.hunts._audits import Audit
 from crashhunt.hunts._next_trials import Unanswered, find_unanswered
 from crashhunt.hunts._progress import Progress
@@ -106,7 +106,7 @@ def test_hunt_that_fails_before_its_first_trial_has_the_facts_of_a_hunt_that_ran
     def fail(*_, **__):
         raise CrashhuntError("no worker can be started")
 
-    monkeypatch.setattr(_running_hunt, "make_executor", fail)
+    monkeypatch.setattr(_hunt, "make_executor", fail)
     monkeypatch.chdir(tmp_path)
     Path("toy.toml").write_text('title = "A toy"\nschema = 1\nsimulator = "toy"\n[agents.ego]\n')
     with pytest.raises(CrashhuntError, match="no worker"):
