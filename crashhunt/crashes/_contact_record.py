@@ -1,4 +1,4 @@
-"""The record of a contact: its time, the sides that touched, and the motion of the two actors before it.
+"""The record of a contact: the sides that touched, its manner, and the lane changes that led to it.
 
 Everything that describes a collision reads this record: its type, the fault, the lane, the speeds and the text. The
 contact is computed by `crashhunt.world.contact_at`, from which the oracles also determine the role of the agent.
@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise, takewhile
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from crashhunt.base import layout
-from crashhunt.base.text import format_time
+from crashhunt.crashes._before_contact import Approach, scenes_since
 from crashhunt.crashes._lanes import LaneMap
 from crashhunt.crashes._trails import BESIDE_M, TRAIL_STEP_M, SharedPath, Trail
 from crashhunt.world import (
@@ -36,11 +36,9 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.recording import Recording
     from crashhunt.trial import Collision
-    from crashhunt.world import Event, RightOfWay, Scene, Touch
+    from crashhunt.world import Scene, Touch
 
 
-_WINDOW_S = 4.0  # earlier movements have not led to the contact
-_SAMPLE_S = 0.1  # as short as the usual steps of simulators
 _EVENTS_S = 10.0  # before the contact
 SAME_WAY = math.radians(45)
 _MIN_BEND_TURN_RAD = math.radians(20)  # between two vehicles that touch in one lane: less is no tight bend
@@ -48,12 +46,10 @@ _OPPOSITE_RAD = math.radians(135)
 _UNSWEPT_CONTACT = "crashed"  # highway-env's collisions: its vehicles drive through several collision checks in a step
 _LATELY_S = 1.5
 _STOOD_S = 1.0  # an actor that stood for less time may only have paused
-_BEFORE_S = 1.0  # as long as the first half of a lane change takes
 _SIDEWAYS_M = 0.3  # less is drifting
 _MAX_STRAIGHT_TURN_RAD = math.radians(10)
 _DRIFTS_M = 0.1
 _OVER_M = 0.1  # less is a rounding error of the map
-_ACROSS_M = 50.0  # from the line of a junction to where it ends; there are larger ones
 _BEND_M = 0.4  # with it, an actor on the neighbouring lane is still not in the way: its centre is more than 2 m away
 _MAX_ASIDE_M, _MIN_OVERLAP_M = 1.5, 0.3  # across the lane, of a follower that does not drive in its middle
 _TRAIL_M = 40.0  # of the path before the contact; longer than any vehicle and the part that a follower must share
@@ -62,138 +58,15 @@ _FRONTS_M = 2.0  # between two fronts that met, each with the middle or with a c
 _MIN_COURSE_M = 0.5  # driven, to know in which direction the front of a vehicle moves
 
 
-@dataclass(frozen=True, slots=True)
-class ApproachPath:
-    """The motion of an actor before the contact, with one row for each of the times of a `ContactRecord`.
-
-    Args:
-        id: identifier of the actor.
-        points: x and y of its front bumper, shape (n, 2), in m.
-        headings: headings of the actor, shape (n,), in rad.
-        speeds: speeds of the actor, shape (n,), in m/s.
-        length: length of the actor, in m.
-        width: width of the actor, in m.
-    """
-
-    id: str
-    points: NDArray[np.float64]
-    headings: NDArray[np.float64]
-    speeds: NDArray[np.float64]
-    length: float
-    width: float
-
-    @property
-    def centers(self) -> NDArray[np.float64]:
-        """The centre of the actor's outline, shape (n, 2), in m."""
-        return self.points - self.length / 2 * np.stack((np.cos(self.headings), np.sin(self.headings)), axis=1)
-
-
 @dataclass(frozen=True)
-class ContactRecord:
-    """The contact of an agent with another actor, and the seconds before the contact.
+class ContactRecord(Approach):
+    """The contact of an agent with another actor.
 
     Args:
-        agent: identifier of the controlled vehicle.
-        other: Identifier of the collision partner.
-        scenes: scenes up to the end of the step in which the actors touched.
-        time_s: simulation time of the first contact.
-        began_s: simulation time at which the episode began.
-        lanes: lanes around the place of the contact.
-        events: events of the last seconds, each with its simulation time.
-        right_of_way: right of way of the map; None if the map has none.
-        lane: The lane of the agent at the contact; empty if it is unknown.
-        swept: whether actors move continuously between scenes and change lanes instantly, as in `Scene`.
-        reported: The collision that the result of the trial contains; None if it is unknown.
+        reported: the collision that the result of the trial contains; None if it is unknown.
     """
 
-    agent: str
-    other: str
-    scenes: Sequence[Scene]
-    time_s: float
-    began_s: float
-    lanes: LaneMap
-    events: tuple[tuple[float, Event], ...] = ()
-    right_of_way: RightOfWay | None = None
-    lane: str = ""
-    swept: bool = True
     reported: Collision | None = None
-
-    @cached_property
-    def before(self) -> list[Scene]:
-        """The last scenes before the contact with both actors; they cover at least 4 s if the recording is that long.
-
-        The result begins with the latest scene that is at least 4 s before the contact. Otherwise, the time of the
-        contact within a long step would decide how much time the fault rules examine.
-        """
-        found: list[Scene] = []
-        for scene in reversed(self.scenes):
-            if scene.time_s >= self.time_s - 1e-6:
-                continue
-            index = scene.roster.index
-            if self.agent not in index or self.other not in index:
-                if found:
-                    break
-                continue
-            found.append(scene)
-            if scene.time_s <= self.time_s - _WINDOW_S + 1e-6:
-                break
-        return found[::-1] or list(self.scenes[-1:])
-
-    @cached_property
-    def through(self) -> list[Scene]:
-        """The scenes before the contact and the first scene after it."""
-        last = self.scenes[-1]
-        there = self.agent in last.roster.index and self.other in last.roster.index
-        return [*self.before, last] if there and last.time_s != self.before[-1].time_s else self.before
-
-    @cached_property
-    def times(self) -> NDArray[np.float64]:
-        """The times at which the movement before the contact is sampled, in s before the contact, the earliest first.
-
-        The times are relative to the contact, not to the scenes. Otherwise the results of the rules would depend on the
-        time of the contact within a long step.
-        """
-        first, last = (self.time_s - self.before[place].time_s for place in (0, -1))
-        first = min(first, max(_WINDOW_S, last))
-        samples = first - _SAMPLE_S * np.arange(math.ceil((first - last) / _SAMPLE_S - 1e-6))
-        return np.append(samples, last)
-
-    def ago(self, before_s: float) -> str:
-        """Return a time in s before the contact as text, relative to the end of the step, as all texts on a crash."""
-        last_s = self.scenes[-1].time_s
-        step_s = last_s - self.scenes[-2].time_s if len(self.scenes) > 1 else 0.1
-        return f"{format_time(before_s + last_s - self.time_s, step_s)} before"
-
-    def way(self, actor: str) -> ApproachPath:
-        """Return how an actor moved before the contact."""
-        return self._ways[actor]
-
-    @cached_property
-    def _ways(self) -> dict[str, ApproachPath]:
-        return {actor: self._way(actor) for actor in (self.agent, self.other)}
-
-    def _way(self, actor: str) -> ApproachPath:
-        rows = [(scene, scene.roster.index[actor]) for scene in self.before]
-        scene, row = rows[-1]
-        known = scene.roster.actors[row]
-        poses = [(*scene.points[row], scene.headings[row], known.length, known.width) for scene, row in rows]
-        at = np.array([self.time_s - scene.time_s for scene, _ in rows])
-        bends = self.swept and not is_person(actor)
-        found = []
-        for time_s in self.times:
-            place = max(0, min(len(rows) - 2, int(np.searchsorted(-at, -time_s, side="right")) - 1))
-            after = min(place + 1, len(rows) - 1)
-            share = (at[place] - time_s) / (at[place] - at[after]) if after > place else 1.0
-            (pose,) = poses_between(poses[place], poses[after], (share,), bends=bends)
-            found.append(pose)
-        return ApproachPath(
-            id=actor,
-            points=np.array([pose[:2] for pose in found]),
-            headings=np.unwrap(np.array([pose[2] for pose in found])),
-            speeds=np.interp(-self.times, -at, [scene.speeds[row] for scene, row in rows]),
-            length=known.length,
-            width=known.width,
-        )
 
     def _at_contact(self, actor: str) -> tuple[NDArray[np.float64], float]:
         """Return the centre of an actor at the contact, in m, and its heading, in rad."""
@@ -221,10 +94,6 @@ class ContactRecord:
                 turn = abs(math.remainder(after.headings[row] - before.headings[was], math.tau))
                 found = max(found, math.dist(before.points[was], after.points[row]) * turn / 8)
         return found
-
-    def partner(self, actor: str) -> str:
-        """Return the identifier of the other actor in the contact."""
-        return self.other if actor == self.agent else self.agent
 
     @cached_property
     def touch(self) -> Touch:
@@ -392,23 +261,6 @@ class ContactRecord:
         own, other = self.way(self.agent), self.way(self.other)
         turns = np.abs((own.headings - other.headings + math.pi) % math.tau - math.pi)
         return float(turns[self.times <= since_s + 1e-6].max(initial=self.turn))
-
-    def ahead_m(self, actor: str, back: int = -1) -> float:
-        """Return how far an actor's centre is ahead of the other's centre, along the other's heading, in m."""
-        own, other = self.way(actor), self.way(self.partner(actor))
-        dx, dy = own.centers[back] - other.centers[back]
-        return float(dx * math.cos(other.headings[back]) + dy * math.sin(other.headings[back]))
-
-    def gap_m(self, actor: str, back: int = -1) -> float:
-        """Return the distance from the other actor's front to an actor's rear, along the other's heading, in m."""
-        own, other = self.way(actor), self.way(self.partner(actor))
-        return self.ahead_m(actor, back) - (own.length + other.length) / 2
-
-    def aside_m(self, actor: str, back: int = -1) -> float:
-        """Return how far an actor's centre is to the left of the other's centre, across the other's heading, in m."""
-        own, other = self.way(actor), self.way(self.partner(actor))
-        dx, dy = own.centers[back] - other.centers[back]
-        return float(dy * math.cos(other.headings[back]) - dx * math.sin(other.headings[back]))
 
     @cached_property
     def follower(self) -> str:
@@ -584,60 +436,6 @@ class ContactRecord:
         lately = [abs(self.aside_m(actor, back)) for back, time_s in enumerate(self.times) if time_s <= _LATELY_S]
         return max(lately, default=0.0) - abs(float(aside)) > _SIDEWAYS_M
 
-    def was_off_path(self, actor: str, back: int) -> bool:
-        """Return whether an actor was off the path of the other actor just before the time with the index ``back``."""
-        return any(
-            abs(self.aside_m(actor, place)) > BESIDE_M
-            for place in range(back + 1)
-            if self.times[place] - self.times[back] <= _BEFORE_S
-        )
-
-    def is_between_junctions(self, *actors: str) -> bool:
-        """Return whether all given actors were on SUMO roads, outside junctions, in the seconds before the contact."""
-        lanes = [self._lanes_since(actor, self.time_s - _WINDOW_S) for actor in actors]
-        return all(bool(found) and not any(lane.startswith(":") or not lane for lane in found) for found in lanes)
-
-    def _lanes_since(self, actor: str, time_s: float) -> list[str]:
-        """Return the lanes of an actor in SUMO, in the scenes since a time that contain it."""
-        return [
-            scene.lanes[scene.roster.index[actor]]
-            for scene in _scenes_since(self.scenes, time_s)
-            if scene.lanes and actor in scene.roster.index
-        ]
-
-    def was_in_junction(self, actor: str, before_s: float) -> bool:
-        """Return whether an actor was inside a junction of SUMO at the given time before the contact."""
-        lanes = (
-            scene.lanes[scene.roster.index[actor]]
-            for scene in reversed(self.scenes)
-            if scene.lanes and actor in scene.roster.index and scene.time_s <= self.time_s - before_s
-        )
-        return next(lanes, "").startswith(":")
-
-    def is_past(self, event: Event, time_s: float) -> bool:
-        """Return whether the actor of an event at a junction had already left the junction.
-
-        Args:
-            event: the event, recorded on the first lane of the junction.
-            time_s: simulation time for which the answer holds.
-        """
-        after = [scene for scene in _scenes_since(self.scenes, time_s) if event.agent in scene.roster.index]
-        points = [scene.points[scene.roster.index[event.agent]] for scene in after]
-        driven = sum(math.dist(a, b) for a, b in pairwise(points))
-        # In a long step, its front may have passed the junction when the event was found, but not its back.
-        is_behind = bool(event.lane) and not event.lane.startswith(":")
-        if driven > (self.way(event.agent).length if is_behind else _ACROSS_M):
-            return True
-        lanes = [event.lane, *(scene.lanes[scene.roster.index[event.agent]] for scene in after if scene.lanes)]
-        if event.agent == self.agent:
-            lanes.append(self.lane)
-        junctions = {lane.rsplit("_", 2)[0] for lane in lanes if lane.startswith(":")}
-        return len(junctions) > 1
-
-    def speed_mps(self, actor: str, before_s: float) -> float:
-        """Return an actor's speed the given time before the contact, or at its first recorded step if that is later."""
-        return float(self.way(actor).speeds[int(np.argmin(np.abs(self.times - before_s)))])
-
     def stood_s(self, actor: str) -> float:
         """Return how long an actor had stood still until the contact, in s; 0 if it moved when the actors touched."""
         if self.speed_at_contact(actor) >= STANDS_MPS:
@@ -658,33 +456,6 @@ class ContactRecord:
                 return max(found, ago - moved_s)
             found, place = ago, scene.points[row]
         return found
-
-    def slowed(self, actor: str, since_s: float) -> float:
-        """Return the average deceleration of an actor in the last seconds before the contact, in m/s²."""
-        way = self.way(actor)
-        back = int(np.argmin(np.abs(self.times - since_s)))
-        took = float(self.times[back] - self.times[-1])
-        return float(way.speeds[back] - way.speeds[-1]) / took if took > 0 else 0.0
-
-    def hardest_braking(self, actor: str) -> float:
-        """Return the greatest deceleration of an actor between two scenes, in m/s²."""
-        way = self.way(actor)
-        steps = -np.diff(self.times)
-        return float((-np.diff(way.speeds) / np.maximum(steps, 1e-9)).max(initial=0.0))
-
-    def links(self, actor: str) -> tuple[int, ...]:
-        """Return the indices of the connections across a junction that an actor may have used."""
-        assert self.right_of_way is not None
-        lanes = self._lanes_since(actor, self.time_s - 3 * _WINDOW_S)
-        if actor == self.agent and self.lane:
-            lanes.append(self.lane)
-        x, y = self.way(actor).points[-1].tolist()
-        return self.right_of_way.places(tuple(lane for lane in lanes if lane), x, y)
-
-
-def _scenes_since(scenes: Sequence[Scene], time_s: float) -> list[Scene]:
-    """Return the last of the given scenes, without the scenes before a time."""
-    return [*takewhile(lambda scene: scene.time_s >= time_s, reversed(scenes))][::-1]
 
 
 def record_in(scenes: Sequence[Scene], hit: Collision) -> ContactRecord | None:
@@ -728,9 +499,7 @@ def contact_record(bundle: Bundle, recording: Recording | None = None) -> Contac
         record,
         time_s=hit.time_s if last.time_s - found.prologue.step_length_s <= hit.time_s <= last.time_s else last.time_s,
         lanes=LaneMap(read_lanes(bundle.path / layout.LOG), (hit.x, hit.y)),
-        events=tuple(
-            (scene.time_s, event) for scene in _scenes_since(record.scenes, since_s) for event in scene.events
-        ),
+        events=tuple((scene.time_s, event) for scene in scenes_since(record.scenes, since_s) for event in scene.events),
         # Earlier versions wrote the lane of SUMO's report, which may be the other actor's.
         lane=(last.lanes[last.roster.index[hit.agent]] if last.lanes else "") or hit.lane,
     )

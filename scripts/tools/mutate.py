@@ -117,6 +117,7 @@ _TESTS_ELSEWHERE = {
     "cli/_whatif.py": ("e2e/test_what_if.py",),
     "corpus": ("corpus/test_*.py", "e2e/test_corpus.py"),
     "corpus/_bisection.py": ("e2e/test_bisect.py",),
+    "crashes/_before_contact.py": ("crashes/test_contact_record.py", "crashes/test_fault.py"),
     "crashes/_bundle_trust.py": ("e2e/test_foreign_hunts.py",),
     "crashes/_saved_crashes.py": ("crashes/test_archive.py", "crashes/test_bundle.py"),
     "crashes/_encounter.py": ("crashes/test_danger_course.py",),
