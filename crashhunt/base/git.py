@@ -12,13 +12,13 @@ import signal
 import subprocess
 import tempfile
 from contextlib import contextmanager, suppress
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.process_owners import this_process
-from crashhunt.base.processes import die_with
+from crashhunt.base.processes import running
 from crashhunt.base.signals import describe_death
 from crashhunt.base.temporary import temporary_beside, temporary_folder
 
@@ -160,10 +160,11 @@ def run_to_end(
     command: Sequence[str], folder: Path | None, environment: Mapping[str, str]
 ) -> subprocess.CompletedProcess[str]:
     """Run a command to its end and return its output; if this process is killed, the command is killed too."""
-    return subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, check=False,
-        preexec_fn=partial(die_with, os.getpid()),
-    )  # fmt: skip
+    with running(
+        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as child:
+        output, errors = child.communicate()
+    return subprocess.CompletedProcess(command, child.returncode, output, errors)
 
 
 def git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str:

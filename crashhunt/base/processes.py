@@ -11,11 +11,15 @@ import os
 import signal
 import time
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from crashhunt.base.signals import blocked_signals
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    import subprocess
+    from collections.abc import Iterator, Sequence
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # of <sys/prctl.h>
 _libc = ctypes.CDLL(None)  # looked up once, not in every fork
@@ -35,6 +39,36 @@ def die_with(parent: int, number: int = signal.SIGKILL) -> None:
     _prctl(_PR_SET_PDEATHSIG, number)
     if os.getppid() != parent:  # it died before the prctl call
         os._exit(1)
+
+
+@contextmanager
+def running(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[Any]]:
+    """Yield the process of a program, which ends at the end of the context or of this process.
+
+    ``options`` are those of `subprocess.Popen`. Signals have their default effect on the program.
+    """
+    import subprocess  # here, because most commands start no program
+
+    begin = partial(_begin, os.getpid(), signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+    child: subprocess.Popen[Any] | None = None
+    try:
+        with blocked_signals():  # Python drops a KeyboardInterrupt that comes in its own hooks around a fork
+            child = subprocess.Popen(command, preexec_fn=begin, **options)
+        yield child
+    finally:
+        if child is not None:
+            child.kill()
+            child.wait()
+            for pipe in filter(None, (child.stdout, child.stderr)):
+                pipe.close()
+
+
+def _begin(parent: int, mask: set[signal.Signals | int]) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    die_with(parent)
 
 
 @contextmanager

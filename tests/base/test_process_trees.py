@@ -21,6 +21,7 @@ from crashhunt.base.processes import (
     has_child,
     is_alive,
     resume,
+    running,
 )
 
 TREE = "sleep 60 & setsid sh -c 'sleep 60 & sleep 60; :' & wait"
@@ -98,3 +99,23 @@ def test_process_whose_parent_is_another_ends_at_once():
         processes.die_with(os.getpid())  # its parent is another
         os._exit(9)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 1
+
+
+interrupted_forks: list[bool] = []
+
+
+def interrupt_fork() -> None:
+    if interrupted_forks:
+        signal.raise_signal(signal.SIGINT)
+
+
+os.register_at_fork(after_in_parent=interrupt_fork)
+
+
+def test_ctrl_c_in_a_hook_around_the_fork_of_a_program_is_not_lost():
+    interrupted_forks.append(True)
+    try:
+        with pytest.raises(KeyboardInterrupt), running(["sleep", "60"]):
+            pass
+    finally:
+        interrupted_forks.clear()

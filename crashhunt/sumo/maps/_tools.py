@@ -5,19 +5,17 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.base.extras import install_command
-from crashhunt.base.processes import die_with
-from crashhunt.base.signals import blocked_signals
+from crashhunt.base.processes import running
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -74,23 +72,13 @@ class Tools:
         log = folder / f"{program}.log"
         try:
             with log.open("wb") as file:
-                child: subprocess.Popen[bytes] | None = None
+                streams = {"stdin": subprocess.DEVNULL, "stdout": file, "stderr": file}
                 try:
-                    # Python drops a KeyboardInterrupt that comes in its own hooks around a fork.
-                    begin = partial(_begin, os.getpid(), signal.pthread_sigmask(signal.SIG_BLOCK, ()))
-                    with blocked_signals():
-                        child = subprocess.Popen(
-                            command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=file, stderr=file,
-                            preexec_fn=begin,
-                        )  # fmt: skip
-                    code = child.wait(_TIME_LIMIT_S)
+                    with running(command, cwd=folder, env=environment, **streams) as child:
+                        code = child.wait(_TIME_LIMIT_S)
                 except subprocess.TimeoutExpired:
                     fix = "choose a smaller map, or a part of it with --bbox W,S,E,N"
                     raise ScenarioError(f"{program} took more than {_TIME_LIMIT_S / 60:g} minutes", fix=fix) from None
-                finally:
-                    if child is not None:
-                        child.kill()
-                        child.wait()
         except OSError as error:
             fix = f"install it again: {install_command('maps')} --force-reinstall"
             raise ScenarioError(f"{program} cannot be started: {error.strerror}", fix=fix) from None
@@ -101,15 +89,6 @@ class Tools:
             fix = "free memory and disk space, or choose a smaller map"
             raise ScenarioError(f"{program} was killed by signal {-code}", fix=fix)
         return ToolResult(code, log.read_text(encoding="utf-8", errors="replace"))
-
-
-def _begin(parent: int, mask: set[signal.Signals | int]) -> None:
-    """Prepare the process of a program: signals have their default effect, and the end of the parent ends it."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
-            signal.signal(number, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-    die_with(parent)
 
 
 @cache
