@@ -7,6 +7,7 @@ this tree contains them. The index of the user's own work tree does not change.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -198,6 +199,7 @@ def git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str
 
 _QUIET_S = 3.0  # before a note on what takes so long
 _MAX_LINES, _MAX_CHARACTERS = 3, 300  # of the output in an error
+_COMPILER_ERROR = re.compile(r"\berror(\[\w+\])?: ")  # of gcc, clang and rustc
 # A pipe that ends with this process, also if it is killed, lets a shell kill the group of the build.
 _RUN_BUILD = 'exec 3<&0; (read -r _ <&3; kill -KILL 0) & exec /bin/sh -c "$1" 3<&- </dev/null'
 
@@ -253,8 +255,9 @@ def run_build(
     if how:
         lines = kept.read_bytes().decode("utf-8", "replace").splitlines()
         said = [" ".join(line.split()) for line in lines if line.strip()]
-        last = " | ".join(said[-_MAX_LINES:])[-_MAX_CHARACTERS:] or "no output"
-        raise BuildError(f"--build {command!r} {how}: {last}", fix=f"{kept} has its whole output", where=name)
+        errors = " | ".join(filter(_COMPILER_ERROR.search, said))[:_MAX_CHARACTERS]
+        shown = errors or " | ".join(said[-_MAX_LINES:])[-_MAX_CHARACTERS:] or "no output"
+        raise BuildError(f"--build {command!r} {how}: {shown}", fix=f"{kept} has its whole output", where=name)
 
 
 def track_built(tree: Path) -> None:

@@ -42,6 +42,10 @@ def test_failed_build_is_one_line_with_the_end_of_its_output_and_keeps_its_log(t
     assert log.read_text() == "one\n\ntwo  2\nthree\nfour\n"
     with pytest.raises(BuildError, match=r"was killed by SIGKILL: no output; .*kept\.log has"):
         build("kill -9 $$", tmp_path, tmp_path / "kept.log")
+    printed = "warning: y|a.c:9:2: error: expected ';'|  9 - x|error[E0425]: no x|make: *** [all] Error 1"
+    (tmp_path / "printed").write_text(printed.replace("|", "\n"))
+    with pytest.raises(BuildError, match=r"with 1: a\.c:9:2: error: expected ';' \| error\[E0425\]: no x; "):
+        build("cat printed; exit 1", tmp_path)
 
 
 def test_long_build_is_announced_once(tmp_path, monkeypatch):
