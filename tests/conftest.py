@@ -554,6 +554,13 @@ def keeps_going(toy: Shell) -> None:
     toy.crashhunt("run", "h", "2", "12", "99", "--scenario", "toy", "--seed", "5", "--keep-going")
 
 
+def crashes_on_loop(shell: Shell) -> None:
+    """Hunt 5 trials on the scenario `loop`, too fast, in ``runs/one``: 3 crashes and a near miss; for `made_once`."""
+    words = ("--arg", "speed=18:25", "--seed", "1", "--keep-going", "--near-misses", "1", "--no-snapshot")
+    (shell.folder / "runs").mkdir()
+    shell.crashhunt("run", "runs/one", "2", "5", "300", *words)
+
+
 @pytest.fixture
 def agents_may_command_sumo(monkeypatch):
     """Lets agents of a test command SUMO, which brings about in a few steps what rarely happens by itself."""

@@ -12,9 +12,8 @@ from crashhunt.crashes import list_bundles
 
 
 def hunted(shell):
-    shell.crashhunt(
-        "run", "out", "1", "2", "99", "--scenario", "toy", "--arg", "speed=14", "--seed", "1", "--keep-going"
-    )
+    words = ("--arg", "speed=14", "--seed", "1", "--keep-going", "--no-snapshot")
+    shell.crashhunt("run", "out", "1", "2", "99", "--scenario", "toy", *words)
 
 
 @pytest.fixture

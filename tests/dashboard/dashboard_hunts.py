@@ -1,17 +1,10 @@
-"""Hunts for the tests of the dashboard: real ones, and a simple object in place of the view of one."""
+"""For the tests of the dashboard: what a file is like, and a simple object in place of the view of a hunt."""
 
 from __future__ import annotations
 
 import hashlib
 from pathlib import Path
 from types import SimpleNamespace
-
-
-def hunted(shell) -> None:
-    """Five trials of the scenario `loop` that drive too fast, in ``runs/one``: three crashes and a near miss."""
-    (shell.folder / "runs").mkdir()
-    words = ("--scenario", "loop", "--arg", "speed=18:25", "--seed", "1", "--keep-going", "--near-misses", "1")
-    shell.crashhunt("run", "runs/one", "2", "5", "300", *words)
 
 
 def written(path: Path) -> str:

@@ -9,8 +9,7 @@ import sqlite3
 from contextlib import closing, suppress
 
 import pytest
-from conftest import add_toy
-from dashboard_hunts import hunted
+from conftest import add_toy, crashes_on_loop
 from served import served
 
 from crashhunt.base.integrity import digest_of_row
@@ -22,7 +21,7 @@ STRANGE = "<img src=x onerror='window.hacked=1'><script>window.hacked=1</script>
 
 @pytest.fixture
 def hunts(shell, made_once):
-    return made_once(hunted, shell).folder / "runs"
+    return made_once(crashes_on_loop, shell).folder / "runs"
 
 
 def ended(process) -> None:

@@ -13,7 +13,7 @@ import urllib.request
 from contextlib import suppress
 
 import pytest
-from dashboard_hunts import hunted
+from conftest import crashes_on_loop
 from served import served
 
 
@@ -108,7 +108,7 @@ def test_other_commands_import_nothing_of_it(shell):
 @pytest.fixture
 def exported(shell, made_once):
     """The archive of one crash."""
-    made_once(hunted, shell).crashhunt("export", "runs/one", "crash.zip")
+    made_once(crashes_on_loop, shell).crashhunt("export", "runs/one", "crash.zip")
     return shell.folder / "crash.zip"
 
 

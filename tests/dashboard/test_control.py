@@ -10,8 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from conftest import _commands, add_toy, wait_for
-from dashboard_hunts import hunted
+from conftest import _commands, add_toy, crashes_on_loop, wait_for
 from served import served
 
 from crashhunt.dashboard import _control
@@ -21,7 +20,7 @@ OURS = {"Host": "localhost", "X-Crashhunt": "1"}
 
 @pytest.fixture
 def hunt(shell, made_once):
-    return made_once(hunted, shell).folder / "runs"
+    return made_once(crashes_on_loop, shell).folder / "runs"
 
 
 def test_nothing_is_controlled_unless_it_is_allowed(hunt):

@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 import pytest
-from dashboard_hunts import hunted
+from conftest import crashes_on_loop
 from served import served
 
 import crashhunt
@@ -44,7 +44,7 @@ MAX_WORDS = 600
 @pytest.mark.nightly  # by day, test_browser.py opens these pages
 @pytest.mark.long
 def test_ten_questions_at_a_crash_are_answered_on_its_page_or_one_click_away(shell, made_once, page):
-    hunts = made_once(hunted, shell).folder / "runs"
+    hunts = made_once(crashes_on_loop, shell).folder / "runs"
     assert len(ON_THE_PAGE_OF_THE_CRASH | ONE_CLICK_AWAY) == 10
     with served(hunts) as dashboard:
         row = dashboard.hunts()["one"]

@@ -10,8 +10,8 @@ import sqlite3
 from contextlib import closing, suppress
 
 import pytest
-from conftest import mostly_nightly
-from dashboard_hunts import hunted, written
+from conftest import crashes_on_loop, mostly_nightly
+from dashboard_hunts import written
 from served import served
 
 from crashhunt.dashboard import _serving
@@ -22,7 +22,7 @@ TOKEN = "a-token-of-a-test-1234"
 @pytest.fixture
 def hunt(shell, made_once):
     """A real hunt of the toy simulator with crashes, in ``runs/one``."""
-    return made_once(hunted, shell).folder / "runs"
+    return made_once(crashes_on_loop, shell).folder / "runs"
 
 
 def test_two_host_headers_or_none_are_refused(hunt):

@@ -9,8 +9,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from conftest import examples
-from dashboard_hunts import hunted
+from conftest import crashes_on_loop, examples
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.crashes import list_near_misses, most_dangerous
@@ -133,7 +132,7 @@ def test_the_sample_keeps_all_crashes_and_an_even_share(tmp_path, monkeypatch, a
 
 
 def test_the_rate_from_counts_is_the_rate_that_crashhunt_rate_reports(shell, made_once):
-    hunt = made_once(hunted, shell).folder / "runs" / "one"
+    hunt = made_once(crashes_on_loop, shell).folder / "runs" / "one"
     view = HuntView(next(iter(Catalog([hunt]).hunts().values())))
     view.refresh()
     assert view.settings is not None
@@ -150,7 +149,7 @@ def test_the_rate_from_counts_is_the_rate_that_crashhunt_rate_reports(shell, mad
 
 
 def test_a_trial_that_runs_again_is_counted_once(tmp_path, shell, made_once):
-    hunt = made_once(hunted, shell).folder / "runs" / "one"
+    hunt = made_once(crashes_on_loop, shell).folder / "runs" / "one"
     view = HuntView(next(iter(Catalog([hunt]).hunts().values())))
     state = view.refresh(points=True)
     with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
@@ -175,7 +174,7 @@ def test_crash_type_came_with_its_first_trial_though_that_bundle_was_deleted():
 
 
 def test_near_misses_are_on_the_map_where_they_were_most_critical(shell, made_once):
-    hunt = made_once(hunted, shell).folder / "runs" / "one"
+    hunt = made_once(crashes_on_loop, shell).folder / "runs" / "one"
     (found,) = Catalog([hunt]).hunts().values()
     crashes = CrashList(found)
     crashes.rows()  # begins the analysis of logs

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from conftest import wait_for
+from conftest import crashes_on_loop, wait_for
 
 from crashhunt.base import layout
 from crashhunt.base.text import format_number
-from crashhunt.crashes import list_bundles
+from crashhunt.crashes import list_bundles, list_near_misses
 from crashhunt.ledger import Ledger
 from crashhunt.report import describe_running
 from crashhunt.report._player_layers import packed_floats
@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def hunted(shell):
-    words = ("--arg", "speed=20:25", "--seed", "1", "--keep-going")
-    shell.crashhunt("run", "<b>bold&", "2", "3", "800", *words)
+def reported(shell):
+    (shell.folder / "runs" / "one").rename(shell.folder / "<b>bold&")
     with closing(Ledger(shell.folder / "<b>bold&" / layout.LEDGER, writable=True)) as ledger:
         ledger.note(notices=["SUMO omits <b>"])
     (shell.folder / "report.json").write_text(shell.crashhunt("report", "<b>bold&", "--json").out)
@@ -39,7 +38,7 @@ def hunted(shell):
 @pytest.fixture
 def hunt(shell, made_once):
     """Three real crashes and their report, in a directory whose name would be markup."""
-    return made_once(hunted, shell)
+    return made_once(reported, made_once(crashes_on_loop, shell))
 
 
 def opened(browser, path: Path) -> None:
@@ -64,17 +63,17 @@ def text(browser, name: str) -> str:
 
 def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
     done = report_of(hunt, browser)
-    bundles = list_bundles(hunt.folder / "<b>bold&")
+    bundles, near = list_bundles(hunt.folder / "<b>bold&"), list_near_misses(hunt.folder / "<b>bold&")
     assert text(browser, "title") == "<b>bold&"  # as text, not as markup
     assert text(browser, "notices") == "SUMO omits <b>"
-    assert text(browser, "tiles").split("\n")[:4] == ["3 of 3", "trials", str(len(bundles)), "crashes"]
+    assert text(browser, "tiles").split("\n")[:4] == ["5 of 5", "trials", str(len(bundles)), "crashes"]
     assert "collision" in text(browser, "outcomes")
     rate = hunt_state(hunt.folder / "<b>bold&").rate
     assert text(browser, "crash-rate") == describe_running(rate).removeprefix("crash rate: ")
     assert browser.find_element(By.CSS_SELECTOR, "#crash-rate-scale .certain").size["width"] > 2
     listed = browser.find_elements(By.CSS_SELECTOR, "#list button")
-    assert sorted(button.text.split("\n")[0] for button in listed) == [bundle.id for bundle in bundles]
-    assert [bundle["id"] for bundle in page_data(browser)["crashes"]] == done["crashes"]
+    assert sorted(button.text.split("\n")[0] for button in listed) == [one.id for one in near + bundles]
+    assert [bundle["id"] for bundle in page_data(browser)["crashes"]] == [*done["crashes"], near[0].id]
     browser.find_element(By.XPATH, "//summary[.='The trial']").click()
     facts = browser.find_element(By.XPATH, "//details[summary='The trial']").text
     for words in (
@@ -88,9 +87,10 @@ def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
     # It opens with the animation.
     box = browser.execute_script("return document.getElementById('scene').getBoundingClientRect()")
     assert box["top"] < 400
-    assert text(browser, "subtitle").startswith("2 crashes in 3 trials; scenario loop")
+    assert text(browser, "subtitle").startswith("3 crashes in 5 trials; scenario loop")
     order = browser.execute_script("return [...document.querySelectorAll('h2')].map((one) => one.textContent)")
-    assert [order.index(one) for one in ("Crashes", "Crash types", "The hunt in numbers", "Crash rate")] == [0, 1, 2, 4]
+    first = ("Crashes and near misses", "Crash types", "The hunt in numbers", "Crash rate")
+    assert [order.index(one) for one in first] == [0, 1, 2, 4]
 
     # The scene on the canvas is the one of the log.
     for number, crash in enumerate(done["crashes"][:2]):

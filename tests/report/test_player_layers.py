@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import add_toy
+from conftest import add_toy, keeps_going
 
 from crashhunt.crashes import list_bundles
 from crashhunt.recording import AgentChannel, ObservedPart
@@ -36,8 +36,8 @@ def unpacked(layer) -> np.ndarray:
 
 
 def hunted(shell):
-    words = ("--arg", "speed=14:20", "--seed", "1", "--keep-going", "--observe", "ego,actors,predictions,lidar2d")
-    add_toy(shell).crashhunt("run", "seen", "1", "3", "99", "--scenario", "toy", *words)
+    words = "--arg speed=14:20 --seed 1 --keep-going --observe ego,actors,predictions,lidar2d --no-snapshot"
+    add_toy(shell).crashhunt("run", "seen", "1", "3", "99", "--scenario", "toy", *words.split())
 
 
 @pytest.fixture
@@ -88,9 +88,8 @@ def test_recording_without_observations_shows_none(hunt):
     assert not any(seen["lights"])
 
 
-def test_crash_without_observed_parts_has_no_layers_of_them(toy):
-    toy.crashhunt("run", "h", "1", "3", "99", "--scenario", "toy", "--arg", "speed=20", "--seed", "1")
-    data = player_data(list_bundles(toy.folder / "h")[0])
+def test_crash_without_observed_parts_has_no_layers_of_them(toy, made_once):
+    data = player_data(list_bundles(made_once(keeps_going, toy).folder / "h")[0])
     assert data["stopLines"] == []
     assert not {"observed", "plan", "yields"} & data.keys()
 
