@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
+    from ._acceleration import Acceleration as Acceleration, accelerate as accelerate
     from ._frames import TrafficFrame as TrafficFrame
     from ._kernel import Poses as Poses, kernel as kernel
     from ._lane_network import Network as Network
@@ -12,8 +13,6 @@ if TYPE_CHECKING:
     from ._substep_loop import SkippedObservation as SkippedObservation
     from ._supported import kind_of as kind_of, reason_against as reason_against
     from ._switch import (
-        Acceleration as Acceleration,
-        accelerate as accelerate,
         switch_off as switch_off,
         switch_on as switch_on,
         why_not as why_not,

@@ -21,7 +21,7 @@ from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, dynamics, kinematics, objects
 
 from crashhunt.highway.accelerator._kernel import Snapshot, kernel, why_not
-from crashhunt.highway.accelerator._known_versions import ACCELERATED
+from crashhunt.highway.accelerator._known_versions import ACCELERATED, reason_against_version
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -396,8 +396,8 @@ _NUMBERS = frozenset((float, int, np.float64))
 def reason_against() -> str:
     """Return why the accelerator must not be used in this process; empty if it may be used."""
     version = highway_env.__version__
-    if version not in ACCELERATED:
-        return f"highway-env {version} is not supported (supported: {', '.join(ACCELERATED)})"
+    if reason := reason_against_version(version):
+        return reason
     if installed_digest() != ACCELERATED[version]:
         return f"the installed highway-env {version} is not the published one"
     for name, function in _functions():

@@ -6,7 +6,7 @@ everything that it does not know, such as a class that overrides one of these me
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from highway_env.envs.common import observation as highway_env_observation
 from highway_env.envs.common.abstract import AbstractEnv
@@ -61,7 +61,7 @@ from crashhunt.highway.accelerator._supported import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import ModuleType, TracebackType
+    from types import ModuleType
 
     from highway_env.road.lane import LaneIndex
     from highway_env.vehicle.controller import MDPVehicle
@@ -317,77 +317,3 @@ _REPLACEMENTS: tuple[tuple[type | ModuleType, str, Callable[..., object]], ...] 
     (highway_env_observation, "compute_ttc_grid", _compute_ttc_grid),
 )
 _ROAD_REPLACEMENTS = [replaced for replaced in _REPLACEMENTS if replaced[0] in (Road, RegulatedRoad)]
-
-
-# ``crashhunt.accelerate()`` accelerates highway-env in the user's process, such as a training of a policy.
-
-
-class Acceleration:
-    """The current state of the acceleration: true if highway-env is accelerated.
-
-    As a context manager, it switches the accelerator off at the end of the block, unless it was on before.
-    """
-
-    def __init__(self, reason: str, *, before: bool) -> None:
-        self._reason = reason
-        self._before = before
-
-    @property
-    def reason(self) -> str:
-        """Why highway-env is not accelerated, such as a missing kernel; empty if it is accelerated."""
-        if self._reason:
-            return self._reason
-        return why_not() if is_on() else "it has been undone"
-
-    @property
-    def left_alone(self) -> dict[str, tuple[str, ...]]:
-        """Classes of vehicles that are not or only partly accelerated, each with the members that it overrides."""
-        return {name: tuple(own) for name, own in left_alone.items()}
-
-    def undo(self) -> None:
-        """Switch the accelerator off."""
-        switch_off()
-
-    def __bool__(self) -> bool:
-        return not self.reason
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if not self._before:
-            self.undo()
-
-    def __repr__(self) -> str:
-        if self.reason:
-            return f"<highway-env is not accelerated: {self.reason}>"
-        own = "; ".join(f"{name} has its own {', '.join(names)}" for name, names in self.left_alone.items())
-        return f"<highway-env is accelerated{f', but {own}' if own else ''}>"
-
-
-def accelerate() -> Acceleration:
-    """Accelerate highway-env in this process: bit-identical results in a fraction of the time.
-
-    Hunts call this function automatically. Call it in your own process, for example for training. In every
-    step, the accelerator checks for cases that it does not know. highway-env's own code runs in these cases:
-
-    - another version of highway-env
-    - an installation of crashhunt without the compiled kernel, which needs a C++ compiler
-    - your classes that override an accelerated method
-    - functions and methods that other code has replaced, on a class, a module or an object
-
-    Returns:
-        The state of the acceleration. The truth value of this object is whether highway-env is accelerated. ``reason``
-        is the reason if not. ``left_alone`` lists classes that are not accelerated. ``undo()``, or the end of a
-        ``with`` block, switches the accelerator off.
-
-    Example:
-        >>> import crashhunt
-        >>> with crashhunt.accelerate() as faster:
-        ...     print(faster)
-        <highway-env is accelerated>
-    """
-    before = is_on()
-    return Acceleration(switch_on(), before=before)

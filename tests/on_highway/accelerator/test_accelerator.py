@@ -329,6 +329,18 @@ def test_it_steps_aside_for_another_version(monkeypatch):
     assert Road.act.__module__ == "highway_env.road.road"
 
 
+def test_in_the_users_process_it_steps_aside_for_a_version_without_the_names_that_it_imports():
+    code = (
+        "import importlib.metadata, highway_env.envs.common.observation as kinds\n"
+        "del kinds.ExitObservation; importlib.metadata.version = lambda name: '1.10.1'\n"
+        "import crashhunt\n"
+        "with crashhunt.accelerate() as faster: print(faster, bool(faster), faster.left_alone)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("<highway-env is not accelerated: highway-env 1.10.1 is not supported (supported: ")
+    assert done.stdout.endswith(")> False {}\n")
+
+
 def test_it_steps_aside_for_a_changed_installation(monkeypatch):
     monkeypatch.setattr(_supported, "ACCELERATED", {highway_env.__version__: "0123"})
     assert "not the published one" in reason_against()
