@@ -119,7 +119,7 @@ def _planned(request: Request, scenario: Scenario, code: CodeFacts | None) -> tu
     settings = with_reuse(settings, scenario)
     scenario = with_notes_on_crashes(_with_notes(scenario, request.run), settings, request, code.oracles)
     notes = (*code.notes, *_notes_on_statistics(settings, signatures), *notes_on_declarations(scenario, signatures))
-    notes += (*notes_on_programs(settings),)
+    notes += (*notes_on_programs(settings), *_notes_on_constants(settings, hunted=hunted))
     scenario = replace(scenario, notes=(*scenario.notes, *notes))
     refuse_misplaced_plans(
         scenario, [*parse_rates(disturb), *(one.what for one in parse_fixed(disturb, tuple(scenario.agents)))]
@@ -155,6 +155,13 @@ def _notes_on_statistics(settings: HuntSettings, signatures: Mapping[str, Signat
         if is_asked and isinstance(path, Constant) and isinstance(path.value, str):
             for file in sorted(Path(path.value).parent.glob("*.pkl")):
                 yield f"{file.name} is next to the policy and is not used; if VecNormalize wrote it: normalize={file}"
+
+
+def _notes_on_constants(settings: HuntSettings, *, hunted: bool) -> Iterator[str]:
+    """Yield a note if a sampler varies only the arguments with a range in the request, and there is none."""
+    if not hunted and all(len(distribution.grid(2)) == 1 for distribution in settings.space.values()):
+        fix = "Fix: give a range, such as --arg speed=5:30:5"
+        yield f"--sampler {settings.sampler} varies no argument: all trials have the same arguments. {fix}"
 
 
 def core_of(scenario: Scenario, run: RunSettings) -> str | None:

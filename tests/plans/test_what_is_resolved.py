@@ -292,6 +292,16 @@ def test_field_of_a_dataclass_that_is_made_with_each_object_is_ignored_with_a_no
     ]
 
 
+def test_a_grid_of_one_point_is_noted():
+    def noted(sampler, speed):
+        request = Request(scenario="loop", trials=3, max_steps=9, sampler=sampler, arguments={"speed": speed})
+        return [note for note in plan(request)[0].notes if "varies no argument" in note]
+
+    (note,) = noted("grid", "12")
+    assert note.endswith("all trials have the same arguments. Fix: give a range, such as --arg speed=5:30:5")
+    assert noted("random", "12") == noted("grid", "5:30") == []
+
+
 def test_disturbances_are_those_that_are_asked_for_or_those_of_the_scenario(folder):
     text = SCENARIO.format(needed="default = 1") + "[disturbances]\nbrake = 0.5\n"
     (folder / "scenario.toml").write_text(text)
