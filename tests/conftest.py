@@ -108,6 +108,7 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("crashhunt")
 
 _TIMEOUT_S = 400.0
+_left_to_the_night: list[bool] = []  # whether this session has the usual tests only
 _OF_ALL_WORKERS = "CRASHHUNT_TEST_COMMANDS"
 _SHARED = os.environ.pop(_OF_ALL_WORKERS, "")  # which commands of tests must not see
 collect_ignore = ["e2e/frozen"]  # in which a case of a corpus is a test to whoever has crashhunt's plugin
@@ -221,6 +222,7 @@ def pytest_configure(config: pytest.Config) -> None:
     Compiling the tests of a fresh clone takes 7 s of a processor, most of it for what pytest adds to assertions, the
     constants that Hypothesis reads from crashhunt 2 s, and the servers that commands are forked from 3 s.
     """
+    _left_to_the_night.append(config.getoption("markexpr") == "not nightly")
     if "PYTEST_XDIST_WORKER" in os.environ:
         return
     if others := outdated_entry_points(Path(_REPOSITORY, "pyproject.toml")):
@@ -426,11 +428,18 @@ def _is_ours(name: str) -> bool:
 
 
 def mostly_nightly(cases: Iterable[Any], always: Container[Any]) -> list[Any]:
-    """Cases of one contract, of which some run always, and the others where `nightly` tests are asked for."""
+    """Cases of one contract, of which some run always, and the others where `nightly` tests are asked for.
+
+    By day the others are no items at all: each worker would make a thousand of them, and leave them out.
+    """
+    listed = [*cases]
+    daily = [case for case in listed if case in always]
+    if daily and any(_left_to_the_night):
+        return daily
     return [
         case if case in always
         else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.nightly)
-        for case in cases
+        for case in listed
     ]  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-pytest.importorskip("highway_env")
+pytest.importorskip("crashhunt.highway._fast_import", exc_type=ImportError)  # without pandas and matplotlib
 from highway_env.vehicle.kinematics import Vehicle
 
 from crashhunt.analysis import _causes, _omissions

@@ -21,7 +21,7 @@ AT_NIGHT = (
     "your-town",
 )  # fmt: skip
 BY_DAY = [root for root in ROOTS if root not in AT_NIGHT]
-# By day, the first hunt of the README and its replay; "all of README" runs the others at night. By day, tests of
+# By day, the first hunt of the README and its replay; "README-all" runs the others at night. By day, tests of
 # scenarios hunt with a user's agent, on highway-env and on Gymnasium.
 FIRST_COMMANDS = {"README": 2}
 WITH_MORE = [root for root in BY_DAY if root in FIRST_COMMANDS or any(page.topic in AT_NIGHT for page in tree(root))]
@@ -87,7 +87,7 @@ class Reader:
         [*((root, AT_NIGHT if root in WITH_MORE else ()) for root in ROOTS), *((root, ()) for root in WITH_MORE)],
         [(root, AT_NIGHT if root in WITH_MORE else ()) for root in BY_DAY],
     ),
-    ids=[*ROOTS, *(f"all of {root}" for root in WITH_MORE)],
+    ids=lambda value: value if isinstance(value, str) else "some pages" if value else "all",
 )
 def test_every_command_does_what_it_states(root, left_out, shell):
     pages = [page for page in tree(root) if page.topic not in left_out]

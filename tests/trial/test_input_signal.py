@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from scipy.interpolate import PchipInterpolator
 
 from crashhunt.errors import ArgumentError
 from crashhunt.trial import InputSignal, expand_signal, fold_signals, with_fewer_points
@@ -40,6 +39,8 @@ VALUES = st.floats(-5, 5).filter(lambda value: value == 0 or abs(value) > 1e-100
 
 @given(points=st.lists(VALUES, min_size=2, max_size=9), share=st.floats(0, 1))
 def test_values_are_those_of_the_interpolation(points, share):
+    from scipy.interpolate import PchipInterpolator  # takes 0.2 s, and every worker collects this module
+
     places, at = np.linspace(0, 10, len(points)), 10 * share
     signal = {kind: InputSignal(tuple(points), kind, 10.0) for kind in ("constant", "linear", "pchip")}
     assert signal["linear"](at) == pytest.approx(np.interp(at, places, points), abs=1e-9)
