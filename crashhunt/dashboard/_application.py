@@ -38,12 +38,15 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp
 
     from crashhunt.base.codec import JsonObject
+    from crashhunt.crashes import Bundle
     from crashhunt.dashboard._catalog import Catalog, FoundHunt
 
 API_VERSION: Final = 1
 """Of the shapes below ``/api``. Keys may be added; a change of a key raises it."""
 
 _MAX_COMPARED = 8
+_NO_HUNT = "this hunt is not there (any more)", "go back to the list of hunts"
+_NO_CRASH = "there is no such crash in this hunt"
 _NO_STORE = {"cache-control": "no-store"}
 _CONTENT_TYPES = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
 _SCRIPTS = ("common.js", "list.js", "hunt.js", "crash.js", "compare.js", "style.css")
@@ -66,10 +69,53 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
 
     The arguments are those of `serve`.
     """
-    shown = _Shown(catalog)
-    jobs = Jobs()
+    answers = _Endpoints(catalog, allow_control=allow_control)
+    routes = [
+        Route("/", _page_route("list")),
+        Route("/hunts/{hunt}", _page_route("hunt")),
+        Route("/hunts/{hunt}/crashes/{crash}", _page_route("crash")),
+        Route("/compare", _page_route("compare")),
+        Route("/static/{name}", answers.asset),
+        Route("/api", answers.api),
+        Route("/api/hunts", answers.hunts),
+        Route("/api/hunts/{hunt}", answers.hunt),
+        Route("/api/hunts/{hunt}/trials", answers.trials),
+        Route("/api/hunts/{hunt}/importance", answers.importance),
+        Route("/api/hunts/{hunt}/map", answers.where),
+        Route("/api/hunts/{hunt}/crashes", answers.crashes),
+        Route("/api/hunts/{hunt}/crashes/{crash}", answers.crash),
+        Route("/api/hunts/{hunt}/crashes/{crash}/log", answers.log),
+        Route("/api/hunts/{hunt}/crashes/{crash}/export", answers.export),
+        Route("/api/compare", answers.compare),
+    ]
+    if allow_control:
+        routes += [
+            Route("/api/hunts/{hunt}/stop", answers.stop, methods=["POST"]),
+            Route("/api/hunts/{hunt}/crashes/{crash}/jobs", answers.job_list),
+            Route("/api/hunts/{hunt}/crashes/{crash}/jobs/{job}", answers.job_add, methods=["POST"]),
+        ]
+    handlers: Any = {
+        404: lambda _request, _: _error(404, "there is no such page"),
+        405: lambda _request, _: _error(405, "the dashboard only reads"),
+        _NotFound: lambda _request, error: _error(404, *error.args),
+        CrashhuntError: lambda _request, error: _from_error(error),
+        OSError: lambda _request, error: _error(500, str(error.strerror or error)),
+        500: lambda _request, error: _error(500, f"this should not happen: {type(error).__name__}"),
+    }
+    inner = Starlette(routes=routes, exception_handlers=handlers)
+    return Application(Guard(inner, host=host, token=token, control=allow_control), answers.jobs.close)
 
-    def asset(request: Request) -> Response:
+
+class _Endpoints:
+    """The functions that answer requests; each has the name of its route."""
+
+    def __init__(self, catalog: Catalog, *, allow_control: bool) -> None:
+        self._catalog = catalog
+        self._allow_control = allow_control
+        self._shown = _Shown(catalog)
+        self.jobs = Jobs()
+
+    def asset(self, request: Request) -> Response:
         name = request.path_params["name"]
         if name == "plotly.js":
             return Response(_plotly(), media_type="text/javascript", headers=_lasting(request, name))
@@ -79,27 +125,22 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
         kind = _CONTENT_TYPES[name.rpartition(".")[2]]
         return Response(text, media_type=kind, headers=_lasting(request, name))
 
-    def page(name: str) -> Callable[[Request], Response]:
-        def show(_request: Request) -> Response:
-            return Response(_page(name), media_type="text/html", headers={"cache-control": "no-cache"})
-
-        return show
-
-    def api(request: Request) -> Response:
-        about = {"crashhunt": __version__, "control": allow_control, "roots": [str(root) for root in catalog.roots]}
+    def api(self, request: Request) -> Response:
+        about = {
+            "crashhunt": __version__,
+            "control": self._allow_control,
+            "roots": [str(root) for root in self._catalog.roots],
+        }
         return _answer(request, about)
 
-    def hunts(request: Request) -> Response:
-        return _answer(request, shown.rows(request.query_params.get("since", "")))
+    def hunts(self, request: Request) -> Response:
+        return _answer(request, self._shown.rows(request.query_params.get("since", "")))
 
-    def hunt(request: Request) -> Response:
-        view = shown.view(request.path_params["hunt"])
-        return _gone() if view is None else _answer(request, detail_of(view))
+    def hunt(self, request: Request) -> Response:
+        return _answer(request, detail_of(self._view(request)))
 
-    def trials(request: Request) -> Response:
-        view = shown.view(request.path_params["hunt"])
-        if view is None:
-            return _gone()
+    def trials(self, request: Request) -> Response:
+        view = self._view(request)
         view.refresh(points=True)
         sample = view.sample
         if sample is None:
@@ -116,10 +157,8 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
             },
         )
 
-    def importance(request: Request) -> Response:
-        view = shown.view(request.path_params["hunt"])
-        if view is None:
-            return _gone()
+    def importance(self, request: Request) -> Response:
+        view = self._view(request)
         view.refresh(points=True)
         units: dict[str, str] = {}
         if view.settings is not None and view.sample is not None:  # else the hunt is damaged or has no trial
@@ -134,35 +173,27 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
             request, {"importance": importance_of_points(points, CodeVersions.of(view.facts).first), "units": units}
         )
 
-    def crashes(request: Request) -> Response:
-        found = shown.crashes(request.path_params["hunt"])
-        return _gone() if found is None else _answer(request, found.rows())
+    def crashes(self, request: Request) -> Response:
+        return _answer(request, self._crashes(request).rows())
 
-    def where(request: Request) -> Response:
-        found = shown.crashes(request.path_params["hunt"])
-        return _gone() if found is None else _answer(request, found.map())
+    def where(self, request: Request) -> Response:
+        return _answer(request, self._crashes(request).map())
 
-    def crash(request: Request) -> Response:
-        found = shown.crashes(request.path_params["hunt"])
-        if found is None:
-            return _gone()
-        detail = found.detail(request.path_params["crash"])
-        return _error(404, "there is no such crash in this hunt") if detail is None else _answer(request, detail)
+    def crash(self, request: Request) -> Response:
+        detail = self._crashes(request).detail(request.path_params["crash"])
+        if detail is None:
+            raise _NotFound(_NO_CRASH)
+        return _answer(request, detail)
 
-    def log(request: Request) -> Response:
+    def log(self, request: Request) -> Response:
         name = request.path_params["crash"]
-        found = shown.crashes(request.path_params["hunt"])
-        path = found.log(name) if found is not None else None
+        path = self._crashes(request).log(name)
         if path is None:
-            return _error(404, "there is no such log")
+            raise _NotFound("there is no such log")
         return FileResponse(path, media_type="application/octet-stream", filename=f"{name}.mcap", headers=_NO_STORE)
 
-    def export(request: Request) -> Response:
-        name = request.path_params["crash"]
-        found = shown.crashes(request.path_params["hunt"])
-        bundle = found.bundle(name) if found is not None else None
-        if bundle is None:
-            return _error(404, "there is no such crash in this hunt")
+    def export(self, request: Request) -> Response:
+        bundle, name = self._bundle(request), request.path_params["crash"]
         place = tempfile.TemporaryDirectory(prefix="crashhunt-export-")
         target = Path(place.name) / f"{name}.zip"
         try:
@@ -175,63 +206,46 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
             target, media_type="application/zip", filename=target.name, headers=_NO_STORE, background=after
         )
 
-    def compare(request: Request) -> Response:
+    def compare(self, request: Request) -> Response:
         names = [name for name in request.query_params.get("hunts", "").split(",") if name][:_MAX_COMPARED]
-        views = [view for name in dict.fromkeys(names) if (view := shown.view(name)) is not None]
-        return _answer(request, shown.compared.compare(views))
+        views = [view for name in dict.fromkeys(names) if (view := self._shown.view(name)) is not None]
+        return _answer(request, self._shown.compared.compare(views))
 
-    def stop(request: Request) -> Response:
-        view = shown.view(request.path_params["hunt"])
-        if view is None:
-            return _gone()
+    def stop(self, request: Request) -> Response:
+        view = self._view(request)
         stop_hunt(view)
         return _answer(request, {})
 
-    def job_list(request: Request) -> Response:
-        found = jobs.list(request.path_params["hunt"], request.path_params["crash"])
+    def job_list(self, request: Request) -> Response:
+        found = self.jobs.list(request.path_params["hunt"], request.path_params["crash"])
         return _answer(request, {"jobs": found})
 
-    def job_add(request: Request) -> Response:
+    def job_add(self, request: Request) -> Response:
         identifier, name = request.path_params["hunt"], request.path_params["crash"]
-        found = shown.crashes(identifier)
-        bundle = found.bundle(name) if found is not None else None
-        if bundle is None:
-            return _error(404, "there is no such crash in this hunt")
-        return _answer(request, jobs.add(identifier, bundle.hunt, name, request.path_params["job"]))
+        added = self.jobs.add(identifier, self._bundle(request).hunt, name, request.path_params["job"])
+        return _answer(request, added)
 
-    routes = [
-        Route("/", page("list")),
-        Route("/hunts/{hunt}", page("hunt")),
-        Route("/hunts/{hunt}/crashes/{crash}", page("crash")),
-        Route("/compare", page("compare")),
-        Route("/static/{name}", asset),
-        Route("/api", api),
-        Route("/api/hunts", hunts),
-        Route("/api/hunts/{hunt}", hunt),
-        Route("/api/hunts/{hunt}/trials", trials),
-        Route("/api/hunts/{hunt}/importance", importance),
-        Route("/api/hunts/{hunt}/map", where),
-        Route("/api/hunts/{hunt}/crashes", crashes),
-        Route("/api/hunts/{hunt}/crashes/{crash}", crash),
-        Route("/api/hunts/{hunt}/crashes/{crash}/log", log),
-        Route("/api/hunts/{hunt}/crashes/{crash}/export", export),
-        Route("/api/compare", compare),
-    ]
-    if allow_control:
-        routes += [
-            Route("/api/hunts/{hunt}/stop", stop, methods=["POST"]),
-            Route("/api/hunts/{hunt}/crashes/{crash}/jobs", job_list),
-            Route("/api/hunts/{hunt}/crashes/{crash}/jobs/{job}", job_add, methods=["POST"]),
-        ]
-    handlers: Any = {
-        404: lambda _request, _: _error(404, "there is no such page"),
-        405: lambda _request, _: _error(405, "the dashboard only reads"),
-        CrashhuntError: lambda _request, error: _from_error(error),
-        OSError: lambda _request, error: _error(500, str(error.strerror or error)),
-        500: lambda _request, error: _error(500, f"this should not happen: {type(error).__name__}"),
-    }
-    inner = Starlette(routes=routes, exception_handlers=handlers)
-    return Application(Guard(inner, host=host, token=token, control=allow_control), jobs.close)
+    def _view(self, request: Request) -> HuntView:
+        view = self._shown.view(request.path_params["hunt"])
+        if view is None:
+            raise _NotFound(*_NO_HUNT)
+        return view
+
+    def _crashes(self, request: Request) -> CrashList:
+        found = self._shown.crashes(request.path_params["hunt"])
+        if found is None:
+            raise _NotFound(*_NO_HUNT)
+        return found
+
+    def _bundle(self, request: Request) -> Bundle:
+        bundle = self._crashes(request).bundle(request.path_params["crash"])
+        if bundle is None:
+            raise _NotFound(_NO_CRASH)
+        return bundle
+
+
+class _NotFound(Exception):  # noqa: N818 - it is an answer, not a failure
+    """A hunt, crash or log of a request that is not there; the message and its fix."""
 
 
 class _Shown:
@@ -329,10 +343,6 @@ def _error(status: int, message: str, fix: str = "", where: str = "") -> Respons
     return JSONResponse(data, status, headers=_NO_STORE)
 
 
-def _gone() -> Response:
-    return _error(404, "this hunt is not there (any more)", "go back to the list of hunts")
-
-
 def _from_error(error: Exception) -> Response:
     assert isinstance(error, CrashhuntError)
     status = 422 if isinstance(error, BundleError) else 409 if isinstance(error, UsageError) else 500
@@ -378,6 +388,13 @@ def _lasting(request: Request, name: str) -> dict[str, str]:
     """Return how long a browser may cache a file: for ever if its address contains the version."""
     fits = request.query_params.get("v") == _stamp(name)
     return {"cache-control": "public, max-age=31536000, immutable" if fits else "no-cache"}
+
+
+def _page_route(name: str) -> Callable[[Request], Response]:
+    def show(_request: Request) -> Response:
+        return Response(_page(name), media_type="text/html", headers={"cache-control": "no-cache"})
+
+    return show
 
 
 @cache
