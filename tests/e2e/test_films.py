@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import av
 import pytest
-from conftest import add_toy, one_in
+from conftest import one_in
 from PIL import Image
+from test_debugger import hunted
 
-if TYPE_CHECKING:
-    import numpy as np
+
+@pytest.fixture
+def crash(toy, made_once):
+    """An agent that prints, and then raises at step 30."""
+    return made_once(hunted, toy)
+
+
+def test_a_film_from_the_log_runs_no_code_at_all(crash):
+    (crash.folder / "faulty.py").unlink()
+    (code,) = crash.folder.glob("h/snapshots/*/code/faulty.py")
+    code.write_text("raise SystemExit('run')", encoding="utf-8")
+    done = crash.crashhunt("replay", "h", "--from-log", "--video", "log.mp4", "--size", "320x200", "--json")
+    assert done.json["written"] == {"log.mp4": 29 + 1 + 10}
+    assert "run" not in done.err.replace("crashhunt", "")
+
+
+def test_what_the_agent_prints_is_not_shown_while_a_film_is_made(crash):
+    done = crash.crashhunt("replay", "h", "--frames", "f", "--last-seconds", "0.2", "--size", "128x128")
+    assert "f has" in done.out
+    assert "about to go wrong" not in done.out + done.err
+
 
 SHOWY = """
 from crashhunt import render
@@ -40,23 +57,6 @@ class Showy:
         with render.scope("mind"):
             return {"seen": render.Heatmap(self.seen), "step": [render.Text(str(self.step), title="count")]}
 """
-WORDS = ("--arg", "speed=8", "--scenario", "toy", "--seed", "1", "--crash-on", "agent_error")
-
-
-def hunted(shell):
-    add_toy(shell)
-    (shell.folder / "showy.py").write_text(SHOWY, encoding="utf-8")
-    shell.crashhunt("run", "h", "1", "1", "60", "--agent", "showy:Showy", *WORDS)
-
-
-@pytest.fixture
-def crash(shell, made_once):
-    return made_once(hunted, shell)
-
-
-def pictures(path) -> list[np.ndarray]:
-    with av.open(str(path)) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
 def size(path) -> tuple[int, int]:
@@ -64,23 +64,11 @@ def size(path) -> tuple[int, int]:
         return image.size
 
 
-def test_a_film_from_the_log_runs_no_code_at_all(crash):
-    (crash.folder / "showy.py").unlink()
-    for found in crash.folder.glob("h/snapshots/*/code/showy.py"):
-        found.write_text("raise SystemExit('run')", encoding="utf-8")
-    done = crash.crashhunt("replay", "h", "--from-log", "--video", "log.mp4", "--size", "320x200", "--json")
-    assert done.json["written"] == {"log.mp4": 39 + 1 + 10}
-    assert "run" not in done.err.replace("crashhunt", "")
-
-
-def test_what_the_agent_prints_is_not_shown_while_a_film_is_made(crash):
-    done = crash.crashhunt("replay", "h", "--frames", "f", "--last-seconds", "0.2", "--size", "128x128")
-    assert "f has" in done.out
-    assert "thinking" not in done.out + done.err
-
-
 @pytest.mark.nightly
-def test_no_panels_and_the_last_seconds(crash):
+def test_no_panels_and_the_last_seconds(toy):
+    crash = toy
+    (toy.folder / "showy.py").write_text(SHOWY, encoding="utf-8")
+    toy.crashhunt("run", "h", "1", "1", "60", "--agent", "showy:Showy", "--arg", "speed=8", "--scenario", "toy")
     words = ("--no-panels", "--last-seconds", "1", "--size", "200x100", "--last-step-repeats", "0")
     done = crash.crashhunt("replay", "h", "--frames", "f", *words, "--json").json
     assert done["written"] == {"f": 11}

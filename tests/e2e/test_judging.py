@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from test_preventability import MODELS
 
 from crashhunt.analysis import judge
 from crashhunt.analysis._avoidability import AvoidanceSearch
@@ -30,11 +31,17 @@ def test_slips(toy, words, said):
     assert said in toy.crashhunt("judge", "h", *words, expect=2).err
 
 
-def test_what_a_failure_hangs_on_is_run_and_reported(toy):
+def hunted(toy):
+    """One error of the agent, for `made_once`, which another value of its argument avoids."""
     words = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=2|30", "--seed", "1")
     toy.crashhunt("run", "h", "1", "9", "9", *words)
+
+
+def test_what_a_failure_hangs_on_is_run_and_reported(toy, made_once):
+    made_once(hunted, toy)
     (judged,) = toy.crashhunt("judge", "h", "--why", "9", "--parallel", "1", "--json").json["judged"]
     assert (judged["runs"], judged["verdict"], judged["avoidable"]) == (0, "unknown", None)
+    assert judged["preventable_by"] == dict.fromkeys(MODELS)  # no model of a driver has an answer
     factors = {(factor["kind"], factor["name"]): factor for factor in judged["why"]["factors"]}
     at = factors["argument", "ego.at"]
     assert (at["needed"], [run["given"] for run in at["runs"]]) == (True, [30])
@@ -46,9 +53,8 @@ def test_what_a_failure_hangs_on_is_run_and_reported(toy):
     assert toy.crashhunt("judge", "h", "--all", "--json").json == {"judged": []}  # it has been judged
 
 
-def test_another_failure_is_not_the_same(toy):
-    words = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=2", "--seed", "1")
-    toy.crashhunt("run", "h", "1", "1", "9", *words)
+def test_another_failure_is_not_the_same(toy, made_once):
+    made_once(hunted, toy)
     bundle = find_bundle(toy.folder / "h")
     search = _Search(prepare(bundle, ReplayOptions()))
     result = bundle.result

@@ -39,10 +39,3 @@ def test_crash_of_a_blind_agent_is_preventable_in_all_outputs(shell):
     assert listed["preventable_by"] == judged["preventable_by"]
     (kept,) = shell.crashhunt("judge", "h", *few, "--no-drivers", "--json").json["judged"]
     assert kept["preventable_by"] == judged["preventable_by"]
-
-
-def test_crash_without_another_vehicle_has_no_answer(toy):
-    words = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=2", "--seed", "1")
-    toy.crashhunt("run", "h", "1", "1", "9", *words)
-    (judged,) = toy.crashhunt("judge", "h", "--why", "2", "--json").json["judged"]
-    assert judged["preventable_by"] == dict.fromkeys(MODELS)
