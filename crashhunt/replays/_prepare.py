@@ -21,7 +21,7 @@ from crashhunt.trial import SENSOR_KINDS
 from crashhunt.trial_reruns import Reruns, Where
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from crashhunt.crashes import Bundle
     from crashhunt.plans import HuntSettings
@@ -156,15 +156,10 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     settings = read_settings(bundle.hunt / layout.HUNT)
     settings = replace(settings, run=replace(settings.run, accelerate=settings.run.accelerate and options.accelerate))
     scenario = with_settings(snapshot.scenario(), settings)
-    environment = snapshot.environment()
-    scenario = with_recorded_load_order(scenario, environment.get("load_order"))
-    warnings += [f"{name} was {then} and is {now}" for name, (then, now) in environment_changes(environment).items()]
-    warnings += filter(None, [load_order_change(scenario, environment.get("load_order"))])
+    scenario = with_recorded_load_order(scenario, snapshot.environment().get("load_order"))
+    warnings += _machine_warnings(scenario, snapshot)
     if code == "snapshot" and trusted:
         warnings += program_warnings(snapshot, [setup.agent for setup in scenario.agents.values()])
-    there, here = environment.get("cpu", ""), processor()
-    if scenario.backend.per_processor and there != here:
-        warnings.append(f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise")
     runs = None if code == "log" or not trusted else snapshot.code if code == "snapshot" else ()
     spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes, code=runs)
     warnings += edits.ignored
@@ -179,20 +174,15 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
                 f"the recorded actions cannot be repeated, because the trial was changed: {edits.all[0]}",
                 fix="run the agent's code in the changed trial, with --code snapshot",
             )
+        if options.scenario:
+            message = f"recorded actions belong to the recorded scenario, not to {options.scenario!r}"
+            raise UsageError(message, fix="omit --scenario or --from-log")
         if not trusted:
             refuse_side_effects(scenario, settings, spec.scenario_arguments)
             if not landlock_version():
                 warnings.append("this kernel has no Landlock, with which the simulator could write in its folder only")
-        log = str((bundle.path / layout.LOG).resolve())
-        scenario = scenario.with_agents(dict.fromkeys(scenario.agents, "crashhunt.agents:Recorded"))
-        # An agent that failed did not act in its last step, and neither can its record.
-        acted = max((len(recorded.actions(agent)) for agent in recorded.agents), default=0)
-        arguments = {agent: {"log": log, "agent": agent} for agent in scenario.agents}
-        spec = replace(spec, arguments=arguments, max_steps=max(1, min(spec.max_steps, acted)))
+        scenario, spec = _with_recorded_actions(scenario, spec, bundle, recorded)
     if options.scenario:
-        if code == "log":
-            message = f"recorded actions belong to the recorded scenario, not to {options.scenario!r}"
-            raise UsageError(message, fix="omit --scenario or --from-log")
         scenario, spec = _in_scenario(options.scenario, settings, spec, recorded.prologue.step_length_s)
         elsewhere = f"the scenario was {settings.scenario} and is {options.scenario}"
         edits = replace(edits, others=(*edits.others, elsewhere))
@@ -219,6 +209,32 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         warnings=tuple(warnings),
         other_traffic=edits.others,
         elsewhere=bool(options.scenario),
+    )
+
+
+def _machine_warnings(scenario: Scenario, snapshot: Snapshot) -> Iterator[str]:
+    """Yield what differs between the machine of the crash and this one, as text."""
+    environment = snapshot.environment()
+    for name, (then, now) in environment_changes(environment).items():
+        yield f"{name} was {then} and is {now}"
+    if changed := load_order_change(scenario, environment.get("load_order")):
+        yield changed
+    there, here = environment.get("cpu", ""), processor()
+    if scenario.backend.per_processor and there != here:
+        yield f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise"
+
+
+def _with_recorded_actions(
+    scenario: Scenario, spec: TrialSpec, bundle: Bundle, recorded: Recording
+) -> tuple[Scenario, TrialSpec]:
+    """Return the trial with agents that repeat the recorded actions."""
+    log = str((bundle.path / layout.LOG).resolve())
+    # An agent that failed did not act in its last step, and neither can its record.
+    acted = max((len(recorded.actions(agent)) for agent in recorded.agents), default=0)
+    arguments = {agent: {"log": log, "agent": agent} for agent in scenario.agents}
+    return (
+        scenario.with_agents(dict.fromkeys(scenario.agents, "crashhunt.agents:Recorded")),
+        replace(spec, arguments=arguments, max_steps=max(1, min(spec.max_steps, acted))),
     )
 
 
