@@ -10,7 +10,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, InternalError
@@ -31,14 +31,15 @@ from crashhunt.recording import (
     read_header,
 )
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, in_effect
-from crashhunt.world import ClosestApproach, DangerMeter, DrivenMeter, Lane, closest_approach, join_frames
+from crashhunt.world import DangerMeter, DrivenMeter, Lane, closest_approach, join_frames
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.json_types import ErrorData
     from crashhunt.trial import TrialSpec
+    from crashhunt.world import Scene
 
 
 _HEAD_BYTES, _TAIL_BYTES = 2000, 4000
@@ -194,17 +195,14 @@ def _result(
     agents: Mapping[str, str] | None = None,
 ) -> TrialResult:
     folder = scratch_of(scratch, spec.number)
-    output = read_ends(folder / layout.RUN_LOG)
     stack = _read_stack(folder / layout.STACK)
-    steps, sim_time_s, digest, closest = 0, 0.0, "", ClosestApproach()
-    danger: float | None = None
-    driven = DrivenMeter((), 1.0)
     phase = header.phase if header is not None else Phase.SETUP
     try:
         recording = Recording(read_black_box(folder / layout.BLACK_BOX)) if header is not None else None
         scenes = recording.scenes() if recording is not None else []
     except Exception:  # of whatever kind: a process that ran foreign code may have written anything there
         recording, scenes = None, []
+    measured: dict[str, Any] = {}
     if phase == Phase.SETUP or (recording is not None and not scenes):
         if header is not None and recording is not None and phase == Phase.ACT:
             agent = recording.agents[header.agent] if header.agent < len(recording.agents) else ""
@@ -212,50 +210,63 @@ def _result(
         agent = agent or agent_in_stack(stack, agents or {})
         message = f"{message}{_users_frame(stack)}" if outcome is Outcome.HANG else message
         outcome, message = Outcome.INVALID, f"{message} while the episode was being set up"
-    elif recording is None:
+    elif recording is None or header is None:
         message = f"{message}, and its recording cannot be read"
     else:
-        steps, sim_time_s, digest = recording.steps, scenes[-1].time_s, recording.digest
-        closest = closest_approach(scenes, recording.agents)
-        meter = DangerMeter(recording.agents, recording.prologue.step_length_s)
-        frames = [*join_frames(scenes)]
-        meter.add(frames)
-        danger = meter.danger
-        driven = DrivenMeter(recording.agents, recording.prologue.step_length_s)
-        driven.add(frames)
-        if outcome is Outcome.AGENT_ERROR:
-            agent = recording.agents[0] if len(recording.agents) == 1 else ""
-        elif header is not None and phase == Phase.ACT:
-            agent = recording.agents[header.agent]
-            message = f"{message} in {agent}'s act() of step {steps + 1}"
-        elif phase == Phase.DONE:  # where no code but that of agents runs, in close() or a finalizer
-            agent = recording.agents[0] if len(recording.agents) == 1 else ""
-            message = f"{message} after the last step"
-        else:
-            agent = agent_in_stack(stack, agents or {})
-            whose = f"{agent}'s code" if agent else "the simulator"
-            where = _users_frame(stack) if outcome is Outcome.HANG else ""
-            message = f"{message} in {whose}{where} at step {steps + 1}"
+        measured = _measures(recording, scenes)
+        agent, where = _place_in_step(outcome, header, recording, stack, agents or {})
+        message = f"{message}{where}"
+    output = read_ends(folder / layout.RUN_LOG)
     failure = Failure(kind=kind, message=message, traceback=stack, agent=agent, exit_code=exit_code, last_output=output)
-    wall_s = time.monotonic() - header.started if header is not None else 0.0
     result = TrialResult(
         spec,
         outcome,
-        steps=steps,
-        sim_time_s=sim_time_s,
-        digest=digest,
-        closest=closest,
-        danger=danger,
         failure=failure,
-        wall_s=wall_s,
+        wall_s=time.monotonic() - header.started if header is not None else 0.0,
         worker=header.pid if header is not None else 0,
         kept=folder.is_dir(),
         setup_steps=(header.setup_steps or None) if header is not None else None,
-        driven_m=driven.driven_m,
-        driven_s=driven.driven_s,
         step_length_s=recording.prologue.step_length_s if recording is not None and scenes else None,
+        **measured,
     )
     return in_effect(result, recording.disturbances if recording is not None else ())
+
+
+def _measures(recording: Recording, scenes: Sequence[Scene]) -> dict[str, Any]:
+    """Return what the recorded steps tell, as fields of a `TrialResult`."""
+    frames = [*join_frames(scenes)]
+    meter = DangerMeter(recording.agents, recording.prologue.step_length_s)
+    meter.add(frames)
+    driven = DrivenMeter(recording.agents, recording.prologue.step_length_s)
+    driven.add(frames)
+    return {
+        "steps": recording.steps,
+        "sim_time_s": scenes[-1].time_s,
+        "digest": recording.digest,
+        "closest": closest_approach(scenes, recording.agents),
+        "danger": meter.danger,
+        "driven_m": driven.driven_m,
+        "driven_s": driven.driven_s,
+    }
+
+
+def _place_in_step(
+    outcome: Outcome, header: BlackBoxHeader, recording: Recording, stack: str, agents: Mapping[str, str]
+) -> tuple[str, str]:
+    """Return the agent whose code a lost trial was in, empty for none, and the place as the end of a message."""
+    only = recording.agents[0] if len(recording.agents) == 1 else ""
+    step = recording.steps + 1
+    if outcome is Outcome.AGENT_ERROR:
+        return only, ""
+    if header.phase == Phase.ACT:
+        agent = recording.agents[header.agent]
+        return agent, f" in {agent}'s act() of step {step}"
+    if header.phase == Phase.DONE:  # where no code but that of agents runs, in close() or a finalizer
+        return only, " after the last step"
+    agent = agent_in_stack(stack, agents)
+    whose = f"{agent}'s code" if agent else "the simulator"
+    where = _users_frame(stack) if outcome is Outcome.HANG else ""
+    return agent, f" in {whose}{where} at step {step}"
 
 
 def agent_in_stack(stack: str, agents: Mapping[str, str]) -> str:
