@@ -209,8 +209,16 @@ def _usual_environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
 
 
-@functools.cache
+_starting_commands = threading.Lock()  # two pools of one test may start their first process at the same time
+
+
 def _commands() -> Commands:
+    with _starting_commands:
+        return _the_commands()
+
+
+@functools.cache
+def _the_commands() -> Commands:
     environment = _usual_environment()
     return (_SHARED and Commands.connect(_SHARED, environment)) or Commands(environment)
 
@@ -311,9 +319,9 @@ def pytest_runtestloop(session: pytest.Session) -> None:  # which pytest-xdist's
 @pytest.fixture(scope="session", autouse=True)
 def _commands_end() -> Iterator[None]:
     yield
-    if _commands.cache_info().currsize:
-        _commands().close()
-        _commands.cache_clear()
+    if _the_commands.cache_info().currsize:
+        _the_commands().close()
+        _the_commands.cache_clear()
 
 
 @pytest.hookimpl(trylast=True)
