@@ -75,11 +75,7 @@ class _Instance(Protocol):
 
 
 class FmuFactory(ForeignFactory):
-    """Creates the agents of one ``fmu:`` locator.
-
-    Args:
-        locator: the locator, such as ``fmu:./planner.fmu``.
-    """
+    """Creates the agents of one ``fmu:`` locator."""
 
     def __init__(self, locator: str) -> None:
         self._locator = locator
@@ -276,12 +272,6 @@ class _Group:
 
 class _Wiring:
     """The places in observations and actions to which the variables of an FMU belong.
-
-    Args:
-        model: the FMU.
-        parts: the arrays of an observation.
-        action: the array of an action.
-        names: the names of the values of an action; empty if they have none.
 
     Raises:
         _UnusableError: an input or a value of the action has no source, or the source does not exist.

@@ -79,9 +79,6 @@ class _Observation(ctypes.Structure):
 class LibraryFactory(ForeignFactory):
     """Creates the agents of one ``lib:`` locator.
 
-    Args:
-        locator: the locator, such as ``lib:./libplanner.so``.
-
     Attributes:
         reads_map: whether the library, which has been loaded, asks for the road map.
     """

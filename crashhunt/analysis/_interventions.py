@@ -127,11 +127,7 @@ class Overrule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeaveOut:
-    """Actors that are excluded from the start.
-
-    Args:
-        actors: ids of the actors.
-    """
+    """Actors that are excluded from the start."""
 
     actors: tuple[str, ...]
 

@@ -90,12 +90,7 @@ class ForeignError(SimulatorError):
 
 
 class Boundary:
-    """Surrounds calls of one owner's code for one purpose: ``with boundary: call()``.
-
-    Args:
-        party: The owner of the called code.
-        place: The purpose of the call, such as ``step``.
-    """
+    """Surrounds calls of one owner's code for one purpose: ``with boundary: call()``."""
 
     __slots__ = ("_party", "_place")
 

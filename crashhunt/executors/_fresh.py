@@ -22,12 +22,7 @@ _LOOK_EVERY_S = 0.01  # starting one takes thirty times as long
 
 
 class FreshProcessExecutor:
-    """Runs every trial in a pool of its own, with the code that the settings name.
-
-    Args:
-        settings: settings of the hunt.
-        parallel: number of pools at a time.
-    """
+    """Runs every trial in a pool of its own, with the code that the settings name."""
 
     def __init__(self, settings: WorkerSettings, *, parallel: int = 1) -> None:
         self._settings = settings

@@ -101,12 +101,7 @@ _DAWDLING_DECELERATION_MPS2 = 1.5
 
 
 class HighwayDisturbances:
-    """Finds the target vehicles of disturbances in one episode, and disturbs them.
-
-    Args:
-        road: The road of the episode.
-        controlled: The agents' vehicles, which are never a target.
-    """
+    """Finds the target vehicles of disturbances in one episode, and disturbs them."""
 
     def __init__(self, road: Road, controlled: Collection[Any]) -> None:
         self._road = road

@@ -153,11 +153,6 @@ _AUDIT_FOLDER = "audits"  # of the scratch folder
 class PendingAudits:
     """The sampled trials that earlier runs of a hunt have not run again.
 
-    Args:
-        ledger: ledger of the hunt.
-        before: facts in the ledger at the end of the earlier runs.
-        settings: settings of the workers, which determine the sampled trials.
-
     Attributes:
         numbers: numbers of these trials.
     """

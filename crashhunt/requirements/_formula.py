@@ -99,13 +99,7 @@ class Not:
 
 @dataclass(frozen=True, slots=True)
 class Join:
-    """A conjunction or disjunction; an implication is a disjunction whose first part is negated.
-
-    Args:
-        span: place in the text.
-        operator: ``and`` or ``or``.
-        parts: the joined formulas.
-    """
+    """A conjunction or disjunction; an implication is a disjunction whose first part is negated."""
 
     span: Span
     operator: Literal["and", "or"]

@@ -72,10 +72,6 @@ class Requirement:
 
     Windows are in seconds, and are cut at the end of the trace. In an empty window, ``always`` and ``historically`` are
     infinitely true, and all other temporal operators are infinitely false.
-
-    Args:
-        text: text of the formula.
-        formula: the parsed formula.
     """
 
     text: str

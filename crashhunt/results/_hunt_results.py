@@ -69,9 +69,6 @@ class IncompleteHuntWarning(UserWarning):
 class HuntResults:
     """The results of a finished or running hunt.
 
-    Args:
-        directory: directory of the hunt.
-
     Raises:
         HuntDirectoryError: the directory contains no hunt.
     """

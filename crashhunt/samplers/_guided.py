@@ -412,13 +412,7 @@ def _scales(rows: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
 
 
 class Arms:
-    """Divides the trials between the conjuncts of requirements; without requirements, one portfolio proposes all.
-
-    Args:
-        cube: as in `Portfolio`.
-        space: as in `Portfolio`.
-        hunt: as in `Portfolio`.
-    """
+    """Divides the trials between the conjuncts of requirements; without requirements, one portfolio proposes all."""
 
     def __init__(self, cube: Cube, space: Space, hunt: HuntFacts) -> None:
         self._make: Callable[[], Portfolio] = partial(Portfolio, cube, space, hunt)

@@ -41,11 +41,7 @@ _NEEDS = {
 
 @dataclass(frozen=True, slots=True)
 class OptunaMaker:
-    """Creates samplers of one class of Optuna.
-
-    Args:
-        kind: the class in ``optuna.samplers``.
-    """
+    """Creates samplers of one class of Optuna."""
 
     kind: str
     only_asked: ClassVar[bool] = False

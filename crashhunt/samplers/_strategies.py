@@ -171,11 +171,7 @@ def _kind(result: TrialResult) -> str:
 
 
 class Elites:
-    """The trials with the greatest scores; of trials with equal scores, those that were reported first.
-
-    Args:
-        most: the maximum number of trials.
-    """
+    """The trials with the greatest scores; of trials with equal scores, those that were reported first."""
 
     def __init__(self, most: int) -> None:
         self._most = most

@@ -163,13 +163,7 @@ class SceneObserver:
 
 
 class _Motion:
-    """The changes of speed and heading of actors since the last step.
-
-    Args:
-        scene: The scene after the last step.
-        before: The heading and the speed of each actor one step before, by identifier.
-        step_length_s: Length of a step, in s.
-    """
+    """The changes of speed and heading of actors since the last step."""
 
     def __init__(self, scene: Scene, before: Mapping[str, tuple[float, float]], step_length_s: float) -> None:
         self.now = {

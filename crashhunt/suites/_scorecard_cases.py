@@ -325,14 +325,7 @@ class ScorecardHunt:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scorecard:
-    """The results of an agent in the cases of a suite.
-
-    Args:
-        suite: name of the suite.
-        agent: the agent.
-        grid: whether all cases were to run.
-        hunts: the hunts, in the order of the groups.
-    """
+    """The results of an agent in the cases of a suite."""
 
     suite: str
     agent: str
@@ -506,14 +499,7 @@ _REACTS_AT_ONCE = {("cut_out", "cc_human"): {"early_s": 1000.0}}
 
 
 class ReferenceMaps:
-    """The motions of all road users in some cases of a manoeuvre, and how each model would end.
-
-    Args:
-        manoeuvre: name of the manoeuvre.
-        cases: arguments of the scenario in each case.
-        steps: number of steps.
-        step_s: step length, in s.
-    """
+    """The motions of all road users in some cases of a manoeuvre, and how each model would end."""
 
     def __init__(self, manoeuvre: str, cases: Sequence[Mapping[str, Value]], *, steps: int, step_s: float) -> None:
         self._manoeuvre, self._step_s, self._count = manoeuvre, step_s, len(cases)

@@ -36,13 +36,7 @@ _OWN_LANE_CHANGES = 0b011001010101  # lane change mode: SUMO's default
 
 
 class Driving:
-    """Applies actions to vehicles.
-
-    Args:
-        setups: The setups of all agents of a scenario, by agent.
-        step_length_s: Step length, in s.
-        net: Path of the network file.
-    """
+    """Applies actions to vehicles."""
 
     def __init__(self, setups: Mapping[str, AgentSetup], step_length_s: float, net: Path) -> None:
         self._setups, self._step_length_s, self._net = setups, step_length_s, net

@@ -49,15 +49,7 @@ _MAX_SLIDE_M, _MAX_TURN_RAD = 0.2, 0.05  # distance of a trajectory's start from
 
 
 class FreeMotion:
-    """The motion of one vehicle in an episode, which begins with the vehicle on the road.
-
-    Args:
-        vehicle: identifier of the vehicle.
-        form: name of the form of its actions.
-        step_length_s: step length, in s.
-        area: the drivable area of the network.
-        settings: settings of the form, by name.
-    """
+    """The motion of one vehicle in an episode, which begins with the vehicle on the road."""
 
     def __init__(
         self,

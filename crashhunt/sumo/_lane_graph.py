@@ -94,9 +94,6 @@ class GraphLane:
 class LaneGraph:
     """The lanes of a network, including those inside junctions.
 
-    Args:
-        network: the contents of the network file, with junctions.
-
     Attributes:
         is_left_hand: whether traffic drives on the left.
         rules: the rules of the junctions, by id.

@@ -22,13 +22,7 @@ _LEFT, _SAME, _RIGHT = 1, 0, -1
 
 
 class PathAhead:
-    """The lanes that a vehicle's route continues to, and whether other lanes lead into the vehicle's lane.
-
-    Args:
-        vehicle: Identifier of the vehicle.
-        graph: The lanes of the network.
-        reach_m: Length of the path, in m.
-    """
+    """The lanes that a vehicle's route continues to, and whether other lanes lead into the vehicle's lane."""
 
     def __init__(self, vehicle: str, graph: LaneGraph, reach_m: float) -> None:
         self._vehicle, self._graph, self._reach_m = vehicle, graph, reach_m

@@ -90,9 +90,6 @@ class Lane:
 class Roster:
     """The actors of a scene, in the order of its rows. A roster is shared by all steps between two changes of actors.
 
-    Args:
-        actors: all actors of the scene.
-
     Attributes:
         vehicles: the same actors in the compiled core; None if it does not know them.
     """

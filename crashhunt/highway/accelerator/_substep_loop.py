@@ -366,9 +366,6 @@ class SkippedObservation:
     - The observation has effects, such as drawing random numbers.
     - The environment itself needs the observation.
     - A class or method of the user could notice the skip.
-
-    Args:
-        env: The environment, after its reset.
     """
 
     def __init__(self, env: AbstractEnv) -> None:

@@ -29,12 +29,7 @@ _LEAST_FREE_BYTES = 1 << 16
 
 @dataclass(frozen=True, slots=True)
 class ToolResult:
-    """The exit code and the output of a program.
-
-    Args:
-        code: exit code of the program; 0 means success.
-        output: everything that the program printed.
-    """
+    """The exit code and the output of a program."""
 
     code: int
     output: str
