@@ -226,6 +226,9 @@ def replay(
     return replace(shown, verdicts=Counter(report.verdict for report in reports))
 
 
+_ENDS = ("length", "outcome")  # differences of recordings without a value that differs
+
+
 def confirm(
     bundle: Bundle,
     stopped: Callable[[], bool] = lambda: False,
@@ -246,7 +249,8 @@ def confirm(
 
     Returns:
         The bundle with the result, or None if the confirmation was stopped. If no replay runs to its end, for example
-        because every replay is killed from outside, `confirmed` is None and `why_unconfirmed` has the reason.
+        because it takes too long, or is killed from outside each time, `confirmed` is None and `why_unconfirmed` has
+        the reason.
 
     Raises:
         UntrustedError: the code of the crash is neither made here nor trusted.
@@ -274,6 +278,9 @@ def confirm(
     if not confirmed and failed is not None:
         failed.append(report.replayed)
     now = report.replayed
+    if now.outcome is Outcome.HANG and report.divergence is not None and report.divergence.field in _ENDS:
+        message = now.failure.message if now.failure else ""
+        return replace(bundle, confirmed=None, divergence=None, why_unconfirmed=f"the replay was {message}")
     escape, why_no_escape = (now.escape, now.why_no_escape) if confirmed else (None, "")
     result = replace(bundle.result, escape=escape, why_no_escape=why_no_escape)
     found = replace(bundle, result=result, confirmed=confirmed, divergence=divergence, why_unconfirmed="")

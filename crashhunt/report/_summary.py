@@ -363,7 +363,8 @@ def _describe_crash(bundle: Bundle) -> list[str]:
     lines.append(f"  saved in {command_line(bundle.path)}")
     if bundle.confirmed is not None:
         first: Plain = bundle.divergence or {}
-        diverged = f"first difference at step {first.get('step')}, {first.get('agent')} {first.get('field')}"
+        what = f"{first.get('agent') or ''} {first.get('field')}".strip()
+        diverged = f"first difference at step {first.get('step')}, {what}"
         lines.append(
             "  confirmed: bit-identical when replayed in a new process"
             if bundle.confirmed

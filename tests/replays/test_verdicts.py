@@ -224,6 +224,12 @@ def test_confirmation_keeps_what_the_replay_shows(replays):
     replays.ends = [CrashhuntError("it was killed")]
     found = _replay.confirm(replace(BUNDLE, confirmed=True, divergence=THERE))
     assert found == Bundle(confirmed=None, divergence=None, why_unconfirmed="it was killed")
+    hang = replace(CRASH, outcome=Outcome.HANG, failure=Failure("timeout", "still running after 60 s"))
+    too_early = [replace(THERE, field=field) for field in ("outcome", "length", "x")]
+    replays.ends = [report("diverged", hang, end) for end in too_early]
+    late = Bundle(confirmed=None, why_unconfirmed="the replay was still running after 60 s")
+    assert [_replay.confirm(BUNDLE) for _ in range(2)] == [late] * 2
+    assert _replay.confirm(BUNDLE).confirmed is False
     replays.ends = [StoppedError()]
     assert _replay.confirm(BUNDLE) is None
     replays.ends = [UntrustedError("it is not yours")]

@@ -184,6 +184,8 @@ def test_printed_paths_can_be_copied_into_a_shell():
     text = f"{describe_hunt(report)}\n{describe_hunt(replace(report, crashes=()))}"
     assert "  saved in $'my\\x0ahunt/4'" in text.splitlines()
     assert "Near misses, saved in $'my\\x0ahunt/near-misses':" in text.splitlines()
+    crash.confirmed, crash.divergence = False, {"step": 19, "agent": "", "field": "outcome"}
+    assert "deviates (first difference at step 19, outcome)" in describe_hunt(report)
     spaced = describe_hunt(replace(report, directory=Path("my hunt"), crashes=()))
     assert "Near misses, saved in 'my hunt/near-misses':" in spaced.splitlines()
 
