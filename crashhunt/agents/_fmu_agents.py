@@ -16,21 +16,24 @@ import tomllib
 import zipfile
 from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
 
 import numpy as np
 
 from crashhunt.agents._library_agents import Action, Parts
+from crashhunt.agents._programs import hello_of
 from crashhunt.agents._protocol import ForeignFactory
 from crashhunt.base.agent_locators import fmu_files
+from crashhunt.base.binaries import length_by_headers
 from crashhunt.base.errors import ArgumentError, PluginError, ProgramError
 from crashhunt.base.text import listed, one_line
 from crashhunt.simulators import PARTS
 from crashhunt.trial import Argument, Signature, parse_spec
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
+    from crashhunt.base.program_message_types import Hello, SpaceDescription
     from crashhunt.simulators import Simulator
     from crashhunt.trial import Kind, Value
 
@@ -42,6 +45,11 @@ _MAX_SHOWN_CHARACTERS: Final = 300
 _SEED: Final = "seed"
 _WIDTH_OF_INTEGERS: Final = 2**32 - 1
 _TABLE_KEYS: Final = ("inputs", "action")
+_EXPONENTS: Final = {
+    "m": (1, 0, 0), "m²": (2, 0, 0), "s": (0, 1, 0), "m/s": (1, -1, 0), "m/s²": (1, -2, 0), "rad": (0, 0, 1),
+    "rad/s": (0, -1, 1),
+}  # fmt: skip
+"""The exponents of m, s and rad in each unit of observations and actions."""
 
 
 class _Variable(Protocol):
@@ -110,6 +118,9 @@ class FmuFactory(ForeignFactory):
             scratch.mkdir(parents=True, exist_ok=True)
             self._folder = Path(tempfile.mkdtemp(prefix=f"fmu-{self._model.path.stem}-", dir=scratch))
             _fmpy().extract(str(self._model.path), str(self._folder))
+            for binary in sorted(self._folder.glob("binaries/*/*.so")):
+                if binary.stat().st_size < length_by_headers(binary):  # it would end this process with SIGBUS
+                    raise self._refusal(f"its {binary.name} is cut: it is shorter than its headers say", _EXPORT)
             self._instance()  # so that what cannot be loaded is an error before the first trial
 
     def agent(
@@ -136,7 +147,8 @@ class FmuFactory(ForeignFactory):
                 guid=model.token, modelIdentifier=model.identifier, unzipDirectory=str(self._folder)
             )
         except Exception as error:  # FMPy has no class of its own
-            raise self._refusal(f"it cannot be loaded: {one_line(str(error))}", "see what the FMU needs") from None
+            text = one_line(str(error).replace(f"{self._folder}/", "")).rstrip(".")
+            raise self._refusal(f"it cannot be loaded: {text}", "see what the FMU needs") from None
         return made
 
     def _read(self, files: Mapping[str, str]) -> _Model:
@@ -149,7 +161,8 @@ class FmuFactory(ForeignFactory):
     def _wired(self, model: _Model, name: str, simulator: Simulator) -> _Wiring:
         form = simulator.actions[name]
         try:
-            return _Wiring(model, Parts.of(simulator, name), Action(form.space, form.names), form.names)
+            parts, action = Parts.of(simulator, name), Action(form.space, form.names)
+            return _Wiring(model, parts, action, form.names, hello_of(name, simulator, {}))
         except _UnusableError as error:
             raise self._refusal(str(error), error.fix) from None
 
@@ -211,11 +224,38 @@ class _Model:
             has = f"it has: {listed(binaries)}" if binaries else "it has none"
             raise _UnusableError(f"it has no binary for {machine} ({has})", _EXPORT)
         self.variables: dict[str, _Variable] = {one.name: one for one in described.modelVariables}
+        self._units = {one.name: one.baseUnit for one in described.unitDefinitions}
         self.inputs, self.action = _tables(table)
 
     def of(self, causality: str) -> list[_Variable]:
         """Return the variables that are inputs, outputs or parameters."""
         return [one for one in self.variables.values() if one.causality == causality]
+
+    def conversion(self, variable: _Variable, units: Collection[str]) -> tuple[float, float]:
+        """Return the factor and the offset that convert a value of a variable to the unit of its place.
+
+        ``units`` has the units of the values of the place; an empty unit is not known, and nothing is converted.
+
+        Raises:
+            _UnusableError: the unit of the variable is another kind of unit, or is not defined.
+        """
+        found = {self._conversion(variable.unit or "", unit) for unit in units}
+        if len(found) == 1 and (one := found.pop()) is not None:
+            return one
+        ours = listed(sorted(filter(None, {*units})))
+        raise _UnusableError(
+            f"its variable {variable.name} has the unit {variable.unit}, which cannot be converted to {ours}",
+            f"export it with the unit {ours}, or define {variable.unit} by a BaseUnit in UnitDefinitions",
+        )
+
+    def _conversion(self, unit: str, ours: str) -> tuple[float, float] | None:
+        if not ours or unit in ("", "1", "-") or unit.replace("^", "").replace("²", "2") == ours.replace("²", "2"):
+            return 1.0, 0.0
+        base, (m, s, rad) = self._units.get(unit), _EXPONENTS[ours]
+        if base is None or (base.m, base.s) != (m, s) or base.rad not in (0, rad):
+            return None
+        is_other = base.factor == 0 or any((base.kg, base.A, base.K, base.mol, base.cd))
+        return None if is_other else (base.factor, base.offset)
 
     def signature(self) -> Signature:
         """Return the parameters as arguments, with the ranges between their minima and maxima."""
@@ -261,28 +301,32 @@ class _Group:
 
     Attributes:
         type_name: type of the variables in the names of FMPy's methods.
+        conversion: factor and offset from the unit of the variables to that of their places.
     """
 
     def __init__(self) -> None:
-        self.type_name = ""
+        self.type_name, self.conversion = "", (1.0, 0.0)
         self.references: list[int] = []
         self.places: list[tuple[np.ndarray[Any, np.dtype[np.generic]], int]] = []
         """For each value, the flat array that contains it, and its index."""
+
+
+_Groups: TypeAlias = defaultdict[tuple[str, tuple[float, float]], _Group]
 
 
 class _Wiring:
     """The places in observations and actions to which the variables of an FMU belong.
 
     Raises:
-        _UnusableError: an input or a value of the action has no source, or the source does not exist.
+        _UnusableError: an input or a value of the action has no source, or the source or the unit does not fit.
     """
 
-    def __init__(self, model: _Model, parts: Parts, action: Action, names: Sequence[str]) -> None:
+    def __init__(self, model: _Model, parts: Parts, action: Action, names: Sequence[str], hello: Hello) -> None:
         self.parts, self.action = parts, action
         self.constants: list[tuple[_Variable, float]] = []
         self.fixed_actions: list[tuple[int, float]] = []
-        inputs: defaultdict[str, _Group] = defaultdict(_Group)
-        outputs: defaultdict[str, _Group] = defaultdict(_Group)
+        inputs: _Groups = defaultdict(_Group)
+        outputs: _Groups = defaultdict(_Group)
         arrays = {leaf.name: leaf.values for leaf in parts.leaves}
         columns = {leaf.name: leaf.columns for leaf in parts.leaves}
         known = {one.name for one in model.of("input")}
@@ -300,7 +344,8 @@ class _Wiring:
                     f"(it has the parts {listed(sorted(arrays))})",
                     _TABLE_FIX,
                 )
-            _add(inputs, model, one, places)
+            units = _units_of(hello["observation"].get(source.partition("[")[0].partition(".")[0]))
+            _add(inputs, model, one, places, {units[index % len(units)] for _, index in places})
         size = action.described.size
         values = {name: [index] for index, name in enumerate(names)} if len(names) == size else {}
         values |= {f"action[{index}]": [index] for index in range(size)} | {"action": list(range(size))}
@@ -317,7 +362,11 @@ class _Wiring:
             if variable is None or variable.causality != "output":
                 has = listed(sorted(one.name for one in model.of("output")))
                 raise _UnusableError(f"it has no output {source} for {name} (it has: {has})", _TABLE_FIX)
-            _add(outputs, model, variable, [(action.values, index) for index in values[name]])
+            units = _units_of(hello["action"])
+            _add(
+                outputs, model, variable, [(action.values, index) for index in values[name]],
+                {units[index % len(units)] for index in values[name]},
+            )  # fmt: skip
         if missing:
             name = names[min(missing)] if len(names) == size else f"action[{min(missing)}]"
             raise _UnusableError(f"no output has the name {name}, which is a value of the action", _TABLE_FIX)
@@ -329,14 +378,19 @@ _TABLE_FIX = (
 )
 
 
+def _units_of(described: SpaceDescription | None) -> Sequence[str]:
+    """Return the units of the values along the last axis of an array; one empty unit if they are not known."""
+    return (described["units"] if described is not None else ()) or ("",)
+
+
 def _add(
-    groups: defaultdict[str, _Group], model: _Model, variable: _Variable,
-    places: list[tuple[np.ndarray[Any, np.dtype[np.generic]], int]],
+    groups: _Groups, model: _Model, variable: _Variable,
+    places: list[tuple[np.ndarray[Any, np.dtype[np.generic]], int]], units: Collection[str],
 ) -> None:  # fmt: skip
-    """Add a variable to the group of its type.
+    """Add a variable to the group of its type and its unit.
 
     Raises:
-        _UnusableError: the variable has another number of values, or a type that is no number.
+        _UnusableError: the variable has another number of values, another kind of unit, or a type that is no number.
     """
     if variable.type not in (*_REALS, *_INTEGERS, "Boolean"):
         raise _UnusableError(f"its variable {variable.name} is of type {variable.type}, which is no number", _EXPORT)
@@ -348,8 +402,9 @@ def _add(
             f"and its place {len(places)}",
             _TABLE_FIX,
         )
-    group = groups[variable.type]
-    group.type_name = _method(variable, model.version)
+    conversion = model.conversion(variable, units)
+    group = groups[variable.type, conversion]
+    group.type_name, group.conversion = _method(variable, model.version), conversion
     group.references.append(variable.valueReference)
     group.places += places
 
@@ -474,6 +529,9 @@ class FmuAgent:
     def _set_inputs(self) -> None:
         for group in self._wiring.inputs:
             values: Iterable[float] = [array.item(index) for array, index in group.places]
+            if group.conversion != (1.0, 0.0):
+                factor, offset = group.conversion
+                values = [(value - offset) / factor for value in values]
             if group.type_name not in _REALS:
                 values = [self._whole(value) for value in values]
             getattr(self._instance, f"set{group.type_name}")(group.references, values)
@@ -481,8 +539,9 @@ class FmuAgent:
     def _get(self, group: _Group) -> None:
         count = (len(group.places),) if self._model.version == 3 else ()
         values = getattr(self._instance, f"get{group.type_name}")(group.references, *count)
+        factor, offset = group.conversion
         for (array, index), value in zip(group.places, values, strict=True):
-            array[index] = value
+            array[index] = value * factor + offset
 
     def _whole(self, value: float) -> int:
         if value != int(value):

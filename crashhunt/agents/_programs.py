@@ -27,6 +27,7 @@ from crashhunt.base.agent_locators import command_of, is_path, library_path, wor
 from crashhunt.base.errors import ArgumentError, ProgramError
 from crashhunt.base.foreign_code import supports
 from crashhunt.base.text import one_line
+from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import NamesMetaActions, ObservesParts, ProvidesRoadMaps
 from crashhunt.trial import Argument, Constant, Signature, kind_of, parse_spec
 from crashhunt.world import describe_road_map
@@ -45,7 +46,10 @@ PROTOCOL: Final = 1
 _FORMATS: Final = ("json", "msgpack")
 _DESCRIPTION_S: Final = 60.0  # as long as a module may take to import
 _MAX_REVISION_CHARACTERS: Final = 100
-_UNITS: Final = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "heading": "rad", "target_speed": "m/s"}
+_UNITS: Final = {
+    "vx": "m/s", "vy": "m/s",
+    **{component.name: component.unit for form in ACTIONS.values() for component in form.components},
+}  # fmt: skip
 _DECLARATION_KEYS: Final = ("range", "unit", "default")
 
 
@@ -74,7 +78,7 @@ class ProgramFactory(ForeignFactory):
             try:
                 program.start()
                 limit = max(limit_s, _DESCRIPTION_S)
-                return _signature_in(program.ask(_hello(agent, simulator, {}), "hello", limit))
+                return _signature_in(program.ask(hello_of(agent, simulator, {}), "hello", limit))
             except ProgramError as error:
                 raise ProgramError(f"{error.message}{_last_line(log)}", fix=error.fix) from None
             finally:
@@ -86,7 +90,7 @@ class ProgramFactory(ForeignFactory):
     ) -> ProgramAgent:  # fmt: skip
         """Return the agent of a vehicle; its program runs in a folder of its own."""
         given = {key: _absolute(value) for key, value in arguments.items()}
-        hello = _hello(name, simulator, given)
+        hello = hello_of(name, simulator, given)
         is_scalar = simulator.actions[name].space.shape == ()
         process = ProgramExchange(
             command_of(self._locator, files), folder / f"agent-{name}", libraries=library_path(self._locator, files),
@@ -242,7 +246,8 @@ def write_road_map(folder: Path, simulator: Simulator, agent: str) -> str | None
     return str(file)
 
 
-def _hello(agent: str, simulator: Simulator | None, arguments: Mapping[str, Value]) -> Hello:
+def hello_of(agent: str, simulator: Simulator | None, arguments: Mapping[str, Value]) -> Hello:
+    """Return the first message, which describes the spaces of a vehicle if there is a simulator."""
     found: Hello = {
         "type": "hello", "protocol": PROTOCOL, "agent": agent, "arguments": dict(arguments), "observation": {},
         "action": {"shape": [], "columns": [], "units": []}, "step_length_s": 0.0,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from crashhunt.agents import FmuFactory, LibraryFactory, NeedsLibraries, ProgramFactory
+from crashhunt.base.agent_locators import is_program
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.foreign_code import Boundary, Party, is_ours, supports
 from crashhunt.base.plugins import add_current_folder, import_module, locate
@@ -104,7 +105,8 @@ class Parts:
             report(f"the module {module!r} cannot be imported")
             import_module(module)
         for agent, setup in scenario.agents.items():
-            report(f"the module {setup.agent.partition(':')[0]!r} of agent {agent} cannot be imported")
+            module = repr(setup.agent) if is_program(setup.agent) else f"the module {setup.agent.partition(':')[0]!r}"
+            report(f"{module} of agent {agent} cannot be imported")
             factory, _ = self._factory(agent)
             # PyTorch takes longer than a short trial may.
             for library in factory.libraries if supports(factory, NeedsLibraries) else ():

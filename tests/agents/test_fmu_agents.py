@@ -94,6 +94,37 @@ def test_a_table_names_the_sources_of_inputs_and_of_the_action(tmp_path):
     assert set(actions) == {(0.0, 1), (9.125, 1)}
 
 
+KM_H = '<Unit name="km/h"><BaseUnit m="1" s="-1" factor="0.25"/></Unit><Unit name="m/s"/>'  # 0.25: exact in doubles
+DECIMETRES = '<Unit name="dm"><BaseUnit m="1" factor="0.125" offset="1"/></Unit>'
+
+
+def with_units(definitions, output="", place=""):
+    """A description whose output, and whose input for the place of the first actor, have units."""
+    made = described_by_fmi_2("kinematics[{row}].{column}", "target_speed")
+    made = made.replace('<Unit name="m/s"/>', definitions)
+    made = made.replace('causality="output"><Real/>', f'causality="output"><Real unit="{output}"/>')
+    return re.sub(r'(name="kinematics\[1\]\.x".*?start="0")', rf'\1 unit="{place}"', made, count=1)
+
+
+def test_values_are_converted_between_the_units_of_an_fmu_and_those_of_the_simulator(tmp_path):
+    (tmp_path / "plain").mkdir()
+    seen = np.zeros((8, 7), np.float32)
+    seen[1, :3] = 1, 3.0, 0.0
+    plain = agent_of(build_fmu(tmp_path / "plain", 2), speed=16.0)
+    converting = agent_of(build_fmu(tmp_path, 2, description=with_units(KM_H + DECIMETRES, "km/h", "dm")), speed=16.0)
+    assert (plain.act(seen)[0], converting.act(seen)[0]) == (0.0, 4.0)  # 3 m are 16 dm here, which is far enough
+    seen[1, 1] = 2.25  # 10 dm
+    assert converting.act(seen)[0] == 0.0
+
+
+@pytest.mark.parametrize("definition", ['<Unit name="dm"><BaseUnit m="2" factor="0.1"/></Unit>', '<Unit name="dm"/>'])
+def test_a_unit_that_cannot_be_converted_is_refused(tmp_path, definition):
+    fmu = build_fmu(tmp_path, 2, description=with_units(KM_H + definition, "km/h", "dm"))
+    message = "its variable kinematics[1].x has the unit dm, which cannot be converted to m; export it with the unit m"
+    with pytest.raises(PluginError, match=re.escape(message)):
+        agent_of(fmu)
+
+
 def test_parameters_are_arguments_with_their_units_and_bounds(tmp_path):
     arguments = signature_of(FmuFactory(f"fmu:{build_fmu(tmp_path, 2)}")).arguments
     speed = arguments["speed"]
@@ -199,6 +230,27 @@ def test_a_file_that_is_no_fmu_is_refused(tmp_path):
     for name, message in {"a.fmu": "it is not an FMU", "b.fmu": "it is not an FMU", "c.fmu": "is not a file"}.items():
         with pytest.raises(PluginError, match=message):
             signature_of(FmuFactory(f"fmu:{tmp_path / name}"))
+
+
+@pytest.mark.parametrize(
+    ("length", "message"),
+    [
+        (
+            7,
+            "it cannot be loaded: Failed to load shared library binaries/linux64/planner.so. binaries/linux64/pl",
+        ),
+        (5000, "its planner.so is cut: it is shorter than its headers say; export it"),
+    ],
+)
+def test_a_damaged_binary_is_refused_without_a_path_of_the_scratch_folder(tmp_path, monkeypatch, length, message):
+    monkeypatch.chdir(tmp_path)  # FMPy leaves the process in the folder of a library that cannot be loaded
+    with zipfile.ZipFile(build_fmu(tmp_path, 2)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(tmp_path / "cut.fmu", "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data[:length] if name.endswith(".so") else data)
+    with pytest.raises(PluginError, match=re.escape(f"cut.fmu': {message}")):
+        agent_of(tmp_path / "cut.fmu")
 
 
 def test_a_step_that_takes_too_long_is_an_error_of_the_agent(tmp_path):

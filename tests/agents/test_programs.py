@@ -21,12 +21,13 @@ from programs import COMPILER, DRIVER, compile_program, write_binary_program, wr
 
 import crashhunt
 from crashhunt.agents import ProgramFactory
+from crashhunt.agents._programs import hello_of
 from crashhunt.base import forks
 from crashhunt.base.agent_locators import command_of, files_of
 from crashhunt.base.errors import ActionError, PluginError, ProgramError
 from crashhunt.panels import labelled
 from crashhunt.plans import Request, plan_with_code, takes_of
-from crashhunt.simulators import MetaAction, SpeedAndLaneChange
+from crashhunt.simulators import AccelerationAndLaneChange, MetaAction, SpeedAndLaneChange
 from crashhunt.trial import Range, signature_of
 from crashhunt.world import MapLane, RoadMap, StopLine, VehicleData
 
@@ -229,6 +230,11 @@ def test_messages_are_those_of_the_protocol(tmp_path):
         f'{{"type":"observe","step":1,"time_s":0.1,"observation":{rows}}}',
         '{"type":"close"}',
     ]
+
+
+def test_hello_has_the_units_of_every_form_of_actions():
+    simulator = Simulated(AccelerationAndLaneChange())
+    assert hello_of("ego", simulator, {})["action"]["units"] == ["m/s²", ""]
 
 
 HARMS = [
