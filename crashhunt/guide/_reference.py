@@ -420,7 +420,7 @@ def _shape(schema: JsonObject, key: str, shown: dict[str, str]) -> str:
     return "|".join(types) if "null" in types else ""
 
 
-# The list of all modules with what each is about, made from what it says first of itself.
+# The list of all modules: what each is about, made from what it says first of itself, and its numbers.
 
 _PACKAGE_FOLDER = Path(__file__).parents[1]
 _SUBJECTS = {
@@ -432,6 +432,12 @@ _SUBJECTS = {
     ".js": re.compile(r"\A/\* (.+?) \*/"),
 }
 """What a file says first of itself; read as text, since importing everything would take seconds."""
+_NUMBERS = re.compile(
+    r"^(?P<names>_?[A-Z][A-Z0-9_]*(?:, _?[A-Z][A-Z0-9_]*)*)(?:: Final)? = (?P<values>[-(]?[\d.][^#\n\"'\[{]*?)"
+    r"(?:  # (?P<comment>.+))?$",
+    re.MULTILINE,
+)
+"""The limits and other numbers of a module in Python: constants at the beginning of a line."""
 
 
 def describe_signals() -> str:
@@ -481,7 +487,7 @@ def _described_entries(entries: Iterable[ListingEntry]) -> Iterator[str]:
 
 
 def describe_modules() -> str:
-    """Return every package with its modules, as Markdown."""
+    """Return every package with its modules and their numbers, as Markdown."""
     return "\n".join(_lines())
 
 
@@ -499,6 +505,9 @@ def _members(folder: Path) -> Iterator[str]:
     for file in sorted(folder.iterdir()):
         if file.suffix in _SUBJECTS and file.name != "__init__.py":
             yield f"- `{file.name}`: {_subject_of(file)}"
+            for found in _NUMBERS.finditer(file.read_text(encoding="utf-8")) if file.suffix == ".py" else ():
+                comment = f": {found['comment']}" if found["comment"] else ""
+                yield f"    - `{found['names']}` = {found['values']} in `{file.relative_to(_PACKAGE_FOLDER)}`{comment}"
         elif file.is_dir() and not (file / "__init__.py").exists():  # pages and scripts, which are no package
             yield from (line.replace("- `", f"- `{file.name}/", 1) for line in _members(file))
 

@@ -195,6 +195,8 @@ def test_every_module_is_listed_with_what_it_is_about():
     assert sum(line.startswith("- `") for line in text.splitlines()) == len(modules)
     assert "## crashhunt/base\n" in text
     assert "\n- `files.py`: Files that are complete or absent, even after a power failure.\n" in text
+    assert "\n    - `_STOP_M` = 5.0 in `sumo/_traffic_events.py`: a vehicle that stands within this distance" in text
+    assert "\n    - `_LOOK_S, _MIN_LOOK_M` = 0.5, 4.0 in `sumo/_free_motion.py`: how far ahead" in text
 
 
 def test_every_file_that_the_architecture_names_is_there():
