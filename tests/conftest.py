@@ -44,7 +44,7 @@ from crashhunt.snapshots._snapshot import code_of_manifest
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator
 
-pytest_plugins = ["browsers"]
+pytest_plugins = ["browsers", "made_up_trials"]
 
 # Every worker, and every process that a test starts, would compile the same files again: seconds each. What is imported
 # from now on is kept, as it is for users.

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from made_up_trials import Inline, survives
 
 import crashhunt
 from crashhunt.errors import CallError, CrashhuntError, HuntDirectoryError, ScenarioError
@@ -35,46 +36,8 @@ range = "6:14"
 """
 
 
-def survives(spec):
-    return TrialResult(spec, Outcome.SURVIVED, steps=10 + spec.number, digest=f"{spec.number:032x}", danger=0.5)
-
-
 def is_invalid(spec):
     return TrialResult(spec, Outcome.INVALID, steps=0, failure=Failure("ScenarioError", "no road"))
-
-
-class Inline:
-    """An executor with two workers, which returns one result at each call."""
-
-    capacity, first = 2, 0
-
-    def __init__(self, settings, *, parallel, ends):
-        self.settings, self.parallel, self.ends = settings, parallel, ends
-        self.waiting, self.submitted, self.most, self.cancelled, self.closed, self.said = [], [], 0, [], 0, ["a note"]
-
-    def submit(self, spec):
-        self.submitted.append(spec)
-        self.waiting.append(spec)
-        self.most = max(self.most, len(self.waiting))
-
-    def completed(self, timeout_s):
-        assert timeout_s == _hunt._TICK_S
-        if self.waiting:
-            yield self.ends(self.waiting.pop(self.first))
-
-    def cancel(self, *, above=-1):
-        self.cancelled.append(above)
-        self.waiting = [spec for spec in self.waiting if spec.number <= above]
-
-    def where(self):
-        return {spec.number: "header" for spec in self.waiting}
-
-    def notes(self):
-        said, self.said = self.said, []
-        return said
-
-    def close(self):
-        self.closed += 1
 
 
 @pytest.fixture
@@ -384,20 +347,6 @@ def test_hunt_until_a_rate_ends_above_it_with_an_interval_above_it(run, bundles)
     rate = run(0, crashes_from(*range(60)), until_rate="0.001/trial", most=60, keep=1).report.rate
     assert (rate.verdict, rate.crashes) == ("above", rate.units)
     assert rate.certain.low >= 0.001
-
-
-@pytest.fixture
-def bundles(monkeypatch):
-    """Replace bundles: each is confirmed, and has the result of its trial."""
-    written = []
-
-    def write(folder, result, trial, *, hunt_seed, snapshot, lanes):
-        written.append(result.spec.number)
-        return SimpleNamespace(result=result, id=f"{result.spec.number:06d}", confirmed=True, path=folder)
-
-    monkeypatch.setattr(_hunt, "write_bundle", write)
-    monkeypatch.setattr(_hunt.TrialReruns, "confirm", lambda again, crashes: list(crashes))
-    return written
 
 
 def crashes_from(*numbers):

@@ -9,19 +9,20 @@ from contextlib import closing
 from dataclasses import replace
 
 import pytest
+from made_up_trials import Inline, replace_bundles, survives
 
 import crashhunt
 from crashhunt.cli import main
 from crashhunt.crashes import group_crashes, list_bundles
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import Hunt, check
+from crashhunt.hunts import Hunt, _hunt, check
 from crashhunt.ledger import Ledger
 from crashhunt.report import describe_hunt, describe_rates
 from crashhunt.results import CodeVersions, HuntResults, count_versions, crashes_by_version, find_crashes, hunt_state
 from crashhunt.samplers import NamedSampler
 from crashhunt.snapshots import _take
 from crashhunt.statistics import compare, measure_rates
-from crashhunt.trial import Outcome
+from crashhunt.trial import Failure, Outcome
 
 TOY = """
 title = "A toy"
@@ -53,6 +54,7 @@ def agent(tmp_path, monkeypatch):
 
     def write(*fails):
         (tmp_path / "mine.py").write_text(AGENT.format(set(fails) or "()"))
+        write.fails = fails
 
     take = _take._take_module
     monkeypatch.setattr(_take, "_take_module", lambda name, *words: None if name == "crashhunt" else take(name, *words))
@@ -61,6 +63,29 @@ def agent(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     write(0)
     return write
+
+
+def make_up(agent, monkeypatch):
+    """Have no trial run: each ends as the agent would have it end."""
+
+    def ends(spec):
+        failed = {"outcome": Outcome.AGENT_ERROR, "failure": Failure("AssertionError", "", agent="ego")}
+        return replace(survives(spec), **(failed if spec.seed % 4 in agent.fails else {}))
+
+    def make(name, settings, *, parallel):
+        executor = Inline(settings, parallel=parallel, ends=ends)
+        executor.said = []
+        return executor
+
+    replace_bundles(monkeypatch)
+    monkeypatch.setattr(_hunt, "make_executor", make)
+
+
+@pytest.fixture
+def made_up(agent, monkeypatch):
+    """The same, where no trial runs."""
+    make_up(agent, monkeypatch)
+    return agent
 
 
 def run(trials, path="h", **options):
@@ -76,34 +101,34 @@ def rows(path):
         return {one.spec.number: str(one.outcome) for one in ledger.results()}
 
 
-def test_hunt_does_not_resume_with_other_code_and_loses_nothing(agent, tmp_path):
+def test_hunt_does_not_resume_with_other_code_and_loses_nothing(made_up, tmp_path):
     run(8)
     before = contents(tmp_path / "h")
-    agent(0, 1, 2, 3)
+    made_up(0, 1, 2, 3)
     for trials in (8, 16):  # also where there is nothing to run: the user expects results of the present code
         with pytest.raises(HuntDirectoryError, match=f"{REFUSED} 8 trials of this hunt: mine.py;") as caught:
             run(trials)
         assert "--continue-with-new-code" in caught.value.fix
     after = contents(tmp_path / "h")
     assert {**after, ".lock": b""} == {**before, ".lock": b""}  # which has the number of the process
-    agent(0)
+    made_up(0)
     os.utime("mine.py", (1, 1))
     (tmp_path / "README.md").write_text("read me")
     (tmp_path / "__pycache__").mkdir(exist_ok=True)
     assert sum(run(9).outcomes.values()) == 9
 
 
-def test_hunt_without_results_may_change_its_code(agent, tmp_path):
+def test_hunt_without_results_may_change_its_code(made_up, tmp_path):
     run(2)
     with closing(Ledger(tmp_path / "h" / "ledger.sqlite", writable=True)) as ledger:
         ledger.replace([0, 1])
-    agent(0, 1, 2, 3)
-    report = run(4, keep=1)
+    made_up(0, 1, 2, 3)
+    report = run(4)
     assert (report.outcomes, report.code_versions) == ({"agent_error": 4}, ())
 
 
 @pytest.mark.long
-def test_versions_are_kept_apart_in_every_figure(agent, tmp_path, capsys):
+def test_versions_are_kept_apart_in_every_figure(agent, tmp_path, capsys, monkeypatch):
     hunt = tmp_path / "h"
     first = run(4, keep=1)
     failed = first.outcomes["agent_error"]
@@ -131,7 +156,9 @@ def test_versions_are_kept_apart_in_every_figure(agent, tmp_path, capsys):
     results = HuntResults(hunt)
     assert [row["code_version"] for row in results.rows()] == [1] * 4 + [2] * 3
     assert results.trials()["code_version"].tolist() == [1] * 4 + [2] * 3
-    run(7, "other", keep=1)
+    with monkeypatch.context() as patch:
+        make_up(agent, patch)
+        run(7, "other")
     comparison = compare(hunt, "other")
     figures = comparison.hunts[0]
     assert (figures.trials, figures.crashes, figures.crash_rate, figures.outcomes) == (3, 3, 1.0, {"agent_error": 3})
@@ -148,14 +175,19 @@ def test_versions_are_kept_apart_in_every_figure(agent, tmp_path, capsys):
         assert ended.value.code == 0
         assert "version 1" in (text := capsys.readouterr().out) or "4 of earlier code" in text
 
-    # A raise after results of the newest version forbids its estimate; the next version begins without it.
+
+def test_raise_after_results_of_the_newest_version_forbids_its_estimate_but_not_that_of_the_next(made_up, tmp_path):
+    hunt = tmp_path / "h"
+    run(4)
+    made_up(0, 1, 2, 3)
+    run(7, continue_with_new_code=True)
     assert measure_rates(hunt, per="trial")[0].estimate == 1.0
-    run(8, keep=1)
+    run(8)
     assert measure_rates(hunt, per="trial")[0].why_not.startswith("TRIALS was changed")
-    agent(0)  # the first version again
+    made_up(0)  # the first version again
     with pytest.raises(HuntDirectoryError, match=f"{REFUSED} 4 trials"):
         run(11)
-    report = run(11, keep=1, continue_with_new_code=True)
+    report = run(11, continue_with_new_code=True)
     newest = next(one for one in report.code_versions if one.is_newest)
     assert (newest.version, newest.first, newest.trials, len(report.code_versions)) == (1, 8, 7, 2)
     (rate,) = measure_rates(hunt, per="trial")
@@ -184,15 +216,15 @@ def test_crash_of_earlier_code_does_not_end_the_hunt_for_one_of_the_new_code(age
     assert (again.stopped_because, again.crashes) == ("all_trials", ())
 
 
-def test_hunts_whose_figures_need_all_trials_do_not_continue_with_new_code(agent):
+def test_hunts_whose_figures_need_all_trials_do_not_continue_with_new_code(made_up):
     options = {"seeds": 2}
     run(4, **options)
-    agent(1)
+    made_up(1)
     with pytest.raises(HuntDirectoryError, match="--continue-with-new-code and --seeds exclude each other"):
         run(8, continue_with_new_code=True, **options)
 
 
-def test_resumed_hunt_names_new_files_that_do_not_count(agent, tmp_path):
+def test_resumed_hunt_names_new_files_that_do_not_count(made_up, tmp_path):
     (tmp_path / "car").mkdir()
     shutil.move("mine.py", tmp_path / "car" / "mine.py")
     (tmp_path / "toy.toml").write_text(TOY.replace("mine:Mine", "car.mine:Mine"))
@@ -210,7 +242,7 @@ def test_resumed_hunt_names_new_files_that_do_not_count(agent, tmp_path):
     ("timeout_s", "says"),
     [(5, "2 of the hunt's trials took longer or hung"), pytest.param(90, "1 of the", marks=pytest.mark.nightly)],
 )
-def test_other_time_limit_is_refused_where_earlier_trials_would_end_otherwise(agent, tmp_path, timeout_s, says):
+def test_other_time_limit_is_refused_where_earlier_trials_would_end_otherwise(made_up, tmp_path, timeout_s, says):
     run(3, timeout_s=50)
     run(4, timeout_s=40)  # which changes nothing
     with closing(Ledger(tmp_path / "h" / "ledger.sqlite", writable=True)) as ledger:
@@ -226,22 +258,22 @@ def test_other_time_limit_is_refused_where_earlier_trials_would_end_otherwise(ag
 
 
 @pytest.mark.nightly
-def test_hunt_of_a_gate_names_no_option_that_its_command_lacks(agent, tmp_path, monkeypatch):
+def test_hunt_of_a_gate_names_no_option_that_its_command_lacks(made_up, tmp_path, monkeypatch):
     run(2)
-    agent(1)
+    made_up(1)
     monkeypatch.setattr("crashhunt.hunts.Hunt", lambda *given, **more: Hunt(*given, **more, partner=tmp_path / "other"))
     with pytest.raises(HuntDirectoryError, match=REFUSED) as caught:
         run(4)
     assert "--" not in caught.value.fix
 
 
-def test_learning_sampler_receives_no_results_of_earlier_code(agent, tmp_path, monkeypatch):
+def test_learning_sampler_receives_no_results_of_earlier_code(made_up, tmp_path, monkeypatch):
     told = []
     run(4, sampler="mutation")
-    agent(0, 1, 2, 3)
+    made_up(0, 1, 2, 3)
     tell = NamedSampler.tell
     monkeypatch.setattr(NamedSampler, "tell", lambda sampler, result: told.append(result) or tell(sampler, result))
-    run(8, sampler="mutation", keep=1, continue_with_new_code=True)
+    run(16, sampler="mutation", continue_with_new_code=True)
     assert {str(one.outcome) for one in told} == {"agent_error"}
     assert min(one.spec.number for one in told) >= 4
 
