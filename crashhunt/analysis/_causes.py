@@ -269,7 +269,9 @@ class _Search:
                 changed = changes_of(self._recording, recording, asked.factor.name, self._lanes, step)
         ending: Without = "none"
         if result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
-            ending = "same" if self._is_same(result) else "other"
+            hit = result.collision
+            is_other_agent = hit is not None and not hit.involves(self._agent)  # its crash has ended the run
+            ending = "same" if self._is_same(result) else "unclear" if is_other_agent else "other"
         return LeftOut(given=given, ending=ending, into=into, changed=changed)
 
     def _is_same(self, result: TrialResult) -> bool:

@@ -193,7 +193,9 @@ class _Search:
         was, now = self._result.collision, result.collision
         if was is None or now is None:
             return "same" if result.outcome is self._result.outcome else "other"
-        return "same" if {was.collider, was.victim} == {now.collider, now.victim} else "other"
+        if {was.collider, was.victim} == {now.collider, now.victim}:
+            return "same"
+        return "other" if now.involves(self._agent) else "unclear"  # the crash of another agent has ended the run
 
     def _omission(self, candidate: JsonObject, faculty: str) -> Omission:
         actor, first = str(candidate["actor"]), int(candidate["first"])

@@ -262,12 +262,13 @@ def ending_of(
     assert hit is not None
     if not has_same_scenes(recording, rerun_recording, after):
         return "diverged"
-    if rerun.outcome is Outcome.COLLISION and rerun.collision is not None:
-        same = {rerun.collision.collider, rerun.collision.victim} == {hit.collider, hit.victim}
-        return "hit" if same else "other"
-    if rerun.outcome is Outcome.OFF_ROAD:
+    if rerun.outcome in (Outcome.COLLISION, Outcome.OFF_ROAD) and (now := rerun.collision) is not None:
+        if now.involves(hit.agent):
+            return "hit" if {now.collider, now.victim} == {hit.collider, hit.victim} else "other"
+        # The crash of another agent has ended the run, and says nothing about this one.
+    elif rerun.outcome is Outcome.OFF_ROAD:
         return "other"
-    if rerun.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
+    elif rerun.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
         return "unclear"
     if not _is_over(rerun_recording, hit.agent, partner(result)):
         return "unclear"

@@ -82,6 +82,10 @@ class Collision(Serializable):
     def __eq__(self, other: object) -> bool:
         return self.equals(other)
 
+    def involves(self, actor: str) -> bool:
+        """Return whether an actor collided or left the road."""
+        return actor in (self.agent, self.collider, self.victim)
+
     @property
     def other(self) -> str:
         """The collision partner of the agent; empty if the agent was alone."""

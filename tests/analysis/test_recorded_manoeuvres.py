@@ -14,7 +14,7 @@ from crashhunt.analysis import _causes, _omissions
 from crashhunt.analysis._causes import Manoeuvre, find_why, lanes_around_crash, manoeuvres_of, relevant_actors
 from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why
-from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled, Range, TrialSpec
+from crashhunt.trial import Choice, Collision, Constant, Disturbance, Outcome, Overruled, Range, TrialSpec
 from crashhunt.trial_reruns import StoppedError
 from crashhunt.world import Actor, Roster, Scene
 
@@ -271,6 +271,8 @@ COLLISION = Outcome.COLLISION, ("ego", "x"), ""
         (COLLISION, COLLISION, "same"),
         (COLLISION, (Outcome.COLLISION, ("x", "ego"), ""), "same"),
         (COLLISION, (Outcome.COLLISION, ("ego", "y"), ""), "other"),
+        (COLLISION, (Outcome.COLLISION, ("second", "y"), ""), "unclear"),  # of another agent
+        (COLLISION, (Outcome.OFF_ROAD, ("second", ""), ""), "unclear"),
         (COLLISION, (Outcome.OFF_ROAD, None, ""), "other"),
         (COLLISION, (Outcome.AGENT_ERROR, None, "KeyError"), "other"),
         *((COLLISION, (outcome, None, ""), "unclear") for outcome in _causes.INCONCLUSIVE_OUTCOMES),
@@ -283,13 +285,13 @@ def test_run_ends_in_the_same_crash_if_the_same_actors_collide_or_the_same_fails
     """Of a software fault, `causes` also compare its place; an omission has no candidate without an actor there."""
 
     def result(outcome, pair, failure):
-        hit = None if pair is None else SimpleNamespace(collider=pair[0], victim=pair[1])
+        hit = None if pair is None else Collision(pair[0], "collider", *pair)
         return SimpleNamespace(outcome=outcome, collision=hit, failure=failure)
 
     monkeypatch.setattr(_causes, "signature_of_fault", lambda result: result.failure)
     for module in (_causes, _omissions):
         search = object.__new__(module._Search)
-        search._result, search._recording = result(*crash), None
+        search._result, search._recording, search._agent = result(*crash), None, "ego"
         ended = SimpleNamespace(place=0, result=result(*run), recording=None)
         if module is _omissions:
             assert search._ending(ended.result) == ending

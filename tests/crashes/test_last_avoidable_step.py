@@ -175,6 +175,24 @@ def test_what_the_runs_do_not_say_clearly_is_not_said():
     assert "outcome is clear" in unclear(still_closing)
 
 
+def test_a_run_that_ends_in_the_crash_of_another_agent_is_no_other_crash_of_this_one():
+    elsewhere = Collision("second", "collider", "second", "third", ("overlap",))
+
+    def crash_of_another(result, scenes):
+        if result.outcome is Outcome.SURVIVED:
+            result = dataclasses.replace(result, outcome=Outcome.COLLISION, collision=elsewhere)
+        return result, scenes
+
+    world = World(change=crash_of_another)
+    assert world.escape().step == world.truth()  # the ego stands when the run ends
+
+    def too_early(result, scenes):
+        result, scenes = crash_of_another(result, scenes)
+        return result, scenes[:-18] if result.collision is elsewhere else scenes
+
+    assert "the run ends before the outcome is clear" in unclear(too_early)
+
+
 def test_danger_is_over_where_one_has_left_or_they_part():
     alone = Roster(ROSTER.actors[:1])
     gone = Roster(ROSTER.actors[1:])
