@@ -679,11 +679,15 @@ def run_episode(
     """Seed the process's random generators, run one trial from its specification, and record and measure the trial.
 
     Args:
+        spec: specification of the trial.
+        simulator: the simulator in which the trial runs.
+        make_agent: function called with agent id, simulator and arguments; it returns the agent that drives.
         box: the black box that records the trial; `BlackBox.begin` has been called.
+        oracles: the oracles, which decide whether a step is a crash.
+        crash_on: The outcomes that end the episode. Other traffic crashes and events are only recorded.
         observers: Further observers, called after the recorder.
+        reset: function that resets the simulator; None for the simulator's own `reset`.
         asking: what makes forks of the episode after its steps. Those that are observers observe the episode as well.
-
-    All other arguments are those of `Episode`.
 
     Returns:
         The result of the trial, including exceptions of agent and simulator.
