@@ -14,6 +14,7 @@ from crashhunt.base.plugins import locate
 from crashhunt.base.text import aligned, did_you_mean
 from crashhunt.crashes import Encounter
 from crashhunt.recording import describe_value, is_opaque
+from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import TRAJECTORY_SHAPE
 from crashhunt.snapshots import latest_snapshot
 from crashhunt.trial import signature_of
@@ -160,6 +161,9 @@ def _actions(channel: AgentChannel) -> dict[str, tuple[int, ...]]:
     places = list(np.ndindex(*channel.action_shape))
     named = {channel.value_name("action", place).replace(" ", ""): place for place in places}
     flat = {f"action[{number}]": place for number, place in enumerate(places)}
+    if channel.action_shape == TRAJECTORY_SHAPE:
+        columns = ACTIONS["trajectory"].names
+        named = {f"action[{row},{columns[column]}]": (row, column) for row, column in places} | named
     return dict(zip(channel.action_names, places, strict=False)) | named | flat
 
 

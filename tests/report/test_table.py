@@ -96,6 +96,16 @@ def test_names_that_a_divergence_contains_are_fields():
     assert {"action[0, 4]", "action[63, 0]", "action[throttle]", "observation[1, 0, 2]"} <= {*named}
 
 
+def test_the_values_of_a_trajectory_have_names():
+    channel = AgentChannel("ego", "<f8", (1,), "<f8", (64, 5))
+    step = StepRecord(4, actions={"ego": np.arange(320.0).reshape(64, 5)})
+    recording = SimpleNamespace(prologue=Prologue((channel,), 0.1), all_steps=[step])
+    (row,) = steps_table(recording, ["action[0, speed]", "action[63,x]", "action[1,4]", "action[5]"], "ego")
+    assert [*row.values()][2:] == [4.0, 316.0, 9.0, 5.0]
+    with pytest.raises(UsageError, match=r"there is no field 'action\[0,v\]'; .*, action, action\[0,time\], "):
+        check_fields(recording, ["action[0,v]"], "ego")
+
+
 @pytest.mark.parametrize(("shape", "said"), [((64, 5), "to (317.0, 318.0) at 320.0 m/s in 316.0 s"),
                                              ((13,), "1, 2, 3, 4, … (13 numbers)"), ((2,), None)])  # fmt: skip
 def test_wide_action_is_one_column(shape, said):
