@@ -109,7 +109,8 @@ def test_addresses_have_their_answers_and_others_an_error(made, tmp_path):
         ("/api/hunts/two/importance", "this hunt is not there"), ("/api/hunts/two/map", "this hunt is not there"),
         ("/api/hunts/two/crashes", "this hunt is not there"), ("/api/hunts/two/crashes/c", "this hunt is not there"),
         (f"{one}/crashes/x", "there is no such crash"), (f"{one}/crashes/x/log", "there is no such log"),
-        ("/api/hunts/two/crashes/c/log", "this hunt is not there"), (f"{one}/crashes/x/export", "there is no such crash"),
+        ("/api/hunts/two/crashes/c/log", "this hunt is not there"),
+        (f"{one}/crashes/x/export", "there is no such crash"),
         ("/api/hunts/two/crashes/c/export", "this hunt is not there"), ("/static/x.js", "there is no such file"),
         ("/nothing", "there is no such page"),
     ):  # fmt: skip
