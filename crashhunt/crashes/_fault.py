@@ -13,7 +13,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.crashes._bundle import snapshot_of
 from crashhunt.crashes._contact_record import SAME_WAY, ContactRecord, contact_record
 from crashhunt.trial import Outcome
-from crashhunt.world import STANDS_MPS, is_person
+from crashhunt.world import STANDS_MPS, is_person, safe_distance
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -77,11 +77,10 @@ class FaultFinding(Serializable):
 
 def safe_gap_m(speed: float, ahead: float) -> float:
     """Return the safe gap to the vehicle ahead, in m, by lemma 2 of RSS; speeds are in m/s."""
-    then = speed + _RESPONSE_S * _RSS_MAX_ACCELERATION_MPS2
-    driven = speed * _RESPONSE_S + _RSS_MAX_ACCELERATION_MPS2 * _RESPONSE_S**2 / 2
-    return float(
-        max(0.0, driven + then * then / (2 * _RSS_MIN_BRAKING_MPS2) - ahead * ahead / (2 * _RSS_MAX_BRAKING_MPS2))
-    )
+    return safe_distance(
+        speed, ahead, response_s=_RESPONSE_S, acceleration_mps2=_RSS_MAX_ACCELERATION_MPS2,
+        braking_mps2=_RSS_MIN_BRAKING_MPS2, front_braking_mps2=_RSS_MAX_BRAKING_MPS2,
+    )  # fmt: skip
 
 
 def _blaming(case: ContactRecord, actor: str, rule: str, words: str, source: str) -> FaultFinding:
