@@ -6,12 +6,8 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._anytime_interval import Bets as Bets, Interval as Interval, RateTest as RateTest
-    from ._comparison import (
-        Comparison as Comparison,
-        HuntFigures as HuntFigures,
-        compare as compare,
-        held_out_by_seed as held_out_by_seed,
-    )
+    from ._comparison import compare as compare, held_out_by_seed as held_out_by_seed
+    from ._comparison_report import Comparison as Comparison, HuntFigures as HuntFigures
     from ._gate_verdict import PairVerdict as PairVerdict, PairWatch as PairWatch
     from ._hunt_pairs import GateCase as GateCase, GateReport as GateReport, PairedHunts as PairedHunts
     from ._hunt_rate import (
