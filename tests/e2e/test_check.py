@@ -9,6 +9,7 @@ import random
 import shutil
 import sqlite3
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 from damage import (
@@ -20,15 +21,12 @@ import crashhunt
 from crashhunt.base.integrity import digest_of_data
 from crashhunt.errors import HuntDirectoryError
 
-HUNT = ("2", "8", "99", "--scenario", "toy", "--arg", "speed=4:14", "--set", "gap_m=20:30", "--seed", "4")
+HUNT = ("1", "8", "99", "--scenario", "toy", "--arg", "speed=4:14", "--set", "gap_m=20:30", "--seed", "4")
 
 
 def hunted(shell):
     shell.environment["XDG_STATE_HOME"] = str(shell.folder / "state")
-    shell.crashhunt("run", "h", *HUNT, "--keep-going", "--keep-trials")
-    shell.crashhunt("export", "h", "crash.zip")
-    shell.crashhunt("run", "small", *HUNT, "--no-snapshot")
-    shell.crashhunt("export", "small", "small.zip")
+    shell.crashhunt("run", "h", *HUNT, "--keep-going", "--keep-trials", "--keep", "2")
 
 
 @pytest.fixture
@@ -57,10 +55,11 @@ def edited(path, change, *, schema: int = 2):
 
 
 @pytest.mark.parametrize(("seed", "times"), [(5, 4), pytest.param(6, 60, marks=pytest.mark.nightly)])
-def test_damaged_archives_are_one_line(hunt, seed, times):
+def test_damaged_archives_are_one_line(tmp_path, monkeypatch, seed, times):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     generator = random.Random(seed)
-    whole = (hunt.parent / "small.zip").read_bytes()
-    bad = hunt.parent / "bad.zip"
+    whole = (Path(__file__).parent / "frozen" / "version-1" / "fault.zip").read_bytes()
+    bad = tmp_path / "bad.zip"
     for _ in range(times):
         if bad.is_dir():
             bad.rmdir()
@@ -159,7 +158,7 @@ def test_a_snapshot_that_has_more_or_other_files_is_refused(hunt, crash):
 def test_a_snapshot_that_is_damaged_is_made_again(hunt, toy):
     (snapshot,) = (hunt / "snapshots").iterdir()
     (snapshot / "code" / "crashhunt" / "episode" / "_episode.py").write_text("")
-    toy.crashhunt("run", "h", "2", "9", *HUNT[2:], "--keep-going", "--keep-trials")
+    toy.crashhunt("run", "h", "1", "9", *HUNT[2:], "--keep-going", "--keep-trials", "--keep", "2")
     assert command("check", "h")[0] == 0
 
 
@@ -187,7 +186,7 @@ def test_check_states_what_is_lost_and_saves_the_rest(hunt, crash, toy):
     )
     # The same hunt goes on there, and has in the end what it had.
     before = hunt.with_name("before")
-    toy.crashhunt("run", "saved", *HUNT, "--keep-going", "--keep-trials")
+    toy.crashhunt("run", "saved", *HUNT, "--keep-going", "--keep-trials", "--keep", "2")
     hunt.rename(before)
     columns = ("number", "outcome", "steps", "digest")
     trials = [

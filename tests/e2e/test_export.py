@@ -7,9 +7,9 @@ import shutil
 import zipfile
 
 import pytest
-from conftest import add_toy
 from hypothesis import HealthCheck, given, settings, strategies as st
 from repositories import make_repository
+from test_replay import hunted, hunted_on_sumo
 
 from crashhunt.base.integrity import digest_of_content
 from crashhunt.crashes import open_archive
@@ -26,35 +26,17 @@ class Agent:
 """
 
 
-def archived(shell, *words):
-    shell.environment["XDG_STATE_HOME"] = str(shell.folder / "state")
-    (shell.folder / "mine.py").write_text(AGENT)
-    shell.crashhunt("run", "h", "1", "1", "60", "--agent", "mine:Agent", *words)
-    shell.crashhunt("export", "h", "crash ä.zip")
-    shutil.rmtree(shell.folder / "h")
-    (shell.folder / "mine.py").unlink()
-
-
-def archived_toy(shell):
-    archived(add_toy(shell), "--scenario", "toy")
-
-
-def archived_sumo(shell):
-    archived(shell, "--set", "vehicles=10")
-
-
 @pytest.fixture
 def exported(shell, made_once):
-    """A crash of an own agent as ``crash.zip``, the hunt and the agent gone."""
-    shell.environment["XDG_STATE_HOME"] = str(shell.folder / "state")
-    return made_once(archived_toy, shell)
+    """A crash of an own agent as ``crash ä.zip``, the hunt and the agent gone."""
+    return without_code(made_once(hunted, shell))
 
 
-@pytest.fixture
-def exported_on_sumo(shell, made_once):
-    """The same on SUMO."""
-    shell.environment["XDG_STATE_HOME"] = str(shell.folder / "state")
-    return made_once(archived_sumo, shell)
+def without_code(shell):
+    shell.crashhunt("export", "h", "crash ä.zip")
+    shutil.rmtree(shell.folder / "h")
+    shutil.rmtree(shell.folder / "my_pkg")
+    return shell
 
 
 def test_it_replays_here_and_elsewhere_if_trusted(exported):
@@ -63,11 +45,11 @@ def test_it_replays_here_and_elsewhere_if_trusted(exported):
     for words in ((), ("--code", "current")):
         refused = exported.crashhunt("replay", "crash ä.zip", *words, expect=2)
         assert "--trust" in refused.err
-        assert "mine:Agent" in refused.err
+        assert "my_pkg.agents:Planner" in refused.err
         assert len(refused.err.strip().splitlines()) == 1
     assert exported.crashhunt("replay", "crash ä.zip", "--trust", "--json").json["verdict"] == "reproduced"
     assert exported.crashhunt("replay", "crash ä.zip", "--from-log", "--json").json["code"] == "log"
-    assert "AssertionError" in exported.crashhunt("show", "crash ä.zip").out
+    assert "out of ideas" in exported.crashhunt("show", "crash ä.zip").out
 
 
 def rewritten(source, target, change):
@@ -83,7 +65,7 @@ def rewritten(source, target, change):
 def test_a_forged_signature_is_a_strangers(exported):
     def forge(name, data):
         if name == "hunt.toml":
-            data = data.replace(b"mine:Agent", b"evil:Agent")
+            data = data.replace(b"my_pkg.agents:Planner", b"evil:Agent")
             digests["hunt.toml"] = {"size": len(data), "blake2b": digest_of_content(data)}
         if name == "archive.json":
             index = json.loads(data)
@@ -119,38 +101,33 @@ def test_any_damage_is_refused_or_harmless(small_archive, tmp_path, data):
         pass
 
 
-@pytest.mark.parametrize(
-    ("file", "before", "after", "says"),
-    [
-        ("scenario/scenario.toml", 'simulator = "sumo"', 'simulator = "os:system"', "os:system"),
-        ("hunt.toml", '"overlap"', '"subprocess:run"', "subprocess:run"),
-        ("scenario/scenario.toml", "[sumo.options]", '[sumo.options]\nsummary-output = "evil"', "summary-output"),
-        ("scenario/traffic.rou.xml", "<routes>", '<routes><event commandPosix="evil"/>', "<event>"),
-    ],
-)  # fmt: skip
-def test_a_strangers_recorded_actions_do_nothing_but_simulate(exported_on_sumo, tmp_path, file, before, after, says):
-    import hashlib
+SIDE_EFFECTS = [
+    ("scenario/scenario.toml", 'simulator = "sumo"', 'simulator = "os:system"', "os:system"),
+    ("hunt.toml", '"overlap"', '"subprocess:run"', "subprocess:run"),
+    ("scenario/scenario.toml", "[sumo.options]", '[sumo.options]\nsummary-output = "evil"', "summary-output"),
+    ("scenario/traffic.rou.xml", "<routes>", '<routes><event commandPosix="evil"/>', "<event>"),
+]
 
-    changed = []
 
-    def change(name, data):
-        if name.endswith(file):
-            assert before in data.decode()
-            data = data.decode().replace(before, after).encode()
-            changed.append((name, data))
-        if name == "archive.json":
-            index = json.loads(data)
-            for path, content in changed:
-                index["files"][path] = {
-                    "size": len(content), "blake2b": hashlib.blake2b(content, digest_size=16).hexdigest()
-                }  # fmt: skip
-            data = json.dumps(index)
-        return [(name, data)]
+def test_a_strangers_recorded_actions_do_nothing_but_simulate(shell, made_once):
+    source = without_code(made_once(hunted_on_sumo, shell)).folder / "crash ä.zip"
+    for file, before, after, says in SIDE_EFFECTS:
+        changed = {}
 
-    bad = rewritten(exported_on_sumo.folder / "crash ä.zip", tmp_path / "bad.zip", change)
-    refused = exported_on_sumo.crashhunt("replay", str(bad), "--from-log", "--force", expect=2)
-    assert says in refused.err
-    assert "not made on this machine" in refused.err
+        def change(name, data, file=file, before=before, after=after, changed=changed):
+            if name.endswith(file):
+                assert before in data.decode()
+                data = data.decode().replace(before, after).encode()
+                changed[name] = {"size": len(data), "blake2b": digest_of_content(data)}
+            if name == "archive.json":
+                index = json.loads(data)
+                data = json.dumps({**index, "files": {**index["files"], **changed}})
+            return [(name, data)]
+
+        rewritten(source, shell.folder / "bad.zip", change)
+        refused = shell.crashhunt("replay", "bad.zip", "--from-log", "--force", expect=2)
+        assert says in refused.err
+        assert "not made on this machine" in refused.err
 
 
 PLANNER = """
@@ -174,7 +151,7 @@ def test_file_that_a_module_reads_when_it_is_imported_is_named_once(toy):
     (toy.folder / "planner.py").write_text(f"LIMIT = float(open('weights.npz').read())\n{AGENT}")
     (toy.folder / ".gitignore").write_text("*.npz\nh/\n")
     make_repository(toy.folder)
-    done = toy.crashhunt("run", "h", "2", "4", "60", "--scenario", "toy", "--agent", "planner:Agent", "--keep-going")
+    done = toy.crashhunt("run", "h", "2", "2", "9", "--scenario", "toy", "--agent", "planner:Agent")
     assert done.out.count("weights.npz is ignored by git, so the snapshot lacks it") == 1
 
 

@@ -33,12 +33,8 @@ class Twin(Calm):
     pass
 
 
-class Shy(Calm):
-    def reset(self, seed):
-        if seed % 2:
-            raise ValueError("no weights")
 """
-TOY = ("--scenario", "toy", "--set", "gap_m=20:30", "--max-steps", "99", "--parallel", "2")
+TOY = ("--scenario", "toy", "--set", "gap_m=20:30", "--max-steps", "99", "--parallel", "1")
 CALM, WILD, TWIN = "drivers:Calm", "drivers:Wild", "drivers:Twin"
 SEED = ("--seed", "4")
 
@@ -63,23 +59,23 @@ def specs(folder):
 def test_worse_agent_fails_the_gate_and_the_hunts_stay_for_compare(drivers):
     report = ("--markdown", "m.md", "--junit", "j.xml", "--summary", "s.md", "--annotate")
     # Trials of BASE end without a crash, many times as fast as those of HEAD: more of them than pairs are no use.
-    most = ("--most", "12")
+    most = ("--most", "7", "--confidence", "80")
     done = drivers.crashhunt("gate", CALM, WILD, *TOY, *SEED, *most, "--keep", "kept", "--json", *report, expect=1)
     found = done.json
-    assert (found["verdict"], found["pairs"], found["only_base"], found["only_head"]) == ("worse", 8, 0, 8)
-    assert found["evidence"] >= 20
+    assert (found["verdict"], found["pairs"], found["only_base"], found["only_head"]) == ("worse", 5, 0, 5)
+    assert found["evidence"] >= 5
     assert 0 < found["difference"]["low"] < 1 == found["difference"]["high"]
     assert found["base"]["certain"]["low"] == 0 < found["head"]["certain"]["low"]  # BASE has as many trials as fit
     assert (found["corpus"], found["dir"], found["seed"], found["interrupted"]) == (None, "kept", 4, False)
     assert done.err.splitlines()[-1].startswith("::error title=crashhunt gate%3A worse")
-    assert "| 8 | 0 | 8 | 0 |" in (drivers.folder / "m.md").read_text()
+    assert "| 5 | 0 | 5 | 0 |" in (drivers.folder / "m.md").read_text()
     assert "❌ crashhunt gate: worse" in (drivers.folder / "s.md").read_text()
     suite = ET.parse(drivers.folder / "j.xml").find("testsuite")
     assert (suite.get("tests"), suite.get("failures"), suite.get("errors")) == ("1", "1", "0")
     assert suite.find("testcase/failure").get("type") == "worse"
     (pair,) = drivers.crashhunt("compare", "kept", "--json").json["pairs"]
-    assert (pair["answer"], pair["only_first"]) == ("first", 0)
-    assert pair["only_second"] >= 8
+    assert pair["only_first"] == 0
+    assert pair["only_second"] >= 5
     trials = len(specs(drivers.folder / "kept" / "head"))
     again = gate(drivers, CALM, WILD, *SEED, *most, "--keep", "kept", expect=1)
     assert {**again, "base": 0, "head": 0} == {**found, "base": 0, "head": 0}
@@ -225,7 +221,7 @@ def begun(shell, *words):
     slow = ("--set", "step_wall_s=0.002", "--margin", "0", "--keep", "kept", *SEED)
     process = shell.begin("gate", CALM, TWIN, *TOY, *slow, "--json", *words)
     sides = [shell.folder / "kept" / side for side in ("base", "head")]
-    wait_for(lambda: min(map(trials_of, sides)) >= 3, every_s=0.05, process=process)
+    wait_for(lambda: min(map(trials_of, sides)) >= 1, every_s=0.05, process=process)
     return process
 
 
@@ -235,7 +231,7 @@ def test_interrupted_gate_reports_its_pairs_and_resumes(drivers):
     out, err = process.communicate(300)
     found = json.loads(out)
     assert (process.returncode, found["verdict"], found["interrupted"]) == (130, "undecided", True)
-    assert found["pairs"] >= 3
+    assert found["pairs"] >= 1
     assert found["difference"]["low"] < 0 < found["difference"]["high"]
     assert "undecided" in err
     before = found["pairs"]
