@@ -49,7 +49,7 @@ HUNT = ("60", "--scenario", "toy", "--seed", "4", "--arg", "speed=8:14", "--set"
 
 def hunted(shell):
     """Hunt 24 trials of which some crash, in ``h``; of each type, one crash is confirmed."""
-    shell.crashhunt("run", "h", "2", "24", *HUNT, "--keep-going", "--keep", "1")
+    shell.crashhunt("run", "h", "1", "24", *HUNT, "--keep-going", "--keep", "1")
 
 
 @pytest.fixture
@@ -129,8 +129,8 @@ def until(toy, folder, workers, trials, rate, *words, expect):
 
 
 def test_hunt_that_cannot_decide_ends_at_most_and_exits_with_3(toy):
-    found = until(toy, "h", "2", "0", "0.3/trial", *FEW, "--most", "6", expect=3)
-    assert (found["stopped_because"], found["trials_run"], found["rate"]["verdict"]) == ("all_trials", 6, "undecided")
+    found = until(toy, "h", "1", "0", "0.3/trial", *FEW, "--most", "3", expect=3)
+    assert (found["stopped_because"], found["trials_run"], found["rate"]["verdict"]) == ("all_trials", 3, "undecided")
 
 
 @pytest.mark.nightly  # half a minute: every crash is confirmed
@@ -163,7 +163,7 @@ def _has_trials(folder):
 
 def test_hunt_with_too_many_invalid_trials_ends_with_a_line(toy):
     words = ("--arg", "speed=2", "--set", "fail_reset=true|false", "--until-rate", "1e-4/trial", "--seed", "3")
-    done = toy.crashhunt("run", "h", "2", "0", "20", "--scenario", "toy", *words, expect=3)
+    done = toy.crashhunt("run", "h", "1", "0", "20", "--scenario", "toy", *words, expect=3)
     why = "too many trials are invalid, so more of them do not help"
     assert f"undecided about the bar of 0.0001 per trial: {why}" in done.out
     assert "more than 5 %: the rest is other traffic than described" in done.out

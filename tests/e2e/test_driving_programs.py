@@ -28,7 +28,7 @@ def rows_of(shell, hunt):
 
 def test_a_hunt_varies_what_a_program_declares_and_its_crash_replays_where_the_program_is_gone(toy):
     planner = write_program(toy.folder)
-    done = toy.crashhunt("run", "h", "2", "6", "60", "--agent", "exec:./planner blind", *RUN, *NEAR, "--json")
+    done = toy.crashhunt("run", "h", "1", "6", "60", "--agent", "exec:./planner blind", *RUN, *NEAR, "--json")
     (crash,) = done.json["crashes"]
     assert crash["outcome"] == "collision"
     assert crash["confirmed"]

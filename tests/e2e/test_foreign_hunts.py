@@ -109,10 +109,8 @@ def test_commands_that_only_read_still_do(theirs):
         ("crashes", "h"),
         ("check", "h"),
         ("export", "h", "again.zip"),
-        ("export", "their.zip", "again.zip"),
         ("corpus", "list", "corpus"),
         ("replay", "h", "--from-log"),
-        ("replay", "their.zip", "--from-log"),
         ("trust", "h"),
     ):
         theirs.crashhunt(*words)
@@ -126,8 +124,6 @@ def test_python_refuses_as_well(theirs):
         crashhunt.load("h").agent(0)
     with pytest.raises(UntrustedError, match="theirs:Agent"):
         run_cases([path.parent for path in Path("corpus").glob("*/crashhunt-case.toml")])
-    assert not ran(theirs)
-    assert crashhunt.replay("h", code="log").verdict == "reproduced"
     assert not ran(theirs)
     assert crashhunt.replay("h", trust=True).verdict == "reproduced"
     assert ran(theirs)

@@ -53,50 +53,31 @@ def test_a_plugin_that_ends_the_process_that_imports_it_is_an_error(toy, option,
 
 
 PLUGINS = """
-import os
+import sqlite3, sys
 from crashhunt.agents import KeepLaneWithSpeed as Agent
-from crashhunt.disturbances import brake as _brake
 
 with open("imports", "a") as file:
-    file.write(f"{os.getpid()}\\n")
+    file.write("once ")
+print("imported")
+sys.stdout = sqlite3.connect = None
 
 class Oracle:
     name = "near"
     outcomes = {"too_near": "traffic crash"}
 
     def check(self, scene, agents):
-        return []
-
-class Brake:
-    what = "brake"
-
-    def draw(self, rng):
-        with open("draws", "a") as file:
-            file.write(f"{os.getpid()}\\n")
-        return _brake().draw(rng)
-
-    def log_likelihood(self, drawn):
-        return _brake().log_likelihood(drawn)
-"""
+        return []"""
 
 
-def test_a_foreign_module_is_imported_once_to_describe_it_and_once_for_trials(toy):
+def test_a_foreign_module_is_imported_once_to_describe_it_and_once_for_trials_and_harms_no_command(toy):
     (toy.folder / "plugins.py").write_text(PLUGINS)
     words = ["--scenario", "toy", "--agent", "plugins:Agent", "--arg", "speed=1", "--oracle", "plugins:Oracle"]
-    toy.crashhunt("run", "h", "1", "2", "5", *words)
-    assert len((toy.folder / "imports").read_text().split()) == 2
+    done = toy.crashhunt("run", "h", "1", "2", "5", *words, "--snapshot-limit", "99")
+    assert (toy.folder / "imports").read_text().split() == ["once", "once"]
     assert '"too_near"' in (toy.folder / "h" / "hunt.toml").read_text()
-
-
-def test_a_module_of_an_agent_changes_nothing_in_the_process_of_the_command(toy):
-    harm = "import sqlite3, sys\nprint('imported')\nsys.stdout = None\nsqlite3.connect = None\n"
-    (toy.folder / "harmful.py").write_text(harm + AGENT)
-    words = ["--scenario", "toy", "--agent", "harmful:Agent", "--arg", "speed=1", "--snapshot-limit", "99"]
-    done = toy.crashhunt("run", "h", "1", "2", "5", *words)
     assert "No crash was found." in done.out
     assert "imported" not in done.out + done.err
-    code = [path.name for path in (toy.folder / "h" / "snapshots").glob("*/code/*")]
-    assert "harmful.py" in code
+    assert [*(toy.folder / "h" / "snapshots").glob("*/code/plugins.py")]
 
 
 # The current folder may be a stranger's. Each name there that Python or a package could import writes down that it ran.

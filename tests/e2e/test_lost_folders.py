@@ -31,7 +31,7 @@ class Agent:
 
 
 def hunt(toy, expect):
-    words = "run ../hunt 1 6 5 --scenario ../toy --agent agent:Agent --keep-going --set gap_m=60 --json --seed 1"
+    words = "run ../hunt 1 2 5 --scenario ../toy --agent agent:Agent --keep-going --set gap_m=60 --json --seed 1"
     done = toy.crashhunt(*words.split(), expect=expect)
     return json.loads(done.out)
 
@@ -59,7 +59,7 @@ def test_trials_without_their_current_folder_are_no_results_and_run_again(toy, h
     state = hunt_state(home.parent / "hunt")
     assert (state.state, state.errors, state.detail.partition(";")[0]) == ("error", 0, f"{home}: {error['message']}")
     write_home(home)
-    assert hunt(toy, 0)["outcomes"] == {"survived": 6}
+    assert hunt(toy, 0)["outcomes"] == {"survived": 2}
 
 
 def test_hunt_whose_directory_was_deleted_fails(toy, home):
@@ -69,4 +69,4 @@ def test_hunt_whose_directory_was_deleted_fails(toy, home):
     assert "deleted" in error["message"]
     shutil.rmtree(directory, ignore_errors=True)
     write_home(home)
-    assert hunt(toy, 0)["outcomes"] == {"survived": 6}
+    assert hunt(toy, 0)["outcomes"] == {"survived": 2}

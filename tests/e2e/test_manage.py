@@ -151,7 +151,7 @@ def test_the_shortest_few_of_a_kind_are_kept(toy, made_once):
     assert len(crashes) == len(list(folder.iterdir())) > 2
     shutil.copytree(toy.folder / "h", toy.folder / "k")
     folder = toy.folder / "k" / "crashes"
-    told = toy.crashhunt("run", "k", "2", "12", "99", "--scenario", "toy", "--seed", "5", *KEEP[-1:], "--keep", "2")
+    told = toy.crashhunt("run", "k", "1", "12", "99", "--scenario", "toy", "--seed", "5", *KEEP[-1:], "--keep", "2")
     assert sorted(path.name for path in folder.iterdir()) == sorted(
         f"{row['number']:06d}-collision" for row in crashes[:2]
     )
@@ -160,7 +160,7 @@ def test_the_shortest_few_of_a_kind_are_kept(toy, made_once):
     (group,) = toy.crashhunt("crashes", "k", "--json").json["groups"]
     assert (group["count"], len(group["members"])) == (len(crashes), 2)
     assert "2 crashes are intact" in toy.crashhunt("check", "k").out
-    told = toy.crashhunt("run", "k", "2", "12", "99", "--scenario", "toy", "--seed", "5", *KEEP[-1:], "--keep", "1")
+    told = toy.crashhunt("run", "k", "1", "12", "99", "--scenario", "toy", "--seed", "5", *KEEP[-1:], "--keep", "1")
     assert len(list(folder.iterdir())) == 1
     assert f"{len(crashes)} crashes of 1 type" in told.out
     shutil.rmtree(next(folder.iterdir()))  # one that is missing is not one that was given up

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-WORDS = ("run", "h", "2", "8", "30", "--scenario", "toy", "--seed", "4", "--keep-going", "--arg", "speed=6:16")
+WORDS = ("run", "h", "1", "8", "30", "--scenario", "toy", "--seed", "4", "--keep-going", "--arg", "speed=6:16")
 
 
 def with_near_misses(toy):

@@ -49,7 +49,7 @@ AT_NIGHT = (
 def test_a_software_fault_is_found_saved_and_replayed(toy, agent, outcome, kind, message):
     where = QUIET if agent in ON_SUMO else TOY
     limit = ("--timeout", "2" if agent in ON_SUMO else "1") if outcome == "hang" else ()
-    words = ("run", "h", "2", "8", "200", "--agent", f"faulty:{agent}", *where, *limit, "--json")
+    words = ("run", "h", "1", "8", "200", "--agent", f"faulty:{agent}", *where, *limit, "--json")
     report = toy.crashhunt(*words).json
     assert report["stopped_because"] == "crash"
     (found,) = report["crashes"]
@@ -95,7 +95,7 @@ def test_an_agent_that_goes_elsewhere_takes_no_one_along(toy):
 
 def test_an_agent_that_does_not_start_is_refused_at_once(toy):
     """It once was so many trials that could not be set up."""
-    done = toy.crashhunt("run", "h", "2", "500", "100", "--agent", "faulty:FailsToStart", *TOY, "--json", expect=2)
+    done = toy.crashhunt("run", "h", "1", "500", "100", "--agent", "faulty:FailsToStart", *TOY, "--json", expect=2)
     assert done.json["error"]["message"] == "faulty:FailsToStart does not start: RuntimeError: no weights"
     assert done.json["error"]["where"] == "faulty.py:93"
     (hunt,) = toy.crashhunt("status", "h", "--json").json["hunts"]
@@ -104,7 +104,7 @@ def test_an_agent_that_does_not_start_is_refused_at_once(toy):
 
 
 def test_process_that_dies_in_the_constructor_of_an_agent_is_no_crash(toy):
-    done = toy.crashhunt("run", "h", "2", "500", "100", "--agent", "faulty:DiesAtStart", *TOY, "--json", expect=2)
+    done = toy.crashhunt("run", "h", "1", "500", "100", "--agent", "faulty:DiesAtStart", *TOY, "--json", expect=2)
     message = done.json["error"]["message"]
     assert message.startswith("faulty:DiesAtStart does not start: ")
     assert "exited with 7" in message
@@ -112,10 +112,10 @@ def test_process_that_dies_in_the_constructor_of_an_agent_is_no_crash(toy):
 
 
 def test_crash_on_decides_what_counts(toy):
-    words = ("run", "h", "2", "4", "60", "--agent", "faulty:Raises", *TOY, "--json")
+    words = ("run", "h", "1", "2", "60", "--agent", "faulty:Raises", *TOY, "--json")
     report = toy.crashhunt(*words, "--crash-on", "collision,hang").json
     assert report["stopped_because"] == "all_trials"
-    assert report["outcomes"] == {"agent_error": 4}
+    assert report["outcomes"] == {"agent_error": 2}
     assert report["crashes"] == []
-    assert sorted(path.name for path in (toy.folder / "h" / "trials").iterdir()) == [f"{n:06d}" for n in range(4)]
-    assert "no plan" in (toy.folder / "h" / "trials" / "000002" / "error.log").read_text()
+    assert sorted(path.name for path in (toy.folder / "h" / "trials").iterdir()) == [f"{n:06d}" for n in range(2)]
+    assert "no plan" in (toy.folder / "h" / "trials" / "000001" / "error.log").read_text()

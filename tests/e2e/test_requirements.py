@@ -13,7 +13,7 @@ CALM = "calm=always (acceleration > -6)"
 
 def hunt(shell, *words, name="h", trials="12", expect=0):
     options = ["--scenario", "toy", "--seed", "4", "--json"]
-    return shell.crashhunt("run", name, "2", trials, "60", *options, *words, expect=expect)
+    return shell.crashhunt("run", name, "1", trials, "60", *options, *words, expect=expect)
 
 
 def collect(shell):
