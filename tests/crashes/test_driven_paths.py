@@ -104,7 +104,7 @@ def in_every_view(case):
 
 
 @pytest.mark.parametrize("name", mostly_nightly(PATHS, NARROWEST))
-@pytest.mark.parametrize("step_s", [0.1, 0.5])
+@pytest.mark.parametrize("step_s", [pytest.param(0.1, marks=pytest.mark.nightly), 0.5])
 def test_contact_in_one_lane_of_a_bend_is_a_rear_end(name, step_s):
     path = PATHS[name]
     way = Way(path)

@@ -91,9 +91,9 @@ def case_of(data):
     )
 
 
-@pytest.mark.long
-def test_what_is_said_is_what_a_person_states_or_nothing():
-    said = [(data, fault_in(case_of(data))) for data in cases()]
+@pytest.mark.parametrize("each", [2, pytest.param(1, marks=pytest.mark.nightly)])
+def test_what_is_said_is_what_a_person_states_or_nothing(each):
+    said = [(data, fault_in(case_of(data))) for data in cases()[each - 1 :: each]]
     wrong = [
         (data["name"], data["label"], fault.to_json())
         for data, fault in said
@@ -104,13 +104,13 @@ def test_what_is_said_is_what_a_person_states_or_nothing():
     known = [
         (data, fault) for data, fault in said if data["label"] != "nobody can tell" and data["manner"] != "pedestrian"
     ]
-    assert len(said) >= 150
+    assert len(said) >= 150 / each
     assert sum(fault.verdict == data["label"] for data, fault in known) >= 0.8 * len(known)
     rules = Counter(finding.rule for _, fault in said for finding in fault.findings)
-    assert min(rules[name] for name in ("rear end", "lane change", "right of way")) >= 8
+    assert min(rules[name] for name in ("rear end", "lane change", "right of way")) >= 8 / each
     assert min(rules[name] for name in ("steps out", "red light", "standing")) >= 1
     manners = Counter(data["manner"] for data, _ in said)
-    assert min(manners.values()) >= 5
+    assert min(manners.values()) >= 5 // each
     assert manners.keys() == {
         "rear end", "side swipe", "crossing from the left", "crossing from the right", "head-on", "pedestrian",
     }  # fmt: skip

@@ -179,6 +179,6 @@ def test_a_hunt_that_continues_comes_back_to_arguments_that_lead_to_several_kind
             sampler.tell(TrialResult(spec_of(number, proposal), outcome, danger=danger, collision=hit))
         return kinds
 
-    hunts = [found(seed) for seed in range(2)]
-    assert sum(len(set(kinds)) for kinds in hunts) >= 6
-    assert max(map(len, hunts)) < 60
+    kinds = found(0)
+    assert len(set(kinds)) >= 3
+    assert len(kinds) < 60

@@ -97,7 +97,7 @@ def origins(asked):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_fifth_trial_is_the_random_one_of_that_number(kind):
-    asked, _ = hunt(kind(UNIT, hunt=HuntFacts(3)), corner, 300, keep_going=True)
+    asked, _ = hunt(kind(UNIT, hunt=HuntFacts(3)), corner, 100, keep_going=True)
     plain = RandomSampler(UNIT)
     for number, proposal in enumerate(asked):
         assert (proposal.origin == "random") == (number % 5 == 0)
@@ -156,10 +156,10 @@ def test_a_hunt_that_continues_looks_for_other_crashes():
         near = min(np.linalg.norm(x - 0.2), np.linalg.norm(x - 0.8))
         return 1.0 if near < 0.08 else 0.95 - float(near) / 2
 
-    asked, results = hunt(GuidedSampler(UNIT), two, 500, keep_going=True)
+    asked, results = hunt(GuidedSampler(UNIT), two, 300, keep_going=True)
     found = [values(one).mean() for one, result in zip(asked, results, strict=True) if result.danger == 1.0]
     assert min(found) < 0.5 < max(found)
-    assert len(found) < 125
+    assert len(found) < 75
 
 
 def test_only_what_the_hunt_is_after_is_a_crash():
