@@ -39,7 +39,7 @@ def hunted(toy):
 
 def test_what_a_failure_hangs_on_is_run_and_reported(toy, made_once):
     made_once(hunted, toy)
-    (judged,) = toy.crashhunt("judge", "h", "--why", "9", "--parallel", "1", "--json").json["judged"]
+    (judged,) = toy.crashhunt("judge", "h", "--why", "5", "--parallel", "1", "--json").json["judged"]
     assert (judged["runs"], judged["verdict"], judged["avoidable"]) == (0, "unknown", None)
     assert judged["preventable_by"] == dict.fromkeys(MODELS)  # no model of a driver has an answer
     factors = {(factor["kind"], factor["name"]): factor for factor in judged["why"]["factors"]}
