@@ -48,6 +48,7 @@ from crashhunt.report._judgement_words import (
 )
 from crashhunt.report._live_screen import draw_signals, format_inputs, input_signals
 from crashhunt.report._step_table import NEAREST, TableCell, describe_action, is_wide, stacked, steps_table
+from crashhunt.scenario import ACTIONS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -421,7 +422,19 @@ class Story:
         """Return the numbers of an action as text; the name of a discrete action, where it is known."""
         if len(action) == 1 and action[0] in range(len(self.action_words)):
             return [self.action_words[int(action[0])]]
-        return [format_number(value) for value in action]
+        names = dict(enumerate(self._names()))  # of a table, only of the first row
+        return [_number_of_action(names.get(number, ""), value) for number, value in enumerate(action)]
+
+
+_NO_ACTION = 5e-4  # in m, m/s, m/s², rad or as a share: less is the rest of a calculation
+_UNITS = {component.name: component.unit for form in ACTIONS.values() for component in form.components}
+
+
+def _number_of_action(name: str, value: float) -> str:
+    """Return a number of an action as text; a position has one decimal."""
+    if name in _UNITS and abs(value) < _NO_ACTION:
+        return "0"
+    return f"{value:.1f}" if _UNITS.get(name) == "m" else format_number(value)
 
 
 _GAP_M = 0.05  # shown as 0.1; a smaller one needs any deceleration, up to millions of m/s²
@@ -434,7 +447,8 @@ def _cells(moment: Moment) -> list[str]:
         f"{moment.gap_m:.1f}",
         f"{moment.closing_speed:+.1f}",
         f"{time_s:.1f}" if math.isfinite(time_s) else "-",
-        f"{moment.required_deceleration:.1f}" if moment.gap_m >= _GAP_M else "-",
+        # Without a time to collision, the calculated deceleration is 0, also before a bend of the road.
+        f"{moment.required_deceleration:.1f}" if moment.gap_m >= _GAP_M and math.isfinite(time_s) else "-",
     ]
 
 

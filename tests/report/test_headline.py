@@ -21,7 +21,7 @@ from crashhunt.crashes import (
     ReferenceRun,
 )
 from crashhunt.crashes._contact_record import record_in
-from crashhunt.report._crash_text import _cells
+from crashhunt.report._crash_text import _cells, _number_of_action
 from crashhunt.report._headline import describe_contact, last_avoidable, verdict_of
 from crashhunt.report._judgement_words import about_drivers, about_reference
 from crashhunt.trial import Collision, Escape
@@ -303,6 +303,19 @@ def test_needed_braking_is_shown_while_a_gap_is(gap_m, shown):
         other_speed=3.0, gap_m=gap_m, closing_speed=2.5, time_to_collision_s=0.0, required_deceleration=52.1
     )
     assert _cells(moment)[-1] == shown
+    moment.time_to_collision_s, moment.required_deceleration = math.inf, 0.0  # before a bend, for example
+    assert _cells(moment)[-2:] == ["-", "-"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "shown"),
+    [
+        ("x", 100345.67, "100345.7"), ("acceleration", -1.2e-8, "0"), ("acceleration", -1.25, "-1.25"),
+        ("target_speed", 15.0, "15"), ("torque", 1.2e-8, "1.2e-8"),
+    ],
+)  # fmt: skip
+def test_numbers_of_an_action_are_shown_as_precisely_as_they_matter(name, value, shown):
+    assert _number_of_action(name, value) == shown
 
 
 @pytest.mark.parametrize(
