@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple, Protocol, cast
 
 import numpy as np
@@ -15,6 +16,7 @@ from crashhunt.base.text import did_you_mean, listed
 from crashhunt.simulators import (
     HasMap,
     NamesObservations,
+    ObservesParts,
     ReportsEvents,
     ReportsNearestAhead,
     ReportsSpeedLimit,
@@ -159,7 +161,7 @@ class TrialSignals:
         }
 
     def meaning(self, name: str) -> str:
-        """Return the meaning of a signal of `known`."""
+        """Return the meaning of a signal of the first agent."""
         element = _OBSERVATION.fullmatch(name)
         if name in SIGNALS:
             return SIGNALS[name].meaning
@@ -172,6 +174,13 @@ class TrialSignals:
     def _column(self, number: int) -> str:
         """Return the meaning of an element of the observation."""
         simulator = self._episode.simulator
+        layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
+        if layout := layouts.get(self._episode.names[0]):
+            part, begin = max((one for one in layout.begins.items() if one[1] <= number), key=itemgetter(1))
+            *rows, last = np.unravel_index(number - begin, layout.shapes[part])
+            column = [*layout.columns[part], *map(str, range(last + 1))][last]
+            row = f" in row {', '.join(map(str, rows))}" if rows else ""
+            return f"{column}{row} of the part {part}"
         columns = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()
         if not columns:
             return "element of the observation"

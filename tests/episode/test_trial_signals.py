@@ -85,9 +85,9 @@ def ramp(*requirements, tmp_path, **options):
     return finish(episode_of(GymSimulator(scenario, tmp_path), *requirements, **options))
 
 
-def toy(tmp_path, agents=("ego",)):
+def toy(tmp_path, agents=("ego",), **setup):
     return ToySimulator(
-        Scenario(simulator="toy", agents=dict.fromkeys(agents, AgentSetup()), step_length_s=STEP_S), tmp_path
+        Scenario(simulator="toy", agents=dict.fromkeys(agents, AgentSetup(**setup)), step_length_s=STEP_S), tmp_path
     )
 
 
@@ -250,6 +250,15 @@ def test_signals_are_listed_with_their_units(tmp_path):
     assert {"reward", "observation[0]"} <= known.keys()
     assert signals.meaning("observation[8]") == "x in row 1 of the observation"
     assert all(signals.meaning(name) for name in known)
+
+
+def test_elements_of_an_observation_in_parts_are_named_by_part(tmp_path):
+    episode = episode_of(toy(tmp_path, observation=("ego", "actors:rows=2")), agent=lambda: Scripted([10.0]))
+    episode.start()
+    layout, signals = episode.simulator.observation_layouts["ego"], TrialSignals(episode)
+    actors, speed = layout.columns["actors"], layout.columns["ego"]["speed"]
+    assert signals.meaning(f"observation[{len(actors) + actors['ahead']}]") == "ahead in row 1 of the part actors"
+    assert signals.meaning(f"observation[{2 * len(actors) + speed}]") == "speed of the part ego"
 
 
 class Surrounded(ToySimulator):
