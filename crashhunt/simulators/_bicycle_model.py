@@ -11,6 +11,7 @@ the distance driven, v t + a t² / 2 up to a standstill, so the pose after the s
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 
 from crashhunt.scenario import ACTIONS
@@ -85,8 +86,9 @@ class BicycleModel:
             distance = (state.speed + a * step_s / 2) * step_s
         slip = math.atan(math.tan(delta) / 2)
         turned = distance * math.cos(slip) * math.tan(delta) / self.wheelbase
-        half = turned / 2  # which is 0 for the smallest number as well
-        chord = distance if half == 0.0 else distance * math.sin(half) / half
+        half = turned / 2
+        # Of numbers below the smallest normal one, products keep few digits.
+        chord = distance if abs(half) < sys.float_info.min else distance * math.sin(half) / half
         course = state.heading + slip + half
         return MotionState(
             x=state.x + chord * math.cos(course), y=state.y + chord * math.sin(course),

@@ -31,6 +31,7 @@ def integrated(state, acceleration, steering, seconds, parts=20_000):
     steering=st.floats(-MAX_STEERING_RAD, MAX_STEERING_RAD), step_s=st.sampled_from([0.05, 0.1, 1.0]),
 )  # fmt: skip
 @example(speed=15.0, heading=0.0, acceleration=0.0, steering=5e-324, step_s=0.1)  # half of it is 0
+@example(speed=5.5, heading=0.0, acceleration=0.0, steering=5e-324, step_s=1.0)  # and of this turn, it is not
 def test_step_equals_a_fine_integration_of_the_equations(speed, heading, acceleration, steering, step_s):
     state = MotionState(x=4.0, y=-7.0, heading=heading, speed=speed, acceleration=acceleration, steering=steering)
     found = MODEL.step(state, acceleration, steering, step_s)
