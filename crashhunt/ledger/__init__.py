@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._reader import (
+    from ._facts import (
         CodeVersionsData as CodeVersionsData,
         Facts as Facts,
         HuntOwner as HuntOwner,
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
         Noted as Noted,
         RateBounds as RateBounds,
         RunningRate as RunningRate,
-        Turn as Turn,
         UntilRate as UntilRate,
     )
+    from ._reader import Turn as Turn
     from ._schema import Row as Row, damaged as damaged, leave_untouched as leave_untouched
     from ._writer import Ledger as Ledger, has_begun as has_begun
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Unpack
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.ledger._reader import Facts, LedgerReader, Noted, Turn as Turn
+from crashhunt.ledger._reader import LedgerReader, Turn as Turn
 from crashhunt.ledger._schema import (
     COLUMNS,
     SEAL,
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from crashhunt.ledger._facts import Facts, Noted
     from crashhunt.trial import TrialResult
 
 
