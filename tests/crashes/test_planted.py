@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from conftest import keeps_going
 
 from crashhunt.crashes import list_bundles
 
@@ -65,8 +66,8 @@ def test_each_defect_is_a_kind(shell):
     assert "log.mcap" in done.err
 
 
-def test_what_has_no_crashes_and_what_is_no_hunt(toy):
-    toy.crashhunt("run", "h", "1", "1", "5", "--scenario", "toy", "--arg", "speed=1")
+def test_what_has_no_crashes_and_what_is_no_hunt(toy, made_once):
+    shutil.rmtree(made_once(keeps_going, toy).folder / "h" / "crashes")
     assert toy.crashhunt("crashes", "h").out == "No crash was saved.\n"
     assert toy.crashhunt("crashes", "h", "--json").json == {"groups": [], "left_out": []}
     done = toy.crashhunt("crashes", "h2", expect=2)

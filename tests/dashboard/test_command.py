@@ -73,7 +73,7 @@ def test_bad_input_is_one_line(shell, words, said):
 
 @pytest.mark.parametrize("terminal", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_a_hunt_with_crashes_ends_with_the_command_on_a_terminal_only(toy, terminal):
-    words = ["run", "my hunt", "1", "1", "99", "--scenario", "toy", "--arg", "speed=20", "--seed", "1"]
+    words = ("--scenario", "toy", "--arg", "speed=20", "--seed", "1", "--no-snapshot")
     reader, writer = pty.openpty() if terminal else os.pipe()
     toy.environment |= {"TERM": "xterm", "COLUMNS": "100"}
     shown = []
@@ -85,7 +85,7 @@ def test_a_hunt_with_crashes_ends_with_the_command_on_a_terminal_only(toy, termi
 
     reading = threading.Thread(target=read)
     reading.start()
-    toy.crashhunt(*words, terminal=writer, streams=(1, 2))
+    toy.crashhunt("run", "my hunt", "1", "1", "99", *words, terminal=writer, streams=(1, 2))
     os.close(writer)
     reading.join(60)
     shown = b"".join(shown)

@@ -75,7 +75,7 @@ def test_commands_are_started_from_the_page_and_run(toy, page, names, monkeypatc
             DEVNULL=subprocess.DEVNULL, PIPE=subprocess.PIPE, STDOUT=subprocess.STDOUT,
         )  # fmt: skip
         monkeypatch.setattr(_control, "subprocess", started)
-    words = ("--scenario", "toy", "--arg", "speed=8:20", "--seed", "4")
+    words = ("--scenario", "toy", "--arg", "speed=8:20", "--seed", "4", "--no-snapshot")
     toy.crashhunt("run", "one", "1", "1", "99", *words)
     with served(toy.folder / "one", control=True) as dashboard:
         one = f"/hunts/{dashboard.hunts()['one']['id']}"
@@ -118,8 +118,8 @@ def test_commands_are_started_from_the_page_and_run(toy, page, names, monkeypatc
 def test_a_running_hunt_is_stopped_as_by_ctrl_c(shell):
     root = shell.folder / "runs"
     root.mkdir()
-    words = ("--scenario", "toy", "--set", "step_wall_s=0.001", "--arg", "speed=5", "--seed", "1", "--keep-going")
-    process = add_toy(shell).begin("run", "runs/one", "1", "3000", "99", *words)
+    words = ("--set", "step_wall_s=0.001", "--arg", "speed=5", "--seed", "1", "--keep-going", "--no-snapshot")
+    process = add_toy(shell).begin("run", "runs/one", "1", "3000", "99", "--scenario", "toy", *words)
     try:
         with served(root, control=True) as dashboard:
             wait_for(lambda: any(row["trials_run"] for row in dashboard.hunts().values()), every_s=0.1)

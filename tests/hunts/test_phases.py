@@ -169,7 +169,7 @@ def test_confirmation_is_seen_while_it_runs_and_resumed_after_an_interrupt(toy):
     (toy.folder / "driver.py").write_text(WAITS.format(folder=toy.folder))  # from the third confirmation on
     (toy.folder / "runs").mkdir()
     words = ("run", "h", "2", "5", "99", "--scenario", "toy", "--agent", "driver:Driver", "--arg", "speed=14:20",
-             "--seed", "1", "--keep-going", "--json")  # fmt: skip
+             "--seed", "1", "--keep-going", "--no-snapshot", "--json")  # fmt: skip
     process = toy.begin(*words)
 
     def confirming():

@@ -54,7 +54,7 @@ def test_value_that_cannot_be_compared_in_the_first_trial_is_refused_at_once():
 
 
 def test_unknown_signal_is_refused_before_the_first_trial(tmp_path):
-    asked = {"scenario": "intersection-two-agents", "trials": 1, "max_steps": 20, "seed": 1}
+    asked = {"scenario": "intersection-two-agents", "trials": 1, "max_steps": 20, "seed": 1, "snapshot_code": False}
     with pytest.raises(FormulaError, match=r"requirement far: the signal 'west.gapp_m' is unknown; .* 'west.gap_m'"):
         run(tmp_path / "h", 1, requirements=["far=always (west.gapp_m > 1 and info.speed > 0)"], **asked)
     assert not (tmp_path / "h").exists()
@@ -62,7 +62,7 @@ def test_unknown_signal_is_refused_before_the_first_trial(tmp_path):
 
 
 def test_key_of_info_of_another_agent_can_be_required(tmp_path):
-    asked = {"scenario": "intersection-two-agents", "max_steps": 30, "keep_going": True}
+    asked = {"scenario": "intersection-two-agents", "max_steps": 30, "keep_going": True, "snapshot_code": False}
     found = run(tmp_path / "h", 1, 3, requirements=["hit=always (not west.crashed)"], seed=1, **asked)
     assert sum(found.outcomes.values()) == 3
     assert found.outcomes.keys() - {"collision"}  # after which west has left, or drives on
