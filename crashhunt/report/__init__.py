@@ -7,6 +7,7 @@ from crashhunt.base.doors import offer_lazily
 if TYPE_CHECKING:
     from ._comparison_text import comparison_page as comparison_page, describe_comparison as describe_comparison
     from ._crash_text import Story as Story, describe_note as describe_note
+    from ._crash_types_table import describe_causes as describe_causes, describe_groups as describe_groups
     from ._findings import (
         corpus_annotations as corpus_annotations,
         corpus_summary as corpus_summary,
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
         gate_summary as gate_summary,
         write_gate_junit as write_gate_junit,
     )
+    from ._hunt_text import describe_hunt as describe_hunt
     from ._listing import (
         ListingEntry as ListingEntry,
         describe as describe,
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
         rates_page as rates_page,
         write_rates_csv as write_rates_csv,
     )
+    from ._replay_text import describe_replay as describe_replay
     from ._scorecard_page import (
         describe_scorecard as describe_scorecard,
         scorecard_page as scorecard_page,
@@ -64,12 +67,6 @@ if TYPE_CHECKING:
         check_fields as check_fields,
         format_table as format_table,
         steps_table as steps_table,
-    )
-    from ._summary import (
-        describe_causes as describe_causes,
-        describe_groups as describe_groups,
-        describe_hunt as describe_hunt,
-        describe_replay as describe_replay,
     )
     from ._version_words import (
         describe_types_by_version as describe_types_by_version,

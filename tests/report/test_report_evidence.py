@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from crashhunt.report._summary import _evidence
+from crashhunt.report._crash_summary import _evidence
 from crashhunt.trial import Collision, Failure, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Event
 

@@ -120,7 +120,7 @@ def test_types_that_were_hunted_for_are_counted(monkeypatch, more, says):
     kinds = tuple(Group(signature, (bundle,)) for signature, bundle in zip((rear_end, swipe), bundles, strict=True))
     settings = replace(SETTINGS, run=RunSettings(keep_going=True, distinct=1))
     report = replace(REPORT, settings=settings, stopped_because="distinct", kinds=kinds, **more)
-    monkeypatch.setattr("crashhunt.report._summary._describe_types", lambda *_, **__: [])
+    monkeypatch.setattr("crashhunt.report._hunt_text._describe_types", lambda *_, **__: [])
     assert says in describe_hunt(report).splitlines()
 
 

@@ -1,92 +1,27 @@
-"""The text that the terminal shows at the end of a hunt and of a replay."""
+"""The text that the terminal shows at the end of a hunt."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.text import aligned, command_line, count_of, in_lines, out_of
-from crashhunt.crashes import count_causes, join_causes
+from crashhunt.base.text import command_line, count_of, in_lines, out_of
+from crashhunt.report._crash_summary import describe_crash
 from crashhunt.report._disturbance_words import (
     by_likelihood,
     describe_branches,
     describe_disturbances,
     describe_probes,
-    list_disturbances,
 )
-from crashhunt.report._judgement_words import fault_words, list_preventing
-from crashhunt.report._live_screen import describe_types, format_arguments, format_inputs, format_seconds
+from crashhunt.report._judgement_words import fault_words
+from crashhunt.report._live_screen import describe_types, format_arguments, format_seconds
 from crashhunt.report._rate_text import describe_rates
 from crashhunt.report._version_words import describe_versions
 from crashhunt.world import event_counts
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from crashhunt.base.json_types import Plain
-    from crashhunt.crashes import Bundle, CauseGroup, Group, Signature
     from crashhunt.hunts import HuntReport
-    from crashhunt.replays import ReplayReport
-    from crashhunt.trial import TrialResult
-
-
-# The table of crash types. `crashhunt.crashes` decides which crashes are of one type, and in which order.
-
-
-def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> str:
-    """Return one line for each crash type, with its shortest crash.
-
-    With a corpus, ``known`` has the name of its case for each known crash type.
-    """
-    if not groups:
-        return "No crash was saved."
-    hunts = {bundle.hunt for group in groups for bundle in group.bundles}
-    faults = any(group.fault for group in groups)
-    prevented = [list_preventing(group.preventable_by) for group in groups]
-    rows = [["crashes", "type", *(["at fault"] if faults else []), "shortest"]]
-    rows[0] += [*(["known as"] if known is not None else []), *(["preventable"] if any(prevented) else []), "steps"]
-    for group, answers in zip(groups, prevented, strict=True):
-        shortest = group.shortest
-        name = shortest.id if len(hunts) == 1 else str(shortest.path)
-        rows.append(
-            [
-                str(group.count),
-                str(group.signature),
-                *([fault_words(group.fault)] if faults else []),
-                name,
-                *([known.get(group.signature, "new")] if known is not None else []),
-                *([answers] if any(prevented) else []),
-                str(shortest.result.steps),
-            ]
-        )
-    count = sum(group.count for group in groups)
-    words = f"{count_of(count, 'crash')} of {describe_types(len(groups), None)}"
-    saved = sum(len(group.bundles) for group in groups)
-    if saved < count:
-        words += f" ({saved} of {count} have a bundle{', and faults are of these' if faults else ''})"
-    return "\n".join([f"{words}:", "", *aligned(rows, left=range(1, len(rows[0]) - 1))])
-
-
-def describe_causes(groups: Sequence[Group], causes: Sequence[Sequence[CauseGroup]]) -> str:
-    """Return the crashes by cause, each cause with a line for each crash type in which it appears."""
-    joined = join_causes(groups, causes)
-    rows = [["crashes", "cause and types", "judged", "shortest", "steps"]]
-    for one in joined:
-        rows.append([str(one.count), str(one.cause), "", "", ""])
-        for group, part in one.variants:
-            shortest = part.shortest
-            cells = [f"  {group.signature}", str(len(part.judged)), shortest.id, str(shortest.result.steps)]
-            rows.append([str(len(part.members)), *cells])
-    dropped = sum(group.dropped for group in groups)
-    if dropped:
-        rows.append([str(dropped), "not judged: their bundles were deleted (--keep)", "", "", ""])
-    count, unknown = count_causes(joined)
-    words = f"{describe_types(count, None)} by cause"
-    if unknown:
-        words += f" (the cause of {count_of(unknown, 'more crash')} is unknown)"
-    return "\n".join(["", f"{words}:", "", *aligned(rows, left=range(1, len(rows[0]) - 1))])
 
 
 _MAX_SHOWN = 10
@@ -94,12 +29,6 @@ _MAX_BLOCKS = 2  # crashes that are described in full, so that the text fits a s
 _MAX_TYPES = 5
 _MAX_LISTED = 3  # crashes of which only the names are given
 _MAX_REASONS = 3
-_MAX_OUTPUT_CHARACTERS = 300  # of the last line that a process has printed
-_SOURCE_WORDS = {
-    ("overlap", "reported"): "the simulator reports it, and the outlines overlap",
-    ("overlap",): "the outlines overlap; the simulator does not report it",
-    ("reported",): "the simulator reports it; the outlines do not overlap",
-}
 
 
 def describe_hunt(report: HuntReport, *, has_dashboard: bool = False) -> str:
@@ -160,13 +89,13 @@ def describe_hunt(report: HuntReport, *, has_dashboard: bool = False) -> str:
         lines += [*([""] if lines else []), *_describe_types(report)]
     else:
         for bundle in crashes[:_MAX_BLOCKS]:
-            lines += ["", *_describe_crash(bundle)]
+            lines += ["", *describe_crash(bundle)]
         if len(crashes) > _MAX_BLOCKS:
             lines += ["", f"{_MAX_BLOCKS} of {report.tally.found} crashes shown; all are in {_crash_folder(report)}"]
     lines += _near_misses(report)
     lines += ["", counts] if has_types else []
     if report.copied is not None:
-        lines += ["", *_describe_crash(report.copied)]
+        lines += ["", *describe_crash(report.copied)]
         lines += ["", f"Replay it:  {command_line('crashhunt', 'replay', report.copied.path)}"]
     if report.crashes:
         chosen = ["--crash", crashes[0].id] if len(crashes) > 1 else []
@@ -249,77 +178,6 @@ def _describe_events(report: HuntReport) -> list[str]:
     return [f"Traffic events: {counts}. To hunt for them: --crash-on {','.join(others)}"]
 
 
-def describe_replay(report: ReplayReport) -> str:
-    """Return the result of a replay as text."""
-    bundle, rerun = report.bundle, report.rerun
-    drivers = {
-        "log": "the recorded actions",
-        "current": "today's code",
-        "snapshot": f"the code in {command_line(rerun.snapshot.path)}",
-    }
-    was = bundle.result
-    lines = [
-        f"{bundle.id}: {was.summary}",
-        f"  {format_inputs(was)}",
-        f"  driven by {drivers[rerun.code]}",
-    ]
-    lines += [f"  {line}" for line in _describe_differences(rerun.code_differences)]
-    lines += [f"  warning: {warning}" for warning in rerun.warnings]
-    lines += [f"  no longer the recorded trial: {edit}" for edit in rerun.edits]
-    lines += _verdict(report)
-    if report.divergence is not None and report.verdict != "not_comparable":
-        lines.append(f"  first difference at {report.divergence}")
-        lines += [f"    {line}" for line in _table_around(report)]
-    times = sum(report.verdicts.values())
-    if times > 1:
-        counts = ", ".join(f"{count} {verdict.replace('_', ' ')}" for verdict, count in report.verdicts.items())
-        lines.append(f"of {times} runs: {counts}")
-    return in_lines(lines)
-
-
-def _describe_differences(files: list[str] | None) -> list[str]:
-    if files is None:
-        return []
-    if not files:
-        return ["no file of the code differs from the snapshot"]
-    more = f" and {len(files) - _MAX_SHOWN} more" if len(files) > _MAX_SHOWN else ""
-    return [f"differs from the snapshot: {', '.join(files[:_MAX_SHOWN])}{more}"]
-
-
-def _verdict(report: ReplayReport) -> list[str]:
-    was, now, steps = report.bundle.result, report.replayed, report.rerun.recorded.steps
-    count = f"{report.steps_replayed} of {steps} steps, digest {now.digest}"
-    if report.verdict == "reproduced":
-        what = "every observation, action and scene is bit-identical"
-        if report.rerun.code == "log":
-            what = "every observation and scene that results from the recorded actions is bit-identical"
-        return [f"reproduced: {count}", f"  {what}"]
-    if report.rerun.elsewhere and report.verdict == "changed":
-        return [f"changed: it crashes there as well; {now.summary}", f"  it was: {was.summary}"]
-    if report.verdict == "fixed":
-        return [f"fixed: no crash; {now.summary}", f"  it was: {was.summary}"]
-    if report.verdict == "changed":
-        what = "it crashes now" if report.bundle.is_near_miss else "it still crashes, in a run that differs"
-        return [f"changed: {what}", f"  it was: {was.summary}", f"  it is:  {now.summary}"]
-    if report.verdict == "not_comparable":
-        ended = [f"  it was: {was.summary}", f"  it is:  {now.summary}"] if report.rerun.other_traffic else []
-        return [f"not comparable: {report.reason}", *ended]
-    lines = [f"diverged: {count}"]
-    if was.outcome is not now.outcome or was.steps != now.steps:
-        lines.append(f"  now: {now.summary}")
-    return lines
-
-
-def _table_around(report: ReplayReport) -> list[str]:
-    if not report.around or report.divergence is None:
-        return []
-    rows = [("step", "recorded", "replayed")]
-    for step, was, now in report.around:
-        mark = ("<- first difference",) if step == report.divergence.step else ()
-        rows.append((str(step), "-" if was is None else f"{was!r}", "-" if now is None else f"{now!r}", *mark))
-    return aligned(rows)
-
-
 def _wanted_types(report: HuntReport) -> str:
     """Return as text the crash types that count for ``--distinct``: of the agent's own fault if only these count."""
     groups = report.kinds or ()
@@ -348,57 +206,4 @@ def _describe_audit(report: HuntReport) -> list[str]:
         )
     if len(found.differences) > _MAX_SHOWN:
         lines.append(f"  … and {len(found.differences) - _MAX_SHOWN} more; for all of them, run: crashhunt logs")
-    return lines
-
-
-def _describe_crash(bundle: Bundle) -> list[str]:
-    result = bundle.result
-    lines = [
-        f"{bundle.id}  ({result.outcome.category})",
-        f"  {result.summary}",
-        f"  after {count_of(result.steps, 'step')}, simulation time {result.sim_time_s:.1f} s",
-        f"  {format_inputs(result)}",
-    ]
-    lines += [f"  {line}" for line in (*_evidence(result), *list_disturbances(result))]
-    lines.append(f"  saved in {command_line(bundle.path)}")
-    if bundle.confirmed is not None:
-        first: Plain = bundle.divergence or {}
-        what = f"{first.get('agent') or ''} {first.get('field')}".strip()
-        diverged = f"first difference at step {first.get('step')}, {what}"
-        lines.append(
-            "  confirmed: bit-identical when replayed in a new process"
-            if bundle.confirmed
-            else f"  flaky: the replay in a new process deviates ({diverged})"
-        )
-    elif bundle.why_unconfirmed:
-        lines.append(f"  not confirmed: {bundle.why_unconfirmed}. Run the same command to try again")
-    if result.why_no_escape:
-        why = result.why_no_escape
-        lines.append(f"  last avoidable step: unknown, because {why}. Run the same command to try again")
-    return lines
-
-
-def _evidence(result: TrialResult) -> list[str]:
-    lines = []
-    hit, failure, event = result.collision, result.failure, result.event
-    if event is not None and math.isfinite(event.x):
-        where = f"at ({event.x:.1f}, {event.y:.1f})" + (f" on lane {event.lane}" if event.lane else "")
-        lines.append(f"{event.agent} {where}, at {event.speed:.1f} m/s")
-    if hit is not None:
-        where = f"at ({hit.x:.1f}, {hit.y:.1f})" + (f" on lane {hit.lane}" if hit.lane else "")
-        speeds = f"{hit.collider} at {hit.collider_speed:.1f} m/s"
-        if hit.victim:
-            speeds += f", {hit.victim} at {hit.victim_speed:.1f} m/s"
-        if math.isfinite(hit.x):  # an environment without a scene has no places
-            lines.append(f"{where}; {speeds}")
-        if hit.victim:
-            lines.append(_SOURCE_WORDS.get(hit.seen_by, f"seen by {', '.join(hit.seen_by)}"))
-    if failure is not None:
-        frames = failure.traceback.strip().splitlines()
-        # Python prints the most recent call last. faulthandler, for dead and hanging processes, prints it first.
-        dumped = [line for line in frames if line.lstrip().startswith("File")]
-        lines += dumped[:3] if failure.kind in ("signal", "timeout") else frames[-4:]
-        if failure.last_output.strip():
-            last = failure.last_output.strip().splitlines()[-1]
-            lines.append(f"last output: {last[:_MAX_OUTPUT_CHARACTERS]}{'…' * (len(last) > _MAX_OUTPUT_CHARACTERS)}")
     return lines
