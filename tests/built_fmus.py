@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import inspect
 import re
-import subprocess
 import zipfile
 from typing import TYPE_CHECKING
 
-from programs import COMPILER
+from programs import COMPILER, build
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -179,9 +178,10 @@ def build_fmu(
     names = [name for name, _ in inspect.getmembers(slave) if name.startswith(f"fmi{version}")]
     offered = IN_C if has_state else re.sub("#ifdef STATE.*?#endif", "", IN_C, flags=re.DOTALL)
     others = "".join(f"int {name}(void) {{ return 3; }}\n" for name in names if f"{name}(" not in offered)
-    (folder / "planner.c").write_text(offered + others, encoding="utf-8")
+    source = folder / "planner.c"
+    source.write_text(offered + others, encoding="utf-8")
     words = ["-shared", "-fPIC", "-o", "planner.so", "planner.c", "-lm"]
-    subprocess.run([str(COMPILER), "-w", f"-DFMI{version}", "-DSTATE", *words], cwd=folder, check=True)
+    build(source, [str(COMPILER), "-w", f"-DFMI{version}", "-DSTATE", *words])
     made = described_by_fmi_2(place, speed) if version == 2 else DESCRIBED_BY_FMI_3
     if has_state:
         attribute = "canGetAndSetFMUstate" if version == 2 else "canGetAndSetFMUState"

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
 from typing import TYPE_CHECKING
 
-from programs import COMPILER, COMPILER_CXX
-
-import crashhunt.agents
+from programs import COMPILER, COMPILER_CXX, HEADER, build
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-HEADER_FOLDER = crashhunt.agents.__path__[0]
 
 # The arguments `harm` and `at` name the harm, and the step in which it is done.
 IN_C = r"""
@@ -111,6 +106,5 @@ def compile_library(
     file.write_text(source, encoding="utf-8")
     compiler = [str(COMPILER_CXX), "-std=c++17"] if in_cpp else [str(COMPILER), "-std=c99"]
     command = [*compiler, "-D_GNU_SOURCE", "-g", "-O1", "-Wall", "-Werror", "-fvisibility=hidden"]
-    command += ["-shared", "-fPIC", f"-I{HEADER_FOLDER}", "-o", name, file.name, *words, "-lm"]
-    subprocess.run(command, cwd=folder, check=True)
-    return folder / name
+    command += ["-shared", "-fPIC", f"-I{HEADER.parent}", "-o", name, file.name, *words, "-lm"]
+    return build(file, command)

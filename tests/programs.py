@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import shlex
 import shutil
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+import tempfile
+from pathlib import Path
 
-if TYPE_CHECKING:
-    from pathlib import Path
+import crashhunt.agents
 
 COMPILER = shutil.which("cc")
 COMPILER_CXX = shutil.which("c++")
+HEADER = Path(crashhunt.agents.__path__[0], "crashhunt_agent.h")
 
 DRIVER = """\
 class Driver:
@@ -198,5 +201,24 @@ def compile_program(folder: Path, name: str = "planner", *, in_cpp: bool = False
     source = folder / (f"{name}.cpp" if in_cpp else f"{name}.c")
     source.write_text(IN_C, encoding="utf-8")
     compiler = [str(COMPILER_CXX), "-std=c++17"] if in_cpp else [str(COMPILER)]
-    subprocess.run([*compiler, "-O1", "-o", name, source.name, "-lm"], cwd=folder, check=True)
-    return folder / name
+    return build(source, [*compiler, "-O1", "-o", name, source.name, "-lm"])
+
+
+def build(source: Path, command: list[str]) -> Path:
+    """Run a compiler in the folder of a source, or copy what the same command has made of the same text before.
+
+    The command has ``-o`` before the name of what it makes. All processes of a session share what they have compiled.
+    """
+    made = source.with_name(command[command.index("-o") + 1])
+    text = HEADER.read_bytes() + source.read_bytes()
+    key = hashlib.blake2b("\0".join(command).encode() + text, digest_size=16).hexdigest()
+    kept = Path(tempfile.gettempdir(), f"compiled-{key}")
+    if not kept.exists():
+        subprocess.run(command, cwd=source.parent, check=True)
+        unfinished = kept.with_name(f"{kept.name}-{os.getpid()}")
+        shutil.copy2(made, unfinished)
+        unfinished.replace(kept)
+    else:
+        made.unlink(missing_ok=True)  # a process may have loaded it
+        shutil.copy2(kept, made)
+    return made

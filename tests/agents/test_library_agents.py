@@ -311,7 +311,10 @@ def hunted(toy, harm, *words):
             "abort", (), "process_died", "the process died of SIGABRT in ego's act() of step 4",
             marks=pytest.mark.nightly,
         ),
-        ("exit", (), "process_died", "the process exited with 0 in ego's act() of step 4"),
+        pytest.param(
+            "exit", (), "process_died", "the process exited with 0 in ego's act() of step 4",
+            marks=pytest.mark.nightly,
+        ),
         pytest.param(
             "deadlock", ("--timeout", "1"), "hang", "still running after 1 s in ego's act() of step 4",
             marks=pytest.mark.nightly,
@@ -334,11 +337,11 @@ def test_a_replay_runs_the_saved_library_and_reports_that_the_current_one_differ
     compile_library(toy.folder)
     hunted(toy, "fails")
     compile_library(toy.folder, source=IN_C.replace('kind, "fails"', 'kind, "never"'))
-    assert "every observation, action and scene is bit-identical" in toy.crashhunt("replay", "h").out
     facts = toy.crashhunt("show", "h", "--json").json["programs"]["./libplanner.so"]
     assert facts["machine"] == platform.machine()
     assert any(name.startswith("libm.so") for name in facts["system"])
-    assert toy.crashhunt("replay", "h", "--json").json["programs"] == {"./libplanner.so": facts}
+    replayed = toy.crashhunt("replay", "h", "--json").json
+    assert (replayed["verdict"], replayed["programs"]) == ("reproduced", {"./libplanner.so": facts})
     assert (
         "differs from the snapshot: ./libplanner.so has changed"
         in toy.crashhunt("replay", "h", "--code", "current", "--expect", "fixed").out
