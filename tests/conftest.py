@@ -29,6 +29,11 @@ from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import as_installed  # noqa: F401 - before anything imports crashhunt
+
+os.environ["HYPOTHESIS_NO_PLUGINS"] = "1"  # one is Trio's, which takes a tenth of a second
+
+# isort: split
+
 import hypothesis
 import json_schemas
 import pytest

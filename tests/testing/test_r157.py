@@ -24,17 +24,18 @@ def cut_in(model: str, **values: float) -> int:
     return int(solve("cut_in", columns(**values), model)[model][0])
 
 
+@pytest.mark.parametrize("half", [0, pytest.param(1, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("kind", ["cut_in", "cut_out", "car_following"])
-def test_answers_agree_with_the_published_implementation_in_each_half_of_the_cases(kind, tmp_path):
+def test_answers_agree_with_the_published_implementation_in_each_half_of_the_cases(kind, half, tmp_path):
     cases, answers = tmp_path / "cases.csv", tmp_path / "out.csv"
-    cases.write_bytes(gzip.decompress((ANSWERS / f"{kind}.csv.gz").read_bytes()))
+    header, *lines = gzip.decompress((ANSWERS / f"{kind}.csv.gz").read_bytes()).splitlines(keepends=True)
+    cases.write_bytes(b"".join([header, *lines[half::2]]))
     assert r157.main([kind, str(cases), str(answers)]) == 0
     with cases.open() as known, answers.open() as answered:
         rows = list(zip(csv.DictReader(known), csv.DictReader(answered), strict=True))
     for model in (name for name in rows[0][0] if name in REFERENCE_MODELS):
-        for half in (rows[::2], rows[1::2]):
-            same = sum(expected[model] == found[model] for expected, found in half)
-            assert same / len(half) >= 0.996, f"{model} agrees in {same} of {len(half)} cases"
+        same = sum(expected[model] == found[model] for expected, found in rows)
+        assert same / len(rows) >= 0.996, f"{model} agrees in {same} of {len(rows)} cases"
 
 
 @pytest.mark.parametrize("ego_kmh", [20, 60, 120])
