@@ -59,7 +59,7 @@ LINES = [
 
 @pytest.mark.parametrize(
     ("line", "found"),
-    mostly_nightly(LINES, LINES[::4]),
+    mostly_nightly(LINES, LINES[::6]),
 )
 def test_the_tab_key_completes(press, toy, line, found):
     for name in ("000004-collision", "000017-hang"):

@@ -114,7 +114,6 @@ def test_an_interrupt_while_it_starts_is_not_lost(toy, libraries):
     ("words", "says"),
     [
         (("run", "h", "2", "ten", "10"), "'ten'"),
-        (("run", "h", "2", "0", "10"), "TRIALS is 0"),
         (("run", "no/such/parent", "2", "3", "10"), "no/such/parent"),
         (("run", "faulty.py", "2", "3", "10"), "is a file"),
         (("run", ".", "2", "3", "10"), "not empty"),

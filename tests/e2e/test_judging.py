@@ -16,21 +16,6 @@ from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Outcome
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--runs", "0"), "--runs is 0"),
-        (("--why", "-1"), "--why is -1"),
-        (("--parallel", "-1"), "--parallel is -1"),
-        (("--all", "--crash", "1"), "contradict"),
-    ],
-)
-def test_slips(toy, words, said):
-    (toy.folder / "h").mkdir()
-    (toy.folder / "h" / "hunt.toml").write_text("")
-    assert said in toy.crashhunt("judge", "h", *words, expect=2).err
-
-
 def hunted(toy):
     """One error of the agent, for `made_once`, which another value of its argument avoids."""
     words = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=2|30", "--seed", "1")

@@ -145,19 +145,13 @@ def test_futures_on_highway_env_exist_where_it_draws_random_numbers(shell, made_
     one_in(
         3,
         [
-            (("--parallel", "-2"), "--parallel is -2"),
-            (("--for", "soon"), "--for is 'soon'"),
-            (("--before", "99", "--futures"), "--before is 99, but the trial lasts only 5.3 s"),
             (("--before", "nan", "--futures"), "--before is nan"),
             (("--from-step", "3", "--before", "1"), "not allowed with"),
-            (("--futures",), "--futures needs a step"),
             (("--overrule", "fly", "--before", "1"), "fly"),
             (("--agent", "nowhere:Missing"), "nowhere"),
             (("--set", "sped=1"), "'sped'"),
-            (("--set", "speed=1:3"), "is not a single value"),
             (("--set", "speed=1:3", "--before", "1"), "is not a single value"),
             (("--set", "gap_m=20", "--before", "1"), "cannot change during the trial"),
-            (("--leave-out", "leader"), "--leave-out 'leader'"),
         ],
     ),
 )
