@@ -51,7 +51,7 @@ class Driver:
     def act(self, observation):
         return self.speed, 0
 '''
-TRIALS = 10
+TRIALS = 8
 
 
 @pytest.fixture(scope="module")

@@ -50,7 +50,7 @@ default = 12.0
 BEFORE_S = 1.0
 
 
-def hunt(folder, name, *, action="meta", trials=8, scenario="toy"):
+def hunt(folder, name, *, action="meta", trials=5, scenario="toy"):
     (folder / f"{scenario}.toml").write_text(TOY.replace("ACTION", action))
     words = ("run", name, "1", str(trials), "60", "--scenario", f"{scenario}.toml", "--seed", "4", "--keep-going")
     Shell(folder).crashhunt(*words, "--no-snapshot")
