@@ -24,12 +24,11 @@ class PairWatch:
     Args:
         margin: the greatest difference in failures per trial that counts as no difference; 0 to disable this verdict.
         alpha: maximum probability of a wrong verdict.
-        rounds: number of trials in each pair.
     """
 
-    def __init__(self, margin: float, alpha: float = 0.05, rounds: int = 1) -> None:
+    def __init__(self, margin: float, alpha: float = 0.05) -> None:
         self.margin, self.alpha = margin, alpha
-        self.test = PairTest(rounds)
+        self.test = PairTest()
         self.verdict: PairVerdict = "undecided"
 
     def add(self, pairs: Sequence[Pair] | Iterator[Pair], *, may_end: bool = True) -> None:
