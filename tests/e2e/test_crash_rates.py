@@ -172,10 +172,8 @@ def test_hunt_with_too_many_invalid_trials_ends_with_a_line(toy):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("--until-rate", "3/trial"), "--until-rate is 3/trial; give a rate from 1e-12 to 1e12"),
         (("--until-rate", "3/hour", "--sampler", "guided"), "omit --sampler guided"),
         (("--until-rate", "3/hour", "--seeds", "2"), "omit --seeds"),
-        (("--until-rate", "3/hour", "--distinct", "2"), "omit --distinct"),
         (("--most", "9"), "--most 9 needs --until-rate"),
     ],
 )

@@ -6,7 +6,6 @@ import json
 import tomllib
 
 import pytest
-from conftest import one_in
 
 CALM = "calm=always (acceleration > -6)"
 
@@ -63,24 +62,14 @@ def test_requirements_of_the_scenario_hold_unless_others_are_given(toy):
     assert "requirement" not in other["outcomes"]
 
 
-MISTAKES = [
-    ("always (speed > 1", "--require: the requirement ends too early; close the parenthesis\n  always (speed > 1\n"),
-    ("calm=", "--require calm: the requirement is empty"),
-    ("always (sped > 1)", "the signal 'sped' of ego is unknown; did you mean 'speed'?"),
-    ("always[0:90] (speed > 1)", "its windows end 90 s after a sample, and 60 steps take"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("text", "message"), one_in(3, MISTAKES))
-def test_a_requirement_that_cannot_be_used_is_refused_in_one_line(text, message, toy):
-    done = hunt(toy, "--require", text, expect=2)
-    assert message in done.err
-    assert "Traceback" not in done.err
-    assert "\n" not in done.json["error"]["message"]
-
-
-def test_two_requirements_of_one_name_and_names_that_are_none_are_refused(toy):
-    assert "'a' is given twice" in hunt(toy, "--require", "a=speed > 1", "--require", "a=speed > 2", expect=2).err
+def test_a_requirement_that_cannot_be_used_is_refused_in_one_line(toy):
+    for text, message in (  # mistakes of the language in tests/requirements/test_language.py
+        ("always (sped > 1)", "the signal 'sped' of ego is unknown; did you mean 'speed'?"),
+        ("always[0:90] (speed > 1)", "its windows end 90 s after a sample, and 60 steps take"),
+    ):
+        done = hunt(toy, "--require", text, expect=2)
+        assert message in done.err
+        assert "\n" not in done.json["error"]["message"]
     file = toy.folder / "toy" / "scenario.toml"
     file.write_text('requirement."so so" = "speed > 1"\n' + file.read_text())
     assert "'so so' is not a name of a requirement" in hunt(toy, expect=2).err
