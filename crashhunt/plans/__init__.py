@@ -8,16 +8,20 @@ if TYPE_CHECKING:
     from ._arguments import Owners as Owners, Takes as Takes, agent_of as agent_of, takes_of as takes_of
     from ._choices import disturber as disturber, disturber_apart as disturber_apart
     from ._code import imported_by as imported_by, reused_agents as reused_agents
-    from ._declaration import (
+    from ._declaration import Given as Given, HuntOption as HuntOption
+    from ._durations_and_rates import (
         RATE_PERS as RATE_PERS,
-        Given as Given,
-        HuntOption as HuntOption,
         RatePer as RatePer,
         check_duration as check_duration,
         check_rate as check_rate,
         rate_of as rate_of,
         seconds_of as seconds_of,
         share_of as share_of,
+    )
+    from ._executor_choice import (
+        ChoosesParallelism as ChoosesParallelism,
+        executor_of as executor_of,
+        parallel_here as parallel_here,
     )
     from ._plan import (
         core_of as core_of,
@@ -26,6 +30,7 @@ if TYPE_CHECKING:
         sampler_of as sampler_of,
         with_settings as with_settings,
     )
+    from ._request import Request as Request, spec_words as spec_words
     from ._run_options import (
         Driver as Driver,
         HuntOptions as HuntOptions,
@@ -38,15 +43,10 @@ if TYPE_CHECKING:
     from ._settings import (
         AgentSettings as AgentSettings,
         ArgumentSpec as ArgumentSpec,
-        ChoosesParallelism as ChoosesParallelism,
         HuntSettings as HuntSettings,
-        Request as Request,
         RunSettings as RunSettings,
-        executor_of as executor_of,
         fields_of as fields_of,
-        parallel_here as parallel_here,
         read_settings as read_settings,
-        spec_words as spec_words,
         write_settings as write_settings,
     )
 

@@ -18,7 +18,8 @@ from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import signals_of_fixed
-from crashhunt.plans._settings import AgentSettings, ArgumentSpec, Request, spec_words
+from crashhunt.plans._request import Request, spec_words
+from crashhunt.plans._settings import AgentSettings, ArgumentSpec
 from crashhunt.trial import (
     FILLED_BY_NAME,
     Argument,

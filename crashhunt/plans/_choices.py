@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from crashhunt.disturbances import DisturbanceModel, DisturbanceSampler
-    from crashhunt.plans._settings import HuntSettings, Request
+    from crashhunt.plans._request import Request
+    from crashhunt.plans._settings import HuntSettings
     from crashhunt.samplers import NamedSampler
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Category, Signature

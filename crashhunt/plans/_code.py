@@ -20,7 +20,7 @@ from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.text import listed
 from crashhunt.disturbances import described_model, modules_of_models, parse_rates
 from crashhunt.oracles import described_oracle, modules_of, oracle_name
-from crashhunt.plans._settings import HuntSettings, executor_name
+from crashhunt.plans._executor_choice import executor_name
 from crashhunt.trial import Signature, signature_of
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.isolation import Report
     from crashhunt.base.json_types import Plain
+    from crashhunt.plans._settings import HuntSettings
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Category
 

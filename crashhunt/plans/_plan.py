@@ -31,8 +31,9 @@ from crashhunt.plans._choices import (
     without_refuted_notes,
 )
 from crashhunt.plans._code import CodeFacts, describe_code, notes_on_programs, with_reuse
+from crashhunt.plans._executor_choice import sized
 from crashhunt.plans._run_options import TrialOptions
-from crashhunt.plans._settings import HuntSettings, Request, RunSettings, fields_of, sized
+from crashhunt.plans._settings import HuntSettings, RunSettings, fields_of
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
 from crashhunt.scenario import (
     FIXED_LOAD_ORDER,
@@ -48,6 +49,8 @@ from crashhunt.trial import CRASHES, Constant, Signature
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
+
+    from crashhunt.plans._request import Request
 
     Surveyor = Callable[[Scenario, Request, HuntSettings], Scenario]
 

@@ -17,19 +17,8 @@ from pathlib import Path
 from typing import Self
 
 from crashhunt.base.errors import UsageError
-from crashhunt.plans._declaration import (
-    HuntOption,
-    above_zero,
-    at_least,
-    check_duration,
-    check_probe,
-    check_rate,
-    check_share,
-    declared,
-    declared_options,
-    option,
-    within,
-)
+from crashhunt.plans._declaration import HuntOption, above_zero, at_least, declared, declared_options, option, within
+from crashhunt.plans._durations_and_rates import check_duration, check_probe, check_rate, check_share
 from crashhunt.trial import CRASHES
 
 Spec = str | int | float | bool

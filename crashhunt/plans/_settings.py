@@ -1,30 +1,27 @@
-"""The user's request for a hunt, and the settings that result from it (``hunt.toml``)."""
+"""The settings of a hunt, which result from the request (``hunt.toml``)."""
 
 from __future__ import annotations
 
-import inspect
-import os
 import sys
 import tomllib
 from contextlib import suppress
-from dataclasses import MISSING, Field, asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, Field, asdict, dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.codec import known_part, merged, slip
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import read_bounded
-from crashhunt.base.plugins import locate, registered
 from crashhunt.base.text import command_line, near_path
 from crashhunt.oracles import DEFAULT_ORACLES
-from crashhunt.plans._declaration import at_least, seconds_of
-from crashhunt.plans._run_options import Driver, HuntOptions, RunOptions, Spec, Subject, TrialOptions, hunt_options
+from crashhunt.plans._durations_and_rates import seconds_of
+from crashhunt.plans._run_options import RunOptions, TrialOptions
 from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator
 
     from crashhunt.base.json_types import Plain
     from crashhunt.samplers import Space
@@ -280,188 +277,6 @@ def _without_none(data: object) -> Any:
     return data
 
 
-# The request of a user for a hunt, from Python, the command line or a file, before it is resolved.
-
-# ``--executor NAME[:ARG]``: where the trials of a hunt run.
-
-
-@runtime_checkable
-class ChoosesParallelism(Protocol):
-    """An executor that decides how many trials run at a time if PARALLEL is 0, such as an executor on many machines.
-
-    For other executors, PARALLEL 0 means one trial per core of this machine.
-    """
-
-    sizes_itself: ClassVar[bool]
-
-
-def executor_of(word: str) -> Callable[..., Any]:
-    """Return the factory of the named executor, with the executor's argument if there is one.
-
-    The word may end with ``:ARG``, which may contain colons.
-
-    Raises:
-        PluginError: the executor does not exist.
-        UsageError: the executor takes no argument.
-    """
-    name, argument = _name_and_argument(word)
-    factory: Callable[..., Any] = locate("executors", name)
-    if argument is None:
-        return factory
-    try:
-        parameters = inspect.signature(factory).parameters.values()
-    except (TypeError, ValueError):
-        parameters = {}.values()
-    if not any(known.name == "argument" or known.kind is known.VAR_KEYWORD for known in parameters):
-        raise UsageError(f"--executor {word}: {name!r} takes no argument", fix=f"write --executor {name}")
-
-    def make(*args: object, **kwargs: object) -> object:
-        return factory(*args, **kwargs, argument=argument)
-
-    return make
-
-
-def executor_name(word: str) -> str:
-    """Return the executor's name or ``module:attribute`` without its argument ``:ARG``; no module is imported."""
-    return _name_and_argument(word)[0]
-
-
-def sizes_itself(word: str) -> bool:
-    """Return whether the named executor decides how many trials run at a time if PARALLEL is 0."""
-    factory = locate("executors", executor_name(word))
-    return isinstance(factory, ChoosesParallelism) and factory.sizes_itself
-
-
-def parallel_here(word: str, parallel: int) -> int:
-    """Return how many trials this machine runs at a time in addition to the executor, for example for confirmations.
-
-    Args:
-        word: choice of an executor, as for `executor_of`.
-        parallel: the value of PARALLEL; for an executor on many machines, this machine may have fewer cores.
-    """
-    cores = len(os.sched_getaffinity(0))
-    return min(parallel or cores, cores) if sizes_itself(word) else parallel or cores
-
-
-def _name_and_argument(word: str) -> tuple[str, str | None]:
-    first, colon, rest = word.partition(":")
-    if first in registered("executors") or not colon:
-        return first, rest if colon else None
-    attribute, colon, argument = rest.partition(":")
-    return f"{first}:{attribute}", argument if colon else None
-
-
-_REQUIRED_NUMBERS = {  # the numbers of a hunt that are no options: everybody has to give them
-    "TRIALS": at_least(0),
-    "MAX_STEPS": at_least(1),
-    "PARALLEL": at_least(0, zero="one per core"),
-}
-
-
-@clear_constructor
-@dataclass(frozen=True, kw_only=True)
-class Request(HuntOptions):
-    """The user's request for a hunt: all options as the user gave them. `plan` determines all further settings.
-
-    The agents are their locators, and values of arguments are texts in the syntax of the command line.
-
-    Args:
-        parallel: number of trials at a time; 0 for one per core.
-        trials: maximum number of trials; 0 for no limit.
-        max_steps: maximum number of steps of a trial.
-
-    Raises:
-        UsageError: the agent is not in a module that workers can import, or a table is no dictionary.
-    """
-
-    parallel: int = 1
-    trials: int
-    max_steps: int
-
-    def __post_init__(self) -> None:
-        """Write the only agent, and values that are not texts, in the form of the command line."""
-        super().__post_init__()
-        for known in hunt_options(Subject):
-            if known.form == "table":
-                known.checked(getattr(self, known.name))
-        drivers = {} if self.agent in (None, "") else {"": self.agent}
-        locators = {name: _locator(who) for name, who in {**(self.agents or {}), **drivers}.items() if who is not None}
-        words = {"arguments": spec_words(self.arguments), "scenario_arguments": spec_words(self.scenario_arguments)}
-        for name, value in {"agents": locators, "agent": None, **words}.items():
-            object.__setattr__(self, name, value)
-
-    @property
-    def locators(self) -> dict[str, str]:
-        """Locator of each agent, by agent id; the id may be empty if the scenario has one controlled vehicle."""
-        return {name: str(locator) for name, locator in (self.agents or {}).items()}
-
-    @property
-    def run(self) -> RunSettings:
-        """The options that determine how the hunt runs."""
-        return RunSettings(parallel=self.parallel, **{name: getattr(self, name) for name in fields_of(RunOptions)})
-
-    def checked(self) -> Self:
-        """Return the same request after validation, with plain Python values.
-
-        Raises:
-            UsageError: a value is invalid.
-        """
-        for (name, check), value in zip(
-            _REQUIRED_NUMBERS.items(), (self.trials, self.max_steps, self.parallel), strict=True
-        ):
-            if not isinstance(value, int) or isinstance(value, bool):
-                raise UsageError(f"{name} is {value!r}", fix="give a whole number")
-            if fix := check(value):
-                raise UsageError(f"{name} is {value}", fix=fix)
-        if not self.trials and not self.duration and not self.until_rate:
-            raise UsageError("TRIALS is 0", fix="give at least 1, or 0 (no limit) with --for or --until-rate")
-        checked = super(Request, replace(self, keep_going=True) if self.rare else self).checked()
-        if checked.until_rate and (checked.sampler != "random" or checked.seeds):
-            option = "--seeds" if checked.seeds else f"--sampler {checked.sampler}"
-            raise UsageError(
-                f"--until-rate needs independent trials, but {option} draws dependent trials",
-                fix=f"omit {option}",
-            )
-        limits = [limit for limit in (self.trials, checked.most) if limit]
-        return replace(checked, trials=min(limits, default=0))
-
-
-def sized(run: RunSettings) -> RunSettings:
-    """Return the settings with a number of parallel trials in place of 0: one per core, unless the executor decides.
-
-    Raises:
-        PluginError: the executor does not exist.
-        UsageError: the executor takes no argument.
-    """
-    executor_of(run.executor)  # before anything runs
-    if run.parallel or sizes_itself(run.executor):
-        return run
-    return replace(run, parallel=len(os.sched_getaffinity(0)))
-
-
 def fields_of(kind: type) -> tuple[str, ...]:
     """Return the names of the fields of a dataclass."""
     return tuple(item.name for item in fields(kind))
-
-
-def _locator(who: Driver) -> str:
-    if isinstance(who, str):
-        return who
-    if not callable(who):
-        kind = type(who).__qualname__
-        raise UsageError(
-            f"the agent is an object of class {kind}, but each trial creates its own agent",
-            fix=f"give the class {kind} itself, or a function that returns the agent",
-        )
-    module, name = getattr(who, "__module__", ""), getattr(who, "__qualname__", "")
-    if module in ("", "__main__") or not name or "<" in name:
-        raise UsageError(
-            f"{name or who!r} is not in a module that workers can import",
-            fix="move it to its own file, and import it from there or name it 'module:attribute'",
-        )
-    return f"{module}:{name}"
-
-
-def spec_words(given: Mapping[str, Spec] | None) -> dict[str, str]:
-    """Return specifications of arguments as texts in the syntax of the command line."""
-    return {name: str(spec).lower() if isinstance(spec, bool) else str(spec) for name, spec in (given or {}).items()}

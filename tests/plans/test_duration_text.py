@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from crashhunt.plans._declaration import check_duration, check_probe, seconds_of
+from crashhunt.plans._durations_and_rates import check_duration, check_probe, seconds_of
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from crashhunt.plans._declaration import check_rate, check_share, rate_of, share_of
+from crashhunt.plans._durations_and_rates import check_rate, check_share, rate_of, share_of
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from crashhunt.plans import (
 )  # fmt: skip
 from crashhunt.plans._arguments import _spec
 from crashhunt.plans._code import notes_on_programs
-from crashhunt.plans._settings import executor_of, parallel_here, sizes_itself
+from crashhunt.plans._executor_choice import executor_of, parallel_here, sizes_itself
 from crashhunt.scenario import copy_shipped_scenario
 from crashhunt.sumo._options import SumoSetup
 from crashhunt.trial import Argument, parse_spec
