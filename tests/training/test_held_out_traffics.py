@@ -108,6 +108,8 @@ def test_the_command_prints_the_parts(place, shell):
     assert [one["id"] for one in found["training"]] == [crash.bundle.id for crash in split.training]
     assert [one["id"] for one in found["held_out"]] == [crash.bundle.id for crash in split.held_out]
     assert len(found["training"]) + len(found["held_out"]) == len(list_bundles(place / "before"))
+    for part, is_test in ((split.training, False), (split.held_out, True)):
+        assert {is_test_traffic(crash.seed, 0.5) for crash in part} == {is_test}
     done = shell.crashhunt("split", "before", "--part", "test")
     assert done.out.splitlines() == [one["path"] for one in found["held_out"]]
     assert "--test is 1; give a share" in shell.crashhunt("split", "before", "--test", "1", expect=2).err
