@@ -7,6 +7,7 @@ after ``close``. Anything else is an error of the agent.
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 from functools import partial
@@ -335,11 +336,18 @@ def _absolute(value: Value) -> Value:
 
 def _described_observation(space: Space[object], names: Sequence[str]) -> dict[str, SpaceDescription]:
     """Return the shape, columns and units of each part of an observation."""
-    from gymnasium.spaces import Dict
+    from gymnasium.spaces import Box, Dict
 
     if isinstance(space, Dict):
         return {str(part): _described_space(one, ()) for part, one in space.spaces.items()}
-    return {"kinematics" if names else "observation": _described_space(space, names)}
+    found = _described_space(space, names)
+    if isinstance(space, Box) and names:
+        # Normalised values are at most 1. Of values without a bound, as highway-env has them, nobody knows the scale.
+        highest = space.high.reshape(-1, len(names)).max(axis=0)
+        found["units"] = [
+            unit if 1 < high < math.inf else "" for unit, high in zip(found["units"], highest, strict=True)
+        ]
+    return {"kinematics" if names else "observation": found}
 
 
 def _described_action(form: ActionForm) -> SpaceDescription:

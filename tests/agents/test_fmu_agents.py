@@ -31,7 +31,7 @@ class Simulated:
 
     step_length_s = 0.1
     observation_names: ClassVar = COLUMNS
-    observation_spaces: ClassVar = {"ego": spaces.Box(-np.inf, np.inf, (8, 7), np.float32)}
+    observation_spaces: ClassVar = {"ego": spaces.Box(-1e6, 1e6, (8, 7), np.float32)}
 
     def __init__(self):
         self.actions = {"ego": SpeedAndLaneChange()}

@@ -21,18 +21,19 @@ from programs import COMPILER, DRIVER, compile_program, write_binary_program, wr
 
 import crashhunt
 from crashhunt.agents import ProgramFactory
-from crashhunt.agents._programs import hello_of
+from crashhunt.agents._programs import _described_observation, hello_of
 from crashhunt.base import forks
 from crashhunt.base.agent_locators import command_of, files_of
 from crashhunt.base.errors import ActionError, PluginError, ProgramError
 from crashhunt.panels import labelled
 from crashhunt.plans import Request, plan_with_code, takes_of
-from crashhunt.simulators import AccelerationAndLaneChange, MetaAction, SpeedAndLaneChange
+from crashhunt.scenario import ObservationSetup
+from crashhunt.simulators import AccelerationAndLaneChange, Kinematics, MetaAction, SpeedAndLaneChange
 from crashhunt.trial import Range, signature_of
 from crashhunt.world import MapLane, RoadMap, StopLine, VehicleData
 
 COLUMNS = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
-SPACE = spaces.Box(-np.inf, np.inf, (8, 7), np.float32)
+SPACE = spaces.Box(-1e6, 1e6, (8, 7), np.float32)
 
 
 def observations(count=20):
@@ -235,6 +236,16 @@ def test_messages_are_those_of_the_protocol(tmp_path):
 def test_hello_has_the_units_of_every_form_of_actions():
     simulator = Simulated(AccelerationAndLaneChange())
     assert hello_of("ego", simulator, {})["action"]["units"] == ["m/s²", ""]
+
+
+def test_hello_has_no_units_for_normalised_values_and_for_those_of_an_unknown_scale():
+    def units(space, names):
+        return _described_observation(space, names)["kinematics"]["units"]
+
+    for normalize, expected in ((False, ["m", "m/s"]), (True, ["", ""])):
+        table = Kinematics(ObservationSetup(features=("x", "vx"), normalize=normalize))
+        assert units(table.space, table.features) == expected
+    assert units(spaces.Box(-np.inf, np.inf, (5, 2)), ("x", "vx")) == ["", ""]
 
 
 HARMS = [
