@@ -124,11 +124,12 @@ def test_texts_of_strangers_are_text_on_every_page(hunts, page):
 
 
 @pytest.mark.nightly  # by day, the report is driven by keyboard
-def test_the_table_of_hunts_is_reached_by_keyboard(hunts, page):
-    shutil.copytree(hunts / "one", hunts / "two")
+def test_the_table_of_hunts_is_reached_by_keyboard(hunts, page, shell):
+    add_toy(shell).crashhunt("run", str(hunts / "two"), "1", "3", "99", "--scenario", "toy", "--arg", "speed=20")
     with served(hunts) as dashboard:
         page.open(dashboard.url)
         page.wait("document.querySelectorAll('tbody tr').length === 2")
+        assert "4\ncrashes\n-\ncrash types" in page.text("#tiles")  # those of `two` are not counted
         page.tab_to("at.id === 'filter'")
         page.keys("two")
         assert page.run("return document.querySelectorAll('tbody tr').length") == 1
@@ -144,6 +145,9 @@ def test_the_table_of_hunts_is_reached_by_keyboard(hunts, page):
         page.tab_to("at.type === 'checkbox' && at.closest('tbody')")
         page.keys(" ")
         assert page.run("return document.activeElement.checked")
+        page.open(f"{dashboard.url}/hunts/{dashboard.hunts()['two']['id']}")
+        page.wait("document.getElementById('discovery').data")
+        assert page.run("return document.getElementById('discovery')._fullLayout.yaxis.dtick") == 1  # whole crashes
     assert page.faults() == []
 
 

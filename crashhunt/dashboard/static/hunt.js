@@ -149,10 +149,11 @@ function drawProgress() {
   types.x.push(at[at.length - 1]);
   types.y.push(firsts.length);
   const title = bySteps ? "simulated steps" : "trials";
+  const ticks = (most) => (most < 6 ? { dtick: 1 } : { tickformat: ",d", nticks: 6 });
   draw($("discovery"), [
     { x: at, y: curve.map((one) => one[2]), name: "crashes", mode: "lines", line: { color: css("--crash"), width: 2 } },
     { ...types, name: "crash types", mode: "lines", yaxis: "y2", line: { color: css("--accent"), width: 2, shape: "hv", dash: "dash" } },
-  ], { xaxis: { title, rangemode: "tozero" }, yaxis: { title: "crashes", rangemode: "tozero", tickformat: ",d", nticks: 6 }, yaxis2: { title: { text: "crash types" }, overlaying: "y", side: "right", rangemode: "tozero", showgrid: false, automargin: true, ...(firsts.length < 6 ? { dtick: 1 } : { tickformat: ",d", nticks: 6 }) } },
+  ], { xaxis: { title, rangemode: "tozero" }, yaxis: { title: "crashes", rangemode: "tozero", ...ticks(hunt.crashed_trials) }, yaxis2: { title: { text: "crash types" }, overlaying: "y", side: "right", rangemode: "tozero", showgrid: false, automargin: true, ...ticks(firsts.length) } },
   `Crashes and crash types over ${title}: ${plural(hunt.crashed_trials, "crash", "crashes")}, ${plural(firsts.length, "type", "types")}`);
   const outcomes = [...new Set(hunt.parts.flatMap((part) => Object.keys(part.outcomes)))].sort();
   const plain = ["survived", "finished", "invalid"];

@@ -168,7 +168,8 @@ function arrange() {
 function fillTotals() {
   const all = [...rows.values()], sum = (name) => all.reduce((total, row) => total + (row[name] || 0), 0);
   const running = all.filter((row) => row.state === "running");
-  const tiles = [["running", count(running.length)], ["hunts", count(all.length)], ["trials", count(sum("trials_run"))], ["trials/s", formatNumber(running.reduce((total, row) => total + row.rate_per_s, 0))], ["crashes", count(sum("crashed_trials"))], ["crash types", count(sum("kinds_count"))]];
+  const counted = all.every((row) => row.kinds_count !== null || !row.crashed_trials); // not in hunts that end at a crash
+  const tiles = [["running", count(running.length)], ["hunts", count(all.length)], ["trials", count(sum("trials_run"))], ["trials/s", formatNumber(running.reduce((total, row) => total + row.rate_per_s, 0))], ["crashes", count(sum("crashed_trials"))], ["crash types", counted ? count(sum("kinds_count")) : "-"]];
   const there = $("tiles").children;
   tiles.forEach(([name, value], place) => {
     if (!there[place]) {
