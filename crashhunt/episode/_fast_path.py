@@ -57,7 +57,7 @@ class FastPath:
         self.at_once = at_once
         self._recorder, self._agent, self._encode = recorder, agent, encode
         self.cannot_record = self.is_resuming = self.is_encoding = False
-        at_once.core.listen(at_once.meet, at_once.adopt, recorder.introduce, self._record_roster)
+        at_once.core.listen(recorder.numbers, self._record_roster)
 
     def resume_after(self, come: int, agents: dict[str, Agent]) -> tuple[int, dict[str, NDArray[np.generic]] | None]:
         """Return the final status of a step and the agent's action; None if the agent has not acted.

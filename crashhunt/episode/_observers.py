@@ -273,11 +273,14 @@ class Recorder(Observer):
     Args:
         box: the black box, for which `BlackBox.begin` has been called.
         simulator: the simulator of the episode.
+
+    Attributes:
+        numbers: the numbers of the actors that are recorded.
     """
 
     def __init__(self, box: BlackBox, simulator: Simulator) -> None:
         self._box = box
-        self._numbers: dict[Actor, int] = {}
+        self.numbers: dict[Actor, int] = {}
         self._same: dict[int, int] = {}
         self._kept: list[Actor] = []
         # Without detection of events, a count of 0 would be misleading.
@@ -292,9 +295,9 @@ class Recorder(Observer):
         Args:
             steps: steps of the core.
             roster: the actors.
-            records: what `introduce` returns for these actors; None if it has not been called.
+            records: the payloads of the records of actors and roster; None if there are none yet.
         """
-        records = records or self.introduce(roster.actors)
+        records = records or self._introduce(roster.actors)
         if roster is not self._box.roster:
             self._note_actors(*records)
         self._box.lend(steps, roster, records[1])
@@ -337,7 +340,7 @@ class Recorder(Observer):
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Record a scene, and before it any changes of actors and lanes."""
         if scene.roster is not self._box.roster:
-            self._note_actors(*self.introduce(scene.roster.actors))
+            self._note_actors(*self._introduce(scene.roster.actors))
         if scene.lanes:
             self._box.append(Tag.LANES, 0, "\n".join(scene.lanes).encode())
         if scene.contacts or scene.off_road:
@@ -352,13 +355,13 @@ class Recorder(Observer):
                 self._events.update([event.kind for event in scene.events])
         self._box.step(step, scene, rewards)
 
-    def introduce(self, actors: Sequence[Actor]) -> tuple[bytes, bytes]:
+    def _introduce(self, actors: Sequence[Actor]) -> tuple[bytes, bytes]:
         """Return the payloads of two records: of those actors that are not recorded yet, and of a roster of all.
 
         The first must be written next. It is empty if all actors have been recorded.
         """
         # Most are the same objects as before: to look for an equal one takes longer than all else about a roster.
-        fresh, known, same = [], self._numbers, self._same
+        fresh, known, same = [], self.numbers, self._same
         numbers: list[Any] = [*map(same.get, map(id, actors))]
         for row, actor in enumerate(actors) if None in numbers else ():
             if numbers[row] is None:

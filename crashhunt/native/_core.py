@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 20
+_INTERFACE = 21
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -92,27 +92,35 @@ class UsualSteps(Protocol):
     def heed(self, limits: dict[str, float], limit: float, stood: dict[str, int], standstill: int, /) -> None:
         """Set the limits of events: hard braking (m/s², 0 for each vehicle's own limit) and standstill (steps)."""
 
-    def listen(
+    def meet(
         self,
-        meet: Callable[[str], tuple[str, object, float, float, float, bool] | None],
+        known: dict[str, Any],
+        know: Callable[[str, str, float, float, float, bool], object],
+        measure: Callable[[str, float, float], float | None],
         adopt: Callable[[_Vehicles, tuple[str, ...], Any, int], object],
-        introduce: Callable[[Any], tuple[bytes, bytes]],
-        record_roster: Callable[[tuple[bytes, bytes]], object],
         /,
     ) -> None:
-        """Set the functions that are called when the visible vehicles change.
+        """Set what is needed for vehicles that come into sight.
 
         Args:
-            meet: function that receives the id of a vehicle that has not been in sight since `resume`. It returns
-                the id, the actor, its length, width and reach (m), and whether it is controlled. It returns None if the
-                core cannot continue with this vehicle.
+            known: the actors that the simulator knows, by id. The core reads the properties of all other vehicles.
+            know: function that receives id, kind, length, width and height (m) of a vehicle, and whether it is parked.
+                It returns the actor, and adds it to the known actors. The core calls this function later: before it
+                passes a step or a report to Python.
+            measure: function that receives kind, length and width (m) of a vehicle, and returns its reach (m). It
+                returns None if the core cannot continue with such a vehicle. The core calls it once for each size.
             adopt: function that receives the vehicles in sight, their ids and actors, and the row of the agent; it
-                returns their roster. If the core makes the observations, it calls this function later: before
-                it passes a step or a report to Python.
-            introduce: function that receives actors, and returns the payloads of two records: of those actors that are
-                not recorded yet, and of a roster of all of them.
-            record_roster: function that writes such records for the actors in sight if the buffer is full; it provides
-                a recording buffer again.
+                returns their roster. If the core makes the observations, it calls this function later, too.
+        """
+
+    def listen(self, numbers: dict[Any, int], record_roster: Callable[[tuple[bytes, bytes]], object], /) -> None:
+        """Set what is needed to record actors.
+
+        Args:
+            numbers: the numbers of the actors that are recorded. The core adds the actors that it records.
+            record_roster: function that receives the payloads of two records: of those actors in sight that are not
+                recorded yet, and of a roster of all of them. The core calls it if the buffer is full; it writes these
+                records and provides a recording buffer again.
         """
 
     def perceive(

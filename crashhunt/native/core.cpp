@@ -18,6 +18,7 @@
 #include <cstring>
 #include <deque>
 #include <exception>
+#include <map>
 #include <memory>
 #include <string>
 #include <tuple>
@@ -74,9 +75,9 @@ typedef const void *(*Singleton)();
 struct Sumo {
     PositionOf position;
     NumberOf angle, speed;
-    NumberOf driven, aside, aside_speed, along, decel, acceleration, min_gap, speed_limit;
+    NumberOf driven, aside, aside_speed, along, decel, acceleration, min_gap, speed_limit, length, width;
     WholeOf lane_index, stop_state, signals, route_index;
-    NameOf road, lane, route, light;
+    NameOf road, lane, route, light, kind;
     NumberAt lane_angle;
     NeighborOf follower, leader;
     Command set_speed;
@@ -143,6 +144,9 @@ PyObject *bind(PyObject *, PyObject *path) {
                  find(library, "_ZN7libsumo7Vehicle13getRouteIndexE" STRING, found.route_index) &&
                  find(library, "_ZN7libsumo7Vehicle10getRouteIDE" STRING, found.route) &&
                  find(library, "_ZN7libsumo7Vehicle12getStopStateE" STRING, found.stop_state) &&
+                 find(library, "_ZN7libsumo7Vehicle15getVehicleClassE" STRING, found.kind) &&
+                 find(library, "_ZN7libsumo7Vehicle9getLengthE" STRING, found.length) &&
+                 find(library, "_ZN7libsumo7Vehicle8getWidthE" STRING, found.width) &&
                  find(library, "_ZN7libsumo7Vehicle9getRoadIDE" STRING, found.road) &&
                  find(library, "_ZN7libsumo7Vehicle9getLaneIDE" STRING, found.lane) &&
                  find(library, "_ZN7libsumo7Vehicle11getFollowerE" STRING "d", found.follower) &&

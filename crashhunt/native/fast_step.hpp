@@ -12,6 +12,7 @@ enum Phase { ACTING = 1, SIMULATING = 2 }; // as BlackBoxHeader has them
 
 const double LOOK_M = 60.0, LOOK_S = 6.0; // as in _surroundings.py
 const int LANES_EVERY = 10, DIRECTION_EVERY = 10; // steps
+const int PARKED = 2; // of SUMO's stop state
 const double STANDING = 0.1;                      // m/s, as Standstill.SPEED
 const double LOOKED_INTO = 2.0, TOLERANCE = 0.01; // m/s², as of HardBraking
 const double ALONG = -0.4; // a cosine; what comes nearer to the -0.5 of SumoEvents is Python's to judge
@@ -22,6 +23,72 @@ struct Moment {
     double time_s = 0;
     std::vector<double> values;
     std::string lanes; // a line each; empty where the step does not look
+};
+
+// An actor of the episode, of which Python makes the object when it asks for a roster.
+struct Met {
+    std::string id, kind;
+    double length = 0, width = 0, reach = 0;
+    bool parked = false, controlled = false;
+    PyObject *name = nullptr, *actor = nullptr;
+    long long number = -1; // in the recording; negative until it is recorded
+
+    Met() = default;
+    Met(const Met &) = delete;
+    ~Met() {
+        Py_XDECREF(name);
+        Py_XDECREF(actor);
+    }
+
+    // Its properties as Python has them; false, with or without an exception, where these are none that can be recorded.
+    bool copy(PyObject *other) {
+        PyObject *whole = PyObject_GetAttrString(other, "kind");
+        Py_ssize_t size = 0;
+        const char *text = whole ? PyUnicode_AsUTF8AndSize(whole, &size) : nullptr;
+        if (text) {
+            kind.assign(text, static_cast<size_t>(size));
+        }
+        Py_XDECREF(whole);
+        double height = 0;
+        for (const auto &[property, place] :
+             {std::pair("length", &length), std::pair("width", &width), std::pair("height", &height)}) {
+            PyObject *value = text ? PyObject_GetAttrString(other, property) : nullptr;
+            text = value && PyFloat_CheckExact(value) ? text : nullptr;
+            *place = text ? PyFloat_AS_DOUBLE(value) : 0;
+            Py_XDECREF(value);
+        }
+        PyObject *stands = text ? PyObject_GetAttrString(other, "parked") : nullptr;
+        parked = stands == Py_True;
+        Py_XDECREF(stands);
+        if (!stands || height != 0) {
+            return false;
+        }
+        Py_INCREF(other);
+        Py_XSETREF(actor, other);
+        return true;
+    }
+
+    // Adds it to the payload of a record as `encode_actors` does; false where that is Python's to do.
+    bool describe(std::string &payload) const {
+        for (const std::string *text : {&id, &kind}) {
+            for (char letter : *text) {
+                if (letter < ' ' || letter > '~' || letter == '"' || letter == '\\') {
+                    return false;
+                }
+            }
+        }
+        payload.append(payload.empty() ? "[" : ", ").append("[\"" + id + "\", \"" + kind + "\"");
+        for (double size : {length, width}) {
+            char *digits = std::isfinite(size) ? PyOS_double_to_string(size, 'r', 0, Py_DTSF_ADD_DOT_0, nullptr) : nullptr;
+            if (!digits) {
+                return false;
+            }
+            payload.append(", ").append(digits);
+            PyMem_Free(digits);
+        }
+        payload += parked ? ", 0.0, true]" : "]";
+        return true;
+    }
 };
 
 template <typename Kept> void keep(Kept *&place, PyObject *value) {
@@ -44,20 +111,22 @@ struct Steps {
     int lateral = 0, takes = NEITHER;
     long every = 1;
     PyObject *limits = nullptr, *stood = nullptr; // of HardBraking, and of Standstill
+    PyObject *driven_by_agents = nullptr; // the controlled vehicles, by id
     double limit = 0;
     long standstill = 0;
     int always_ask = 0, overlaps = 0;
     long long last = 0, now_and_then = 0;
-    // Called with a vehicle that comes into sight, with all that are then in sight, for the records of these, and to make
-    // room for them.
-    PyObject *meet = nullptr, *adopt = nullptr, *introduce = nullptr, *record_roster = nullptr;
+    // The actors that the simulator knows, by id, and the numbers of those that are recorded. Called with a vehicle that it
+    // does not know, with the properties of one for its reach, with all that are in sight, and to make room for them.
+    PyObject *known_actors = nullptr, *know = nullptr, *measure = nullptr, *adopt = nullptr;
+    PyObject *recorded = nullptr, *record_roster = nullptr;
     // of the present roster, and of the step that is complete
     bool ready = false, stopped = false, known = false; // whether the vehicles were found in the step before
     long long made = 0; // by SUMO so far when they were, vehicles of this and other runs
     struct Sight {
         Vehicles *vehicles = nullptr;
-        PyObject *ids = nullptr, *actors = nullptr;
-        std::vector<char> controlled;
+        PyObject *ids = nullptr;
+        std::vector<Met *> actors;
         size_t row = 0;
         bool recorded = false;
     } sight, entered;
@@ -74,66 +143,87 @@ struct Steps {
     PyObject *tape = nullptr;
     size_t offset = 0, reserved = 0;
     long tags[6] = {}; // of an observation, an action, a step, lanes, a roster, actors
-    std::unordered_map<PyObject *, uint32_t> numbers; // of the actors that are recorded, which the recorder keeps
+    std::vector<Met *> fresh; // those that are recorded, in order, of which Python does not know that yet
     // Steps with the same actors, whose roster Python makes when it asks for it: many at a time take less.
     struct Run {
-        PyObject *vehicles, *ids, *actors, *roster;
+        PyObject *vehicles, *ids, *roster;
+        std::vector<Met *> actors;
         size_t row;
         std::vector<uint64_t> places; // where the numbers of each step begin
     };
     std::vector<Run> runs;
-    std::unordered_map<std::string, PyObject *> met; // what `meet` has returned since Python took a step
+    std::unordered_map<std::string, Met> met;
+    std::map<std::tuple<std::string, double, double>, double> measured; // what `measure` has returned, 0 where it is none
 
     Steps() = default;
     Steps(const Steps &) = delete;
     ~Steps() {
         for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, perceive, restore, draft, whole_type,
                               part_names, perceived, reinterpret_cast<PyObject *>(eyes),
-                              limits, stood, reinterpret_cast<PyObject *>(sight.vehicles), sight.ids, sight.actors,
-                              reinterpret_cast<PyObject *>(entered.vehicles), entered.ids, entered.actors,
-                              reinterpret_cast<PyObject *>(before_vehicles), meet, adopt, introduce, record_roster,
-                              observation, answer, tape}) {
+                              limits, stood, driven_by_agents, reinterpret_cast<PyObject *>(sight.vehicles), sight.ids,
+                              reinterpret_cast<PyObject *>(entered.vehicles), entered.ids,
+                              reinterpret_cast<PyObject *>(before_vehicles), known_actors, know, measure, adopt,
+                              recorded, record_roster, observation, answer, tape}) {
             Py_XDECREF(one);
         }
         clear_runs();
-        forget_met();
     }
 
     void clear_runs() {
         for (const Run &run : runs) {
-            for (PyObject *one : {run.vehicles, run.ids, run.actors, run.roster}) {
+            for (PyObject *one : {run.vehicles, run.ids, run.roster}) {
                 Py_XDECREF(one);
             }
         }
         runs.clear();
     }
 
-    void forget_met() {
-        for (const auto &known : met) {
-            Py_DECREF(known.second);
-        }
-        met.clear();
-    }
-
     // The next steps have these actors, whose roster may be null yet.
     void begin_run(Sight &seen, PyObject *roster) {
         runs.push_back({Py_NewRef(reinterpret_cast<PyObject *>(seen.vehicles)), Py_NewRef(seen.ids),
-                        Py_NewRef(seen.actors), Py_XNewRef(roster), seen.row, {}});
+                        Py_XNewRef(roster), seen.actors, seen.row, {}});
         seen.recorded = true;
     }
 
-    // Has Python make each roster that is still missing; false with an exception.
+    // Has Python make each roster that is still missing, and says which actors are recorded; false with an exception.
     bool adopt_all() {
         for (Run &run : runs) {
             if (!run.roster && !(run.roster = roster_of(run.vehicles, run.ids, run.actors, run.row))) {
                 return false;
             }
         }
+        for (Met *one : fresh) {
+            PyObject *number = is_made(*one) ? PyLong_FromLongLong(one->number) : nullptr;
+            const bool done = number && PyDict_SetItem(recorded, one->actor, number) == 0;
+            Py_XDECREF(number);
+            if (!done) {
+                return false;
+            }
+        }
+        fresh.clear();
         return true;
     }
 
-    PyObject *roster_of(PyObject *vehicles, PyObject *ids, PyObject *actors, size_t row) const {
-        return PyObject_CallFunction(adopt, "OOOn", vehicles, ids, actors, static_cast<Py_ssize_t>(row));
+    // Has Python make the object of an actor, if there is none yet; false with an exception.
+    bool is_made(Met &one) const {
+        if (!one.actor) {
+            one.actor = PyObject_CallFunction(know, "OsdddO", one.name, one.kind.c_str(), one.length, one.width, 0.0,
+                                              one.parked ? Py_True : Py_False);
+        }
+        return one.actor;
+    }
+
+    PyObject *roster_of(PyObject *vehicles, PyObject *ids, const std::vector<Met *> &whose, size_t row) const {
+        PyObject *actors = PyTuple_New(static_cast<Py_ssize_t>(whose.size()));
+        for (size_t place = 0; actors && place < whose.size(); place++) {
+            if (is_made(*whose[place])) {
+                PyTuple_SET_ITEM(actors, static_cast<Py_ssize_t>(place), Py_NewRef(whose[place]->actor));
+            } else {
+                Py_CLEAR(actors);
+            }
+        }
+        return actors ? PyObject_CallFunction(adopt, "OONn", vehicles, ids, actors, static_cast<Py_ssize_t>(row))
+                      : nullptr;
     }
 
     // Returns the roster of the actors in sight from now on, which Python makes at once; null with an exception.
@@ -230,7 +320,7 @@ struct Steps {
                 continue;
             }
             const double deceleration = (last.speeds[was] - present.speeds[actor]) / step_s;
-            if (deceleration < LOOKED_INTO || who.controlled[actor]) {
+            if (deceleration < LOOKED_INTO || who.actors[actor]->controlled) {
                 continue;
             }
             if (std::isnan(deceleration)) {
@@ -370,29 +460,37 @@ struct Steps {
         return parts;
     }
 
-    // Who is controlled, of those in sight; false with an exception.
-    static bool set_sight(Sight &place, PyObject *vehicles, PyObject *ids, Py_ssize_t row, PyObject *controlled,
-                          PyObject *actors) {
-        place.controlled.clear();
-        for (Py_ssize_t actor = 0; actor < PyTuple_GET_SIZE(ids); actor++) {
-            const int known = PyDict_Contains(controlled, PyTuple_GET_ITEM(ids, actor));
-            if (known < 0) {
-                return false;
-            }
-            place.controlled.push_back(known != 0);
-        }
+    // Who is in sight, as Python says; false with an exception.
+    bool set_sight(PyObject *vehicles, PyObject *ids, Py_ssize_t row, PyObject *controlled, PyObject *actors) {
         const Roster &roster = *reinterpret_cast<Vehicles *>(vehicles)->roster;
         const size_t size = roster.ids.size();
-        if (roster.lengths.size() != size || place.controlled.size() != size || row < 0 ||
-            static_cast<size_t>(row) >= size || static_cast<size_t>(PyTuple_GET_SIZE(actors)) != size) {
+        const auto rows = [&](PyObject *tuple) { return static_cast<size_t>(PyTuple_GET_SIZE(tuple)); };
+        if (roster.lengths.size() != size || rows(ids) != size || row < 0 || static_cast<size_t>(row) >= size ||
+            rows(actors) != size) {
             PyErr_SetString(PyExc_ValueError, "these are not the vehicles of the scene");
             return false;
         }
-        keep(place.vehicles, vehicles);
-        keep(place.ids, ids);
-        keep(place.actors, actors);
-        place.recorded = false;
-        place.row = static_cast<size_t>(row);
+        sight.actors.clear();
+        for (size_t place = 0; place < size; place++) {
+            PyObject *name = PyTuple_GET_ITEM(ids, static_cast<Py_ssize_t>(place));
+            PyObject *actor = PyTuple_GET_ITEM(actors, static_cast<Py_ssize_t>(place));
+            Met &one = met[roster.ids[place]];
+            const int driven = PyDict_Contains(controlled, name);
+            if (driven < 0) {
+                return false;
+            }
+            one.id = roster.ids[place];
+            one.controlled = driven;
+            one.length = roster.lengths[place], one.width = roster.widths[place], one.reach = roster.reaches[place];
+            keep(one.name, name);
+            keep(one.actor, actor);
+            sight.actors.push_back(&one);
+        }
+        keep(driven_by_agents, controlled);
+        keep(sight.vehicles, vehicles);
+        keep(sight.ids, ids);
+        sight.recorded = false;
+        sight.row = static_cast<size_t>(row);
         return true;
     }
 
@@ -412,24 +510,50 @@ struct Steps {
             }
             earlier.push_back(row_before);
         }
-        const bool known = meet && meet_all();
+        const bool known = recorded && know && meet_all();
         PyErr_Clear(); // it is said again
         return known;
     }
 
-    // What Python says of a vehicle that was not in sight, borrowed; null where it is none that can be read here.
-    PyObject *meet_one(const std::string &id) {
-        const auto known = met.find(id);
-        if (known != met.end()) {
-            return known->second;
-        }
-        PyObject *name = text_of(id), *found = name ? PyObject_CallOneArg(meet, name) : nullptr;
-        Py_XDECREF(name);
-        if (!found || !PyTuple_CheckExact(found)) {
-            Py_XDECREF(found);
+    // A vehicle that was not in sight; null where it is none that can be read here.
+    Met *meet_one(const std::string &id) {
+        Met &one = met[id];
+        if (!one.name && !(one.name = text_of(id))) {
             return nullptr;
         }
-        return met[id] = found;
+        one.id = id;
+        PyObject *known = PyDict_GetItemWithError(known_actors, one.name); // borrowed
+        if (one.number >= 0 && (!known || known == one.actor)) {
+            return &one;
+        }
+        const int driven = PyDict_Contains(driven_by_agents, one.name);
+        PyObject *number = nullptr; // borrowed
+        if (known) {
+            number = one.copy(known) ? PyDict_GetItemWithError(recorded, known) : nullptr;
+            if (one.actor != known) {
+                return nullptr;
+            }
+        } else {
+            one.kind = sumo.kind(id);
+            one.length = sumo.length(id), one.width = sumo.width(id);
+            one.parked = sumo.stop_state(id) & PARKED;
+        }
+        one.number = number ? PyLong_AsLongLong(number) : -1;
+        one.controlled = driven > 0;
+        return PyErr_Occurred() || !is_measured(one) ? nullptr : &one;
+    }
+
+    // Sets how far it reaches; false, with or without an exception, where it bends, and so is none that can be read here.
+    bool is_measured(Met &one) {
+        const auto found = measured.emplace(std::tuple(one.kind, one.length, one.width), -1);
+        double &reach = found.first->second;
+        if (found.second) {
+            PyObject *value = PyObject_CallFunction(measure, "sdd", one.kind.c_str(), one.length, one.width);
+            reach = value && value != Py_None ? PyFloat_AsDouble(value) : -1;
+            Py_XDECREF(value);
+        }
+        one.reach = reach;
+        return reach >= 0;
     }
 
     // Fills in who is in sight now: as before, who was, and otherwise as Python has met them.
@@ -437,37 +561,25 @@ struct Steps {
         const size_t count = earlier.size();
         Py_XSETREF(entered.vehicles, reinterpret_cast<Vehicles *>(vehicles_type->tp_alloc(vehicles_type, 0)));
         Py_XSETREF(entered.ids, PyTuple_New(static_cast<Py_ssize_t>(count)));
-        Py_XSETREF(entered.actors, PyTuple_New(static_cast<Py_ssize_t>(count)));
         entered.recorded = false;
-        entered.controlled.clear();
-        if (!entered.vehicles || !entered.ids || !entered.actors) {
+        entered.actors.clear();
+        if (!entered.vehicles || !entered.ids) {
             return false;
         }
-        const Roster &were = *sight.vehicles->roster;
         Roster &roster = *(entered.vehicles->roster = new Roster());
         bool present = false;
         for (size_t row = 0; row < count; row++) {
             const long was = earlier[row];
-            double length, width, reach;
-            PyObject *id, *actor;
-            int controlled;
-            if (was >= 0) {
-                length = were.lengths[was], width = were.widths[was], reach = were.reaches[was];
-                id = PyTuple_GET_ITEM(sight.ids, was), actor = PyTuple_GET_ITEM(sight.actors, was);
-                controlled = sight.controlled[was];
-            } else {
-                PyObject *found = meet_one(around.names[around.near[row]]);
-                if (!found || !PyArg_ParseTuple(found, "OOdddp", &id, &actor, &length, &width, &reach, &controlled)) {
-                    return false;
-                }
+            Met *one = was >= 0 ? sight.actors[was] : meet_one(around.names[around.near[row]]);
+            if (!one) {
+                return false;
             }
-            PyTuple_SET_ITEM(entered.ids, static_cast<Py_ssize_t>(row), Py_NewRef(id));
-            PyTuple_SET_ITEM(entered.actors, static_cast<Py_ssize_t>(row), Py_NewRef(actor));
-            roster.ids.push_back(around.names[around.near[row]]);
-            roster.lengths.push_back(length);
-            roster.widths.push_back(width);
-            roster.reaches.push_back(reach);
-            entered.controlled.push_back(controlled != 0);
+            PyTuple_SET_ITEM(entered.ids, static_cast<Py_ssize_t>(row), Py_NewRef(one->name));
+            entered.actors.push_back(one);
+            roster.ids.push_back(one->id);
+            roster.lengths.push_back(one->length);
+            roster.widths.push_back(one->width);
+            roster.reaches.push_back(one->reach);
             if (was == static_cast<long>(sight.row)) {
                 entered.row = row;
                 present = true;
@@ -485,37 +597,35 @@ struct Steps {
             PyErr_Clear();
             return REFUSED;
         }
-        PyObject *fresh = PyList_New(0);
-        bool good = fresh;
-        for (Py_ssize_t row = 0; good && row < PyTuple_GET_SIZE(entered.actors); row++) {
-            PyObject *actor = PyTuple_GET_ITEM(entered.actors, row);
-            good = numbers.count(actor) || PyList_Append(fresh, actor) == 0;
+        std::string actors;
+        for (const Met *one : entered.actors) {
+            if (one->number < 0 && !one->describe(actors)) {
+                Py_XDECREF(roster);
+                return REFUSED;
+            }
         }
-        PyObject *records = nullptr;
-        const char *actors = "", *places;
-        Py_ssize_t length = 0, size;
-        if (good && PyList_GET_SIZE(fresh)) {
-            records = PyObject_CallOneArg(introduce, fresh);
-            good = records && PyArg_ParseTuple(records, "y#y#", &actors, &length, &places, &size) &&
-                   number(fresh, places, size);
+        for (Met *one : entered.actors) {
+            if (one->number < 0) {
+                one->number = PyDict_GET_SIZE(recorded) + static_cast<long long>(fresh.size());
+                fresh.push_back(one);
+            }
         }
-        const int noted = good ? note_sight(actors, length, roster) : -1;
-        Py_XDECREF(records);
-        Py_XDECREF(fresh);
+        const int noted = note_sight(actors.empty() ? actors : actors.append("]"), roster);
         Py_XDECREF(roster);
         return noted;
     }
 
     // Records those who are in sight now, and before them the actors that have been numbered; as `note_roster`.
-    int note_sight(const char *actors, Py_ssize_t length, PyObject *roster) {
+    int note_sight(const std::string &actors, PyObject *roster) {
         std::vector<uint32_t> present;
-        for (Py_ssize_t row = 0; row < PyTuple_GET_SIZE(entered.actors); row++) {
-            present.push_back(numbers.at(PyTuple_GET_ITEM(entered.actors, row)));
+        for (const Met *one : entered.actors) {
+            present.push_back(static_cast<uint32_t>(one->number));
         }
         const size_t size = 4 * present.size();
-        if (offset + static_cast<size_t>(length) + size + 64 > reserved) {
-            PyObject *known = roster ? Py_NewRef(roster) : adopt_entered();
-            PyObject *done = known ? PyObject_CallFunction(record_roster, "((y#y#))", actors, length,
+        if (offset + actors.size() + size + 64 > reserved) {
+            PyObject *known = !roster ? adopt_entered() : adopt_all() ? Py_NewRef(roster) : nullptr;
+            PyObject *done = known ? PyObject_CallFunction(record_roster, "((y#y#))", actors.data(),
+                                                           static_cast<Py_ssize_t>(actors.size()),
                                                            reinterpret_cast<const char *>(present.data()),
                                                            static_cast<Py_ssize_t>(size))
                                    : nullptr;
@@ -523,8 +633,8 @@ struct Steps {
             Py_XDECREF(done);
             return !done ? -1 : able() ? DONE : REFUSED;
         }
-        if (length) {
-            record(5, actors, static_cast<size_t>(length), SIMULATING);
+        if (!actors.empty()) {
+            record(5, actors.data(), actors.size(), SIMULATING);
         }
         record(4, present.data(), size, SIMULATING);
         begin_run(entered, roster);
@@ -532,14 +642,16 @@ struct Steps {
     }
 
     // Takes the numbers of actors from the payload of a record; false with an exception.
-    bool number(PyObject *actors, const char *bytes, Py_ssize_t length) {
-        const Py_ssize_t count = PySequence_Fast_GET_SIZE(actors);
-        if (length != 4 * count) {
+    static bool number(const std::vector<Met *> &actors, const char *bytes, Py_ssize_t length) {
+        if (static_cast<size_t>(length) != 4 * actors.size()) {
             PyErr_SetString(PyExc_ValueError, "these are not the numbers of the actors");
             return false;
         }
-        for (Py_ssize_t row = 0; row < count; row++) {
-            memcpy(&numbers[PySequence_Fast_GET_ITEM(actors, row)], bytes + 4 * row, 4);
+        for (Met *one : actors) {
+            uint32_t given;
+            memcpy(&given, bytes, 4);
+            bytes += 4;
+            one->number = given;
         }
         return true;
     }
@@ -740,16 +852,28 @@ PyObject *usual_heed(PyObject *object, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
-// listen(meet, adopt, introduce, record_roster): who is called where others than before are in sight
-PyObject *usual_listen(PyObject *object, PyObject *arguments) {
+// meet(known actors, know, measure, adopt): of whom is asked about vehicles that come into sight
+PyObject *usual_meet(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
-    PyObject *meet, *adopt, *introduce, *record_roster;
-    if (!PyArg_ParseTuple(arguments, "OOOO", &meet, &adopt, &introduce, &record_roster)) {
+    PyObject *known, *know, *measure, *adopt;
+    if (!PyArg_ParseTuple(arguments, "O!OOO", &PyDict_Type, &known, &know, &measure, &adopt)) {
         return nullptr;
     }
-    keep(steps.meet, meet);
+    keep(steps.known_actors, known);
+    keep(steps.know, know);
+    keep(steps.measure, measure);
     keep(steps.adopt, adopt);
-    keep(steps.introduce, introduce);
+    Py_RETURN_NONE;
+}
+
+// listen(numbers, record_roster): the numbers of the actors that are recorded, and who makes room for further ones
+PyObject *usual_listen(PyObject *object, PyObject *arguments) {
+    Steps &steps = steps_of(object);
+    PyObject *numbers, *record_roster;
+    if (!PyArg_ParseTuple(arguments, "O!O", &PyDict_Type, &numbers, &record_roster)) {
+        return nullptr;
+    }
+    keep(steps.recorded, numbers);
     keep(steps.record_roster, record_roster);
     Py_RETURN_NONE;
 }
@@ -822,7 +946,7 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
         PyErr_SetString(PyExc_ValueError, "these are not the vehicles of the scene");
         return nullptr;
     }
-    if (!Steps::set_sight(steps.sight, vehicles, ids, row, controlled, actors)) {
+    if (!steps.set_sight(vehicles, ids, row, controlled, actors)) {
         return nullptr;
     }
     keep(steps.before_vehicles, vehicles);
@@ -837,7 +961,6 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     steps.follower = follower;
     steps.step = step;
     steps.known = false;
-    steps.forget_met(); // such as of a vehicle that has parked since
     steps.ready = true;
     Py_RETURN_NONE;
 }
@@ -865,7 +988,7 @@ PyObject *usual_borrow(PyObject *object, PyObject *arguments) {
         return nullptr;
     }
     Steps::Sight &seen = steps.earlier.empty() ? steps.sight : steps.entered;
-    if (!seen.vehicles || !steps.number(seen.actors, numbers, length)) {
+    if (!seen.vehicles || !Steps::number(seen.actors, numbers, length)) {
         return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_ValueError, "no vehicle is in sight");
     }
     keep(steps.tape, tape);
@@ -1027,17 +1150,17 @@ PyObject *usual_reads(PyObject *object, PyObject *given) {
         return nullptr;
     }
     try {
-        const std::string lane = sumo.lane(steps.agent);
+        const std::string lane = sumo.lane(steps.agent), kind = sumo.kind(steps.agent);
         const double along = sumo.along(steps.agent), angle = sumo.lane_angle(lane, along);
         std::string lanes;
         for (const std::string &id : vehicles->roster->ids) {
             lanes += sumo.lane(id) + '\n';
         }
-        return Py_BuildValue("(NidddddddNNidi)", text_of(sumo.road(steps.agent)), sumo.lane_index(steps.agent),
+        return Py_BuildValue("(NidddddddNNidisdd)", text_of(sumo.road(steps.agent)), sumo.lane_index(steps.agent),
                              sumo.driven(steps.agent), sumo.aside(steps.agent), sumo.aside_speed(steps.agent), along,
                              angle, sumo.speed_limit(lane), sumo.decel(steps.agent), text_of(lanes),
                              text_of(sumo.follower(steps.agent, 0.0).first), sumo.stop_state(steps.agent), sumo.time(),
-                             sumo.emergencies());
+                             sumo.emergencies(), kind.c_str(), sumo.length(steps.agent), sumo.width(steps.agent));
     } catch (...) {
         Py_RETURN_NONE;
     }
@@ -1058,7 +1181,8 @@ PyMethodDef usual_methods[] = {
     {"note", usual_note, METH_O, "Record an action; return whether that could be done."},
     {"go_on", usual_go_on, METH_O, "Simulate, and look where nothing has happened yet; return what has come of it."},
     {"heed", usual_heed, METH_VARARGS, "Take what is counted of braking and of standing."},
-    {"listen", usual_listen, METH_VARARGS, "Take who is called where others than before are in sight."},
+    {"meet", usual_meet, METH_VARARGS, "Take who is asked about vehicles that come into sight."},
+    {"listen", usual_listen, METH_VARARGS, "Take the numbers of recorded actors, and who makes room for others."},
     {"perceive", usual_perceive, METH_VARARGS, "Take what makes and restores observations that consist of parts."},
     {"perceived", usual_perceived, METH_O, "Return what has been made for a step; None if nothing has."},
     {"judge", usual_judge, METH_VARARGS, "Take when somebody has to be asked about a step."},

@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from gymnasium import Space
 
     from crashhunt.base.foreign_code import Party
-    from crashhunt.native import UsualSteps, Vehicles
+    from crashhunt.native import UsualSteps
     from crashhunt.simulators._observation_layout import ObservationLayout
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Actor, Lane, Motion, Neighbor, Paths, RoadMap, Roster, Scene, Surroundings, VehicleData
+    from crashhunt.world import Lane, Motion, Neighbor, Paths, RoadMap, Roster, Scene, Surroundings, VehicleData
 
 
 class Options(TypedDict, total=False):
@@ -570,15 +570,6 @@ class FastStepper(Protocol):
     @property
     def roster(self) -> Roster:
         """The actors in sight; while `core` runs a step, they may already be the actors after this step."""
-
-    def meet(self, vehicle: str, /) -> tuple[str, Actor, float, float, float, bool] | None:
-        """Return id, actor, length, width and reach (m) of a vehicle, and whether it is controlled.
-
-        The method returns None if `core` cannot continue with the vehicle.
-        """
-
-    def adopt(self, vehicles: Vehicles, ids: tuple[str, ...], actors: tuple[Actor, ...], row: int, /) -> Roster:
-        """Set the vehicles in sight, with the row of the agent, and return their roster."""
 
     def resume(self) -> Scene | None:
         """Bring `core` to the state of the simulator; return the scene, or None if that is not possible yet."""

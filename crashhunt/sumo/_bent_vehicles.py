@@ -12,7 +12,7 @@ from libsumo import _libsumo as sumo
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from crashhunt.world import Actor, Spine
+    from crashhunt.world import Spine
 
 _RAIL_CLASSES = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
 _RIGID_M = 15.0  # longest rigid bus in the EU (Directive 96/53/EC, Annex I); a longer vehicle has a joint
@@ -25,10 +25,10 @@ _MISPLACED_M = 1.0  # a vehicle further from its lane, as after moveToXY, is tre
 Point = tuple[float, float]
 
 
-def is_articulated(actor: Actor) -> bool:
+def is_articulated(kind: str, length: float) -> bool:
     """Return whether a vehicle has joints: rail vehicles, trailers, and vehicles longer than a rigid bus."""
-    jointed = actor.kind in _RAIL_CLASSES or actor.kind == "trailer"
-    return actor.length > (_JOINT_M if jointed else _RIGID_M)
+    jointed = kind in _RAIL_CLASSES or kind == "trailer"
+    return length > (_JOINT_M if jointed else _RIGID_M)
 
 
 class Bends:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, ParamSpec, Protocol, TypeVar
 import numpy as np
 from libsumo import _libsumo as sumo
 
+from crashhunt.sumo._range_of_sight import reach_of
 from crashhunt.world import Scene
 
 if TYPE_CHECKING:
@@ -110,13 +111,13 @@ class UsualSteps:
         self._core, self._agent = core, agent
         self._sight, self._events, self._kinematics = sight, events, kinematics
         self._present, self._arrive = present, arrive
-        self.apply, self.finish, self.meet = part(apply), part(finish), part(sight.meet)
-        self.adopt = part(self._adopt)
+        self.apply, self.finish = part(apply), part(finish)
         array = np.ndarray, shape, _FLOAT32 if draft is None else _FLOAT64
         self.core = core.UsualSteps(
             agent, SimpleNamespace(simulationStep=simulate), array, kinematics.shape[0] - 1,
             step_length_s, lateral, takes, sight.around, start_m,
         )  # fmt: skip
+        self.core.meet(sight.known, sight.know, reach_of, part(self._adopt))
         self._perceive, self._enter_parts = perceive, enter_parts
         if perceive is not None:
             names = () if record is None else record.names or ()
@@ -210,6 +211,9 @@ class UsualSteps:
             sumo.vehicle_getStopState(agent),
             sumo.simulation_getTime(),
             sumo.simulation_getEmergencyStoppingVehiclesNumber(),
+            sumo.vehicle_getVehicleClass(agent),
+            sumo.vehicle_getLength(agent),
+            sumo.vehicle_getWidth(agent),
         )
         lights = sumo.trafficlight_getIDList()[:1]
         states = [sumo.trafficlight_getRedYellowGreenState(light) for light in lights]

@@ -175,15 +175,18 @@ class Sight:
         """The actors in sight."""
         return self._roster
 
-    def meet(self, vehicle: str) -> tuple[str, Actor, float, float, float, bool] | None:
-        """Return id, actor, length, width and reach (m) of a vehicle, and whether it is controlled.
+    @property
+    def known(self) -> dict[str, Actor]:
+        """The actors that have been in sight in this episode, by id; also of persons."""
+        return self._known
 
-        The method returns None if the core cannot read the vehicle.
-        """
-        actor = self._actor(vehicle)
-        if vehicle in self._articulated:
-            return None
-        return vehicle, actor, actor.length, actor.width, self._reaches[vehicle], vehicle in self._controlled
+    def know(self, vehicle: str, kind: str, length: float, width: float, height: float, parked: bool) -> Actor:
+        """Return the actor of a vehicle that was not known before; all sizes in m."""
+        found = self._known[vehicle] = Actor(vehicle, kind, length=length, width=width, height=height, parked=parked)
+        self._reaches[vehicle] = math.hypot(length, width / 2)
+        if is_articulated(kind, length):
+            self._articulated.add(vehicle)
+        return found
 
     def reads_right(self) -> bool:
         """Return whether the core's values are bit-identical to the values of libsumo's getters."""
@@ -304,10 +307,7 @@ class Sight:
             kind = sumo.vehicle_getVehicleClass(vehicle)
             height = sumo.vehicle_getHeight(vehicle) if self._high else 0.0
             size = sumo.vehicle_getLength(vehicle), sumo.vehicle_getWidth(vehicle), height
-            found = self._known[vehicle] = Actor(vehicle, kind, *size, parked=_is_parked(vehicle))
-            self._reaches[vehicle] = math.hypot(found.length, found.width / 2)
-            if is_articulated(found):
-                self._articulated.add(vehicle)
+            found = self.know(vehicle, kind, *size, _is_parked(vehicle))
         return found
 
     def _person(self, person: str) -> Actor:
@@ -360,6 +360,11 @@ def _is_coming_or_going() -> bool:
         or sumo.simulation_getParkingStartingVehiclesNumber()
         or sumo.simulation_getParkingEndingVehiclesNumber()
     )
+
+
+def reach_of(kind: str, length: float, width: float) -> float | None:
+    """Return the reach of a vehicle in m, as in `Roster.reaches`; None for a vehicle that the core cannot read."""
+    return None if is_articulated(kind, length) else math.hypot(length, width / 2)
 
 
 def _is_parked(vehicle: str) -> bool:

@@ -42,11 +42,11 @@ TRAFFIC = (
 class Street:
     """A small scenario, whose episodes run with the core's own steps or without."""
 
-    def __init__(self, folder, agent=""):
+    def __init__(self, folder, agent="", further=""):
         from crashhunt.sumo import SumoSimulator
 
         shutil.copy(NET, folder)
-        (folder / "r.rou.xml").write_text(f"<routes>{TRAFFIC}</routes>")
+        (folder / "r.rou.xml").write_text(f"<routes>{TRAFFIC}{further}</routes>")
         (folder / "scenario.toml").write_text(
             'title = "t"\nschema = 1\nsimulator = "sumo"\nstep_length_s = 0.1\nwarmup_s = 0.0\n'
             '[sumo]\nnet = "signal.net.xml"\nroutes = ["r.rou.xml"]\n'
@@ -592,7 +592,7 @@ def test_what_sumo_does_not_report_is_seen_by_the_oracle(street):
     assert street.comes[ASK]
 
 
-@pytest.mark.parametrize("place", range(13))
+@pytest.mark.parametrize("place", range(17))
 def test_what_reads_something_else_takes_no_steps(street, place):
     class Lying:
         def __init__(self, *given):
@@ -652,6 +652,45 @@ def test_arguments_of_another_kind_are_refused(street):
             steps.resume((sized, ids, row, {}, actors), None, columns, 0.0, "", ("", 0, "", 0.0), "", 1)
     assert steps.take({}) == steps.take(None) == 2
     assert not steps.note(np.zeros(2))
+
+
+# Each drives where the agent does, or stands beside its road.
+SIZES = {
+    "plain": ("passenger", 4.3), "small": ("motorcycle", 0.1 + 0.2), "bent": ("trailer", 16.5), "é": ("taxi", 5.0),
+    "long": ("bus", 12.0),
+}  # fmt: skip
+ENDS = "east", "north"
+FURTHER = (
+    '<vehicle id="stands" depart="2.6" departPos="70"><route edges="west east"/>'
+    '<stop lane="west_0" endPos="76" duration="900" parking="true"/></vehicle>'
+) + "".join(
+    f'<vType id="{name}" vClass="{kind}" length="{length!r}" width="{length / 3!r}" sigma="0"/>'
+    f'<vehicle id="{name}-1" type="{name}" depart="{3 + number}"><route edges="west {ENDS[number % 2]}"/>'
+    f'</vehicle><vehicle id="{name}-2" type="{name}" depart="{3 + number}"><route edges="south north"/></vehicle>'
+    for number, (name, (kind, length)) in enumerate(SIZES.items())
+)
+
+
+def test_vehicles_of_all_sizes_and_names_are_recorded_as_python_does(tmp_path, monkeypatch):
+    from crashhunt.sumo import Sight, _range_of_sight
+
+    read, actor_of = [], Sight._actor
+    monkeypatch.setattr(Sight, "_actor", lambda sight, vehicle: (read.append(vehicle), actor_of(sight, vehicle))[1])
+    street = Street(tmp_path, further=FURTHER)
+    met = set()
+
+    def waits(step, _):
+        return 0.0 if step % 100 < 60 else 8.0, 0
+
+    for sight_m in (12.0, 20.0, 30.0, 45.0):
+        monkeypatch.setattr(_range_of_sight, "_SIGHT_SQUARED", sight_m**2)
+        whole = street.run(waits, at_once=False, steps=300, crash_on=())
+        read.clear()
+        assert street.run(waits, steps=300, crash_on=()) == whole
+        met |= {*street.simulator._sight.known} - {*read}
+    assert {"stands", "small-1"} <= met  # they were read by the core
+    street.box.close()
+    street.simulator.close()
 
 
 def test_vehicles_that_come_into_sight_again_are_recorded_without_python(tmp_path, monkeypatch):

@@ -277,7 +277,7 @@ def test_long_vehicles_have_spines(world):
      ("trailer", 6.1, True), ("trailer", 6.0, False), ("bus", 14.0, False)],
 )  # fmt: skip
 def test_long_vehicles_have_joints(kind, length, jointed):
-    assert _bent_vehicles.is_articulated(Actor("v", kind, length, 2.5, 3.0)) is jointed
+    assert _bent_vehicles.is_articulated(kind, length) is jointed
 
 
 @pytest.fixture
