@@ -3,8 +3,8 @@
 const double SLACK = 1e-6; // m, and relative: what NumPy rounds otherwise is far less
 const double MOST_KNOWN = 1e9; // of numbers beyond, what is rounded otherwise may be more
 
-// Successive scenes of one roster, of a Frame: (columns, row or -1, lengths, widths, numbers of the actors). Vehicles may
-// stand for the lengths, and None for the widths then, and for numbers that are the rows.
+// Successive scenes of one roster, of a Frame: (columns, row or -1, lengths, widths, numbers of the actors). Vehicles
+// may stand for the lengths, and None for the widths then, and for numbers that are the rows.
 struct Part {
     Py_buffer buffer = {};
     bool held = false;
@@ -305,8 +305,8 @@ PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
                             touched = true;
                         }
                         // What NumPy leaves out for being far from a collision course counts for nothing here either.
-                        sure = sure && -(dx * vx + dy * vy) > scale && fabs(dx * vy - dy * vx) < reach * speed - scale &&
-                               bound < horizon * speed - scale;
+                        sure = sure && -(dx * vx + dy * vy) > scale &&
+                               fabs(dx * vy - dy * vx) < reach * speed - scale && bound < horizon * speed - scale;
                         found.braking = found.time > 0 ? (speed + scale) / (2 * found.time) : HUGE_VAL;
                         if (sure) {
                             best_time = std::min(best_time, latest);

@@ -40,7 +40,8 @@ struct Met {
         Py_XDECREF(actor);
     }
 
-    // Its properties as Python has them; false, with or without an exception, where these are none that can be recorded.
+    // Its properties as Python has them; false, with or without an exception, where these are none that can be
+    // recorded.
     bool copy(PyObject *other) {
         PyObject *whole = PyObject_GetAttrString(other, "kind");
         Py_ssize_t size = 0;
@@ -79,8 +80,9 @@ struct Met {
         }
         payload.append(payload.empty() ? "[" : ", ").append("[\"" + id + "\", \"" + kind + "\"");
         for (double size : {length, width}) {
-            char *digits = std::isfinite(size) ? PyOS_double_to_string(size, 'r', 0, Py_DTSF_ADD_DOT_0, nullptr) : nullptr;
-            if (!digits) {
+            char *digits = PyOS_double_to_string(size, 'r', 0, Py_DTSF_ADD_DOT_0, nullptr);
+            if (!digits || !std::isfinite(size)) {
+                PyMem_Free(digits);
                 return false;
             }
             payload.append(", ").append(digits);
@@ -116,8 +118,9 @@ struct Steps {
     long standstill = 0;
     int always_ask = 0, overlaps = 0;
     long long last = 0, now_and_then = 0;
-    // The actors that the simulator knows, by id, and the numbers of those that are recorded. Called with a vehicle that it
-    // does not know, with the properties of one for its reach, with all that are in sight, and to make room for them.
+    // The actors that the simulator knows, by id, and the numbers of those that are recorded. Called with a vehicle
+    // that it does not know, with the properties of one for its reach, with all that are in sight, and to make room for
+    // them.
     PyObject *known_actors = nullptr, *know = nullptr, *measure = nullptr, *adopt = nullptr;
     PyObject *recorded = nullptr, *record_roster = nullptr;
     // of the present roster, and of the step that is complete
@@ -153,7 +156,7 @@ struct Steps {
     };
     std::vector<Run> runs;
     std::unordered_map<std::string, Met> met;
-    std::map<std::tuple<std::string, double, double>, double> measured; // what `measure` has returned, 0 where it is none
+    std::map<std::tuple<std::string, double, double>, double> measured; // -1 where `measure` has returned None
 
     Steps() = default;
     Steps(const Steps &) = delete;
@@ -421,7 +424,8 @@ struct Steps {
         return made;
     }
 
-    // Makes an array of an observation that is bytes yet, because the agent receives its parts; false with an exception.
+    // Makes an array of an observation that is bytes yet, because the agent receives its parts; false with an
+    // exception.
     bool show_array(PyObject *&place) const {
         if (place && PyBytes_CheckExact(place)) {
             place = array_of(place);
@@ -543,7 +547,8 @@ struct Steps {
         return PyErr_Occurred() || !is_measured(one) ? nullptr : &one;
     }
 
-    // Sets how far it reaches; false, with or without an exception, where it bends, and so is none that can be read here.
+    // Sets how far it reaches; false, with or without an exception, where it bends, and so is none that can be read
+    // here.
     bool is_measured(Met &one) {
         const auto found = measured.emplace(std::tuple(one.kind, one.length, one.width), -1);
         double &reach = found.first->second;
@@ -600,6 +605,7 @@ struct Steps {
         std::string actors;
         for (const Met *one : entered.actors) {
             if (one->number < 0 && !one->describe(actors)) {
+                PyErr_Clear();
                 Py_XDECREF(roster);
                 return REFUSED;
             }

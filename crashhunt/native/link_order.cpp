@@ -6,7 +6,8 @@
 //
 // - libsumo calls its own functions through a table of addresses. This library finds the entries of two functions there
 //   and replaces them. That works however and whenever libsumo was loaded, with all versions that export the functions.
-// - Instead of the constructor of MSLink, `construct` runs: it notes the order of construction and calls the constructor.
+// - Instead of the constructor of MSLink, `construct` runs: it notes the order of construction and calls the
+// constructor.
 // - Instead of the recheck, `recheck` runs: it calls the recheck once per pair, with the set holding that pair alone.
 // - Where an assumption fails, libsumo's own recheck runs once on the whole set, as without this library, and the load
 //   counts as unordered.

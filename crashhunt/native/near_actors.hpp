@@ -1,6 +1,6 @@
 // Actors near to each other: the default observation, who may touch whom, hard braking. A part of core.cpp.
 
-// ----------------------------------------------------------------------------------------------- those near to each other
+// -------------------------------------------------------------------------------------------- those near to each other
 
 typedef std::pair<double, size_t> Near; // squared distance of front bumpers, row; sorted as Python sorts such tuples
 std::vector<Near> nearest;
@@ -99,7 +99,7 @@ PyObject *observe(PyObject *, PyObject *const *given, Py_ssize_t count) {
     return bytes || PyErr_Occurred() ? bytes : Py_NewRef(Py_None);
 }
 
-// --------------------------------------------------------------------------------------------------- who may touch whom
+// -------------------------------------------------------------------------------------------------- who may touch whom
 
 const double TAU = 6.283185307179586;
 const double TOUCH = 1e-9;
@@ -170,7 +170,8 @@ bool reach(const Scene &present, const Scene &previous, size_t row, double step_
     }
     const Moved mine = moved(previous, present, row, earlier);
     const long was = earlier_row(earlier, row);
-    const Rectangle own = outline(present, row), own_before = was < 0 ? own : outline(previous, static_cast<size_t>(was));
+    const Rectangle own = outline(present, row);
+    const Rectangle own_before = was < 0 ? own : outline(previous, static_cast<size_t>(was));
     for (const Near &near : nearest) {
         const size_t other = near.second;
         const double reach = reaches[row] + reaches[other];

@@ -116,8 +116,9 @@ PyObject *vehicles_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
             return nullptr;
         }
     }
-    if (!numbers_of(lengths, roster->lengths) || !numbers_of(widths, roster->widths) || !numbers_of(reaches, roster->reaches) ||
-        roster->lengths.size() != roster->widths.size() || roster->lengths.size() != roster->reaches.size()) {
+    if (!numbers_of(lengths, roster->lengths) || !numbers_of(widths, roster->widths) ||
+        !numbers_of(reaches, roster->reaches) || roster->lengths.size() != roster->widths.size() ||
+        roster->lengths.size() != roster->reaches.size()) {
         Py_DECREF(self);
         PyErr_SetString(PyExc_TypeError, "lengths, widths and reaches are lists of floats, as many of each");
         return nullptr;

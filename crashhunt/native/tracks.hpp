@@ -1,7 +1,7 @@
 // The way of an agent in an episode, and who is near it. A part of core.cpp.
 
-// The way of an agent as _Way of crashhunt/world/_danger.py has it, up to what NumPy rounds otherwise: enough to rule out
-// that others touch it.
+// The way of an agent as _Way of crashhunt/world/_danger.py has it, up to what NumPy rounds otherwise: enough to rule
+// out that others touch it.
 struct Way {
     struct Outline { // of another actor: the middle, the direction, half sizes, and how far the corners are
         double x, y, c, s, length, width, reach;
@@ -47,7 +47,8 @@ struct Way {
         sincos(angle, &s, &c);
         const double turn_c = other.c * c + other.s * s, turn_s = other.s * c - other.c * s;
         const double along_x = dx * c + dy * s, across = dy * c - dx * s, far = fabs(turn_c), wide = fabs(turn_s);
-        const double own_l = half_length[sample], own_w = half_width[sample], length = other.length, width = other.width;
+        const double own_l = half_length[sample], own_w = half_width[sample];
+        const double length = other.length, width = other.width;
         double found = fabs(along_x) - own_l - length * far - width * wide;
         found = std::max(found, fabs(across) - own_w - length * wide - width * far);
         found = std::max(found, fabs(along_x * turn_c + across * turn_s) - length - own_l * far - own_w * wide);
@@ -92,9 +93,10 @@ struct Way {
     }
 };
 
-// tracks(parts, every, within, ahead, behind, unknown) -> (numbers, places) | None, each a pair for the agent and the others
-// As `_straight` of crashhunt/world/_tracks.py, of every so many scenes. Where a distance ahead is given, those are left
-// out whom the agent would not touch so far ahead of it and behind it, on its way and as much further straight on.
+// tracks(parts, every, within, ahead, behind, unknown) -> (numbers, places) | None, each a pair for the agent and the
+// others. As `_straight` of crashhunt/world/_tracks.py, of every so many scenes. Where a distance ahead is given, those
+// are left out whom the agent would not touch so far ahead of it and behind it, on its way and as much further straight
+// on.
 PyObject *tracks(PyObject *, PyObject *const *given, Py_ssize_t count) {
     if (count != 6) {
         PyErr_SetString(PyExc_TypeError, "tracks takes parts and five numbers");

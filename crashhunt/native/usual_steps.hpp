@@ -90,9 +90,9 @@ PyObject *usual_listen(PyObject *object, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
-// perceive(make, restore, draft | None, record, names): an observation is an array that the first makes where it cannot be
-// written from the draft again, and the agent receives what the second returns: the values with these names, where the
-// record is the type of all of them as one value
+// perceive(make, restore, draft | None, record, names): an observation is an array that the first makes where it cannot
+// be written from the draft again, and the agent receives what the second returns: the values with these names, where
+// the record is the type of all of them as one value
 PyObject *usual_perceive(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
     PyObject *make, *restore, *draft, *record, *names;
@@ -135,8 +135,8 @@ PyObject *usual_judge(PyObject *object, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
-// resume((vehicles, ids, row, controlled, actors), observation, columns, time_s, lanes, (road, lane_index, lane, from_left),
-//        follower, step)
+// resume((vehicles, ids, row, controlled, actors), observation, columns, time_s, lanes,
+//        (road, lane_index, lane, from_left), follower, step)
 PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
     PyObject *vehicles, *ids, *controlled, *actors, *observation, *columns;
@@ -177,8 +177,8 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
-// borrow(map, offset, reserved, (tags of an observation, an action, a step, lanes, a roster, actors), roster, numbers): the
-// roster is of those in sight, and has been recorded with these numbers
+// borrow(map, offset, reserved, (tags of an observation, an action, a step, lanes, a roster, actors), roster, numbers):
+// the roster is of those in sight, and has been recorded with these numbers
 PyObject *usual_borrow(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
     PyObject *tape, *roster;
