@@ -342,7 +342,7 @@ def _described_observation(space: Space[object], names: Sequence[str]) -> dict[s
         return {str(part): _described_space(one, ()) for part, one in space.spaces.items()}
     found = _described_space(space, names)
     if isinstance(space, Box) and names:
-        # Normalised values are at most 1. Of values without a bound, as highway-env has them, nobody knows the scale.
+        # Normalised values are at most 1. The scale of values without a bound, as highway-env has them, is unknown.
         highest = space.high.reshape(-1, len(names)).max(axis=0)
         found["units"] = [
             unit if 1 < high < math.inf else "" for unit, high in zip(found["units"], highest, strict=True)
