@@ -50,6 +50,7 @@ _EXPONENTS: Final = {
     "rad/s": (0, -1, 1),
 }  # fmt: skip
 """The exponents of m, s and rad in each unit of observations and actions."""
+_SAME_UNIT: Final = (1.0, 0.0)
 
 
 class _Variable(Protocol):
@@ -250,7 +251,7 @@ class _Model:
 
     def _conversion(self, unit: str, ours: str) -> tuple[float, float] | None:
         if not ours or unit in ("", "1", "-") or unit.replace("^", "").replace("²", "2") == ours.replace("²", "2"):
-            return 1.0, 0.0
+            return _SAME_UNIT
         base, (m, s, rad) = self._units.get(unit), _EXPONENTS[ours]
         if base is None or (base.m, base.s) != (m, s) or base.rad not in (0, rad):
             return None
@@ -305,7 +306,7 @@ class _Group:
     """
 
     def __init__(self) -> None:
-        self.type_name, self.conversion = "", (1.0, 0.0)
+        self.type_name, self.conversion = "", _SAME_UNIT
         self.references: list[int] = []
         self.places: list[tuple[np.ndarray[Any, np.dtype[np.generic]], int]] = []
         """For each value, the flat array that contains it, and its index."""
@@ -529,7 +530,7 @@ class FmuAgent:
     def _set_inputs(self) -> None:
         for group in self._wiring.inputs:
             values: Iterable[float] = [array.item(index) for array, index in group.places]
-            if group.conversion != (1.0, 0.0):
+            if group.conversion != _SAME_UNIT:
                 factor, offset = group.conversion
                 values = [(value - offset) / factor for value in values]
             if group.type_name not in _REALS:
@@ -539,9 +540,11 @@ class FmuAgent:
     def _get(self, group: _Group) -> None:
         count = (len(group.places),) if self._model.version == 3 else ()
         values = getattr(self._instance, f"get{group.type_name}")(group.references, *count)
-        factor, offset = group.conversion
+        if group.conversion != _SAME_UNIT:  # without it, a value keeps all its bits, such as the sign of -0.0
+            factor, offset = group.conversion
+            values = [value * factor + offset for value in values]
         for (array, index), value in zip(group.places, values, strict=True):
-            array[index] = value * factor + offset
+            array[index] = value
 
     def _whole(self, value: float) -> int:
         if value != int(value):

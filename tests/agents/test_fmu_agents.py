@@ -115,6 +115,8 @@ def test_values_are_converted_between_the_units_of_an_fmu_and_those_of_the_simul
     assert (plain.act(seen)[0], converting.act(seen)[0]) == (0.0, 4.0)  # 3 m are 16 dm here, which is far enough
     seen[1, 1] = 2.25  # 10 dm
     assert converting.act(seen)[0] == 0.0
+    unconverted = agent_of(tmp_path / "plain" / "planner.fmu", speed=-0.0)
+    assert str(unconverted.act(np.zeros_like(seen))[0]) == "-0.0"  # the same bits, which digests contain
 
 
 @pytest.mark.parametrize("definition", ['<Unit name="dm"><BaseUnit m="2" factor="0.1"/></Unit>', '<Unit name="dm"/>'])
