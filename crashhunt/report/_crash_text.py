@@ -434,7 +434,7 @@ def _number_of_action(name: str, value: float) -> str:
     """Return a number of an action as text; a position has one decimal."""
     if name in _UNITS and abs(value) < _NO_ACTION:
         return "0"
-    return f"{value:.1f}" if _UNITS.get(name) == "m" else format_number(value)
+    return f"{value:z.1f}" if _UNITS.get(name) == "m" else format_number(value)
 
 
 _GAP_M = 0.05  # shown as 0.1; a smaller one needs any deceleration, up to millions of m/s²

@@ -311,7 +311,7 @@ def test_needed_braking_is_shown_while_a_gap_is(gap_m, shown):
     ("name", "value", "shown"),
     [
         ("x", 100345.67, "100345.7"), ("acceleration", -1.2e-8, "0"), ("acceleration", -1.25, "-1.25"),
-        ("target_speed", 15.0, "15"), ("torque", 1.2e-8, "1.2e-8"),
+        ("target_speed", 15.0, "15"), ("torque", 1.2e-8, "1.2e-8"), ("y", -0.04, "0.0"),
     ],
 )  # fmt: skip
 def test_numbers_of_an_action_are_shown_as_precisely_as_they_matter(name, value, shown):
