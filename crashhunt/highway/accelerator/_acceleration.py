@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Self
 
 from crashhunt.highway.accelerator._known_versions import reason_against_version
@@ -80,7 +79,9 @@ def accelerate() -> Acceleration:
         ...     print(faster)
         <highway-env is accelerated>
     """
-    if reason := reason_against_version(version("highway-env")):
+    import highway_env  # a checkout has a version, too, and no metadata or those of another installation
+
+    if reason := reason_against_version(highway_env.__version__):
         return Acceleration(reason)
     from crashhunt.highway.accelerator import _switch
 
