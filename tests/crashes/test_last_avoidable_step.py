@@ -161,6 +161,8 @@ def test_what_the_runs_do_not_say_clearly_is_not_said():
     another = dataclasses.replace(HIT, victim="third")
     assert unclear(ending(outcome=Outcome.COLLISION, collision=another)).endswith("another crash follows")
     assert "outcome is clear" in unclear(ending(outcome=Outcome.COLLISION, collision=None))
+    for place in (None, Collision("ego", "alone", "ego")):
+        assert unclear(ending(outcome=Outcome.OFF_ROAD, collision=place)).endswith("another crash follows")
 
     def otherwise(result, scenes):
         scenes[0].points[1] = (1.0, 1.0)
@@ -175,12 +177,13 @@ def test_what_the_runs_do_not_say_clearly_is_not_said():
     assert "outcome is clear" in unclear(still_closing)
 
 
-def test_a_run_that_ends_in_the_crash_of_another_agent_is_no_other_crash_of_this_one():
-    elsewhere = Collision("second", "collider", "second", "third", ("overlap",))
+@pytest.mark.parametrize(("outcome", "hit"), [(Outcome.COLLISION, "third"), (Outcome.OFF_ROAD, "")])
+def test_a_run_that_ends_in_the_crash_of_another_agent_is_no_other_crash_of_this_one(outcome, hit):
+    elsewhere = Collision("second", "collider" if hit else "alone", "second", hit)
 
     def crash_of_another(result, scenes):
         if result.outcome is Outcome.SURVIVED:
-            result = dataclasses.replace(result, outcome=Outcome.COLLISION, collision=elsewhere)
+            result = dataclasses.replace(result, outcome=outcome, collision=elsewhere)
         return result, scenes
 
     world = World(change=crash_of_another)
