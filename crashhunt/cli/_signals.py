@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 
 from crashhunt.base.text import aligned, visible
-from crashhunt.cli._common import Commands, Options, add_json, pairs
+from crashhunt.cli._common import Commands, Options, add_json, add_options, chosen_options
+
+_HUNT_OPTIONS = ("ego", "action", "observe", "agents", "arguments", "scenario_arguments")
 
 
 def add_signals(commands: Commands) -> None:
@@ -17,10 +19,7 @@ def add_signals(commands: Commands) -> None:
         "one step of a trial, because a Gymnasium environment adds keys of info in its steps.",
     )
     signals.add_argument("scenario", metavar="SCENARIO", help="name of an included scenario, or a path")
-    signals.add_argument("--ego", metavar="VEHICLE", default="", help="as for crashhunt run")
-    signals.add_argument(
-        "--agent", metavar="[ID=]MODULE:ATTR", action="append", default=[], help="as for crashhunt run"
-    )
+    add_options({"what": signals.add_argument_group("as for crashhunt run")}, _HUNT_OPTIONS)
     add_json(signals)
     signals.set_defaults(command=_signals)
 
@@ -32,8 +31,8 @@ def _signals(options: Options, _words: list[str]) -> int:
     from crashhunt.hunts import list_signals
     from crashhunt.plans import Request, plan
 
-    agents = pairs(options.agent, "--agent", named=False)
-    asked = Request(scenario=options.scenario, ego=options.ego, agents=agents, trials=1, max_steps=_ANY_STEPS)
+    given = chosen_options(options, _HUNT_OPTIONS)
+    asked = Request(scenario=options.scenario, trials=1, max_steps=_ANY_STEPS, **given)
     found = list_signals(*plan(asked))
     if options.json:
         print(json.dumps(found))

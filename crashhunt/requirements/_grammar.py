@@ -158,6 +158,10 @@ def _at_unexpected(text: str, error: UnexpectedInput) -> _At:
         return _At((begin, end), "'=' is not an operator", "write == to compare")
     if last is not None and (similar := did_you_mean(last[1], _WORDS)) and last[1] not in _WORDS:
         return _At((begin - len(last[0]), begin - len(last[0]) + len(last[1])), f"{last[1]!r} is unknown", similar)
+    if word == "[" and last is not None and last[1] not in _WORDS:
+        place = begin - len(last[0]), len(text) if (closed := text.find("]", begin)) < 0 else closed + 1
+        fix = "give the number that crashhunt signals lists, such as observation[3]"
+        return _At(place, "the index in brackets is not a number", fix)
     similar = did_you_mean(word, _WORDS) if word.isidentifier() and word not in _WORDS else ""
     operators = "a comparison, and, or, implies, ->, until or since"
     fix = (

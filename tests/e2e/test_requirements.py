@@ -79,6 +79,10 @@ def test_signals_are_listed_with_units(toy):
     listed = toy.crashhunt("signals", "toy", "--json").json
     assert {"name": "speed", "unit": "m/s", "meaning": "speed along the heading"} in listed["signals"]
     assert listed["agents"] == ["ego"]
+    (toy.folder / "needs.py").write_text(DRIVER)
+    words = ("--agent", "needs:Follows", "--arg", "speed=signal:0:1", "--observe", "actors:rows=1,ego", "--json")
+    observed = [one for one in toy.crashhunt("signals", "toy", *words).json["signals"] if "observation" in one["name"]]
+    assert observed[-1]["meaning"].endswith("of the part ego")
     path = toy.folder / "toy" / "scenario.toml"
     path.write_text(f'requirement.late = "eventually[0:99] (speed > 1)"\n{path.read_text()}')
     assert "m/s²" in toy.crashhunt("signals", "toy").out  # although the window is longer than the step that runs
