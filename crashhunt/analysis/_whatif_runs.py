@@ -425,6 +425,6 @@ class Counts(Serializable):
             found.append("  all runs are bit-identical")
         found += [f"  excluded: {count} runs, {reason}" for reason, count in self.excluded.items()]
         if self.interrupted:
-            counted = f"{len(self.each)} of {self.asked} runs (those before the first run that had not finished)"
-            found.append(f"  interrupted: {self.interrupted}, after {counted}")
+            why = "interrupted" if self.interrupted == "stopped" else self.interrupted
+            found.append(f"  {why}: {len(self.each)} of {self.asked} runs count, those before the first unfinished run")
         return [*found, *(f"  warning: {warning}" for warning in self.warnings)]

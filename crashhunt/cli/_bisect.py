@@ -52,10 +52,14 @@ def _bisect(options: Options, _words: list[str]) -> int:
 
     with opened_crash(options.directory, options.crash) as (bundle, archive):
         run_trusted(partial(check_trust, bundle), bundle, archive, options)
-        found = bisect(
-            bundle, options.good, bad=options.bad, folder=options.folder, watch=show, tell=tell, build=options.build,
-            build_limit_s=build_limit_s(options),
-        )  # fmt: skip
+        try:
+            found = bisect(
+                bundle, options.good, bad=options.bad, folder=options.folder, watch=show, tell=tell,
+                build=options.build, build_limit_s=build_limit_s(options),
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            say("Interrupted: the commit is not known yet. The same command begins again.", as_json=options.json)
+            raise
     text = f"it is one of {', '.join(one[:12] for one in found.candidates)}"
     if found.commit:
         text = one_line(f"{found.commit[:12]} is the first in which it crashes: {found.subject}")

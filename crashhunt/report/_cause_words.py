@@ -83,10 +83,12 @@ def _outcome(factor: Factor) -> str:
     of = factor.clear
     if factor.kind in ("argument", "seed") and of > 1:
         low, high = factor.interval or (0.0, 1.0)
-        words = f"{factor.crashed} of {of} runs crash ({format_percent(low)} to {format_percent(high)})"
+        crash = "crashes" if factor.crashed == 1 else "crash"
+        words = f"{factor.crashed} of {of} runs {crash} ({format_percent(low)} to {format_percent(high)})"
         if factor.crashed == factor.same:
             return words
-        return f"{words}, {factor.same or 'none'} of them the same crash"
+        same = f"{factor.same or 'none'} of them the same crash" if factor.crashed > 1 else "another crash"
+        return f"{words}, {same}"
     counts = (("no crash", of - factor.crashed), ("another crash", factor.crashed - factor.same))
     several = [*counts, ("the same crash", factor.same)]
     parts = [f"{words} in {number} of {of} runs" if of > 1 else words for words, number in several if number]

@@ -75,7 +75,7 @@ def test_stopped_runs_count_up_to_the_first_unfinished_number():
         runs.found[number] = run(number)
     assert [each.number for each in runs.counted] == [0, 1]
     assert counts(*runs.counted, asked=9, interrupted="stopped").lines()[-1] == (
-        "  interrupted: stopped, after 2 of 9 runs (those before the first run that had not finished)"
+        "  interrupted: 2 of 9 runs count, those before the first unfinished run"
     )
 
 

@@ -652,6 +652,20 @@ def test_bisect_ends_with_1_where_it_stays_open(opened, monkeypatch, capsys, com
         run("bisect", "h")
 
 
+def test_interrupted_bisect_reports_that_the_commit_is_not_known(opened, monkeypatch, capsys):
+    from crashhunt.cli import _bisect
+
+    def bisect(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("crashhunt.corpus.bisect", bisect)
+    monkeypatch.setattr(_bisect, "check_trust", lambda *_: None)
+    opened(crash(), _bisect)
+    with pytest.raises(KeyboardInterrupt):
+        run("bisect", "h", "--good", "v1")
+    assert capsys.readouterr().out.startswith("Interrupted: the commit is not known yet.")
+
+
 def test_crash_is_exported_as_a_zip_file_or_as_a_scenario(opened, monkeypatch, capsys, tmp_path):
     from crashhunt.cli import _export
 

@@ -16,6 +16,17 @@ def test_a_default_is_reported_where_other_values_say_nothing(drawn):
     assert about_why(Why((default, others), 100), str)[1:] == ["- ego.speed at its default 5: no crash."]
 
 
+@pytest.mark.parametrize(("ends", "said"), [
+    (("other", "none", "none"), "1 of 3 runs crashes (6.15 % to 79.2 %), another crash."),
+    (("other", "other", "none"), "2 of 3 runs crash (20.8 % to 93.9 %), none of them the same crash."),
+    (("same", "other", "none"), "2 of 3 runs crash (20.8 % to 93.9 %), 1 of them the same crash."),
+    (("same", "none", "none"), "1 of 3 runs crashes (6.15 % to 79.2 %)."),
+])  # fmt: skip
+def test_runs_with_other_values_are_counted_in_words(ends, said):
+    others = Factor("argument", "ego.speed", "drawn", was=9.0, runs=tuple(LeftOut(6.0, one) for one in ends))
+    assert about_why(Why((others,), 100), str)[-1].endswith(f": {said}")
+
+
 def test_that_braking_helped_from_the_first_step_on_is_reported_next_to_what_helped_longer():
     brake, left = Attempt("brake", 3, {0: "avoided", 1: "hit", 2: "hit"}), Attempt("left", 3, {2: "avoided"})
     told = about_judgement(Judgement((brake, left)), lambda step: f"step {step}", "ego", "other")
