@@ -119,8 +119,9 @@ def test_values_are_converted_between_the_units_of_an_fmu_and_those_of_the_simul
     assert str(unconverted.act(np.zeros_like(seen))[0]) == "-0.0"  # the same bits, which digests contain
 
 
-@pytest.mark.parametrize("definition", ['<Unit name="dm"><BaseUnit m="2" factor="0.1"/></Unit>', '<Unit name="dm"/>'])
-def test_a_unit_that_cannot_be_converted_is_refused(tmp_path, definition):
+@pytest.mark.parametrize("base", ['m="2"', 'm="1" rad="1"', 'm="1" kg="1"', 'm="1" factor="0"', ""])
+def test_a_unit_that_cannot_be_converted_is_refused(tmp_path, base):
+    definition = f'<Unit name="dm"><BaseUnit {base}/></Unit>' if base else '<Unit name="dm"/>'
     fmu = build_fmu(tmp_path, 2, description=with_units(KM_H + definition, "km/h", "dm"))
     message = "its variable kinematics[1].x has the unit dm, which cannot be converted to m; export it with the unit m"
     with pytest.raises(PluginError, match=re.escape(message)):

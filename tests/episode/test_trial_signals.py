@@ -259,6 +259,7 @@ def test_elements_of_an_observation_in_parts_are_named_by_part(tmp_path):
     actors, speed = layout.columns["actors"], layout.columns["ego"]["speed"]
     assert signals.meaning(f"observation[{len(actors) + actors['ahead']}]") == "ahead in row 1 of the part actors"
     assert signals.meaning(f"observation[{2 * len(actors) + speed}]") == "speed of the part ego"
+    assert signals.meaning(f"observation[{2 * len(actors)}]") == f"{next(iter(layout.columns['ego']))} of the part ego"
 
 
 class Surrounded(ToySimulator):

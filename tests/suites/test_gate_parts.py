@@ -301,7 +301,8 @@ def test_corpus_of_a_commit_runs_with_its_code(corpus, tmp_path):
 
 
 def test_corpus_of_an_agent_has_its_cases_only(corpus, tmp_path):
-    assert started(gate(corpus.folder), tmp_path / "g")._run_corpus() is None
+    (corpus.folder / "crashes").mkdir()
+    assert started(gate(corpus.folder), tmp_path / "g")._run_corpus() is None  # crashes are a commit's
     asked = gate(corpus.folder, corpus=Path("cases"), parallel=1)
     run = started(asked, tmp_path / "g2")
     with pytest.raises(UsageError, match="--corpus cases is not a folder in HEAD"):
