@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Facts, Ledger
     from crashhunt.trial import TrialResult
 
+_ENDS = ("length", "outcome", "the outcome")  # differences of two runs without a value that differs
+
 
 class Audit:
     """Runs sampled trials again during the hunt, one at a time, and compares them.
@@ -98,6 +100,9 @@ class Audit:
                 self._clean_up(result.spec.number)
                 continue
             difference = self._compare(was, result)
+            if result.is_no_answer_to(was) and difference is not None and difference.field in _ENDS:
+                self._killed.add(result.spec.number)
+                continue
             self._done += 1
             if difference is not None:
                 found.append(difference)
@@ -194,7 +199,7 @@ def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, li
     try:
         for one in again.run([result.spec for result in wanted.values()], _AUDIT_FOLDER):
             now, was = one.result, wanted[one.result.spec.number]
-            if now.was_killed_from_outside:
+            if now.is_no_answer_to(was):
                 continue
             left.discard(now.spec.number)
             again.phases.advance()

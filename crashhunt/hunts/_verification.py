@@ -437,7 +437,7 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
         for one in again.run([result.spec for result in wanted.values()], layout.NEAR_MISSES):
             again.phases.advance()
             now, was = one.result, wanted[one.result.spec.number]
-            if now.was_killed_from_outside:
+            if now.is_no_answer_to(was):
                 what = f"trial {now.spec.number}, a near miss, was {now.summary}"
                 again.progress.notes.append(f"{what}: it has no bundle until the same command is run again")
             elif was.is_identical_run(now):

@@ -230,6 +230,8 @@ def test_confirmation_keeps_what_the_replay_shows(replays):
     late = Bundle(confirmed=None, why_unconfirmed="the replay was still running after 60 s")
     assert [_replay.confirm(BUNDLE) for _ in range(2)] == [late] * 2
     assert _replay.confirm(BUNDLE).confirmed is False
+    replays.ends = [report("diverged", hang, replace(THERE, field="length"))]
+    assert _replay.confirm(replace(BUNDLE, result=hang)).confirmed is False  # it hangs elsewhere
     replays.ends = [StoppedError()]
     assert _replay.confirm(BUNDLE) is None
     replays.ends = [UntrustedError("it is not yours")]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from crashhunt.trial import (
@@ -64,6 +66,14 @@ def forced(**given):
 )
 def test_trial_whose_processes_were_killed_from_outside_runs_again(evidence, again):
     assert TrialResult(SPEC, Outcome.SURVIVED, **evidence).is_to_be_run_again is again
+
+
+def test_run_that_was_killed_or_only_now_takes_too_long_is_no_answer():
+    first, late = TrialResult(SPEC, Outcome.SURVIVED), TrialResult(SPEC, Outcome.HANG)
+    assert late.is_no_answer_to(first)
+    assert replace(first, failure=Failure(KILLED, "killed")).is_no_answer_to(first)
+    assert not late.is_no_answer_to(late)
+    assert not first.is_no_answer_to(late)
 
 
 @pytest.mark.parametrize(
