@@ -108,9 +108,8 @@ class NumbersAction:
 
         self.check: Callable[[NDArray[np.float64]], None] | None = None
 
-        self._description = ACTIONS[form]
-        self._components = self._description.components
-        self.names = self._description.names
+        described = ACTIONS[form]
+        self._components, self.names, self._layout = described.components, described.names, described.layout
         low, high = np.transpose([(one.low, one.high) for one in self._components])
         self.space: Space[object] = spaces.Box(low, high, dtype=np.float64)
         self._count = len(self._components)
@@ -118,17 +117,18 @@ class NumbersAction:
 
     def encode(self, action: object) -> NDArray[np.float64]:
         """Return the action as a float64 array with one number for each component."""
-        layout = self._description.layout
         array: NDArray[np.generic] | None = None
         with suppress(Exception):  # converting the agent's object runs the agent's code, which may raise anything
             array = cast(action, np.dtype(np.float64))
         if array is None or array.shape != (self._count,):
-            fix = f"return {self._count} numbers"
-            raise ActionError(f"the action {describe_value(action)}{_form_of(action, array)} is not {layout}", fix=fix)
+            what = f"{describe_value(action)}{_form_of(action, array)}"
+            raise ActionError(f"the action {what} is not {self._layout}", fix=f"return {self._count} numbers")
         for value, component in zip(array.tolist(), self._components, strict=True):
             if not component.low <= value <= component.high:  # NaN fails the comparison
                 allowed = f"within {component.low:g} and {component.high:g} {component.unit}".rstrip()
-                raise ActionError(f"{component.name} is {value:g} in the action {layout}", fix=f"return it {allowed}")
+                raise ActionError(
+                    f"{component.name} is {value:g} in the action {self._layout}", fix=f"return it {allowed}"
+                )
         found = array.astype(np.float64, copy=False)
         if self.check is not None:
             self.check(found)
