@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -16,6 +15,8 @@ if TYPE_CHECKING:
 
     from gymnasium import Space
     from numpy.typing import NDArray
+
+T = TypeVar("T")
 
 MAX_TARGET_SPEED = 100.0  # m/s; a Box space needs a finite bound, and no road vehicle is faster
 MAX_ACCELERATION = 10.0  # m/s²; no road vehicle brakes harder on dry asphalt
@@ -42,24 +43,28 @@ class SpeedAndLaneChange:
 
     def encode(self, action: Any) -> NDArray[np.float64]:
         """Return the action as a float64 array of shape (2,)."""
-        try:
-            value, lane_change = action
-            # Most agents return this form in every step, so check it first.
-            usual = action.__class__ is tuple and value.__class__ is float and lane_change.__class__ is int
-            if usual and self._low <= value <= self._high and -1 <= lane_change <= 1:
-                return np.array(action)
-            # NaN and masked values fail both comparisons. Unpacking a dictionary would have returned its keys.
-            if (
-                not isinstance(action, dict | set | frozenset)
-                and self._low <= value <= self._high
-                and lane_change in (-1, 0, 1)
-            ):
-                array = np.array((value, lane_change))
-                if array.dtype.kind in "fiubO" and array.shape == (2,):  # refuses complex numbers
-                    return array.astype(np.float64, copy=False)
-        except Exception:  # the agent's object may raise anything when it is compared
-            pass
-        raise ActionError(f"the action {describe_value(action)} is not ({', '.join(self.names)})", fix=self._fix)
+        found = _tried(self._encoded, action)
+        if found is None:
+            message = f"the action {describe_value(action)} is not ({', '.join(self.names)})"
+            raise ActionError(message, fix=self._fix)
+        return found
+
+    def _encoded(self, action: Any) -> NDArray[np.float64] | None:
+        value, lane_change = action
+        # Most agents return this form in every step, so check it first.
+        usual = action.__class__ is tuple and value.__class__ is float and lane_change.__class__ is int
+        if usual and self._low <= value <= self._high and -1 <= lane_change <= 1:
+            return np.array(action)
+        # NaN and masked values fail both comparisons. Unpacking a dictionary would have returned its keys.
+        if (
+            not isinstance(action, dict | set | frozenset)
+            and self._low <= value <= self._high
+            and lane_change in (-1, 0, 1)
+        ):
+            array = np.array((value, lane_change))
+            if array.dtype.kind in "fiubO" and array.shape == (2,):  # refuses complex numbers
+                return array.astype(np.float64, copy=False)
+        return None
 
 
 class AccelerationAndLaneChange(SpeedAndLaneChange):
@@ -117,9 +122,7 @@ class NumbersAction:
 
     def encode(self, action: object) -> NDArray[np.float64]:
         """Return the action as a float64 array with one number for each component."""
-        array: NDArray[np.generic] | None = None
-        with suppress(Exception):  # converting the agent's object runs the agent's code, which may raise anything
-            array = cast(action, np.dtype(np.float64))
+        array = _tried(cast, action, np.dtype(np.float64))
         if array is None or array.shape != (self._count,):
             what = f"{describe_value(action)}{_form_of(action, array)}"
             raise ActionError(f"the action {what} is not {self._layout}", fix=f"return {self._count} numbers")
@@ -167,9 +170,7 @@ class TrajectoryAction:
 
     def encode(self, action: object) -> NDArray[np.float64]:
         """Return the trajectory as a float64 array of the shape (64, 5)."""
-        array: NDArray[np.generic] | None = None
-        with suppress(Exception):  # converting the agent's object runs the agent's code, which may raise anything
-            array = cast(action, np.dtype(np.float64))
+        array = _tried(cast, action, np.dtype(np.float64))
         if array is None or array.ndim != 2 or array.shape[1] != _WIDTH or not 0 < array.shape[0] <= MAX_POINTS:
             fix = f"return an array (K, {_WIDTH}) of time, x, y, heading and speed, with 1 to {MAX_POINTS} rows"
             message = f"the action {describe_value(action)}{_form_of(action, array)} is not a trajectory"
@@ -215,9 +216,7 @@ class SpaceAction:
 
     def encode(self, action: object) -> NDArray[np.generic]:
         """Return an array of the space's type and shape."""
-        array: NDArray[np.generic] | None = None
-        with suppress(Exception):  # converting the agent's object runs the agent's code, which may raise anything
-            array = cast(action, self._dtype)
+        array = _tried(cast, action, self._dtype)
         if array is None or not self._contains(array):
             raise ActionError(
                 f"the action {describe_value(action)} is not in {self.space}", fix="return an action in this space"
@@ -263,6 +262,23 @@ def _form_of(action: object, array: NDArray[np.generic] | None) -> str:
     if array is not None:
         return f" of the shape {array.shape}"
     return f" of the type {action.dtype}" if isinstance(action, np.ndarray) else ""
+
+
+def _tried(convert: Callable[..., T], *given: Any) -> T | None:
+    """Return what a conversion of an action returns; None if the action cannot be converted.
+
+    Raises:
+        Exception: an exception that does not come again. It is not the action's, but for example that of a signal
+            handler of the agent.
+    """
+    try:
+        return convert(*given)
+    except Exception:  # converting the agent's object runs the agent's code, which may raise anything
+        try:
+            convert(*given)
+        except Exception:
+            return None
+        raise
 
 
 def cast(action: object, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:

@@ -125,6 +125,28 @@ class Silent:
         raise MemoryError
 
 
+class Interrupted:
+    """An action during whose first conversion a signal handler of the agent raises an error."""
+
+    def __init__(self):
+        self.conversions = 0
+
+    def __array__(self, dtype=None, copy=None):
+        return np.array([*self])
+
+    def __iter__(self):
+        self.conversions += 1
+        if self.conversions == 1:
+            raise ZeroDivisionError("of a signal handler")
+        return iter((0.5, 0.0))
+
+
+@pytest.mark.parametrize("form", [FORMS["steering"], SpeedAndLaneChange()], ids=["steering", "speed_and_lane"])
+def test_an_exception_that_does_not_come_again_is_not_that_of_the_action(form):
+    with pytest.raises(ZeroDivisionError, match="of a signal handler"):
+        form.encode(Interrupted())
+
+
 @pytest.mark.parametrize("name", FORMS)
 def test_an_object_that_fails_when_it_is_looked_at_is_refused(name):
     with pytest.raises(ActionError, match=r"of class Silent, whose repr raises RuntimeError, is not"):
