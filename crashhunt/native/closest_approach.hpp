@@ -158,7 +158,7 @@ struct Pair {
         for (const double(&axis)[3] : axes) {
             const double distance = x * axis[0] + y * axis[1], speed = vx * axis[0] + vy * axis[1], reach = axis[2];
             const double slack = SLACK * (1 + fabs(x) + fabs(y) + reach);
-            if (fabs(speed) < SLACK) { // it hardly moves on this axis, for as long as anybody looks
+            if (fabs(speed) < SLACK) { // it hardly moves on this axis within the time that is looked at
                 const double room = reach - fabs(distance), most = slack + SLACK * 4 * horizon;
                 if (room < -most) {
                     sure = false;
@@ -186,7 +186,7 @@ struct Pair {
 
 // may_be_near(parts, gap, horizon, gap so far, time so far, braking so far, only the best) -> (numbers, places) | None
 // The conditions of `approaches` in world/_closest_approach.py with some slack: who fulfils them there does so here.
-// Where only the best is asked for, those are left out who are surely not as near, in any way, as somebody else.
+// If only the best pair is asked for, pairs are left out for which another pair is certainly nearer in every measure.
 PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
     if (count != 7) {
         PyErr_SetString(PyExc_TypeError, "may_be_near takes parts, five numbers and a truth");
@@ -213,7 +213,7 @@ PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
     };
     std::vector<Body> bodies;
     std::vector<Candidate> candidates;
-    // Nobody who surely touches nobody is sooner or harder than anybody.
+    // A pair that certainly does not touch has neither the shortest time nor the hardest braking.
     const auto beaten = [&](const Candidate &one) {
         return (one.gap > best_gap || one.gap == HUGE_VAL) && (one.time > best_time || one.time == HUGE_VAL) &&
                (one.braking < best_braking || one.braking == 0);
@@ -338,7 +338,7 @@ PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
     int64_t agent = 0, last = -1;
     for (const Candidate &one : candidates) {
         if (beaten(one)) {
-            continue; // by somebody after it
+            continue; // by a pair after it
         }
         if (one.step != last) {
             last = one.step;

@@ -15,7 +15,7 @@ const int LANES_EVERY = 10, DIRECTION_EVERY = 10; // steps
 const int PARKED = 2; // of SUMO's stop state
 const double STANDING = 0.1;                      // m/s, as Standstill.SPEED
 const double LOOKED_INTO = 2.0, TOLERANCE = 0.01; // m/s², as of HardBraking
-const double ALONG = -0.4; // a cosine; what comes nearer to the -0.5 of SumoEvents is Python's to judge
+const double ALONG = -0.4; // a cosine; Python judges values nearer to the -0.5 of SumoEvents
 const double MOST_SPEED = 100.0, MOST_ACCELERATION = 10.0; // as in _actions.py
 const double RADIANS = 3.141592653589793 / 180.0;
 
@@ -69,7 +69,7 @@ struct Met {
         return true;
     }
 
-    // Adds it to the payload of a record as `encode_actors` does; false where that is Python's to do.
+    // Adds it to the payload of a record as `encode_actors` does; false if Python has to do it.
     bool describe(std::string &payload) const {
         for (const std::string *text : {&id, &kind}) {
             for (char letter : *text) {
@@ -236,7 +236,7 @@ struct Steps {
                            : nullptr;
     }
 
-    // Whether an answer is one that `command` carries out; anything else is Python's.
+    // Whether `command` carries out an answer; Python handles all others.
     bool takes_answer(double value) const {
         return takes == SPEED ? value >= 0.0 && value <= MOST_SPEED : fabs(value) <= MOST_ACCELERATION;
     }
@@ -252,7 +252,7 @@ struct Steps {
 
     bool able() const { return ready && !stopped && tape && sight.recorded; }
 
-    // Writes a record and where the process is; false where that is Python's to do.
+    // Writes a record and where the process is; false if Python has to do it.
     bool record(int kind, const void *data, size_t length, Phase phase) {
         Py_buffer buffer;
         if (offset + length + 16 > reserved || length > UINT32_MAX) {
@@ -280,7 +280,7 @@ struct Steps {
         return done;
     }
 
-    // Takes the last record back, which nobody has read.
+    // Takes the last record back, which has not been read.
     void forget(size_t end) {
         Py_buffer buffer;
         if (PyObject_GetBuffer(tape, &buffer, PyBUF_WRITABLE) < 0) {
@@ -306,7 +306,7 @@ struct Steps {
         return (dx * sin(angle) + dy * cos(angle)) / driven >= ALONG;
     }
 
-    // Whether somebody braked harder than its limit; -1 where Python has to say.
+    // Whether a vehicle braked harder than its limit; -1 if Python has to decide.
     int is_braking_hard(const Scene &present, const Scene &last, const Sight &who) {
         if (earlier.empty()) {
             const double least = least_of(last, present);
@@ -351,7 +351,7 @@ struct Steps {
         return 0;
     }
 
-    // Counts a step in which it stands; false where that is an event, or Python's to say. The last thing that is asked.
+    // Counts a step in which it stands; false if that is an event, or if Python has to decide. It is asked last.
     bool stands_on(double speed) {
         if (fabs(speed) >= STANDING) {
             return speed > 0 && PyDict_GET_SIZE(stood) == 0;
@@ -370,7 +370,7 @@ struct Steps {
         return counted;
     }
 
-    // The lanes of everybody, as a record has them; false where they are not plain text, or nobody is on one.
+    // The lanes of all actors, as a record has them; false if one is not plain text, or if no actor is on a lane.
     static bool note_lanes(std::string &text, const Roster &roster) {
         text.clear();
         bool first = true;
@@ -498,7 +498,7 @@ struct Steps {
         return true;
     }
 
-    // Lets others than before be in sight; false where that is Python's to do.
+    // Lets others than before be in sight; false if Python has to do it.
     bool let_in() {
         // Most are where they were in the list.
         const std::vector<std::string> &were = sight.vehicles->roster->ids;
@@ -725,7 +725,7 @@ struct Steps {
             }
             std::vector<uint64_t> &places = runs.back().places;
             if (places.size() == places.capacity()) {
-                places.reserve(2 * places.size() + 16); // where there is no memory, the step is Python's
+                places.reserve(2 * places.size() + 16); // if there is no memory, Python does the step
             }
             seen = shown(present, who);
             if (!seen) {

@@ -1,4 +1,4 @@
-// Actors near to each other: the default observation, who may touch whom, hard braking. A part of core.cpp.
+// Actors near to each other: the default observation, pairs that may touch, hard braking. A part of core.cpp.
 
 // -------------------------------------------------------------------------------------------- those near to each other
 
@@ -26,7 +26,7 @@ bool find_nearest(const Scene &scene, size_t row, double below, size_t wanted) {
 
 // --------------------------------------------------------------------------------------------------- the observation
 
-// As Kinematics.observe in its usual form; null without an exception where that is Python's to do.
+// As Kinematics.observe in its usual form; null without an exception if Python has to do it.
 PyObject *observed(const Scene &present, size_t row, size_t shown, double distance, double from_left,
                    double lateral_speed) {
     const std::vector<double> &lengths = present.roster->lengths;
@@ -99,7 +99,7 @@ PyObject *observe(PyObject *, PyObject *const *given, Py_ssize_t count) {
     return bytes || PyErr_Occurred() ? bytes : Py_NewRef(Py_None);
 }
 
-// -------------------------------------------------------------------------------------------------- who may touch whom
+// ------------------------------------------------------------------------------------------------ pairs that may touch
 
 const double TAU = 6.283185307179586;
 const double TOUCH = 1e-9;
@@ -155,7 +155,7 @@ Moved moved(const Scene &previous, const Scene &present, size_t row, const Earli
     return {dx, dy, aside};
 }
 
-// As _within_reach of oracles/_included_oracles.py, of two scenes; false where that is Python's to do.
+// As _within_reach of oracles/_included_oracles.py, of two scenes; false if Python has to do it.
 bool reach(const Scene &present, const Scene &previous, size_t row, double step_s, double hardest,
            std::vector<size_t> &found, const Earlier &earlier = Earlier()) {
     const std::vector<double> &reaches = present.roster->reaches;
@@ -258,7 +258,7 @@ PyObject *within_reach(PyObject *, PyObject *const *given, Py_ssize_t count) {
     return found;
 }
 
-// The least of the changes of speed; 0 where nobody is, and not a number where that is Python's to say.
+// The least change of speed; 0 if there is no actor, and NaN if Python has to compute it.
 double least_of(const Scene &earlier, const Scene &later) {
     double least = later.size ? HUGE_VAL : 0.0;
     for (size_t row = 0; row < later.size; row++) {
@@ -271,7 +271,7 @@ double least_of(const Scene &earlier, const Scene &later) {
     return least;
 }
 
-// least_change(earlier, later) -> float | None: the least of the changes of speed; 0 where nobody is
+// least_change(earlier, later) -> float | None: the least change of speed; 0 if there is no actor
 PyObject *least_change(PyObject *, PyObject *const *given, Py_ssize_t count) {
     Columns *was = count == 2 ? columns_of(given[0]) : nullptr, *is = was ? columns_of(given[1]) : nullptr;
     if (!is) {

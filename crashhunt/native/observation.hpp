@@ -150,7 +150,7 @@ struct Written {
     size_t place = 0;
     virtual ~Written() {}
     virtual size_t size() const = 0;
-    // Writes the columns, where there are zeros; false where that is Python's to do. Nothing is noted yet.
+    // Writes the columns, where there are zeros; false if Python has to do it. Nothing is noted yet.
     virtual bool write(const Here &here, double *out) = 0;
     // Notes what the next step needs; false with an exception.
     virtual bool note(const Here &) { return true; }

@@ -59,7 +59,7 @@ struct Seen {
 };
 std::vector<Seen> seen_actors; // used again
 
-// The actors within a radius, as nearest_actors of simulators/_scene_parts.py; false where that is Python's to do.
+// The actors within a radius, as nearest_actors of simulators/_scene_parts.py; false if Python has to do it.
 bool see(const Here &here, double radius, size_t limit) {
     seen_actors.clear();
     const Scene &scene = here.scene;

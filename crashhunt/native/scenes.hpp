@@ -173,7 +173,7 @@ PyObject *columns(PyObject *, PyObject *const *given, Py_ssize_t count) {
     return reinterpret_cast<PyObject *>(new_columns(vehicles, std::move(values)));
 }
 
-// A list of which a part has been filled must not be seen by anybody; the garbage collector knows what is empty in it.
+// Other code must not see a list that is filled in part; the garbage collector knows which entries are empty.
 PyObject *list_of(const double *values, size_t size) {
     PyObject *list = PyList_New(static_cast<Py_ssize_t>(size));
     for (size_t row = 0; list && row < size; row++) {
@@ -223,7 +223,7 @@ PyObject *columns_speed(PyObject *object, PyObject *number) {
         return nullptr;
     }
     if (row < 0 || static_cast<size_t>(row) >= scene.size) {
-        PyErr_SetString(PyExc_IndexError, "nobody has this row");
+        PyErr_SetString(PyExc_IndexError, "no actor has this row");
         return nullptr;
     }
     return PyFloat_FromDouble(scene.speeds[row]);
@@ -366,7 +366,7 @@ PyObject *near_names() {
 }
 
 // Vehicles.look(controlled: Vehicles, distance squared) -> Columns | ids | None
-// What most steps come to: nobody has come or gone, nobody is on foot, nobody has collided. None where any of this is
+// What most steps come to: no actor has come or gone, none is on foot, none has collided. None where any of this is
 // otherwise; the ids of all who are near, where there is a distance and these are others than before.
 PyObject *vehicles_look(PyObject *object, PyObject *const *given, Py_ssize_t count) {
     Vehicles *controlled = count == 2 ? vehicles_of(given[0]) : nullptr;

@@ -79,7 +79,7 @@ struct Way {
             if (room > 2 * far + 100) {
                 return false;
             }
-            if (room > slack) { // nobody gets there in less than that
+            if (room > slack) { // no actor gets there in less time
                 place += std::max(1L, static_cast<long>((room - slack) / fabs(gap)));
                 continue;
             }

@@ -124,7 +124,7 @@ PyObject *usual_perceived(PyObject *object, PyObject *number) {
     return Py_NewRef(steps.perceived && step == steps.perceived_step ? steps.perceived : Py_None);
 }
 
-// judge(overlaps, hardest, always_ask, last, now_and_then): when somebody has to be asked about a step
+// judge(overlaps, hardest, always_ask, last, now_and_then): when the oracles have to be asked about a step
 PyObject *usual_judge(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
     if (!PyArg_ParseTuple(arguments, "pdpLL", &steps.overlaps, &steps.hardest, &steps.always_ask, &steps.last,
@@ -397,7 +397,7 @@ PyMethodDef usual_methods[] = {
     {"listen", usual_listen, METH_VARARGS, "Take the numbers of recorded actors, and who makes room for others."},
     {"perceive", usual_perceive, METH_VARARGS, "Take what makes and restores observations that consist of parts."},
     {"perceived", usual_perceived, METH_O, "Return what has been made for a step; None if nothing has."},
-    {"judge", usual_judge, METH_VARARGS, "Take when somebody has to be asked about a step."},
+    {"judge", usual_judge, METH_VARARGS, "Take when the oracles have to be asked about a step."},
     {"resume", usual_resume, METH_VARARGS, "Go on from a step that is complete."},
     {"borrow", usual_borrow, METH_VARARGS, "Record into a buffer from now on."},
     {"give_back", usual_give_back, METH_NOARGS, "Record no more; return what has been recorded."},
