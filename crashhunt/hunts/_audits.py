@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Facts, Ledger
     from crashhunt.trial import TrialResult
 
-_ENDS = ("length", "outcome", "the outcome")  # differences of two runs without a value that differs
-
 
 class Audit:
     """Runs sampled trials again during the hunt, one at a time, and compares them.
@@ -99,13 +97,27 @@ class Audit:
                 self._killed.add(result.spec.number)
                 self._clean_up(result.spec.number)
                 continue
-            difference = self._compare(was, result)
-            if result.is_no_answer_to(was) and difference is not None and difference.field in _ENDS:
+            divergence = self._divergence(result.spec.number)
+            if result.is_no_answer_to(was) and (divergence is None or divergence.is_end):
                 self._killed.add(result.spec.number)
                 continue
             self._done += 1
-            if difference is not None:
-                found.append(difference)
+            if divergence is None and not was.is_identical_run(result):
+                divergence = Divergence(
+                    step=result.steps, agent="", field="the outcome", recorded=str(was.outcome),
+                    replayed=str(result.outcome),
+                )  # fmt: skip
+            if divergence is not None:
+                found.append(
+                    Difference(
+                        trial=result.spec.number,
+                        step=divergence.step,
+                        agent=divergence.agent,
+                        field=divergence.field,
+                        recorded=divergence.recorded,
+                        replayed=divergence.replayed,
+                    )
+                )
                 self._failed.append(result)
         self._differences += found
         return found
@@ -114,30 +126,16 @@ class Audit:
         """Cancel the trials that have not been run again."""
         self._executor.close()
 
-    def _compare(self, was: TrialResult, now: TrialResult) -> Difference | None:
-        number = was.spec.number
+    def _divergence(self, number: int) -> Divergence | None:
+        """Return the first difference between both recordings of a trial, which are deleted."""
         try:
             folders = self._folders(number)
             recorded, replayed = (Recording(read_black_box(folder / layout.BLACK_BOX)) for folder in folders)
-            found = first_divergence(recorded, replayed)
+            return first_divergence(recorded, replayed)
         except BundleError:  # it could not even be set up
-            found = None
+            return None
         finally:
             self._clean_up(number)
-        if found is None and was.is_identical_run(now):
-            return None
-        if found is None:
-            found = Divergence(
-                step=now.steps, agent="", field="the outcome", recorded=str(was.outcome), replayed=str(now.outcome)
-            )
-        return Difference(
-            trial=number,
-            step=found.step,
-            agent=found.agent,
-            field=found.field,
-            recorded=found.recorded,
-            replayed=found.replayed,
-        )
 
     def _folders(self, number: int) -> tuple[Path, Path]:
         """Return the paths of a trial's two recordings: from the hunt, and from the new process."""

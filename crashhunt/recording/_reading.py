@@ -221,6 +221,11 @@ class Divergence(Serializable):
     replayed: object
     place: tuple[str, tuple[int, ...]] | None = None
 
+    @property
+    def is_end(self) -> bool:
+        """Whether no value differs, and the runs only end at different steps or with different outcomes."""
+        return self.field in ("length", "outcome")
+
     def to_json(self) -> JsonObject:
         """Return the divergence in the form that ``replay --json`` prints."""
         facts = asdict(self)

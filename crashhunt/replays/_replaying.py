@@ -226,9 +226,6 @@ def replay(
     return replace(shown, verdicts=Counter(report.verdict for report in reports))
 
 
-_ENDS = ("length", "outcome")  # differences of recordings without a value that differs
-
-
 def confirm(
     bundle: Bundle,
     stopped: Callable[[], bool] = lambda: False,
@@ -278,7 +275,7 @@ def confirm(
     if not confirmed and failed is not None:
         failed.append(report.replayed)
     now = report.replayed
-    if now.is_no_answer_to(bundle.result) and report.divergence is not None and report.divergence.field in _ENDS:
+    if now.is_no_answer_to(bundle.result) and report.divergence is not None and report.divergence.is_end:
         message = now.failure.message if now.failure else ""
         return replace(bundle, confirmed=None, divergence=None, why_unconfirmed=f"the replay was {message}")
     escape, why_no_escape = (now.escape, now.why_no_escape) if confirmed else (None, "")
