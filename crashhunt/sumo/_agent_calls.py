@@ -37,12 +37,13 @@ _CALLERS_OF_AGENTS = {
 }
 """The functions that call agents, by module."""
 _STEP = "simulation.step"
+_NEW_SIMULATION = ("simulation.start", "simulation.load")
 _SPEED_COMMANDS = {"vehicle.setSpeed", "vehicle.setSpeedMode", "vehicle.slowDown", "vehicle.setAcceleration"}
 
 commanded_elsewhere: set[str] = set()
 """The vehicles whose speed a user's code commands in this episode."""
 refused_calls: list[ActionError] = []
-"""The error of the first call of an agent that was refused, until the next step or episode."""
+"""The error of the first call of an agent that was refused, until the next step, episode or simulation."""
 
 
 def forget_calls() -> None:
@@ -75,6 +76,8 @@ def _guarded(name: str, function: Callable[..., object]) -> Callable[..., object
                 raise error
             if name in _SPEED_COMMANDS:
                 _note_command(name, *given, **named)
+        if name in _NEW_SIMULATION:
+            refused_calls.clear()
         if refused_calls and name == _STEP:
             raise refused_calls.pop()
         return function(*given, **named)

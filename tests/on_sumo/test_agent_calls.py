@@ -5,13 +5,14 @@ from __future__ import annotations
 from contextlib import suppress
 
 import libsumo
+import numpy as np
 import pytest
 
 from crashhunt.episode import Episode
 from crashhunt.oracles import OffRoad
 from crashhunt.scenario import argument_values, load_scenario
-from crashhunt.sumo import SumoSimulator
-from crashhunt.sumo._agent_calls import commanded_elsewhere
+from crashhunt.sumo import Fleet, SumoSimulator
+from crashhunt.sumo._agent_calls import commanded_elsewhere, refused_calls
 from crashhunt.trial import Outcome, TrialSpec
 
 
@@ -109,6 +110,13 @@ def test_call_of_an_agent_that_hides_the_error_ends_the_trial_and_has_changed_no
     assert "the agent called libsumo's vehicle.setSpeed, which changes the simulation" in str(result.failure)
     assert speeds[0] == speeds[1]
     assert driven(simulator, lambda: None).outcome is Outcome.SURVIVED
+
+
+def test_refused_call_is_no_error_of_a_simulation_that_begins_later(simulator):
+    driven(simulator, libsumo.simulationStep)
+    assert refused_calls
+    with Fleet(np.array([20.0]), length_m=5.0, step_s=0.1) as fleet:
+        assert fleet.drive(np.zeros(1)) == pytest.approx([2.0])
 
 
 def test_oracle_of_a_user_and_a_program_may_command_sumo(simulator):
