@@ -45,7 +45,7 @@ CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 IMPORTED = ("cli", "api", "crashes", "executors", "hunts", "plans", "recording", "replays", "report", "snapshots")
 # What these import while they run, and whoever writes, reads and packs hunts; and what one command does that is rare.
 _WHILE_RUNNING = (
-    "crashhunt.agents._protocol", "crashhunt.analysis._shrink_runs", "crashhunt.analysis._whatif_runs",
+    "crashhunt.agents._protocol", "crashhunt.analysis._minimization_runs", "crashhunt.analysis._whatif_runs",
     "crashhunt.corpus._cases", "crashhunt.corpus._case_runs", "crashhunt.dashboard._server",
     "crashhunt.gym._descriptor", "crashhunt.highway._descriptor", "crashhunt.results._log_reader",
     "crashhunt.samplers._space_filling", "crashhunt.samplers._strategies", "crashhunt.simulators._toy_descriptor",

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         interventions_of as interventions_of,
     )
     from ._minimization import Shrunk as Shrunk, shrink as shrink
-    from ._shrink_stages import Form as Form
+    from ._minimization_candidates import Form as Form
     from ._types_by_cause import (
         REPRESENTATIVES as REPRESENTATIVES,
         divide_by_cause as divide_by_cause,

@@ -8,8 +8,8 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from crashhunt.analysis._shrink_runs import Runs, is_same
-from crashhunt.analysis._shrink_stages import Ended, Form, Minimizer
+from crashhunt.analysis._minimization_candidates import Ended, Form, Minimizer
+from crashhunt.analysis._minimization_runs import Runs, is_same
 from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     )
     from ._blame import has_users_code as has_users_code, internal_error as internal_error
     from ._branches import Brancher as Brancher
-    from ._competent_driver import CompetentDriver as CompetentDriver
     from ._episode import (
         Episode as Episode,
         FastEpisode as FastEpisode,
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     )
     from ._parts import Parts as Parts, require_origin as require_origin, seal as seal, stage_of as stage_of
     from ._probes import BUDGET as BUDGET, BUDGET_BESIDE as BUDGET_BESIDE, Prober as Prober
+    from ._reference_driver_takeover import CompetentDriver as CompetentDriver
     from ._trial_signals import INFO_KEY as INFO_KEY, SIGNALS as SIGNALS, TrialSignals as TrialSignals
     from ._worker_settings import WorkerSettings as WorkerSettings, scratch_of as scratch_of
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.agents import REFERENCE_MODELS, Closes, Recorded
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.base.foreign_code import supports
-from crashhunt.episode._competent_driver import CompetentDriver
+from crashhunt.episode._reference_driver_takeover import CompetentDriver
 from crashhunt.scenario import ACTIONS, OVERRIDES_ONLY
 from crashhunt.simulators import (
     MAX_ACCELERATION,

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from ._blackbox_file import (
         BlackBoxFile as BlackBoxFile,
         BlackBoxHeader as BlackBoxHeader,
-        digest_of as digest_of,
         read_black_box as read_black_box,
         read_header as read_header,
     )
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
         StepRecord as StepRecord,
     )
     from ._recording import Recording as Recording
+    from ._trace_digest import digest_of as digest_of
     from ._values import (
         OPAQUE_SHAPE as OPAQUE_SHAPE,
         decode_value as decode_value,

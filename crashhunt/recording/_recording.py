@@ -14,8 +14,9 @@ import numpy as np
 from crashhunt.base.errors import BundleError
 from crashhunt.base.text import format_time, one_of
 from crashhunt.recording._blackbox import is_evidence
-from crashhunt.recording._blackbox_file import Record, Records, digest_of
+from crashhunt.recording._blackbox_file import Record, Records
 from crashhunt.recording._reading import AgentChannel, Prologue, Reading, StepRecord
+from crashhunt.recording._trace_digest import digest_of
 from crashhunt.recording._values import is_opaque
 from crashhunt.recording.records import RECORD_TYPES
 from crashhunt.recording.records._agent_records import OBSERVATION, PROLOGUE

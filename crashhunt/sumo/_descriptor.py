@@ -140,8 +140,8 @@ BACKEND: Backend = Backend(
     load_order=LoadOrder(what="SUMO's links", keep=_keep_link_order, why_not=_why_no_link_order),
     explained=import_at_call("crashhunt.sumo._scenario_check:explained"),
     side_effect=import_at_call("crashhunt.sumo._side_effects:side_effect"),
-    right_of_way=import_at_call("crashhunt.sumo._right_of_way:right_of_way"),
-    stop_lines=import_at_call("crashhunt.sumo._right_of_way:stop_lines"),
+    right_of_way=import_at_call("crashhunt.sumo._junction_rules:right_of_way"),
+    stop_lines=import_at_call("crashhunt.sumo._junction_rules:stop_lines"),
     survey=TrafficSurvey(
         module="crashhunt.sumo._traffic_survey",
         refine=import_at_call("crashhunt.sumo._ego_choice:refine"),

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt import trial_reruns
-from crashhunt.analysis import _shrink_runs as _runs
+from crashhunt.analysis import _minimization_runs as _runs
 from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError
 from crashhunt.crashes import Bundle, Signature, signature_of
 from crashhunt.replays import _prepare

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given, strategies as st
 
-from crashhunt.analysis import _shrink_stages as _stages, fewest
+from crashhunt.analysis import _minimization_candidates as _stages, fewest
 from crashhunt.analysis._delta_debugging import plainest
-from crashhunt.analysis._shrink_stages import Minimizer, Part
+from crashhunt.analysis._minimization_candidates import Minimizer, Part
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.trial import ALL_AGENTS, Disturbance, Escape, TrialSpec
 from crashhunt.trial_reruns import OutOfTimeError, StoppedError

@@ -54,7 +54,9 @@ def test_a_full_disk_is_reported_and_what_came_of_the_trials_is_remembered(hunt,
             shrink(bundle, parallel=1)
     assert not list(folder.glob("*.small"))
     run_again = []
-    monkeypatch.setattr("crashhunt.analysis._shrink_runs.Runs._remember", lambda _, spec, ran: run_again.append(spec))
+    monkeypatch.setattr(
+        "crashhunt.analysis._minimization_runs.Runs._remember", lambda _, spec, ran: run_again.append(spec)
+    )
     found = shrink(bundle, parallel=1)
     assert (found.verdict, found.ended, run_again) == ("shrunk", "done", [])
     assert not list(folder.glob(".*"))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crashhunt.base.errors import InvalidEpisodeError
-from crashhunt.episode._competent_driver import CompetentDriver
+from crashhunt.episode._reference_driver_takeover import CompetentDriver
 from crashhunt.scenario import load_scenario
 from crashhunt.sumo import SumoSimulator
 from crashhunt.trial import Overruled

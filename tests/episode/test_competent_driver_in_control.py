@@ -10,7 +10,7 @@ import pytest
 from crashhunt.agents import REFERENCE_MODELS
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.episode import overruled_agent
-from crashhunt.episode._competent_driver import _measured
+from crashhunt.episode._reference_driver_takeover import _measured
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.trial import Overruled
 from crashhunt.world import Actor, Crossing, Neighbor, Roster, Scene, Side, Surroundings

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+from crashhunt.sumo._junction_rules import right_of_way
 from crashhunt.sumo._options import SumoSetup
-from crashhunt.sumo._right_of_way import right_of_way
 
 # A road from the west with priority; one from the south turns left in two parts, around a place to wait.
 NET = """<net>

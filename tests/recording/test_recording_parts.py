@@ -25,7 +25,8 @@ from crashhunt.recording import (
     encode_notes,
     encode_spines,
 )
-from crashhunt.recording._blackbox_file import Record, _with_changes_only, changes_of
+from crashhunt.recording._blackbox_file import Record
+from crashhunt.recording._trace_digest import _with_changes_only, changes_of
 from crashhunt.world import Actor, Contact, Event, Roster, Scene
 
 AGENTS = (

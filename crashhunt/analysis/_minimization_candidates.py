@@ -17,7 +17,7 @@ from crashhunt.world import paths_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from crashhunt.analysis._shrink_runs import Runs
+    from crashhunt.analysis._minimization_runs import Runs
     from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
     from crashhunt.trial import Disturbance, TrialSpec, Value
