@@ -26,7 +26,7 @@ from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import blocked_signals
 from crashhunt.episode._blame import Blame, blame, internal_error, party_of_simulator
 from crashhunt.scenario import SIMULATOR_PACKAGES, Scenario
-from crashhunt.trial import UNUSABLE_VALUE, Failure, Outcome, TrialResult
+from crashhunt.trial import BAD_ACTION, UNUSABLE_VALUE, Failure, Outcome, TrialResult
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 _MIN_RECURSION_LIMIT: Final = 1000
 _PARTY_BY_ERROR: tuple[tuple[type[BaseException], str], ...] = (
-    (ActionError, "bad action"),
+    (ActionError, BAD_ACTION),
     (InvalidEpisodeError, "invalid"),
     (ProgramError, "program"),
     (UnusableValueError, UNUSABLE_VALUE),

@@ -6,13 +6,15 @@ import math
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import command_line, count_of
+from crashhunt.crashes import own_frames
 from crashhunt.report._disturbance_words import list_disturbances
 from crashhunt.report._live_screen import format_inputs
+from crashhunt.trial import BAD_ACTION
 
 if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain
     from crashhunt.crashes import Bundle
-    from crashhunt.trial import TrialResult
+    from crashhunt.trial import Failure, TrialResult
 
 
 _MAX_OUTPUT_CHARACTERS = 300  # of the last line that a process has printed
@@ -67,11 +69,21 @@ def _evidence(result: TrialResult) -> list[str]:
         if hit.victim:
             lines.append(_SOURCE_WORDS.get(hit.seen_by, f"seen by {', '.join(hit.seen_by)}"))
     if failure is not None:
-        frames = failure.traceback.strip().splitlines()
-        # Python prints the most recent call last. faulthandler, for dead and hanging processes, prints it first.
-        dumped = [line for line in frames if line.lstrip().startswith("File")]
-        lines += dumped[:3] if failure.kind in ("signal", "timeout") else frames[-4:]
+        lines += innermost_calls(failure, 3, lines=4)
         if failure.last_output.strip():
             last = failure.last_output.strip().splitlines()[-1]
             lines.append(f"last output: {last[:_MAX_OUTPUT_CHARACTERS]}{'…' * (len(last) > _MAX_OUTPUT_CHARACTERS)}")
     return lines
+
+
+def innermost_calls(failure: Failure, calls: int, *, lines: int) -> list[str]:
+    """Return the last ``lines`` of a traceback, or the innermost ``calls`` of the stack of a dead or hanging process.
+
+    For an action that crashhunt refuses, the message is complete, and the calls are crashhunt's own.
+    """
+    if failure.kind == BAD_ACTION and not own_frames(failure):
+        return []
+    frames = [line for line in failure.traceback.splitlines() if line.strip()]
+    # Python prints the most recent call last. faulthandler, for dead and hanging processes, prints it first.
+    dumped = [line for line in frames if line.lstrip().startswith("File")]
+    return dumped[:calls] if failure.kind in ("signal", "timeout") else frames[-lines:]

@@ -24,6 +24,7 @@ from crashhunt.crashes import (
 )
 from crashhunt.recording import describe_value, is_opaque
 from crashhunt.report._cause_words import about_why
+from crashhunt.report._crash_summary import innermost_calls
 from crashhunt.report._disturbance_words import about_disturbances
 from crashhunt.report._encounter_words import (
     COLUMNS,
@@ -373,12 +374,8 @@ class Story:
                 values = channel.values_by_name(seen).items()
                 facts = ", ".join(f"{name} {format_number(value)}" for name, value in values)
             sentences.append(f"Its last observation, in step {last.step}: {facts}.")
-        frames = [line.strip() for line in failure.traceback.splitlines() if line.strip()]
-        if frames and failure.kind in ("signal", "timeout"):  # the most recent call comes first
-            sentences += ["", *[frame for frame in frames if frame.startswith("File")][:6]]
-        elif frames:
-            sentences += ["", *frames[-6:]]
-        return sentences
+        frames = [line.strip() for line in innermost_calls(failure, 6, lines=6)]
+        return [*sentences, "", *frames] if frames else sentences
 
     def _names(self) -> tuple[str, ...]:
         channel = next((agent for agent in self.recording.prologue.agents if agent.id == self.agent), None)

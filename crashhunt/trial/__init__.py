@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         outcome_of as outcome_of,
     )
     from ._result import (
+        BAD_ACTION as BAD_ACTION,
         KILLED as KILLED,
         MAX_ROBUSTNESS as MAX_ROBUSTNESS,
         UNUSABLE_VALUE as UNUSABLE_VALUE,

@@ -32,6 +32,8 @@ from crashhunt.world import ClosestApproach, Event
 
 KILLED: Final = "killed from outside"
 """Kind of the failure of a trial whose processes were killed from outside until no attempt was left."""
+BAD_ACTION: Final = "bad action"
+"""Kind of the failure of an agent whose action crashhunt refuses."""
 UNUSABLE_VALUE: Final = "unusable value"
 """Kind of the failure of a trial in which a value of the user's code is neither a bool nor a number."""
 _OF_SURROUNDINGS: Final = frozenset({

@@ -45,6 +45,16 @@ def test_of_an_exception_the_last_call_and_the_message_are_shown():
     ]  # fmt: skip
 
 
+def test_refused_action_has_no_calls_but_those_of_the_agent():
+    ours = "".join(
+        f'File "/x/crashhunt/{file}", line 1, in f\n' for file in ("episode/_episode.py", "simulators/_actions.py")
+    )
+    assert evidence(Outcome.AGENT_ERROR, failure=Failure("bad action", "not in Discrete(5)", traceback=ours)) == []
+    called = ours + 'File "agent.py", line 9, in act\n'
+    (*_, last) = evidence(Outcome.AGENT_ERROR, failure=Failure("bad action", "not for agents", traceback=called))
+    assert last == 'File "agent.py", line 9, in act'
+
+
 def test_a_collision_has_its_place_and_both_speeds_where_they_are_known():
     hit = Collision("ego", "collider", "ego", "x", ("overlap",), "overlap", 1.5, 2.5, "a_0", 9.0, 3.0, math.nan)
     first, second = evidence(Outcome.COLLISION, collision=hit)
