@@ -98,7 +98,7 @@ class Audit:
                 self._clean_up(result.spec.number)
                 continue
             divergence = self._divergence(result.spec.number)
-            if result.is_no_answer_to(was) and (divergence is None or divergence.is_end):
+            if result.is_no_answer_to(was.outcome) and (divergence is None or divergence.is_end):
                 self._killed.add(result.spec.number)
                 continue
             self._done += 1
@@ -197,7 +197,7 @@ def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, li
     try:
         for one in again.run([result.spec for result in wanted.values()], _AUDIT_FOLDER):
             now, was = one.result, wanted[one.result.spec.number]
-            if now.is_no_answer_to(was):
+            if now.is_no_answer_to(was.outcome):
                 continue
             left.discard(now.spec.number)
             again.phases.advance()

@@ -368,7 +368,7 @@ class VerificationRuns:
         return crashed.get(found.spec.number)
 
     def _run(self, found: Sequence[Found], folder: str) -> tuple[dict[int, Bundle], set[int]]:
-        """Return the bundles of runs that crashed like their forks, and the numbers of trials without a result."""
+        """Return the bundles of runs that crashed like their forks, and the numbers of trials without an answer."""
         wanted = {one.spec.number: one for one in found}
         unanswered = set(wanted)
         bundles: dict[int, Bundle] = {}
@@ -376,7 +376,7 @@ class VerificationRuns:
             for one in self.again.run([one.spec for one in found], folder):
                 self.again.phases.advance()
                 result, copy = one.result, wanted[one.result.spec.number]
-                if result.was_killed_from_outside:
+                if result.is_no_answer_to(copy.outcome):
                     continue
                 unanswered.discard(result.spec.number)
                 if (str(result.outcome), result.steps) != (copy.outcome, copy.step):
@@ -437,7 +437,7 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
         for one in again.run([result.spec for result in wanted.values()], layout.NEAR_MISSES):
             again.phases.advance()
             now, was = one.result, wanted[one.result.spec.number]
-            if now.is_no_answer_to(was):
+            if now.is_no_answer_to(was.outcome):
                 what = f"trial {now.spec.number}, a near miss, was {now.summary}"
                 again.progress.notes.append(f"{what}: it has no bundle until the same command is run again")
             elif was.is_identical_run(now):

@@ -275,7 +275,7 @@ def confirm(
     if not confirmed and failed is not None:
         failed.append(report.replayed)
     now = report.replayed
-    if now.is_no_answer_to(bundle.result) and report.divergence is not None and report.divergence.is_end:
+    if now.is_no_answer_to(bundle.result.outcome) and report.divergence is not None and report.divergence.is_end:
         message = now.failure.message if now.failure else ""
         return replace(bundle, confirmed=None, divergence=None, why_unconfirmed=f"the replay was {message}")
     escape, why_no_escape = (now.escape, now.why_no_escape) if confirmed else (None, "")

@@ -506,13 +506,12 @@ class TrialResult(Serializable):
         """Whether processes of the trial were killed from outside in every attempt, so that its outcome is unknown."""
         return self.failure is not None and self.failure.kind == KILLED
 
-    def is_no_answer_to(self, first: TrialResult) -> bool:
-        """Return whether this second run of a trial says nothing about the first run.
+    def is_no_answer_to(self, first: str) -> bool:
+        """Return whether this second run of a trial says nothing about the outcome of the ``first`` run.
 
         It was killed from outside, or it exceeded the time limit and the first run did not, as on a busy machine.
         """
-        is_late = self.outcome is Outcome.HANG and first.outcome is not Outcome.HANG
-        return self.was_killed_from_outside or is_late
+        return self.was_killed_from_outside or (self.outcome is Outcome.HANG and first != Outcome.HANG)
 
     @property
     def is_to_be_run_again(self) -> bool:

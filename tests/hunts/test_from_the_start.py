@@ -63,15 +63,16 @@ def test_what_cannot_be_run_is_reported_and_the_hunt_has_ended_well(tmp_path):
     assert not (tmp_path / "probes").exists()
 
 
-@pytest.mark.parametrize(("outcome", "step"), [("survived", 5), ("collision", 6)])
+@pytest.mark.parametrize(("outcome", "step"), [("survived", 5), ("collision", 6), ("hang", 5)])
 def test_another_end_is_no_crash_of_it(tmp_path, outcome, step):
     def another(specs, folder):
         for spec in specs:
             yield SimpleNamespace(result=TrialResult(spec, Outcome(outcome), steps=step))
 
     again = runs(tmp_path, [], another)
-    assert VerificationRuns(again, None).crashes([FOUND], "probes", "probes") == ((), 0)
-    assert [result.steps for result in again.progress.failed] == [step]
+    is_late = outcome == "hang"  # as on a busy machine: it is run again by the same command
+    assert VerificationRuns(again, None).crashes([FOUND], "probes", "probes") == ((), int(is_late))
+    assert [result.steps for result in again.progress.failed] == [step] * (not is_late)
 
 
 class Copies:

@@ -70,10 +70,10 @@ def test_trial_whose_processes_were_killed_from_outside_runs_again(evidence, aga
 
 def test_run_that_was_killed_or_only_now_takes_too_long_is_no_answer():
     first, late = TrialResult(SPEC, Outcome.SURVIVED), TrialResult(SPEC, Outcome.HANG)
-    assert late.is_no_answer_to(first)
-    assert replace(first, failure=Failure(KILLED, "killed")).is_no_answer_to(first)
-    assert not late.is_no_answer_to(late)
-    assert not first.is_no_answer_to(late)
+    assert late.is_no_answer_to(first.outcome)
+    assert replace(first, failure=Failure(KILLED, "killed")).is_no_answer_to(first.outcome)
+    assert not late.is_no_answer_to(late.outcome)
+    assert not first.is_no_answer_to(late.outcome)
 
 
 @pytest.mark.parametrize(
