@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 from repositories import git
 from test_corpus import BROKEN, DRIVER, MENDED
-
-from crashhunt.base.errors import UsageError
-from crashhunt.corpus import _bisection as _bisect
 
 
 @pytest.fixture
@@ -53,30 +48,3 @@ def test_the_first_of_them_is_reported(repository):
     repository.crashhunt("export", "../h", "../crash.zip")
     refused = repository.crashhunt("bisect", "../crash.zip", "--good", "HEAD", expect=2)
     assert "the crash is still, and not fixed" in refused.err
-
-
-@pytest.mark.nightly
-def test_a_revision_on_another_branch_that_mended_it_is_reported(tmp_path, monkeypatch):
-    """Git says so again and again, and goes on to no other revision."""
-    git(tmp_path, "init", "-q", "-b", "main")
-    for words, code in ((), "bad"), (("-b", "mended"), "good"), (("main",), "bad as well"):
-        if words:
-            git(tmp_path, "checkout", "-q", *words)
-        (tmp_path / "code").write_text(code)
-        git(tmp_path, "add", "code")
-        git(tmp_path, "commit", "-qm", code)
-
-    def ran(case, folder, tree, modules):
-        return "still" if (tree / "code").read_text().startswith("bad") else "fixed", ""
-
-    monkeypatch.setattr(_bisect, "_run", ran)
-    monkeypatch.setattr(_bisect, "add_case", lambda bundle, to: SimpleNamespace(case=SimpleNamespace(path=to)))
-    monkeypatch.setattr(_bisect, "read_settings", lambda path: SimpleNamespace(agents={}, texts={}))
-    parts = git(tmp_path, "rev-parse", "main~1")[:12]
-    monkeypatch.setenv("GIT_DIR", str(tmp_path / ".git"))  # as in a hook; it goes before git's -C
-    monkeypatch.setenv("GIT_INDEX_FILE", str(tmp_path / ".git" / "index"))
-    expected = f"--good mended is not before --bad main: their common ancestor {parts} already"
-    with pytest.raises(UsageError, match=expected):
-        _bisect.bisect(SimpleNamespace(hunt=tmp_path), "mended", bad="main", folder=tmp_path)
-    assert git(tmp_path, "status", "--short", "--branch") == "## main\n"
-    assert len(git(tmp_path, "worktree", "list").splitlines()) == 1

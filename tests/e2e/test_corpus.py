@@ -74,25 +74,6 @@ def test_a_case_is_small_has_no_code_and_is_looked_at_like_a_hunt(kept):
         assert str(kept.folder) not in file.read_text()
 
 
-@pytest.mark.nightly
-def test_crashes_that_a_corpus_has_are_reported_from_new_ones(kept):
-    words = ("crashes", "h", "--json", "--annotate", "--summary", "s.md", "--sarif", "x.sarif", "--known")
-    done = kept.crashhunt(*words, "kept crashes")
-    (group,) = done.json["groups"]
-    assert group["known"].startswith("kept crashes")
-    assert "::error" not in done.err
-    (kept.folder / "none yet").mkdir()
-    done = kept.crashhunt(*words, "none yet")
-    assert done.json["groups"][0]["known"] is None
-    assert "::error file=driver.py,line=2,title=rear end" in done.err
-    summary = (kept.folder / "s.md").read_text()
-    assert summary.count("### crashhunt: 2 crashes of 1 type, ") == 2  # the second is added to the first
-    assert (kept.folder / "x.sarif").is_file()
-    assert "known" not in kept.crashhunt("crashes", "h", "--json").json["groups"][0]
-    assert "'nowhere' does not exist" in kept.crashhunt("crashes", "h", "--known", "nowhere", expect=2).err
-    assert "cannot be written" in kept.crashhunt("crashes", "h", "--summary", "no/s.md", expect=2).err
-
-
 def test_todays_code_is_judged(kept):
     found = kept.crashhunt("corpus", "run", "kept crashes", "--keep", "out", "--json").json["cases"]
     assert [(case["got"], case["ok"]) for case in found] == [("still", True)] * 2

@@ -83,15 +83,6 @@ def test_bar_decides_the_exit_code(hunt):
     assert rates(hunt, "h", "--bar", f"{close['estimate']}/trial", expect=3)[0]["verdict"] == "undecided"
 
 
-@pytest.mark.nightly
-def test_workers_change_no_rate(toy):
-    found = []
-    for workers in ("1", "2"):
-        toy.crashhunt("run", workers, workers, "30", *HUNT, "--keep-going")
-        found.append([{**rate, "dir": ""} for rate in rates(toy, workers)])
-    assert found[0] == found[1]
-
-
 def test_bad_input_is_one_line(hunt):
     toy = hunt
     os.mkfifo(toy.folder / "pipe")
@@ -105,16 +96,6 @@ def test_bad_input_is_one_line(hunt):
         assert says in done.err
         assert done.err.count("\n") == 1
     assert "pipe: is a device or a pipe" in toy.crashhunt("rate", "h", "--html", "pipe", expect=2).err
-
-
-@pytest.mark.nightly
-def test_disturbed_and_undisturbed_crashes_are_reported_apart(toy):
-    toy.crashhunt("run", "h", "2", "30", *HUNT, "--keep-going", "--disturb", "brake=0.5")
-    (rate,) = rates(toy, "h", "--per", "trial")
-    assert {part["name"] for part in rate["parts"]} == {"undisturbed", "disturbed"}
-    assert sum(part["crashes"] for part in rate["parts"]) == rate["crashes"]
-    (rate,) = rates(toy, "h", "--by", "disturbance")
-    assert {part["name"] for part in rate["parts"]} <= {"undisturbed", "brake"}
 
 
 # --- run --until-rate
@@ -131,16 +112,6 @@ def until(toy, folder, workers, trials, rate, *words, expect):
 def test_hunt_that_cannot_decide_ends_at_most_and_exits_with_3(toy):
     found = until(toy, "h", "1", "0", "0.3/trial", *FEW, "--most", "3", expect=3)
     assert (found["stopped_because"], found["trials_run"], found["rate"]["verdict"]) == ("all_trials", 3, "undecided")
-
-
-@pytest.mark.nightly  # half a minute: every crash is confirmed
-def test_workers_decide_at_the_same_trial(toy):
-    found = []
-    for workers in ("1", "3"):
-        until(toy, workers, workers, "0", "40/hour", expect=1)
-        found.append([{**rate, "dir": ""} for rate in rates(toy, workers, "--per", "hour")])
-    assert found[0] == found[1]
-    assert found[0][0]["crashes"] > 0
 
 
 @pytest.mark.nightly

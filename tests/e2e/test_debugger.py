@@ -67,34 +67,6 @@ def test_a_breakpoint_in_the_users_code_works(crash):
     assert "reproduced: 9 of 29 steps" in out
 
 
-@pytest.mark.nightly
-def test_a_stop_compares_what_was_run(crash):
-    done = crash.crashhunt("replay", "h", "--until", "12", "--json").json
-    assert (done["verdict"], done["steps_replayed"]) == ("reproduced", 12)
-    whole = crash.crashhunt("replay", "h", "--until", "50", "--json").json
-    assert (whole["verdict"], whole["steps_replayed"], whole["outcome_replayed"]) == ("reproduced", 29, "agent_error")
-    other = crash.crashhunt("replay", "h", "--until", "12", "--set", "speed=7", "--json", expect=1).json
-    assert (other["verdict"], other["divergence"]["step"]) == ("diverged", 1)  # whether it is fixed is not known
-
-
-@pytest.mark.nightly
-def test_fields_are_printed_as_a_table(crash):
-    fields = "x, speed,action,gap_m,reward,observation[0,vx]"
-    done = crash.crashhunt("replay", "h", "--until", "5", "--print", fields, "--json")
-    table = done.json["table"]
-    assert [row["step"] for row in table] == list(range(6))
-    assert table[0]["target_speed"] is None
-    assert all(row["target_speed"] == 8.0 and row["lane_change"] == 0.0 for row in table[1:])
-    # What an agent is shown before a step is how the step before left it.
-    speeds = [row["speed"] for row in table]
-    assert [row["observation[0,vx]"] for row in table[1:]] == pytest.approx(speeds[:-1], rel=1e-6)
-    heading, *rows = done.err.splitlines()[:7]
-    assert heading.split() == [
-        "step", "time_s", "x", "speed", "target_speed", "lane_change", "gap_m", "reward", "observation[0,vx]"
-    ]  # fmt: skip
-    assert [row.split()[0] for row in rows] == list("012345")
-
-
 def test_mistakes_are_one_line(crash):
     for words, says in (
         (("--until", "3", "--before", "3"), "--before"),

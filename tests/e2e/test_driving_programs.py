@@ -99,20 +99,6 @@ def test_forks_of_trials_give_equal_results_with_a_program_and_the_same_agent_in
     assert found[0] == found[1]
 
 
-@pytest.mark.nightly  # by day, test_reused_programs.py has one that does
-def test_a_scenario_names_its_program_relative_to_its_own_folder(toy):
-    write_program(toy.folder / "toy")
-    file = toy.folder / "toy" / "scenario.toml"
-    file.write_text(
-        file.read_text().replace('agent = "crashhunt.agents:KeepLaneWithSpeed"', 'agent = { exec = ["./planner"] }')
-    )
-    assert toy.crashhunt("run", "h", "1", "2", "20", *RUN, "--json").json["trials_run"] == 2
-    file.write_text(file.read_text().replace('["./planner"]', '"./planner"'))
-    refused = toy.crashhunt("run", "g", "1", "2", "20", *RUN, expect=2)
-    assert "agents.ego.agent" in refused.err
-    assert 'write agent = { exec = ["./planner", "--mode", "test"] }' in refused.err
-
-
 @pytest.mark.nightly
 def test_modules_next_to_a_program_in_python_travel_with_it(toy):
     planner = toy.folder / "planner"

@@ -28,65 +28,9 @@ def test_what_the_agent_prints_is_not_shown_while_a_film_is_made(crash):
     assert "about to go wrong" not in done.out + done.err
 
 
-SHOWY = """
-from crashhunt import render
-
-
-class Showy:
-    def __init__(self, speed: float = 20.0, broken: bool = False):
-        self.speed, self.broken = speed, broken
-
-    def reset(self, seed):
-        self.step = 0
-
-    def act(self, observation):
-        print("thinking", flush=True)
-        self.step += 1
-        self.seen = observation
-        if self.step == 40:
-            raise ValueError("no plan")
-        return self.speed, 0
-
-    def close(self):
-        open("closed", "a").write("x")
-
-    def panels(self):
-        if self.broken and self.step > 20:
-            raise KeyError("no picture")
-        with render.scope("mind"):
-            return {"seen": render.Heatmap(self.seen), "step": [render.Text(str(self.step), title="count")]}
-"""
-
-
 def size(path) -> tuple[int, int]:
     with Image.open(path) as image:
         return image.size
-
-
-@pytest.mark.nightly
-def test_no_panels_and_the_last_seconds(toy):
-    crash = toy
-    (toy.folder / "showy.py").write_text(SHOWY, encoding="utf-8")
-    toy.crashhunt("run", "h", "1", "1", "60", "--agent", "showy:Showy", "--arg", "speed=8", "--scenario", "toy")
-    words = ("--no-panels", "--last-seconds", "1", "--size", "200x100", "--last-step-repeats", "0")
-    done = crash.crashhunt("replay", "h", "--frames", "f", *words, "--json").json
-    assert done["written"] == {"f": 11}
-    assert size(crash.folder / "f/000000.png") == (200, 100)
-    crash.crashhunt("replay", "h", "--frames", "g", "--last-seconds", "1", "--size", "200x100")
-    assert size(crash.folder / "g/000000.png") > (200, 100)
-
-
-@pytest.mark.nightly
-def test_several_crashes_in_one_film(toy):
-    words = ("--agent", "faulty:Raises", "--arg", "at=12", "--scenario", "toy", "--seed", "1", "--keep-going")
-    found = toy.crashhunt("run", "h", "2", "2", "40", *words, "--json").json
-    names = ",".join(crash["id"] for crash in found["crashes"])
-    for who in ((), ("--from-log",)):
-        out = toy.crashhunt("replay", "h", "--crash", names, *who, "--frames", f"f{len(who)}", "--size", "128x128",
-                              "--blank-frames", "3", "--last-step-repeats", "1")  # fmt: skip
-        assert f"f{len(who)} has {13 * 2 + 3} pictures" in out.out
-    done = toy.crashhunt("replay", "h", "--crash", names, expect=2)
-    assert "names several" in done.err
 
 
 @pytest.mark.nightly

@@ -86,12 +86,6 @@ def test_worse_agent_fails_the_gate_and_the_hunts_stay_for_compare(drivers):
     assert "--set" in refused.err  # given twice
 
 
-@pytest.mark.nightly
-def test_better_agent_passes_the_gate(drivers):
-    found = gate(drivers, WILD, CALM, expect=0)
-    assert (found["verdict"], found["only_base"], found["only_head"], found["dir"]) == ("better", 8, 0, None)
-
-
 @pytest.fixture
 def repository(drivers):
     """A repository with a calm driver, then a wild one, then a calm one that is not committed."""
@@ -165,14 +159,6 @@ def test_bad_input_is_one_line_that_names_it(repository, words, says):
     assert "Traceback" not in done.err
     assert len(done.err.splitlines()) == 1
     assert len(git(repository.folder, "worktree", "list").splitlines()) == 1
-
-
-@pytest.mark.nightly
-def test_gate_whose_time_is_up_is_undecided(drivers):
-    words = ("--set", "step_wall_s=0.001", "--margin", "0", "--for", "4s", "--most", "100000")
-    found = gate(drivers, CALM, TWIN, *words, expect=3)
-    assert (found["verdict"], found["interrupted"]) == ("undecided", False)
-    assert found["why"].startswith("the time is up; give --for more")
 
 
 SUITE = """

@@ -200,22 +200,6 @@ def test_arguments_that_cannot_be_split_are_no_hunt(tmp_path):
     assert not (tmp_path / "asked.jsonl").exists()
 
 
-@pytest.mark.nightly  # by day, a hunt and its corpus as a runner does it
-def test_a_crash_that_cannot_be_made_smaller_is_kept_as_it_is(tmp_path):
-    crashes = ["h/crashes/000000-collision", "h/crashes/000001-hang", "h/crashes/000002-hang"]
-    runner = stubbed(tmp_path, *crashes, directory="h", examples=2, known="my crashes")
-    runner.run()
-    assert runner.ran[-2:] == ["Keep them", "Something new"], runner.said
-    files = {file.name for file in runner.artifacts["crashes"].iterdir()}
-    exported = ["000000-collision.zip", "000001-hang.small.zip", "000001-hang.zip"]
-    assert files == {"crashes.json", "new.txt", "report.html", *exported}
-    lines = runner.summary.read_text().splitlines()
-    assert [line for line in lines if line.startswith("crashhunt replay")] == [
-        f"crashhunt replay {name} --trust" for name in exported
-    ]
-    assert "crashhunt corpus add 000001-hang.zip --to my\\ crashes --trust  # keep it" in lines
-
-
 def test_no_examples_are_wanted(tmp_path):
     runner = stubbed(tmp_path, "h/crashes/000000-hang", directory="h", examples=0)
     runner.run()

@@ -77,14 +77,6 @@ def test_list_refuses_an_unknown_kind_and_the_copy_of_anything_but_a_scenario(sh
     assert "run crashhunt list scenarios --copy loop x" in shell.crashhunt("list", "--copy", "loop", "x", expect=2).err
 
 
-@pytest.mark.nightly
-def test_listed_agents_can_be_hunted_by_name(shell):
-    for agent in ("car-following", "lane-changer", "random"):
-        found = shell.crashhunt("run", f"out-{agent}", "1", "1", "3", "--agent", agent, "--seed", "1", "--json")
-        assert found.json["trials_run"] == 1
-        assert set(found.json["outcomes"]) <= {"survived", "off_road"}
-
-
 def test_networks_are_what_their_sources_say():
     done = subprocess.run(
         [ROOT / "scripts" / "tools" / "networks", "--check"], capture_output=True, text=True, check=False

@@ -7,8 +7,6 @@ import shutil
 
 import pytest
 
-from crashhunt.results import hunt_state
-
 AGENT = """
 import os
 import shutil
@@ -48,18 +46,6 @@ def write_home(folder, *, delete=""):
     (folder / "agent.py").write_text(AGENT, encoding="utf-8")
     (folder / "delete").write_text(str(delete), encoding="utf-8")
     return folder
-
-
-@pytest.mark.nightly  # by day, the folder of the hunt
-def test_trials_without_their_current_folder_are_no_results_and_run_again(toy, home):
-    write_home(home, delete=home)
-    error = hunt(toy, 2)["error"]
-    assert error["where"] == str(home)
-    assert error["message"] == "the current folder of the command was deleted or moved while trials ran"
-    state = hunt_state(home.parent / "hunt")
-    assert (state.state, state.errors, state.detail.partition(";")[0]) == ("error", 0, f"{home}: {error['message']}")
-    write_home(home)
-    assert hunt(toy, 0)["outcomes"] == {"survived": 2}
 
 
 def test_hunt_whose_directory_was_deleted_fails(toy, home):

@@ -6,10 +6,8 @@ import csv
 import json
 import shutil
 import signal
-import sqlite3
 import subprocess
 import time
-from contextlib import closing
 
 import pytest
 from conftest import CRASHHUNT, keeps_going, wait_for
@@ -49,63 +47,12 @@ def test_watching_ends_with_the_hunt(toy):
 
 
 @pytest.mark.nightly
-def test_logs_are_found_wherever_they_are(shell):
-    words = ("--agent", "faulty:Raises", "--arg", "at=12", "--set", "vehicles=10", "--seed", "1", "--keep-going")
-    shell.crashhunt("run", "h", "1", "2", "40", *words)
-    everything = shell.crashhunt("logs", "h").out
-    for title in ("==> state <==", "==> trial 0, run <==", "==> trial 0, error <==", "==> trial 1, error <=="):
-        assert title in everything
-    assert "about to go wrong" in everything
-    only = shell.crashhunt("logs", "h", "--trial", "1", "--errors-only").out
-    assert "ValueError: no plan" in only
-    assert "trial 0" not in only
-    assert "about to go wrong" not in shell.crashhunt("logs", "h", "--type", "state").out
-    nothing = shell.crashhunt("logs", "h", "--trial", "77")
-    assert nothing.out == ""
-    assert nothing.err.startswith("trial 77 printed nothing, or its log was not kept; ")
-    assert "contradict" in shell.crashhunt("logs", "h", "--errors-only", "--type", "run", expect=2).err
-
-
-@pytest.mark.nightly
-def test_trials_that_could_not_be_set_up_run_again(toy):
-    (toy.folder / "moody.py").write_text(
-        "import pathlib\nclass Agent:\n    def __init__(self, number: int = 0):\n"
-        "        if number % 3 == 0 and not pathlib.Path('mended').exists(): raise RuntimeError('no weights')\n"
-        "    def reset(self, seed): pass\n    def act(self, observation): return 4.0, 0\n"
-    )
-    words = ("--scenario", "toy", "--seed", "4", "--agent", "moody:Agent", "--arg", "number=0:20")
-    toy.crashhunt("run", "h", "2", "8", "20", *words)
-    before = rows(toy, "h")
-    failed = {row["number"] for row in before if row["outcome"] == "invalid"}
-    assert 0 < len(failed) < 8
-    (toy.folder / "mended").touch()
-    again = toy.crashhunt("rerun", "h", "--json").json
-    assert [hunt["outcomes"] for hunt in again["hunts"]] == [{"survived": 8}]
-    kept = [row for row in rows(toy, "h") if row["number"] not in failed]
-    assert kept == [row for row in before if row["number"] not in failed]
-    with closing(sqlite3.connect(toy.folder / "h/ledger.sqlite")) as database:
-        assert {number for (number,) in database.execute("SELECT number FROM replaced")} == failed
-    assert toy.crashhunt("rerun", "h", "--json").json["hunts"][0]["trials_run"] == 8
-
-
-@pytest.mark.nightly
 def test_a_hunt_whose_scenario_is_gone_runs_again_from_its_snapshot(toy):
     toy.crashhunt("run", "h", "1", "5", "50", *KEEP, "--arg", "speed=4")
     (toy.folder / "toy/scenario.toml").unlink()
     done = toy.crashhunt("rerun", "h", "--to", "again", "--json").json
     assert done["hunts"][0]["outcomes"] == {"survived": 5}
     assert [row["digest"] for row in rows(toy, "again")] == [row["digest"] for row in rows(toy, "h")]
-
-
-@pytest.mark.nightly
-def test_a_hunt_of_ones_own_scenario_begins_again(toy):
-    toy.crashhunt("run", "h", "1", "4", "99", *KEEP)
-    before = [row["digest"] for row in rows(toy, "h")]
-    for number in range(2):  # the second time, the scenario is that of what was set aside the first time
-        done = toy.crashhunt("rerun", "h", "--all", "--json").json
-        assert done["replaced"] == [f"h.replaced-{number}"]
-        assert [row["digest"] for row in rows(toy, "h")] == before
-    assert toy.crashhunt("replay", "h.replaced-0", "--json").json["verdict"] == "reproduced"
 
 
 def rows(shell, hunt: str, *words: str) -> list[dict]:

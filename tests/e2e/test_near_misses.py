@@ -97,20 +97,3 @@ def test_a_hunt_that_continues_keeps_those_of_all_its_trials(hunt):
     assert left.stat().st_mtime_ns == before[left.name]  # which was not run again
     assert "near_misses" not in hunt.crashhunt(*WORDS, "--json").json
     assert left.exists()
-
-
-@pytest.mark.nightly
-def test_one_that_is_damaged_is_found_and_made_again(hunt):
-    log = next((hunt.folder / "h" / "near-misses").iterdir()) / "log.mcap"
-    log.write_bytes(log.read_bytes()[:-100])
-    (found,) = hunt.crashhunt("check", "h", "--json", expect=1).json["hunts"]
-    findings = found["findings"]
-    assert [finding["lost"] for finding in findings] == [f"the near miss {log.parent.name}"] * len(findings)
-    (log.parent / "crash.json").unlink()
-    log.unlink()
-    for path in log.parent.iterdir():
-        path.unlink()
-    log.parent.rmdir()
-    hunt.crashhunt(*WORDS, "--near-misses", "2")
-    assert hunt.crashhunt("check", "h", "--json").json["fine"]
-    assert log.exists()

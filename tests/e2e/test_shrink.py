@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import signal
-import time
 
 import pytest
 
@@ -118,18 +116,6 @@ def test_of_several_agents_one_is_left_in_traffic(shell):
     assert list(small.result.spec.arguments) == [path.actor.id for path in small.result.spec.script.agents]
     assert len(small.result.spec.arguments) == 1
     assert shell.crashhunt("replay", "h", "--crash", small.id, "--json").json["verdict"] == "reproduced"
-
-
-@pytest.mark.nightly
-def test_ctrl_c_leaves_the_best(hunt):
-    running = hunt.begin("shrink", "h", "--parallel", "1")
-    deadline = time.monotonic() + 300
-    while not list((hunt.folder / "h" / "crashes").glob(".*")) and time.monotonic() < deadline:
-        time.sleep(0.02)  # until a candidate has been run
-    running.send_signal(signal.SIGINT)
-    _, err = running.communicate(timeout=300)
-    assert running.returncode in (0, 130), err
-    assert "Traceback" not in err
 
 
 @pytest.mark.nightly

@@ -84,32 +84,3 @@ def test_a_large_work_tree_is_kept_whole(project):
     project.crashhunt(*RUN)
     (snapshot,) = snapshots(project)
     assert len(list((snapshot / "code" / "@my project" / "many").rglob("*.txt"))) == 3000
-
-
-@pytest.mark.nightly
-def test_replay_of_todays_code_names_the_files_that_differ(toy):
-    def differences(*words):
-        return toy.crashhunt("replay", "h", "--code", "current", "--json", *words, expect=None).json["code_differences"]
-
-    (toy.folder / "driver.py").write_text(
-        "import helper\nclass Agent:\n    def reset(self, seed): pass\n    def act(self, observation): 1 / 0\n"
-    )
-    for name in ("helper.py", "weights.txt"):
-        (toy.folder / name).write_text("")
-    (toy.folder / ".gitignore").write_text("*.txt\n")
-    make_repository(toy.folder)
-    words = ("--scenario", "toy", "--agent", "driver:Agent", "--snapshot-root", "weights.txt")
-    toy.crashhunt("run", "h", "1", "1", "9", *words)
-    assert differences() == []
-    done = toy.crashhunt("replay", "h", "--code", "current")
-    assert "no file of the code differs from the snapshot" in done.out
-    (toy.folder / "helper.py").write_text("# another one\n")
-    (toy.folder / "weights.txt").unlink()
-    (toy.folder / "added.py").write_text("")
-    assert differences() == ["added.py is new", "helper.py has changed", "weights.txt is missing"]
-    assert toy.crashhunt("replay", "h", "--json").json["code_differences"] is None
-    shutil.copytree(toy.folder, toy.folder / "elsewhere", ignore=shutil.ignore_patterns("h", "elsewhere", ".git"))
-    toy.folder = toy.folder / "elsewhere"  # the modules of the current folder run, wherever the hunt was
-    (toy.folder / "helper.py").write_text("")
-    (toy.folder / "h").symlink_to(toy.folder.parent / "h")
-    assert differences() == ["added.py is new", "weights.txt is missing"]

@@ -23,32 +23,10 @@ id = "slow"
 arguments = { speed = 4 }
 scenario_arguments.gap_m = 50
 """
-BROKEN = """
-[[hunts]]
-id = "unimportable"
-agent = "nothing:There"
-
-[[hunts]]
-id = "a-word"
-arguments.speed = "fast"
-
-[[hunts]]
-id = "raises"
-agent = "explodes:Agent"
-
-[[hunts]]
-id = "no-scenario"
-scenario = "nowhere"
-"""
 
 
 def written(shell, text: str) -> None:
     (shell.folder / "suite.toml").write_text(text, encoding="utf-8")
-
-
-def states(shell, directory: str = "out") -> dict[str, str]:
-    found = shell.crashhunt("status", directory, "--json").json["hunts"]
-    return {hunt["dir"].removeprefix(f"{directory}/"): hunt["state"] for hunt in found}
 
 
 def numbers(shell, hunt: str) -> list[int]:
@@ -71,30 +49,6 @@ def test_every_hunt_stops_at_its_own_first_crash(toy):
     before = (toy.folder / "out/slow/0/ledger.sqlite").stat().st_mtime_ns
     assert toy.crashhunt("suite", "run", "suite.toml", "out", "2", "--json").json["hunts"] == done["hunts"]
     assert (toy.folder / "out/slow/0/ledger.sqlite").stat().st_mtime_ns == before
-
-
-@pytest.mark.nightly
-def test_all_runs_again_with_the_same_seeds_and_crashes(toy):
-    written(toy, SUITE.replace("runs = 2\n", "") + BROKEN.partition('[[hunts]]\nid = "raises"')[0])
-    toy.crashhunt("suite", "run", "suite.toml", "out", "2", expect=1)
-    crash = {path.name for path in (toy.folder / "out/fast/0/crashes").iterdir()}
-    everything = toy.crashhunt("rerun", "out", "--all", "--parallel", "1", "--json", expect=1).json
-    assert len(everything["replaced"]) == len(everything["hunts"]) == 4
-    assert {path.name for path in (toy.folder / "out/fast/0/crashes").iterdir()} == crash
-    assert toy.crashhunt("replay", "out/fast/0.replaced-0", "--json").json["verdict"] == "reproduced"
-
-
-@pytest.mark.nightly
-def test_a_damaged_plan_leaves_the_others_untouched(toy):
-    from crashhunt.suites import Suite
-    from crashhunt.suites._processes import run_all
-
-    written(toy, SUITE)
-    folders = Suite.read(toy.folder / "suite.toml").plan(toy.folder / "out")
-    (folders[0] / "request.json").write_text("{}")
-    run_all(folders, 2)
-    assert states(toy) == {"fast/0": "error", "fast/1": "crashed", "slow/0": "finished"}
-    assert "no request.json" in toy.crashhunt("logs", "out", "--errors-only").out
 
 
 def test_snapshots_of_a_suite_take_in_what_is_asked_for(toy):

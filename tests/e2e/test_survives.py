@@ -23,23 +23,6 @@ def test_what_is_printed_of_a_crash_in_traffic_is_small_and_can_be_pasted(tmp_pa
     assert str(again.value).splitlines()[1] == str(raised.value).splitlines()[1]
 
 
-@pytest.mark.nightly
-def test_an_example_may_have_disturbances(toy, monkeypatch):
-    monkeypatch.chdir(toy.folder)
-    (toy.folder / "erring").mkdir()
-    text = (toy.folder / "toy" / "scenario.toml").read_text(encoding="utf-8")
-    (toy.folder / "erring" / "scenario.toml").write_text(f"{text}\n[disturbances]\nbrake = 2.0\n", encoding="utf-8")
-    with pytest.raises(AssertionError) as raised:
-        assert_survives(
-            "keep-lane", "erring", trials=3, max_steps=80, arguments={"speed": "8:10"}, budget=0, parallel=1
-        )
-    (call,) = re.findall(r"^    (assert_survives\(.*\))$", str(raised.value), re.MULTILINE)
-    assert "'disturbances': [{" in call
-    with pytest.raises(AssertionError) as again:
-        exec(call, {"assert_survives": assert_survives})
-    assert str(again.value).splitlines()[1] == str(raised.value).splitlines()[1]
-
-
 NEEDS = """
 class Needs:
     def __init__(self, speed: float):

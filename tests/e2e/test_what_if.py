@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import re
-import signal
-import time
 from contextlib import closing
 from dataclasses import replace
 
 import pytest
 from conftest import mostly_nightly, one_in
 
-import crashhunt
 from crashhunt.analysis import _whatif_runs as _engine
-from crashhunt.base.errors import UsageError
 from crashhunt.crashes import find_bundle
 from crashhunt.recording import first_divergence
 from crashhunt.replays import ReplayOptions, prepare, reruns_of, up_to
@@ -159,45 +154,6 @@ def test_bad_input_is_refused_in_one_line(crash, words, said):
     done = crash.crashhunt("whatif", "h", *words, expect=2)
     assert said in done.err
     assert (done.err.count("\n"), done.out) == (1, "")
-
-
-@pytest.mark.nightly
-def test_ctrl_c_counts_the_runs_that_ended(toy):
-    toy.crashhunt(
-        "run", "h", "1", "20", "300", "--scenario", "toy", "--arg", "speed=14", "--set", "step_wall_s=0.01",
-        "--seed", "1",
-    )  # fmt: skip
-    words = ("whatif", "h", "--from-step", "5", "--futures", "--times", "5000", "--parallel", "2")
-    for has_limit, why in ((True, "the time is over"), (False, "interrupted")):
-        for seconds in (5, 100):  # on a loaded machine, no run may have ended after 5 s
-            running = toy.begin(*words, *(("--for", f"{seconds}s") if has_limit else ()))
-            if not has_limit:
-                time.sleep(seconds + 1)
-                running.send_signal(signal.SIGINT)
-            out, err = running.communicate(timeout=300)
-            if ended := re.search(rf"  {why}: ([1-9]\d*) of 5000 runs count", out):
-                break
-        assert running.returncode == (0 if has_limit else 130), err
-        assert "Traceback" not in err
-        assert ended, out
-        assert ", those before the first unfinished run" in out
-        assert f" of {ended[1]} runs crashed" in out
-
-
-@pytest.mark.nightly
-def test_python_counts_as_the_command_does(crash):
-    folder = crash.folder / "h"
-    told = crash.crashhunt(
-        "whatif", "h", "--before", "3", "--futures", "--times", "5", "--parallel", "1", "--json"
-    ).json
-    found = crashhunt.what_if(folder, before_s=3, futures=True, times=5, parallel=2)
-    assert found.to_json() == told
-    assert (found.runs, found.different > 2) == (5, True)
-    assert [each["number"] for each in told["each"]] == list(range(5))
-    assert told["interval"][0] <= told["share"] <= told["interval"][1]
-    assert crashhunt.what_if(folder, changes={"speed": 8.0}).survived == 1
-    with pytest.raises(UsageError, match="recorded actions cannot react"):
-        crashhunt.what_if(folder, code="log")
 
 
 @pytest.mark.nightly
