@@ -35,8 +35,6 @@ class Agent:
                 os.kill(os.getpid(), 11)
             if self.what == "exits":
                 os._exit(7)
-            if self.what == "hangs":
-                time.sleep(600)
         return self.speed + random.random() + np.random.random(), 0  # noqa: NPY002
 
 
@@ -48,12 +46,4 @@ class Draws(ToySimulator):
         np.random.random()  # noqa: NPY002
         self.setup_steps = 40
         time.sleep(0.03)
-        return super().reset(**asked)
-
-
-class Threads(Draws):
-    """Starts a thread while it is reset."""
-
-    def reset(self, **asked):
-        threading.Thread(target=threading.Event().wait, daemon=True).start()
         return super().reset(**asked)

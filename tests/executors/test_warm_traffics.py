@@ -86,13 +86,6 @@ def test_shared_warm_up_changes_no_result(pool, tmp_path, scenario):
     assert Recording(read_black_box(folder / "blackbox.bin")).digest == own[5].digest
 
 
-@pytest.mark.nightly  # by day, test_zygotes.py makes room for copies that are made up
-def test_with_more_traffics_than_copies_the_first_are_kept(pool):
-    with pool(2) as sharing:
-        found = run(sharing, *(spec(number, number % 3) for number in range(9)))
-    assert [one.setup_steps == 0 for one in found] == [False, False, False, True, True, False, True, True, False]
-
-
 def test_warm_up_that_takes_no_time_is_not_shared(pool):
     with pool(2, simulator="toy") as sharing:
         assert [one.outcome for one in run(sharing, spec(0, 1), spec(1, 1))] == [Outcome.SURVIVED] * 2
@@ -112,14 +105,6 @@ def test_trial_in_shared_traffic_dies_as_it_does_alone(pool, tmp_path):
         assert stack.count("Fatal Python error") == 1
 
 
-@pytest.mark.nightly  # by day, test_zygotes.py kills the trial of a made-up copy
-def test_hanging_trial_in_shared_traffic_is_killed_alone(pool):
-    with pool(2, timeout_s=5.0) as sharing:  # which the others need on no machine
-        found = run(sharing, spec(0, 1), spec(1, 1, "hangs"), spec(2, 1))
-    assert [one.outcome for one in found] == [Outcome.SURVIVED, Outcome.HANG, Outcome.SURVIVED]
-    assert [one.setup_steps or 0 for one in found] == [40, 0, 0]
-
-
 def test_trial_runs_again_when_its_warmed_up_copy_was_killed(pool):
     with pool(2) as sharing:
         first = run(sharing, spec(0, 1))
@@ -128,18 +113,6 @@ def test_trial_runs_again_when_its_warmed_up_copy_was_killed(pool):
         notes = sharing.notes()
     assert [one.outcome for one in (*first, *found)] == [Outcome.SURVIVED] * 3
     assert notes == ["trial 1 was ended by SIGKILL from outside, and is run again"]
-
-
-@pytest.mark.nightly  # by day, test_zygotes.py has copies that cannot be forked
-def test_traffic_that_cannot_be_forked_is_not_shared(pool):
-    with pool(2, simulator="sharing:Threads") as sharing:
-        found = run(sharing, spec(0, 1), spec(1, 1), spec(2, 2))
-        notes = sharing.notes()
-    assert [(one.outcome, one.setup_steps) for one in found] == [(Outcome.SURVIVED, 40)] * 3
-    (note,) = notes
-    assert note.startswith(
-        "trials in the same traffic do not share its warm-up: a process with several threads cannot be forked"
-    )
 
 
 def deepest_process_below(pid):

@@ -208,18 +208,6 @@ def test_last_avoidable_step_is_one_click_away_and_shows_where_braking_leads(hun
     assert driven < along[-1]
 
 
-@pytest.mark.nightly  # by day, clicks do
-def test_keys_lead_to_the_next_crash_and_show_all_names(hunt, browser):
-    report_of(hunt, browser)
-    shown = [one["id"] for one in page_data(browser)["crashes"]]
-    for key, number in (("[", -1), ("]", 0), ("]", 1)):
-        browser.find_element(By.TAG_NAME, "body").send_keys(key)
-        wait_for(lambda number=number: text(browser, "summary") == shown[number])
-    assert browser.find_element(By.ID, "ids").get_attribute("aria-pressed") == "false"
-    browser.find_element(By.TAG_NAME, "body").send_keys("i")
-    assert browser.find_element(By.ID, "ids").get_attribute("aria-pressed") == "true"
-
-
 def page_data(browser):
     return json.loads(browser.execute_script("return document.getElementById('data').textContent"))
 

@@ -92,6 +92,7 @@ def test_20_000_formulas_have_the_value_that_rtamt_computes():
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.timeout(3600)
 def test_20_000_formulas_of_the_past_have_the_value_that_rtamt_computes_sample_by_sample():
+    """Of the future, whole traces only are compared: rtamt delays a comparison beside a window twice."""
     import rtamt
 
     for tree, trace in _known_to_rtamt(past=False):
@@ -101,26 +102,6 @@ def test_20_000_formulas_of_the_past_have_the_value_that_rtamt_computes_sample_b
         specification = _specified(rtamt.StlDiscreteTimeOnlineSpecification(), of_the_past)
         rows = ([(name, values[at]) for name, values in trace.items()] for at in range(count))
         assert values == pytest.approx([specification.update(at, row) for at, row in enumerate(rows)], abs=1e-9)
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(importlib.util.find_spec("rtamt") is None, reason="pip install rtamt")
-@pytest.mark.filterwarnings("ignore")
-def test_rtamt_contradicts_itself_on_the_future_sample_by_sample():
-    """It delays a comparison beside a window twice, so formulas of the future are compared on whole traces only."""
-    import rtamt
-
-    low = ("compare", "<", ("signal", "a"), ("number", 3.0))
-    tree = ("and", low, ("eventually", (2, 2), ("compare", ">", ("signal", "b"), ("number", 0.0))))
-    trace = {"a": [1.0, 2, 4, 8, 16, 3, 7], "b": [5.0, 1, 9, 2, 2, 6, 0], "c": [0.0] * 7}
-    whole = _specified(rtamt.StlDiscreteTimeOfflineSpecification(), tree)
-    delayed = _specified(rtamt.StlDiscreteTimeOnlineSpecification(), tree)
-    delayed.pastify()
-    ours = parse(written(tree)).values(arrays(trace), 1.0)[:5].tolist()
-    assert ours == [ByDefinition(trace).value(tree, at)[0] for at in range(5)] == [2.0, 1.0, -1.0, -5.0, -13.0]
-    assert ours == [value for _, value in whole.evaluate({"time": [*range(7)], **trace})][:5]
-    rows = ([(name, values[at]) for name, values in trace.items()] for at in range(7))
-    assert ours != [delayed.update(at, row) for at, row in enumerate(rows)][2:]
 
 
 def test_the_sign_of_the_robustness_agrees_with_the_truth():
