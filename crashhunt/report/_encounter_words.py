@@ -93,8 +93,8 @@ def about_danger(course: DangerCourse, *, partner: str = "") -> str:
         ("Rear criticality", course.greatest_behind, course.behind_total, "by", "no vehicle closed in"),
     ):
         if moment.danger > 0:
-            if partner and moment is course.greatest and moment.other != partner:
-                heading += " before the contact"
+            if partner and moment is course.greatest and moment.other != partner and moment.step < course.steps[-1]:
+                heading += " before the contact"  # highway-env also shows other vehicles in the step of the contact
             most = f"at most {moment.danger:.2f}, after step {moment.step}, {relation} {moment.other}"
             parts.append(f"{heading}: {most} ({total:.2f} over the trial).")
         elif not partner:

@@ -92,6 +92,8 @@ def test_lane_change_counts_the_vehicle_behind_in_the_target_lane(turn):
     assert "no actor" not in about_danger(calm, partner="ahead")
     assert about_danger(found, partner="ahead").startswith("Criticality of ego: at most")
     assert about_danger(found, partner="behind").startswith("Criticality of ego before the contact: at most")
+    at_contact = replace(found, greatest=found.greatest._replace(step=found.steps[-1]))
+    assert about_danger(at_contact, partner="behind").startswith("Criticality of ego: at most")
     words = about_danger(calm)
     assert "no actor was on its way; ahead came nearest, 1.0 m away after step 21" in words
     assert "no actor came within 50 m" in about_danger(
