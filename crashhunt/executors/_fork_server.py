@@ -149,7 +149,7 @@ class _Server:
                 data = b""
             if not data:
                 return False
-            said = _parse_request(data)
+            said = _parse_message(data)
             if "importing" in said:
                 self._watch.begin(said["importing"])
             else:
@@ -260,8 +260,8 @@ def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool)
         end_descendants(frozenset(zygotes))
 
 
-def _parse_request(data: bytes) -> FromForkServer:
-    """Return the message of the template; None if an imported agent has written other data to the connection."""
+def _parse_message(data: bytes) -> FromForkServer:
+    """Return the message of the template; empty if an imported agent has written other data to the connection."""
     said: FromForkServer = {}
     with suppress(ValueError, KeyError, TypeError):
         message = json.loads(data)

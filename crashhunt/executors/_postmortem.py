@@ -305,7 +305,7 @@ def _users_frame(stack: str) -> str:
 
 
 def read_map(scratch: Path, trial: Path) -> list[Lane]:
-    """Return the map of a kept trial, or the map of its hunt; None if neither was written."""
+    """Return the map of a kept trial, or the map of its hunt; empty if neither was written."""
     for folder in (trial, scratch):
         with suppress(OSError, ValueError, TypeError):
             data = json.loads((folder / layout.MAP).read_text(encoding="utf-8"))

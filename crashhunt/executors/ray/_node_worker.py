@@ -194,7 +194,7 @@ class Work:
         return said
 
     def _map(self) -> bytes:
-        """Return the map that all trials of this node share; None after the first call."""
+        """Return the map that all trials of this node share; empty after the first call."""
         if self._map_sent or self._place is None:
             return b""
         with suppress(OSError):
